@@ -1,11 +1,11 @@
-"""Rehearse learned drone policies through MAVLink: the Python API.
+"""Python API to rehearse learned drone policies through MAVLink.
 
 >>> from airl_mav import Scenario, rehearse
 >>> run = rehearse(Scenario(level="lockstep", episodes=2))
 >>> run.quality.success_rate.value, run.latency["t2"].mean()
 
-Everything is imported when it is first used, so that a companion computer loads no simulator.
-`gymnasium.make("airl_mav:airl/Navigation-v0")` finds the environment as soon as this is imported.
+All names are imported on first use, so a companion computer does not load the simulator.
+`gymnasium.make("airl_mav:airl/Navigation-v0")` finds the environment after this import.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
+    """Import a public name on first use."""
     if name not in _EXPORTS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_EXPORTS[name]), name)
@@ -82,5 +82,5 @@ def __dir__() -> list[str]:
     return sorted([*globals(), *_EXPORTS])
 
 
-# Not imported here: it takes more than all the rest, and a light installation has none.
+# Imported on demand: gymnasium is slow to import, and a light installation does not have it.
 _after_import("gymnasium", "airl_mav.envs.registration")

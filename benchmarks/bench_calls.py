@@ -1,10 +1,11 @@
-"""Python calls per tick of flight controller, MAVLink link and whole flight, whatever the load.
+"""Python calls per tick of flight controller, MAVLink link and whole flight.
 
     python benchmarks/bench_calls.py [--top 40]
 
-The flights of benchmarks/bench_stack.py: (a) plant and flight controller in a hover, (b) with the
-onboard MAVLink link, (c) a whole flight in lockstep with MAVSDK, camera and policy. Counts calls of
-Python functions, not of C functions, compiled kernels and the threads of MAVSDK.
+The result does not depend on the machine's load. The flights are from benchmarks/bench_stack.py:
+(a) plant and flight controller in a hover, (b) with the onboard MAVLink link, (c) a whole flight in
+lockstep with MAVSDK, camera and policy. Counts Python functions. Excludes C functions, compiled
+kernels and MAVSDK's threads.
 """
 
 from __future__ import annotations
@@ -52,16 +53,16 @@ class Calls:
             self.companion[frame.f_code] += 1
 
     def begin(self) -> None:
-        """Count from now on, in this thread and those that it starts."""
+        """Start counting, in this thread and in threads started later."""
         threading.setprofile(self.profile_companion)
         sys.setprofile(self.profile_vehicle)
 
 
 def count_calls(flight: Callable[[Callable[[], None]], Timed]) -> Calls:
-    """Return the calls of a flight, which is given a function to call where counting begins.
+    """Return the calls of a flight, which receives a function to call when counting starts.
 
-    The flight with fewer calls of two: the first one also loads kernels, and frames that MAVSDK
-    sends by the wall clock, as heartbeats, add up to 0.5 % on a loaded host.
+    The smaller count of two flights is used. The first flight also loads kernels. MAVSDK sends
+    frames by the wall clock, such as heartbeats: they add up to 0.5 % on a loaded host.
     """
     flights = []
     for _ in range(2):

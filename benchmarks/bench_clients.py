@@ -1,12 +1,12 @@
-"""Do many clients make the flight controller late? One client against twenty, turn by turn.
+"""Lateness of the flight controller with one client and with twenty, in alternating turns.
 
     python benchmarks/bench_clients.py
 
 Two vehicles fly in real time, never both at once: one has one client, the other has twenty. Every
-client commands at 50 Hz, and downloads all parameters and a log again and again. They run in a
-process of their own, on real sockets. Prints how late ticks began and how much processor time they
-took, and whether every command was acknowledged to who had sent it. Compare the two columns, not
-two runs: both see the same neighbours on the host.
+client commands at 50 Hz, and repeatedly downloads all parameters and a log. Clients run in a
+separate process, on real sockets. Prints the lateness of ticks, their processor time, and whether
+every command was acknowledged to its sender. Compare the two columns, not two runs: both columns
+see the same load on the host.
 """
 
 from __future__ import annotations
@@ -63,21 +63,21 @@ class Bench:
     """Measure what many clients cost."""
 
     clients: int = 20
-    """Against one."""
+    """Compared with one client."""
     seconds: float = 5.0
-    """Of a turn."""
+    """Duration of a turn."""
     turns: int = 4
-    """Of each of the two."""
+    """Turns for each vehicle."""
 
 
 @dataclass
 class Tally:
-    """What one client has sent and got."""
+    """Messages that one client has sent and received."""
 
     asked: int = 0
     acknowledged: int = 0
     strangers: int = 0
-    """Acknowledgements of what somebody else had sent."""
+    """Acknowledgements of other clients' commands."""
     parameters: int = 0
     log_bytes: int = 0
     attitudes: int = 0
@@ -100,12 +100,12 @@ class Client:
         self._mav.seq = (self._mav.seq + 1) % 256
 
     def download(self) -> None:
-        """Ask for all parameters and a log."""
+        """Request all parameters and a log."""
         self._send(dialect.MAVLink_param_request_list_message(1, 1))
         self._send(dialect.MAVLink_log_request_data_message(1, 1, 0, 0, LOG_BYTES))
 
     def command(self) -> None:
-        """Ask for a message."""
+        """Request a message."""
         more = [math.nan] * 5
         asked = dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL, dialect.MAVLINK_MSG_ID_ATTITUDE
         self._send(dialect.MAVLink_command_long_message(1, 1, 512, 0, *asked, *more))
@@ -145,7 +145,7 @@ def serve(pipe: Connection) -> None:
             return
         clients = known.setdefault(vehicle, [Client(n, vehicle) for n in range(number)])
         for client in clients:
-            client.listen()  # what came since its last turn belongs to no turn
+            client.listen()  # discard messages from between the turns
             client.tally = Tally()
             client.download()
         began = time.monotonic()
@@ -164,7 +164,7 @@ def serve(pipe: Connection) -> None:
 
 
 class Pacing:
-    """As fast as possible until `paced`, then in real time; notes how late ticks begin."""
+    """Pacing at full speed until `paced`, then in real time; records the lateness of ticks."""
 
     quiet_until_us = 0.0
     arrivals = None
@@ -209,7 +209,7 @@ class Pacing:
 
 @dataclass
 class Vehicle:
-    """One of the two, with its clients."""
+    """A vehicle of the comparison, with its clients."""
 
     firmware: Firmware
     pacing: Pacing

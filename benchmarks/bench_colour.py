@@ -1,8 +1,8 @@
-"""Colour images a second on one core, and what one costs in depth images.
+"""Colour images per second on one core, and their cost relative to depth images.
 
-Run as `python benchmarks/bench_colour.py`. The arenas and poses are those of `bench_depth`; every
-obstacle has a texture, the sun casts shadows. Depth and colour are measured in turns, so that their
-ratio holds on a busy machine, too. Both kernels are called from a compiled loop, as in training.
+Run as `python benchmarks/bench_colour.py`. Arenas and poses are from `bench_depth`; every obstacle
+has a texture, the sun casts shadows. Depth and colour are measured in turns, so that their ratio
+holds on a busy machine, too. Both kernels are called from a compiled loop, as in training.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""How long compensation of latency takes in a decision, on one core.
+"""Time of latency compensation per decision, on one core.
 
     python benchmarks/bench_compensation.py [VEHICLE]
 
-Images of a real arena along a flight through it, carried forward by 396 ms; the camera is the
-vehicle's own (64 x 48 of the shipped one).
+Images of a real arena along a flight through it, predicted 396 ms ahead; the camera is the
+vehicle's (64 x 48 pixels on the shipped vehicle).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""How long the first start after an install compiles: into an empty cache, then from a full one.
+"""Compile time of the first start after an install: with an empty cache, then with a full one.
 
-Run as `python benchmarks/bench_compiling.py`. Wall and processor time of what each level compiles
-before its first flight, in a new process each.
+Run as `python benchmarks/bench_compiling.py`. Wall and processor time of the kernels that each
+level compiles before its first flight, in a new process each.
 """
 
 from __future__ import annotations

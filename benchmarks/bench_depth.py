@@ -1,9 +1,9 @@
 """Depth images a second on one core: this project's ray caster beside pybullet's TinyRenderer.
 
-Run as `python benchmarks/bench_depth.py`. Both draw the same arena from the same poses: a
-50 x 50 m room with 5 m walls, the vehicle among boxes, pillars and spheres, 90 degrees, 20 m. The
-kernel is called from a compiled loop, as in training, and through `render`, as in the plant.
-TinyRenderer shades a colour image as well; it has no way to leave that out.
+Run as `python benchmarks/bench_depth.py`. Both draw the same arena from the same poses: a room of
+50 x 50 m with 5 m walls, the vehicle among boxes, pillars and spheres. The camera has 90 degrees
+and 20 m range. The kernel is called from a compiled loop, as in training, and through `render`, as
+in the plant. TinyRenderer always shades a colour image as well.
 """
 
 from __future__ import annotations

@@ -1,17 +1,16 @@
-"""Environment steps a second on one core: the batch twin, beside other drone simulators.
+"""Environment steps per second on one core: vectorized simulator and other drone simulators.
 
     python benchmarks/bench_envs.py [--crazyflow-python P] [--pyflyt-python P] [--gpd P]
 
 A thousand vehicles fly random velocity setpoints, a new one each step: 20 ms of flight a step
-without a camera, 100 ms and a 64x48 depth image with one. Time is processor time, and every number
-the best of several stretches, as other processes only ever slow it down.
+without a camera, 100 ms and a 64x48 depth image with one. Times are processor times. Each number is
+the best of several stretches, as other processes only slow it down.
 
-The others are measured by an interpreter each, of an environment that has them installed
-(`pip install crazyflow`, `pip install PyFlyt`, gym-pybullet-drones from its repository), each with
-its own vehicle, rigid body, velocity or position controller and physics rate, pinned to one core
-like ours. crazyflow flies its thousand vehicles in one call as we do; PyFlyt and
-gym-pybullet-drones fly one at a time. "flight s/s" is what compares best: seconds of flight of all
-vehicles per second of computing.
+Each other simulator runs in a Python interpreter with that simulator installed (`pip install
+crazyflow`, `pip install PyFlyt`, gym-pybullet-drones from its repository). Each uses its own
+vehicle, rigid body, velocity or position controller and physics rate. All are pinned to one core.
+crazyflow and this project fly a thousand vehicles in one call. PyFlyt and gym-pybullet-drones fly
+one at a time. Compare "flight s/s": seconds of flight of all vehicles per second of computing.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ Result = dict[str, Any]
 
 
 def result(name: str, step_s: float, hz: float, steps: float, seconds: float) -> Result:
-    """Return one row: so many environment steps took so many seconds."""
+    """Return one row for a number of environment steps in a number of seconds."""
     rate = steps / seconds
     return {"name": name, "step_s": step_s, "hz": hz, "steps": rate, "ticks": rate * step_s * hz}
 
@@ -58,7 +57,7 @@ def fastest(
 
 
 class Row(NamedTuple):
-    """What is measured of ours, and how it is told."""
+    """One row for this project: name, seconds of flight per step, and measured function."""
 
     name: str
     step_s: float

@@ -1,20 +1,20 @@
-"""Are the estimator's errors as large as it says? NIS and NEES over ten minutes of mixed flight.
+"""Consistency of the estimator: NIS and NEES over ten minutes of mixed flight.
 
     python benchmarks/bench_estimator.py
 
-Ten flights of plant and flight controller in simulated time, each with a seed of its own: take-off,
-hold, a minute of offboard velocities and headings as they come, landing. Of every measurement the
-normalised innovation squared (NIS) is noted, of position, velocity and attitude the normalised
-error squared (NEES), both divided by their degrees of freedom: 1 = as large as the filter says,
-less = it says more. Beside the means stand the two-sided 95 % bounds of the mean of a filter that
-says what is: innovations are independent of each other, errors only from flight to flight. Then
-what share of samples lies below the 95 % quantile of chi-square, and within its two-sided 95 %
-bounds (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation,
-ch. 5.4).
+Ten flights of plant and flight controller in simulated time, each with a different seed: take-off,
+hold, a minute of random offboard velocities and headings, landing. Records the normalised
+innovation squared (NIS) of every measurement, and the normalised error squared (NEES) of position,
+velocity and attitude. Both are divided by their degrees of freedom: 1 = consistent, less = the
+filter overstates its errors. The table has the means with the two-sided 95 % bounds of a consistent
+filter's mean. The bounds assume that innovations are independent, and errors only between flights.
+Further columns have the share of samples below the 95 % quantile of chi-square, and within its
+two-sided 95 % bounds (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and
+Navigation, ch. 5.4).
 
 The vehicle's parameters overstate the noises, as PX4's defaults do, so the means lie below 1. With
-`--matched` the filter is told what the sensors have, and the GPS does not wander, for which it has
-no state: then the means say whether the filter itself is right.
+`--matched` the filter uses the sensors' true noises. The GPS does not drift then, as the filter has
+no state for drift: the means show whether the filter is consistent.
 """
 
 from __future__ import annotations
@@ -52,15 +52,15 @@ from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 ALTITUDE_M = 8.0
 HOLD_S = 5.0
 REPEAT_TICKS = 13
-"""Setpoints are repeated every so many ticks: some 20 Hz."""
+"""Ticks between repetitions of a setpoint: about 20 Hz."""
 NEES_TICKS = 50
-"""The error is looked at every so many ticks: 5 Hz."""
+"""Ticks between samples of the error: 5 Hz."""
 LONGEST_LANDING_S = 60.0
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Which flights."""
+    """Flights of the benchmark."""
 
     vehicle: str = "quad"
     """Profile name or path."""
@@ -69,11 +69,11 @@ class Bench:
     seconds: float = 60.0
     """In offboard, each."""
     matched: bool = False
-    """Tell the filter the noises that the sensors have; the GPS does not wander."""
+    """Configure the filter with the sensors' true noises; the GPS does not drift."""
 
 
 class Noted:
-    """Normalised squares, by what they are of; each with its degrees of freedom."""
+    """Normalised squares by quantity and degrees of freedom."""
 
     def __init__(self) -> None:
         self.values: dict[tuple[str, int], list[float]] = {}
@@ -85,7 +85,7 @@ class Noted:
 
 
 def told_its_noises(vehicle: VehicleProfile) -> VehicleProfile:
-    """Return the vehicle whose filter is told the noises of its sensors."""
+    """Return the vehicle with a filter configured for the noises of its sensors."""
     imu, gps = vehicle.sensors.imu, vehicle.sensors.gps.model_copy(update={"drift_m_sqrt_s": 0.0})
     step_s = math.sqrt(BIAS_STEP_S)
     horizontal = math.hypot(*MAGNETIC_FIELD_NED[:2])
@@ -136,7 +136,7 @@ def fly(vehicle: VehicleProfile, seed: int, seconds: float, nis: Noted, nees: No
 def pilot(
     simulation: Simulation, autopilot: BuiltinAutopilot, rng: np.random.Generator, seconds: float
 ) -> Iterator[None]:
-    """Say what a pilot does; yield for every tick to be flown. Raises SystemExit: it went wrong."""
+    """Command the vehicle; yield for every tick. Raises SystemExit if the flight fails."""
     while autopilot.flight.phase is Phase.BOOT:
         yield
     if autopilot.arm(force=False) is not Result.ACCEPTED:
@@ -188,7 +188,7 @@ def note_errors(
 
 
 def shown(title: str, noted: Noted, independent: int | None = None) -> Table:
-    """Return the table of what was noted, of which so many are independent (None = all)."""
+    """Return the table of recorded values, `independent` of them independent (None = all)."""
     table = Table(title=title)
     for column in ("of", "freedom", "samples", "mean", "bounds", "< 95 %", "within"):
         table.add_column(column, justify="left" if column == "of" else "right")

@@ -1,10 +1,10 @@
-"""What 8-bit integers save: size of the file, and processor time of a decision, on one thread.
+"""Savings by 8-bit integers: file size, and processor time per decision on one thread.
 
     python benchmarks/bench_int8.py [POLICY | LAYERSxFILTERS ...]
 
-Policies are exported as `airl export --int8` does; a size stands for a random network of the
-paper's template on its image, whose ranges come from noise: its time does not depend on them.
-Processor time, not wall time: other processes change it little.
+Policies are exported as by `airl export --int8`. A size selects a random network of the paper's
+template on its image. Its ranges come from noise: they do not affect its time. Measures processor
+time, which other processes change little.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from airl_mav.policy.template import write_template
 
 DEFAULT = ("static-obstacles", "5x32")
 LONGEST_S = 10.0
-"""Of measuring one network."""
+"""Maximum time for measuring one network [s]."""
 CALLS, WARM_UP, NOISE_FRAMES = 5000, 20, 32
 
 
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def pair_of(name: str, scratch: Path) -> tuple[Path, Path, ObservationSpec]:
-    """Return the folder in floats, the file in integers, and what both take."""
+    """Return the float model's folder, the integer model's file, and the input of both."""
     size = re.fullmatch(r"(\d+)x(\d+)", name)
     if size is None:
         folder = find_policy(name).folder

@@ -1,9 +1,9 @@
-"""Samples a second that an update of the double DQN learns from, on one thread.
+"""Samples per second in updates of the double DQN, on one thread.
 
-Run as `python benchmarks/bench_learner.py`. The memory is filled by the real environment; an update
-is a draw of 128, two passes without gradients, one with, and the optimiser's step. Weights lie as
-torch has them by default ("plain") or as its convolutions like them ("channels last", what
-`make_model` does).
+Run as `python benchmarks/bench_learner.py`. The real environment fills the replay buffer. An update
+draws 128 samples, and runs two passes without gradients, a pass with gradients, and the optimiser's
+step. Weights have torch's default memory format ("plain") or the preferred format of its
+convolutions ("channels last", as in `make_model`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SECONDS = 1.5  # of each measurement
 
 
 def fastest(model: DoubleDQN) -> float:
-    """Samples a second of CPU time, of the fastest tenth of the updates: what an idle core does."""
+    """Return samples per second of CPU time in the fastest tenth of updates, as on an idle core."""
     took: list[float] = []
     end = time.perf_counter() + SECONDS
     while time.perf_counter() < end or len(took) < 20:

@@ -1,18 +1,17 @@
-"""How long setpoints and telemetry take between a client's Python and the flight controller.
+"""Latency of setpoints and telemetry between a client's Python and the flight controller.
 
-    python scripts/foreign_clients.py ~/foreign-clients        # mavsdk-grpc has a Python of its own
+    python scripts/foreign_clients.py ~/foreign-clients        # separate Python for mavsdk-grpc
     python benchmarks/bench_mavsdk.py --grpc-python ~/foreign-clients/mavsdk-grpc/bin/python
 
-The built-in flight controller runs here, on the ground, in real time, on real sockets of this
-host; each client is a process of its own that sends 50 setpoints a second and gets 50 positions a
-second. A setpoint counts from the call to the datagram in the flight controller's hands, a position
-from the moment before its datagram is sent to the callback in Python. Both are stamped by
-CLOCK_MONOTONIC and matched by their values. Each client is measured twice: undisturbed, and beside
-as many processes as there are cores that do nothing but count. On a host with other work,
-`--realtime` keeps that work away (it needs the right to SCHED_FIFO): from the flight controller
-always, as an aircraft has a processor for it alone, and from the client while it is undisturbed.
-The load average of the last minute stands beside each figure. Leaves table.json, which results.py
-publishes.
+The built-in flight controller runs here, on the ground, in real time, on real sockets of this host.
+Each client is a separate process that sends 50 setpoints a second and receives 50 positions a
+second. A setpoint's latency is from the call until the flight controller has the datagram. A
+position's latency is from before its datagram is sent until the callback in Python. Both are
+stamped by CLOCK_MONOTONIC and matched by their values. Each client is measured twice: undisturbed,
+and beside one busy counting process per core. On a loaded host, use `--realtime` to keep other work
+away (requires permission for SCHED_FIFO). It always applies to the flight controller, because an
+aircraft has a processor for it, and to the client only while undisturbed. Each figure has the
+load average of the last minute. Writes table.json, which results.py publishes.
 """
 
 from __future__ import annotations
@@ -81,26 +80,26 @@ class Bench:
     """Python with mavsdk-grpc, MAVSDK's older interface; None: without it."""
 
     setpoints: int = 1500
-    """Of each client, at 50 Hz, in each condition."""
+    """Number for each client, at 50 Hz, in each condition."""
 
     rate_hz: float = 50.0
-    """Of setpoints and positions."""
+    """Rate of setpoints and positions."""
 
     realtime: bool = False
     """Run the flight controller, and undisturbed clients, by SCHED_FIFO."""
 
     out: Path = Path("runs/mavsdk-latency")
-    """Where table.json goes."""
+    """Folder of table.json."""
 
 
 class Tap:
-    """When the flight controller got setpoints and sent positions [ns, CLOCK_MONOTONIC]."""
+    """Times of received setpoints and sent positions [ns, CLOCK_MONOTONIC]."""
 
     def __init__(self) -> None:
         self.got: dict[int, int] = {}
         """First arrival by the number of the setpoint; MAVSDK repeats the newest."""
         self.sent: dict[str, int] = {}
-        """By the bytes of the position."""
+        """Send time by the bytes of the position."""
 
     def arrived(self, data: bytes) -> None:
         """Note the setpoints in a datagram."""
@@ -137,7 +136,7 @@ class TappedPeer(UdpPeer):
 
 
 class TappedEndpoint(UdpEndpoint):
-    """The flight controller's socket, with a tap on what comes and goes."""
+    """The flight controller's socket, recording arrivals and departures."""
 
     def __init__(self, remote: Address, tap: Tap) -> None:
         super().__init__((LOOPBACK, 0), remote, local_option="local", remote_option="remote")
@@ -154,7 +153,7 @@ class TappedEndpoint(UdpEndpoint):
 
 
 def run_at_once(*, with_children: bool) -> None:
-    """Let this process, and those that it starts or not, run as soon as they can."""
+    """Run this process with real-time priority; `with_children` includes its child processes."""
     way = os.SCHED_FIFO if with_children else os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
     os.sched_setscheduler(0, way, os.sched_param(REALTIME))
 

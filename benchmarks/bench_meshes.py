@@ -1,15 +1,15 @@
-"""Meshes that cameras see: images a second on one core, and depth beside trimesh's rays.
+"""Meshes in camera images: images per second on one core, and depth against trimesh's rays.
 
-Run as `python benchmarks/bench_meshes.py`. The arenas and poses are those of `bench_depth`, with
-ten things: boxes, pillars and spheres, or in their places meshes, bent rings that stand on the
-floor. Depth and colour of all scenes are measured in turns, in one process, so that their ratios
-hold on a busy machine, too. The kernels are called from a compiled loop, as in training.
+Run as `python benchmarks/bench_meshes.py`. Arenas and poses are from `bench_depth`, with ten
+objects: boxes, pillars and spheres, or meshes in their places: bent rings on the floor. Depth and
+colour of all scenes are measured in turns, in one process, so that their ratios hold on a busy
+machine, too. The kernels are called from a compiled loop, as in training.
 
-Both are measured with a pinhole and with a fisheye, and then 1,000 views of the meshes are compared
-with rays that trimesh casts: by Embree where `embreex` is installed, else by its own caster, which
-needs `rtree` and takes hours; `--views` asks for fewer. All pixels are compared, those on edges as
-well, and how many differ is told. Embree's rays are of 32 bits: where they pass an edge by less
-than that, it may see another triangle.
+Both are measured with a pinhole and a fisheye camera. Then 1,000 views of the meshes are compared
+with trimesh's rays: by Embree if `embreex` is installed, else by trimesh's caster, which needs
+`rtree` and takes hours; use `--views` for fewer. The comparison covers all pixels, including edges,
+and prints how many differ. Embree uses 32-bit rays: within their rounding of an edge, Embree may
+hit another triangle.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ THINGS = 10
 ROUNDS = 15
 FISHEYE_FOV = math.radians(170.0)
 DISTORTION = (-0.05, 0.008, -0.0045, 0.0004)
-"""Of the fisheye that looks at the same scenes."""
+"""Distortion coefficients of the fisheye camera for the same scenes."""
 
 RINGS = {2_000: (50, 20), 20_000: (200, 50)}
 """Sections around and across a ring, by its number of triangles."""
@@ -141,7 +141,7 @@ def traced(
 def compare(
     arena: Arena, k: Intrinsics, views: int, rng: np.random.Generator, console: Console
 ) -> None:
-    """Tell how far depth images of an arena's meshes are from trimesh's rays."""
+    """Print the differences between depth images of an arena's meshes and trimesh's rays."""
     mesh = in_world(arena)
     bare = replace(arena, meshes=(), obstacles=make_arena(0, rng).obstacles)
     apart: list[NDArray[np.float64]] = []

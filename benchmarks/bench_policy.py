@@ -1,9 +1,9 @@
-"""How long a decision of a shipped policy takes, on one thread.
+"""Time per decision of a shipped policy, on one thread.
 
     python benchmarks/bench_policy.py [POLICY]
 
-ONNX Runtime, as the companion runs it; torch beside it, eager, on a network of the same shape; and
-the whole decision from frame and telemetry to velocity command.
+Measures ONNX Runtime, as used by the companion; torch in eager mode with a network of the same
+shape; and the whole decision from frame and telemetry to velocity command.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""How fast the plant runs under PX4.
+"""Speed of the plant under PX4.
 
     python benchmarks/bench_px4.py --px4-dir PX4-Autopilot [--instance 7]
     python benchmarks/bench_px4.py
 
 Boots PX4 SITL (without --px4-dir: the tests' stand-in, which flies our own autopilot), takes off
-and hovers, first as fast as it goes, then by the wall clock. Prints multiples of real time and
-where the time of a tick goes.
+and hovers, first at full speed, then by the wall clock. Prints multiples of real time and the parts
+of a tick's time.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Operator:
         self._on_ground, self.airborne = True, False
 
     def look(self, now_us: int, *, armed: bool) -> None:
-        """Take what has come, and ask once a second for what is next."""
+        """Handle received messages, and send the next command once a second."""
         for chunk in self._link.receive():
             if not self.airborne:
                 for message in self._decoder.feed(chunk):
@@ -88,7 +88,7 @@ class Operator:
             return
         self._asked_us = now_us
         self._link.send(self._encoder.pack(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)))
-        # A take-off that is asked for again in the air climbs on from there, and never ends.
+        # A repeated take-off command in the air restarts the climb, which then never ends.
         if self._ready and self._on_ground:
             number, first = (TAKEOFF, float("nan")) if armed else (ARM, 1.0)
             rest = [float("nan")] * 6

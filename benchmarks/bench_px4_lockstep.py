@@ -1,12 +1,12 @@
-"""What a flight of PX4 and companion in lockstep costs: processor time, by process and thread.
+"""Cost of a flight of PX4 and companion in lockstep: processor time by process and thread.
 
     python benchmarks/bench_px4_lockstep.py --px4-dir PX4-Autopilot [--seeds 3] [--threads 12]
     python benchmarks/bench_px4_lockstep.py
 
-Flies static-obstacles in its arena (without --px4-dir: the tests' stand-in, which flies
-our own autopilot). All figures are for a simulated second of flight. Processor time does not
-depend on what else the host does; the multiple of real time, and how long threads that could run
-waited for a core, do. Linux only: from /proc.
+Flies static-obstacles in its arena (without --px4-dir: the tests' stand-in, which flies our own
+autopilot). All figures are per simulated second of flight. Processor time does not depend on the
+host's load. The multiple of real time, and the time that runnable threads waited for a core, depend
+on it. Linux only: reads /proc.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ LOOK_US = 4 * US_PER_S
 
 
 class Spent(NamedTuple):
-    """Of one thread, since it began. Source: /proc/PID/task/TID/schedstat."""
+    """Scheduling times of one thread since its start. Source: /proc/PID/task/TID/schedstat."""
 
     ran_ns: int
     waited_ns: int
-    """Time in which it could have run, and no core was free for it."""
+    """Time in which the thread was runnable, but no core was free."""
     slices: int
-    """How often it was given a core."""
+    """Number of time slices."""
 
 
 Threads = dict[tuple[str, str, int], Spent]
-"""By name of the process, name of the thread, and its number."""
+"""Scheduling times by process name, thread name and thread id."""
 
 
 def threads() -> Threads:
@@ -63,7 +63,7 @@ def threads() -> Threads:
             try:
                 name = (task / "comm").read_text().strip()
                 spent = Spent(*map(int, (task / "schedstat").read_text().split()))
-            except OSError:  # It has ended meanwhile.
+            except OSError:  # The thread has ended.
                 continue
             found[program, name, int(task.name)] = spent
     return found
@@ -92,11 +92,11 @@ class Meter(Observer):
 
 
 Spending = dict[tuple[str, str], float]
-"""By name of the process and name of the thread."""
+"""Seconds by process name and thread name."""
 
 
 class Flight(NamedTuple):
-    """What one flight took for each simulated second."""
+    """Times of one flight for each simulated second."""
 
     speed: float
     """Multiple of real time."""

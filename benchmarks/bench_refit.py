@@ -1,15 +1,15 @@
-"""How near a refit comes to the truth, on flights whose truth is known.
+"""Accuracy of refits, on flights with known parameters.
 
     .venv/bin/python benchmarks/bench_refit.py [--flights 20] [--keep FOLDER] [--rehearsals 4]
 
-Flies aircraft in lockstep whose mass, thrust, drag, link, latency and wind are not those of the
-profile, recorded by the companion's black box and the vehicle's log, refits each from both, from
-the black box alone and from the log alone, and prints the errors. 20 flights take about two
+Flies aircraft in lockstep with mass, thrust, drag, link, latency and wind that differ from the
+profile. The companion's black box and the vehicle's log record the flights. Refits each from both,
+from the black box alone and from the log alone, and prints the errors. 20 flights take about two
 minutes. With --rehearsals each is flown again on its refit, as a whole and part by part: a minute
 or two more for each.
 
-The true dead time is that of the same model on the simulator's own path, from when the flight
-controller took each setpoint: what no recording knows.
+The true dead time is from the same model on the simulator's path, starting when the flight
+controller took each setpoint. No recording contains this time.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from tests.support.recorded_flights import RecordedFlight
 from tests.support.refit_truths import RefitErrors, drawn_truth, errors_of, true_dead_time_s
 
 BOTH, BOX, LOG = "both", "box", "log"
-"""What a refit is made from: black box and vehicle's log, or one of them alone."""
+"""Sources of a refit: black box and vehicle's log, or only one."""
 
 ASKED = {"dead_s": 0.008, "mass": 0.03, "wind_m_s": 0.5, "t2": 0.02}
-"""Errors that are asked for."""
+"""Required accuracy."""
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ AHEAD = 22
 def measure(name: str, **beside: Any) -> str:
     """Return a line of the table."""
     env = gymnasium.make("airl_mav:airl/Rehearsal-v0", arena="static-obstacles", **beside)
-    env.reset(seed=1)  # What is compiled or loaded once.
+    env.reset(seed=1)  # Compile and load before the measurement.
     takeoffs_s = steps_s = flown_s = 0.0
     decisions = 0
     for seed in range(1, FLIGHTS + 1):

@@ -1,8 +1,8 @@
-"""How long the page of a run takes to be drawn, and how large it is.
+"""Time to draw the page of a run, and its size.
 
-Run as `python benchmarks/bench_report.py RUN [TIMES]`; RUN is a run folder, which stays as it is.
-Each time in a new process, without the time of the first imports: with all that `airl report` draws
-for the page, the PNG files and the verdict.
+Run as `python benchmarks/bench_report.py RUN [TIMES]`; RUN is a run folder, which is not changed.
+Each time in a new process, excluding the first imports. Includes everything that `airl report`
+draws for the page, the PNG files and the verdict.
 """
 
 from __future__ import annotations

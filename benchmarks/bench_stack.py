@@ -1,11 +1,11 @@
-"""How fast vehicle, flight controller and companion run when nothing waits for the wall clock.
+"""Speed of vehicle, flight controller and companion without waiting for the wall clock.
 
     python benchmarks/bench_stack.py
 
 On one core. (a) plant and flight controller in a hover with 20 Hz setpoints, (b) with the MAVLink
-streams of the onboard link, and of both links, packed as well, (c) whole flights in lockstep:
-real MAVSDK, depth camera, `static-obstacles` at two decisions a second. Prints multiples of real
-time, the best of three, and where the time of a tick goes.
+streams of the onboard link, and of both links, packed as well, (c) whole flights in lockstep: real
+MAVSDK, depth camera, `static-obstacles` at two decisions a second. Prints multiples of real time,
+the best of three, and the parts of a tick's time.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Stopwatches:
         return lambda: setattr(owner, name, call)
 
     def reset(self) -> None:
-        """Begin anew."""
+        """Reset all times to zero."""
         self.seconds = dict.fromkeys(self.seconds, 0.0)
 
 
@@ -98,7 +98,7 @@ class Timed:
     simulated_s: float
     wall_s: float
     cpu_s: float
-    """Of all threads of this process; on a core shared with others less than the wall time."""
+    """Processor time of all threads of this process; less than the wall time on a shared core."""
 
 
 class Timer:

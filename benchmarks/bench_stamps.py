@@ -1,13 +1,13 @@
-"""What the stamps cost, and by how much the harness changes the latency t2 that it measures.
+"""Cost of the stamps, and the harness's effect on the measured latency t2.
 
     python benchmarks/bench_stamps.py
 
 1. One stamp (`WallClock.time_us`) and one row of the decision log.
-2. In a real flight (airl-firmware in a process of its own, MAVSDK and camera here, as on the drone)
-   every decision is also timed from inside, from the encoding to the bounded action: t2 less that
-   is what the pilot's stamps add. Pairs, decision by decision.
-3. The same decisions without any flight, with the same pauses, right before and after each flight:
-   what MAVSDK and the camera in the same process, and the simulator beside it, do to them.
+2. In a real flight (airl-firmware in a separate process, MAVSDK and camera here, as on the drone)
+   every decision is also timed from inside, from the encoding to the bounded action. The difference
+   from t2 is the cost of the pilot's stamps. Compared in pairs, decision by decision.
+3. The same decisions without a flight, with the same pauses, before and after each flight: the
+   effect of MAVSDK and the camera in the same process, and of the simulator beside it.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def watched() -> Iterator[list[int]]:
         took_ns.append(time.perf_counter_ns() - started_ns)
         return bounded
 
-    # Raises AttributeError where the pilot has no such name any more.
+    # Raises AttributeError if the pilot's names change.
     with (
         patch.object(pilot.Pilot, "_observe", encode_timed),
         patch.object(pilot, "flyable", flyable_timed),
@@ -117,7 +117,7 @@ def free_port(kind: socket.SocketKind) -> int:
 
 @contextmanager
 def firmware(vehicle: str, folder: Path) -> Iterator[tuple[str, str]]:
-    """Run a simulator of its own; give its two addresses."""
+    """Run a separate simulator; yield its two addresses."""
     udp = [free_port(socket.SOCK_DGRAM) for _ in range(2)]
     tcp = free_port(socket.SOCK_STREAM)
     words = [sys.executable, "-m", "airl_mav.cli.firmware", "--vehicle", vehicle]

@@ -1,10 +1,10 @@
-"""How many flights a verdict takes, by the way in which a test spends its error over its looks.
+"""Flights until a verdict, by the error spending of the sequential test.
 
 Run as `python benchmarks/bench_verdict.py [THRESHOLD]`. For true success rates around the threshold
-(0.95): the mean number of flights until the verdict, 500 at most, and how often there is one. All
-are exact; each is wrong with a probability of 2.5 % at most on either side. O'Brien and Fleming's
-and Pocock's (as spent by Lan & DeMets, Biometrika 70, 1983) are planned for 500 flights and leave
-nothing for more; the others may be gone on with for ever.
+(0.95): the mean number of flights until the verdict, 500 at most, and the probability of a verdict.
+All are exact; each is wrong with a probability of 2.5 % at most on either side. O'Brien and
+Fleming's and Pocock's tests (as spent by Lan & DeMets, Biometrika 70, 1983) are planned for 500
+flights and spend all error by then. The others may continue without a limit.
 """
 
 from __future__ import annotations

@@ -1,21 +1,20 @@
 """The view in a browser: update rates, memory and replay.
 
-Run as `python benchmarks/bench_view.py [live memory replay]`; without words, all of them. What a
-watcher costs those who fly and learn is measured by `bench_watched.py`. It needs a Chromium, which
-draws in software unless it has a GPU: what it takes is then taken from everything else on the
-machine, whose load stands in the first line.
+Run as `python benchmarks/bench_view.py [live memory replay]`; without arguments, all of them.
+`bench_watched.py` measures the cost of a viewer for flights and training. Requires a Chromium,
+which draws in software unless it has a GPU, and then takes processor time from everything else on
+the machine. The first line shows the machine's load.
 
 live      A flight of 31 vehicle states and 10 images a second reaches the page by the view's
-          own process. Counted on the page: updates of the vehicle's pose and of the camera's image
-          that arrive, and frames that are drawn; the lower of the two is what is seen. The same
-          again on a page of 64x64 pixels, which leaves out most of what pixels take.
+          process. Counts on the page the updates of pose and image, and drawn frames; the lower
+          number is visible. The same is repeated on a page of 64x64 pixels, which leaves out
+          most of the cost of pixels.
 memory    Half an hour of flights of a minute each, sent thirty times as fast: growth of the view's
           process and of the page's JavaScript heap, after their garbage is collected.
-replay    `airl view` of a run of 100 flights: from the command to a frame with the flight, and to
-          one with its arena; how long a moment takes to be drawn by the server, and updates a
-          second while the slider is dragged. Where Python keeps no bytecode
-          (PYTHONDONTWRITEBYTECODE), each start compiles all that it imports: the first line says
-          so.
+replay    `airl view` of a run of 100 flights: time from the command to a frame with the flight,
+          and to a frame with its arena; the server's time to draw a moment; updates per second
+          while the slider is dragged. If Python keeps no bytecode (PYTHONDONTWRITEBYTECODE), each
+          start compiles all imports: the first line reports this.
 """
 
 from __future__ import annotations
@@ -61,11 +60,11 @@ from airl_mav.view.viewer import Viewer  # noqa: E402
 from tests.support.browser import Page, browser  # noqa: E402
 
 VEHICLE_US, PICTURE_US, DECISION_US = 32_000, 96_000, 512_000
-"""Between two states, images and decisions of the flight [simulated µs]."""
+"""Interval of states, images and decisions of the flight [simulated µs]."""
 
 FLIGHT_US = 60_000_000
 RADIUS_M, TURN_RAD_S, ALTITUDE_M = 4.0, 0.4, 2.5
-"""Of the circle that is flown around the start."""
+"""Radius, turn rate and altitude of the circle around the start."""
 
 COUNTING = """(() => {
   const told = {pose: 0, image: 0, walls: 0, messages: 0, frames: 0, drawn: false};
@@ -110,11 +109,10 @@ COUNTING = """(() => {
   };
   requestAnimationFrame(count);
 })()"""
-"""Counts what the page's worker hands over, and the frames in which anything was drawn.
+"""Count the updates passed on by the page's worker, and the drawn frames.
 
-`flight` and `arena` are true once a frame is done that was drawn with them there, and with the
-panel that says which flight it is.
-"""
+`flight` and `arena` become true after a frame is drawn that contains them and the panel with the
+flight's seed."""
 
 
 def say(*words: object) -> None:
@@ -128,7 +126,7 @@ def load() -> str:
 
 @dataclass
 class Counts:
-    """Of the page, a second."""
+    """Updates and frames of the page per second."""
 
     pose: float
     image: float
@@ -178,7 +176,7 @@ class Circle:
         return np.array([north, east, -ALTITUDE_M]), attitude, velocity
 
     def begin(self, feed: Feed, began_us: int) -> None:
-        """Tell a view that the flight begins."""
+        """Report the start of a flight to a view."""
         north, east = self.arena.goal.tolist()
         feed.send(
             Episode(
@@ -192,7 +190,7 @@ class Circle:
         )
 
     def tell(self, feed: Feed, began_us: int, time_us: int) -> None:
-        """Tell a view what is due at a time since the flight's beginning [µs]."""
+        """Send a view the messages due at a time since the start of the flight [µs]."""
         position, quaternion, velocity = self.pose(time_us)
         image = self._images[time_us // PICTURE_US % len(self._images)]
         height, width = image.shape
@@ -226,7 +224,7 @@ class Circle:
             feed.send(decided, image)
 
     def fly(self, feed: Feed, seconds: float, speed: float, began_us: int = 0) -> None:
-        """Fly so many simulated seconds at a pace, in flights of a minute."""
+        """Fly a number of simulated seconds at a pace, in flights of a minute."""
         started, end_us = time.monotonic(), round(1e6 * seconds)
         for now_us in range(0, end_us, VEHICLE_US):
             flight = now_us // FLIGHT_US * FLIGHT_US
@@ -262,7 +260,7 @@ def drawing_process() -> psutil.Process:
 
 @contextmanager
 def flying(ends: ViewEnds, seconds: float, speed: float) -> Iterator[subprocess.Popen[bytes]]:
-    """Fly the circle in a process of its own, so that counting does not hold it back."""
+    """Fly the circle in a separate process, so that counting does not slow it down."""
     words = [sys.executable, __file__, "--fly", ends.model_dump_json(), str(seconds), str(speed)]
     process = subprocess.Popen(words)  # noqa: S603 (this file)
     try:
@@ -301,7 +299,7 @@ def measure_live(folder: Path) -> None:
                 f" {found.frames:.1f} frames/s drawn; the view's process takes {cpu:.0%} of a core;"
                 f" {load()}"
             )
-        # Nothing is drawn at a pixel: what is left is the server, the socket and JavaScript.
+        # With few pixels, the remaining cost is the server, the socket and JavaScript.
         page.resize(64, 64)
         found = counted(page, 10.0)
         say(
@@ -386,10 +384,10 @@ def measure_replay(folder: Path, flights: int = 100) -> None:
 
 
 def scrub(page: Page) -> tuple[float, Counts]:
-    """Drag the slider of time to and fro for 5 s, as often as the page takes it, and count.
+    """Drag the time slider back and forth for 5 s, as often as the page accepts it, and count.
 
     Returns:
-        Moves a second, and what came of them.
+        Moves per second, and the resulting updates.
     """
     assert page.press("Pause")
     find = """(() => {
@@ -417,7 +415,7 @@ def scrub(page: Page) -> tuple[float, Counts]:
 
 
 def measure_drawing(run: Path) -> None:
-    """What the server takes to put a moment of a replayed flight into the scene."""
+    """Measure the server's time to draw a moment of a replayed flight in the scene."""
     import viser
 
     from airl_mav.report.replay.page import ReplayPage

@@ -1,15 +1,15 @@
-"""What a watcher costs those who fly and learn: pairs of the same run, alone and watched.
+"""Cost of a viewer for flights and training: pairs of the same run, alone and watched.
 
-Run as `python benchmarks/bench_watched.py [lockstep sitl training]`; without words, all of them. It
-needs a Chromium, which draws in software unless it has a GPU: what it takes is then taken from
-everything else on the machine, whose load stands beside each figure.
+Run as `python benchmarks/bench_watched.py [lockstep sitl training]`; without arguments, all of
+them. Requires a Chromium, which draws in software unless it has a GPU, and then takes processor
+time from everything else on the machine. Each figure shows the machine's load.
 
-lockstep  The same flight at full speed, alone, with a view that nobody looks at, and with a page:
+lockstep  The same flight at full speed, alone, with a view without viewers, and with a page:
           fingerprints, and wall time.
-sitl      Flights in real time on twenty seeds, each alone and with a page, in turn: t2, how late
-          the vehicle's ticks were, and the simulated time that was given up, paired by seed. The
-          watcher is elsewhere: a process takes all that a page gets, and draws nothing. With
-          `--browser` it is a browser of this machine, at the lowest priority.
+sitl      Flights in real time on twenty seeds, each alone and with a page, in turn: t2, lateness
+          of the vehicle's ticks, and skipped simulated time, paired by seed. The viewer is remote:
+          a process receives all data of a page, and draws nothing. With `--browser` it is a
+          browser of this machine, at the lowest priority.
 training  The same short training, alone and watched: weights, wall time and processor time.
 """
 
@@ -48,7 +48,7 @@ from tests.support.browser import Page, browser  # noqa: E402
 from tests.support.processes import SITL_WITHOUT_REPORT  # noqa: E402
 
 LOWEST = 19
-"""Niceness of what takes no more than what is left over."""
+"""Niceness of processes that use only idle processor time."""
 
 ELSEWHERE = """
 import sys
@@ -107,7 +107,7 @@ def measure_lockstep(folder: Path, pairs: int = 4) -> None:
 
 
 Watch: TypeAlias = Callable[[Path, str], AbstractContextManager[None]]
-"""Watches the page of an address for a while, with a folder of its own."""
+"""Context manager that keeps the page of an address open, with a scratch folder."""
 
 
 @contextmanager
@@ -138,14 +138,14 @@ def elsewhere(folder: Path, url: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Disturbed:
-    """How well a host has kept up with a flight in real time [ms]."""
+    """Timing of a flight in real time [ms]."""
 
     t2: float
     """Median."""
     lateness: float
     """99 % of the vehicle's ticks began less late."""
     slipped: float
-    """Simulated time that was given up."""
+    """Skipped simulated time."""
 
 
 def measure_sitl(folder: Path, pairs: int = 20, watch: Watch = elsewhere) -> None:
@@ -230,7 +230,7 @@ def measure_training(folder: Path, pairs: int = 3) -> None:
             took = {}
             for ends in (None, viewer.ends):
                 out = folder / f"train-{k}-{ends is not None}"
-                # A process each: what one has compiled, allocated and cached is not the other's.
+                # A process each: compiled code, allocations and caches are not shared.
                 words = [sys.executable, __file__, "--train", str(folder / "bench.toml"), str(out)]
                 words += [] if ends is None else [ends.model_dump_json()]
                 done = subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True)  # noqa: S603

@@ -1,4 +1,4 @@
-"""How often the experts that training imitates reach the goal of an arena, in the batch twin.
+"""Success rates of the experts for imitation in an arena, in the vectorized simulator.
 
 python benchmarks/fly_experts.py rooms --expert planner --episodes 300
 """

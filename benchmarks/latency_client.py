@@ -1,11 +1,11 @@
-"""A client that stamps its setpoints and its telemetry. Started by `bench_mavsdk.py`, not by hand.
+"""Client that stamps its setpoints and its telemetry. Started by `bench_mavsdk.py`, not by hand.
 
     PYTHON latency_client.py KIND PORT SETPOINTS RATE_HZ OUT
 
-Uses the standard library and its kind of client alone: mavsdk-grpc has a Python of its own. Writes
-its stamps to OUT: `sent`, when a setpoint was handed over [ns, CLOCK_MONOTONIC], whose velocity to
-the north is its number / 1024 m/s, and `heard`, when a position reached the callback, with that
-position (three float32, hexadecimal).
+Uses only the standard library and the client library, as mavsdk-grpc needs a separate Python.
+Writes its stamps to OUT: `sent`, when a setpoint was passed to the library [ns, CLOCK_MONOTONIC],
+with its number / 1024 m/s as velocity to the north; and `heard`, when a position reached the
+callback, with the position (three float32, hexadecimal).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SETTLE_S = 1.0
 
 
 class Notes:
-    """What a client has sent and heard."""
+    """Sent setpoints and received positions of a client."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[int, int]] = []
@@ -69,7 +69,7 @@ def mavsdk_sync(notes: Notes, port: int, setpoints: int, rate_hz: float) -> None
     time.sleep(SETTLE_S)
 
     def send(number: int) -> None:
-        # Made before the stamp: what is measured is the way, not the making.
+        # Created before the stamp: only the transmission is measured.
         setpoint = VelocityNedYaw(number / 1024.0, 0.0, 0.0, 0.0)
         notes.send(number)
         offboard.set_velocity_ned(setpoint)

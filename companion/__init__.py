@@ -1,1 +1,1 @@
-"""Everything that runs on the drone: link, camera, pilot, watchdog."""
+"""Companion software on the drone: link, camera, pilot and watchdog."""

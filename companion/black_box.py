@@ -1,7 +1,7 @@
-"""The black box: the companion's images, decisions and setpoints in a file that survives a crash.
+"""Black box: the companion's images, decisions and setpoints in a file that survives a crash.
 
-A thread samples telemetry, status and resources, takes the pilot's decisions without delaying it,
-and syncs the file four times a second.
+A thread samples telemetry, status and resources, records the pilot's decisions without delaying the
+pilot, and syncs the file four times a second.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from companion.interfaces import BatteryState, VehicleStatus
 from companion.pilot import OLDEST_FRAME_US, Decided
 
 SAMPLE_US = US_PER_S // 25
-"""Time between two samples of the telemetry [µs]; the flight controller sends 50 a second."""
+"""Interval of telemetry samples [µs]; the flight controller sends 50 per second."""
 
 STATUS_US = US_PER_S // 2
-"""Time between two of status, battery and resources [µs]."""
+"""Interval of status, battery and resources [µs]."""
 
 SYNC_US = US_PER_S // 4
-"""Time between two writes onto the disk [µs]: what a crash loses at most, and a sample."""
+"""Interval of syncs to disk [µs]; a crash loses at most this time plus one sample."""
 
 
 class RecordedLink(Protocol):
@@ -47,14 +47,14 @@ class RecordedLink(Protocol):
         """Return the newest telemetry."""
 
     def status(self) -> VehicleStatus:
-        """Return who flies."""
+        """Return armed state, flight mode and charge."""
 
     def battery(self) -> BatteryState:
         """Return the newest state of the battery."""
 
 
 class BlackBoxRecorder:
-    """Writes a black box during a mission; a write error (`failure`) ends only the file."""
+    """Recorder of a black box during a mission; a write error (`failure`) ends only the file."""
 
     def __init__(
         self,
@@ -64,43 +64,43 @@ class BlackBoxRecorder:
         goal: Goal,
         images_hz: float,
     ) -> None:
-        """Record into a new file at most `images_hz` images per second [Hz], of decisions."""
+        """Record to a new file, with at most `images_hz` images of decisions per second [Hz]."""
         self.failure: str | None = None
-        """Why the file ends early."""
+        """Reason for an early end of the file; None = no failure."""
         self._file, self._link, self._clock, self._goal = file, link, clock, goal
         self._image_us = math.inf if images_hz == 0.0 else US_PER_S / images_hz
         self._next_image_us = -math.inf
         self._unix_us = utc_us() - clock.time_us()
-        """Calendar time of the clock's zero, kept for the whole flight: it never jumps."""
+        """Calendar time at the clock's zero [µs since 1970], constant during the flight."""
         self._told: deque[Decided | tuple[messages.Message, int]] = deque()
         self._next_status_us = self._next_sync_us = 0
         self._process = psutil.Process()
         self._used_us, self._used_at_us = processor_time_us(), clock.time_us()
-        psutil.cpu_percent()  # The first call only begins to measure.
+        psutil.cpu_percent()  # the first call only starts the measurement
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="black box", daemon=True)
 
     def start(self) -> None:
-        """Call `record` from a thread from now on, as often as it wants to be called."""
+        """Start a thread that calls `record` at the sample interval."""
         self._thread.start()
 
     def decided(self, decided: Decided) -> None:
-        """Take a decision; returns at once."""
+        """Queue a decision without blocking."""
         self._told.append(decided)
 
     def phase(self, phase: str) -> None:
-        """Take a phase that begins now."""
+        """Queue a phase that begins now."""
         now_us = self._clock.time_us()
         self._told.append((messages.Phase(now_us, phase), now_us))
 
     def heard(self, message: str) -> None:
-        """Take a text of the flight controller's."""
+        """Queue a text of the flight controller."""
         now_us = self._clock.time_us()
         said = messages.text(message, "flight controller", self._unix_us + now_us)
         self._told.append((said, now_us))
 
     def end(self, reason: str, notes: Sequence[str]) -> None:
-        """Write how the mission ended, and close the file."""
+        """Write the end of the mission and close the file."""
         self._stop()
         now_us = self._clock.time_us()
         for note in notes:
@@ -110,7 +110,7 @@ class BlackBoxRecorder:
         self.record(now_us, last=True)
 
     def break_off(self) -> None:
-        """Close the file without an end, if it is still open."""
+        """Close the file without an end record, if still open."""
         self._stop()
         self._file.abandon()
 
@@ -127,7 +127,7 @@ class BlackBoxRecorder:
             self._clock.sleep_until(next_us, self._ended)
 
     def record(self, now_us: int, *, last: bool = False) -> None:
-        """Write new data and a sample; `last` closes the file. No effect after a write error."""
+        """Write new data and a sample; `last` completes the file. No effect after a write error."""
         if self.failure is not None:
             return
         try:
@@ -164,7 +164,7 @@ class BlackBoxRecorder:
         position, velocity, quaternion = _numbers(told.state)
         (away_m,) = _finite([goal_distance_m(self._goal, told.state.position)])
         decision = messages.Decision(
-            # A camera that stamps by another clock says nothing of its images' age.
+            # Stamps of another clock do not give an image's age.
             frame.capture_time_us if 0 <= age_us <= OLDEST_FRAME_US else NO_STAMP,
             told.seen.received_us,
             told.started_us,
@@ -218,7 +218,7 @@ def open_recorder(
     clock: Clock,
     goal: Goal,
 ) -> BlackBoxRecorder:
-    """Return the recorder of a mission into a new file of a folder, or raise FieldError."""
+    """Return the recorder of a mission with a new file in a folder, or raise FieldError."""
     now = utc_now()
     made = {
         "name": "flight",
@@ -239,7 +239,7 @@ def open_recorder(
 
 @contextmanager
 def recording(recorder: BlackBoxRecorder) -> Iterator[BlackBoxRecorder]:
-    """Record for a while, from a thread of the recorder's own."""
+    """Record from the recorder's thread while the context is active."""
     recorder.start()
     try:
         yield recorder

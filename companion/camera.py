@@ -1,4 +1,4 @@
-"""Where depth frames come from: the newest one, and when it was decoded."""
+"""Sources of camera frames: the newest frame and the time it was decoded."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from airl_mav.core.errors import FieldError
 from airl_mav.scenario.aircraft import GREATEST_PORT
 
 MESSAGES_PER_LOOK = 8
-"""Messages that are read at a time, of a publisher that sends faster than they can be read."""
+"""Maximum number of messages read at once, for a publisher that sends faster than it is read."""
 
 SHARE_S = 0.02
-"""Longest time for which one of two threads that share a source keeps it [wall s]."""
+"""Maximum time for which one of two threads occupies a shared source [wall s]."""
 
 REDIAL_S = 2.0
-"""Silence after which the connection is made anew [wall s]."""
+"""Silence after which the source reconnects [wall s]."""
 
 
 @dataclass(frozen=True)
 class ReceivedFrame:
-    """A frame and the time at which the companion had it."""
+    """Frame and the time it was available to the companion."""
 
     frame: Frame
     received_us: int
@@ -36,21 +36,21 @@ class ReceivedFrame:
 
 
 class FrameSource(Protocol):
-    """A depth camera as the companion sees it: only the newest frame counts."""
+    """Camera interface of the companion: only the newest frame counts."""
 
     def latest(self) -> ReceivedFrame | None:
-        """Return the newest frame so far, without waiting; None before the first."""
+        """Return the newest frame without waiting; None before the first frame."""
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a frame other than a sequence (-1 = none); None after a timeout [wall s]."""
+        """Wait for a frame with another sequence (-1 = any); None after a timeout [wall s]."""
 
 
 class ZmqFrameSource:
     """Frames published by a simulator or a camera driver over ZeroMQ (tcp, ipc).
 
-    ZeroMQ keeps the newest message only and reconnects to a closed publisher. It notices neither a
-    publisher without power nor recovers from oversized frames: after silence it is connected anew.
-    For one thread at a time.
+    ZeroMQ keeps only the newest message and reconnects to a closed publisher. It does not detect a
+    publisher without power or recover from oversized frames, so the source reconnects after
+    silence. Use from one thread at a time.
     """
 
     def __init__(
@@ -58,11 +58,11 @@ class ZmqFrameSource:
     ) -> None:
         """Connect to an endpoint such as "tcp://192.168.1.2:5560", or raise FieldError."""
         self.malformed = 0
-        """Messages that were no frames, or frames of another size than the first one's."""
+        """Number of invalid messages, or frames of another size than the first frame."""
         self.failure: str | None = None
-        """Why no more frames come: never known here, as a publisher may start at any time."""
+        """Reason for missing frames; always None, as a publisher may start at any time."""
         self.dropped = 0
-        """Frames that never came here: not known, as those between two looks are meant to go."""
+        """Number of lost frames; always 0, as frames between two reads are dropped by design."""
         self._clock = clock
         self._newest: ReceivedFrame | None = None
         self._owns_context = context is None
@@ -74,7 +74,7 @@ class ZmqFrameSource:
         self._socket.subscribe(b"")
         self._endpoint = endpoint
         self._silent = WallClock()
-        """Since the last message, or the last attempt to connect."""
+        """Time since the last message or the last connection attempt."""
         try:
             self._socket.connect(endpoint)
         except zmq.ZMQError as error:
@@ -83,14 +83,14 @@ class ZmqFrameSource:
             raise FieldError("camera", endpoint, accepted) from None
 
     def latest(self) -> ReceivedFrame | None:
-        """Return the newest frame so far, without waiting; None before the first."""
+        """Return the newest frame without waiting; None before the first frame."""
         for _ in range(MESSAGES_PER_LOOK):
             if not self._socket.poll(0):
                 if self._silent.time_us() >= REDIAL_S * US_PER_S:
                     self._redial()
                 break
             self._silent = WallClock()
-            # Parts of a message are messages: nobody who speaks this format sends any.
+            # Message parts are read as messages; publishers of this format send no parts.
             data = self._socket.recv()
             try:
                 frame = self._known(Frame.from_bytes(data))
@@ -102,12 +102,12 @@ class ZmqFrameSource:
 
     def _redial(self) -> None:
         self._silent = WallClock()
-        with suppress(zmq.ZMQError):  # it has ended already
+        with suppress(zmq.ZMQError):  # already disconnected
             self._socket.disconnect(self._endpoint)
         self._socket.connect(self._endpoint)
 
     def _known(self, frame: Frame) -> Frame:
-        """Return a frame, or raise FrameError if its size differs from the first one's."""
+        """Return a frame, or raise FrameError if its size differs from the first frame's."""
         if self._newest is not None:
             known = self._newest.frame
             if (frame.intrinsics, frame.lenses) != (known.intrinsics, known.lenses):
@@ -115,7 +115,7 @@ class ZmqFrameSource:
         return frame
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a frame, see `FrameSource`; lower sequences are newer: a simulator restart."""
+        """Wait for a frame, see `FrameSource`; a lower sequence is new after a restart."""
         stopwatch = WallClock()
         while True:
             newest = self.latest()
@@ -134,20 +134,20 @@ class ZmqFrameSource:
 
 
 class SharedFrames:
-    """A frame source for two threads, one of which may wait. Implements `FrameSource`."""
+    """Frame source for two threads; one thread may wait. Implements `FrameSource`."""
 
     def __init__(self, frames: FrameSource) -> None:
-        """Share a source that is to be used from one thread at a time."""
+        """Share a source that supports one thread at a time."""
         self._frames = frames
         self._one_at_a_time = threading.Lock()
 
     def latest(self) -> ReceivedFrame | None:
-        """Return the newest frame so far; None before the first."""
+        """Return the newest frame; None before the first frame."""
         with self._one_at_a_time:
             return self._frames.latest()
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a frame that is not the one already seen; see `FrameSource`."""
+        """Wait for a frame with another sequence; see `FrameSource`."""
         stopwatch = WallClock()
         while True:
             left_s = timeout_s - stopwatch.time_us() / US_PER_S
@@ -160,7 +160,7 @@ class SharedFrames:
 def open_camera(endpoint: str, clock: Clock) -> ZmqFrameSource:
     """Connect to the camera at a ZeroMQ address. Raises FieldError for an unusable address."""
     port = endpoint.rpartition(":")[2]
-    # libzmq would cut the number to 16 bits without a word.
+    # libzmq would silently truncate the number to 16 bits.
     if endpoint.startswith("tcp:") and not (port.isdecimal() and 1 <= int(port) <= GREATEST_PORT):
         raise FieldError("camera", endpoint, f"tcp://HOST:PORT, port 1..{GREATEST_PORT}")
     return ZmqFrameSource(endpoint, clock)

@@ -1,4 +1,4 @@
-"""The companion's lockstep clock: simulated time advances only while the companion sleeps."""
+"""Lockstep clock of the companion: simulated time advances only while the companion sleeps."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from companion.watchdog import Watchdog
 
 
 class Poll(NamedTuple):
-    """A condition that is checked at an interval."""
+    """Condition checked at an interval."""
 
     every_us: int
     due: Due
     quiet_us: Quiet | None = None
-    """Tells, where `due` does not hold, which checks may be left out; None = none."""
+    """Time without required checks while `due` is False; None = check at every interval."""
 
 
 class Sleep(Protocol):
-    """Gives the turn back."""
+    """Function that returns the turn to the scheduler."""
 
     def __call__(
         self, wake_us: int, interrupt: threading.Event | None = None, poll: Poll | None = None
     ) -> None:
-        """Return with the next turn; at `wake_us`, or later while a `poll` is not due."""
+        """Wait for the next turn, at `wake_us` [µs], or later while a `poll` is not due."""
         ...
 
 
 class Abandoned(BaseException):
-    """Raised when the scheduler is gone; not an Exception, to pass handlers of failures."""
+    """The scheduler is lost; derived from BaseException to bypass handlers of failures."""
 
 
 class ConductedClock:
-    """Simulated time of a companion in lockstep, which only sleeping takes, and its guard."""
+    """Simulated clock of a companion in lockstep, advanced only by sleeping, and watchdog guard."""
 
     def __init__(self, clock: Clock, sleep: Sleep) -> None:
-        """Take the simulated time, which the scheduler advances, and what gives the turn back."""
+        """Set the clock, which the scheduler advances, and the function that returns the turn."""
         self._clock = clock
         self._sleep = sleep
         self._watchdog: Watchdog | None = None
@@ -58,7 +58,7 @@ class ConductedClock:
                 watchdog.look()
 
     def poll(self, every_us: int, due: Due, quiet_us: Quiet) -> None:
-        """Sleep for one interval [µs] or several, until a condition has to be checked."""
+        """Sleep for one interval [µs] or several, until a condition must be checked."""
         wake_us = self.time_us() + every_us
         if self._watchdog is None:
             self._sleep(wake_us, None, Poll(every_us, due, quiet_us))

@@ -1,8 +1,8 @@
-"""How flight controllers differ behind MAVSDK; the rest of the companion knows one kind only.
+"""Differences between flight controllers behind MAVSDK, hidden from the rest of the companion.
 
-Measured with MAVSDK 4.1 on PX4 1.16 and ArduCopter 4.7. What MAVSDK itself hides is not here.
-Take-off and offboard fly in ArduCopter's GUIDED mode, leaving offboard is its BRAKE mode. The
-altitude of a take-off travels with the command.
+Measured with MAVSDK 4.1 on PX4 1.16 and ArduCopter 4.7, without differences hidden by MAVSDK.
+Take-off and offboard use ArduCopter's GUIDED mode, leaving offboard uses its BRAKE mode. The
+take-off command contains the altitude.
 """
 
 from __future__ import annotations
@@ -12,36 +12,36 @@ from dataclasses import dataclass
 from mavsdk.autopilot import Autopilot
 
 RATE_HZ = 50.0
-"""Rate asked for position, velocity and attitude [Hz]."""
+"""Requested rate of position, velocity and attitude [Hz]."""
 
 _STATUS_HZ = 5.0
-"""Rate of health and landed state where they must be requested [Hz]; as PX4's."""
+"""Rate of health and landed state if they must be requested [Hz]; equal to PX4's."""
 
 _KINEMATICS = (("position_velocity_ned", RATE_HZ), ("attitude_quaternion", RATE_HZ))
 
 
 @dataclass(frozen=True)
 class Dialect:
-    """What is particular to one kind of flight controller."""
+    """Properties of one kind of flight controller."""
 
     name: str
     streams: tuple[tuple[str, float], ...]
     """Streams to request, in order: X of MAVSDK's telemetry.set_rate_X, and the rate [Hz]."""
     health: tuple[str, ...]
-    """Flags of MAVSDK's health that must be set for arming and flight by position."""
+    """Flags of MAVSDK's health required for arming and flight by position."""
     arm_timeout_s: float
-    """Longest time from the beginning of a mission, with the flight controller just powered up, to
-    its arming [s]."""
+    """Timeout from the start of a mission to arming, with a flight controller just powered up
+    [s]."""
 
 
 POSITION = ("is_local_position_ok", "is_global_position_ok")
-"""Flags of MAVSDK's health that are about positions."""
+"""Flags of MAVSDK's health for positions."""
 
 PX4 = Dialect(
     "PX4",
     _KINEMATICS,
-    # health_all_ok without the home position: PX4 sets home when it arms, and MAVSDK forgets it
-    # whenever this process has stood still for 3 s.
+    # health_all_ok without the home position: PX4 sets home when it arms, and MAVSDK discards it
+    # after this process was stopped for 3 s.
     (
         "is_gyrometer_calibration_ok",
         "is_accelerometer_calibration_ok",
@@ -54,7 +54,7 @@ PX4 = Dialect(
 
 ARDUPILOT = Dialect(
     "ArduPilot",
-    # Only heartbeats are sent unasked (SRn_ parameters are 0), and health needs several streams.
+    # By default only heartbeats are sent (SRn_ parameters are 0); health needs several streams.
     (
         *_KINEMATICS,
         ("position", _STATUS_HZ),
@@ -62,11 +62,11 @@ ARDUPILOT = Dialect(
         ("landed_state", _STATUS_HZ),
         ("home", 1.0),
     ),
-    # In STABILIZE it may be armed without a position; GUIDED, and so take-off, needs one. MAVSDK's
-    # calibration flags are left out: they mean "enabled and healthy now" here, and the pre-arm
-    # checks have looked at the calibration.
+    # STABILIZE can be armed without a position; GUIDED, and so take-off, requires a position.
+    # MAVSDK's calibration flags are omitted: for ArduPilot they mean "enabled and healthy now", and
+    # the pre-arm checks include the calibration.
     (*POSITION, "is_home_position_ok", "is_armable"),
-    # Its EKF learns the gyros' bias for 40 s before it uses GPS.
+    # The EKF estimates the gyro bias for 40 s before it uses GPS.
     arm_timeout_s=90.0,
 )
 

@@ -25,20 +25,20 @@ from companion.program import Mission, mission_camera
 from companion.signing_proxy import signed
 
 LOOK_S = 3.0
-"""How long the camera, and then the telemetry, is looked at [s of wall time]."""
+"""Duration of the checks of the camera and of the telemetry [wall s]."""
 
 POLL_S = 0.002
-"""Time between two looks at the telemetry [s]."""
+"""Interval of telemetry reads [s]."""
 
 DECISIONS = 30
-"""Decisions that are timed; the first one is left out."""
+"""Number of timed decisions, without the first one."""
 
 LEAST_SHARE = 0.5
-"""Telemetry that comes at less than this share of the rate that was asked for is too rare."""
+"""Minimum share of the requested telemetry rate."""
 
 
 class Finding(NamedTuple):
-    """One thing that was looked at."""
+    """Result of one check."""
 
     what: str
     good: bool
@@ -76,7 +76,7 @@ def check_on_ground(
 def look_at_camera(
     mission: Mission, camera: FrameSource, clock: Clock, stop: threading.Event
 ) -> Iterator[Finding]:
-    """Take frames for a while: how many, how old, and whether they change and suit the policy."""
+    """Check rate, age and changes of frames, and if they fit the policy."""
     first = camera.wait(-1, FRAME_TIMEOUT_S)
     if first is None:
         yield Finding("camera", False, f"no frame for {FRAME_TIMEOUT_S:g} s")
@@ -86,7 +86,7 @@ def look_at_camera(
     except UsageError as error:
         yield Finding("camera", False, str(error))
         return
-    # Frames are not kept: a driver may send thousands of large ones.
+    # Frames are not stored: a driver may send thousands of large frames.
     watch, last, frozen, ages_us = WallClock(), first, True, []
     while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
         newer = camera.wait(last.frame.sequence, 0.5)
@@ -103,14 +103,14 @@ def look_at_camera(
     for name, other in first.frame.lenses.items():
         told += f"; {name}: {other.kind}, {other.width}x{other.height} px"
     if frozen:
-        # A simulator's image of a vehicle at rest has no noise, so this is no fault by itself.
+        # Not a fault: a simulator's images of a vehicle at rest may be without noise.
         told += "; every image is the same (a real camera has noise)"
     age_us = float(np.median(ages_us))
     yield Finding("camera", True, f"{told}; {age_us / US_PER_MS:.0f} ms old where it is decided on")
 
 
 def look_at_vehicle(link: MavsdkLink, mission: Mission, stop: threading.Event) -> Iterator[Finding]:
-    """Look at the telemetry for a while, then at what it says."""
+    """Check the telemetry rate, then the reported state."""
     watch, changes, last = WallClock(), 0, link.kinematics()
     while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
         watch.sleep_until(watch.time_us() + int(POLL_S * US_PER_S))
@@ -144,7 +144,7 @@ def look_at_vehicle(link: MavsdkLink, mission: Mission, stop: threading.Event) -
 
 
 def time_decisions(mission: Mission, seen: ReceivedFrame, state: Kinematics) -> Finding:
-    """Let the policy decide on what is seen, and say how long that takes (t2)."""
+    """Measure the policy's inference time (t2) on a received frame."""
     frame, watch, took_us = seen.frame, WallClock(), []
     observation = observe(
         *(frame.image, frame.intrinsics, state, np.asarray(mission.goal, np.float64)),
@@ -157,7 +157,7 @@ def time_decisions(mission: Mission, seen: ReceivedFrame, state: Kinematics) -> 
             mission.policy.act(observation)
             took_us.append(watch.time_us() - begun_us)
     except Exception as error:
-        # A policy may raise anything.
+        # A policy may raise any exception.
         what = " ".join(f"{type(error).__name__}: {error}".split())
         return Finding("decision", False, f"the policy failed: {what}")
     del took_us[0]

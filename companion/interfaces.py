@@ -1,4 +1,4 @@
-"""The pilot's view of a flight controller, as plain data and a protocol."""
+"""Interface between pilot and flight controller, as plain data and a protocol."""
 
 from __future__ import annotations
 
@@ -9,45 +9,45 @@ from airl_mav.policy.actions import Attitude, BodyRates
 from airl_mav.policy.observation import Kinematics
 
 LINK_LOST = "link lost"
-"""Why a mission ended: the flight controller was no longer heard."""
+"""End of a mission: the flight controller was no longer received."""
 
 CAMERA_SILENT = "camera silent"
-"""Why a mission ended: the watchdog saw that no frame came."""
+"""End of a mission: the watchdog found that no frame arrived."""
 
 
 TELEMETRY_FROZEN = "telemetry frozen"
-"""Why a mission ended: telemetry did not change."""
+"""End of a mission: telemetry did not change."""
 
 FRAMES_LATE = "frames late"
-"""Why a mission ended: frames came, but long after they were taken."""
+"""End of a mission: frames arrived long after their capture."""
 
 
 class LinkError(Exception):
-    """The flight controller refused, or is gone."""
+    """The flight controller rejected a request, or the link is lost."""
 
 
 class VehicleStatus(NamedTuple):
-    """Who flies, by the newest heartbeat (known up to 1 s late)."""
+    """Armed state, mode and charge from the newest heartbeat (latency up to 1 s)."""
 
     armed: bool
     offboard: bool
-    """Whether it flies our setpoints; on ArduPilot GUIDED."""
+    """True if the vehicle flies the companion's setpoints; GUIDED on ArduPilot."""
     mode: str
     battery: float | None = None
-    """Charge that is left, 1 to 0; None: not told."""
+    """Remaining charge, 1 to 0; None = not reported."""
 
 
 class BatteryState(NamedTuple):
-    """The battery, as the flight controller tells it; None: it does not."""
+    """Battery state reported by the flight controller; None = not reported."""
 
     voltage_v: float | None
     current_a: float | None
     remaining: float | None
-    """1 to 0."""
+    """Remaining charge, 1 to 0."""
 
 
 class BodyVelocity(NamedTuple):
-    """A velocity setpoint in the heading frame, with a yaw rate, in the order on the wire."""
+    """Velocity setpoint in the heading frame, with a yaw rate, in wire order."""
 
     forward_m_s: float
     right_m_s: float
@@ -58,22 +58,22 @@ class BodyVelocity(NamedTuple):
 STOP = BodyVelocity(0.0, 0.0, 0.0, 0.0)
 
 Due: TypeAlias = "Callable[[Sequence[bytes]], bool]"
+"""Function that returns True if a condition must be checked, given the flight controller's MAVLink
+frames that MAVSDK has not received yet."""
 Quiet: TypeAlias = "Callable[[Sequence[bytes]], float]"
-"""Returns by the newest frames for how long at least a condition fails on [µs]; inf = until the
-next heartbeat."""
-"""Returns whether a condition has to be checked, given the MAVLink frames of the flight controller
-that MAVSDK has not received yet."""
+"""Function that returns the minimum time for which a condition continues to fail [µs], given the
+newest frames; inf = until the next heartbeat."""
 
 Setpoint: TypeAlias = "BodyVelocity | Attitude | BodyRates"
-"""Setpoints of four numbers each."""
+"""Setpoint types, with four numbers each."""
 
 
 class Link(Protocol):
-    """The pilot's view of a flight controller. Calls raise LinkError when refused."""
+    """Link of the pilot to a flight controller. Calls raise LinkError if rejected."""
 
     @property
     def connected(self) -> bool:
-        """Whether the flight controller is heard."""
+        """True while the flight controller is received."""
         ...
 
     def kinematics(self) -> Kinematics:
@@ -81,15 +81,15 @@ class Link(Protocol):
         ...
 
     def status(self) -> VehicleStatus:
-        """Return who flies."""
+        """Return armed state, flight mode and charge."""
         ...
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
-        """Send a setpoint; it is repeated until the next one, of whatever kind."""
+        """Send a setpoint; it is repeated until the next setpoint of any kind."""
         ...
 
     def release(self) -> None:
-        """Send nothing more: somebody else flies."""
+        """Stop sending setpoints without a mode change: the pilot has control."""
         ...
 
     def leave_offboard(self) -> None:

@@ -1,8 +1,8 @@
 """Plausibility limits of telemetry, camera and mode, and limits of the flight.
 
-A learned policy acts on any input: with a frozen position it flies past its goal, with a frozen
-image into obstacles. The first broken rule ends the flight: see `mission.py`. The bounds are wide;
-sensor quality is the estimator's task.
+A learned policy acts on any input: with a frozen position it overshoots the goal, with a frozen
+image it hits obstacles. The first broken rule ends the flight: see `mission.py`. The bounds are
+wide; sensor quality is the estimator's task.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from companion.camera import ReceivedFrame
 from companion.interfaces import FRAMES_LATE, TELEMETRY_FROZEN, VehicleStatus
 
 TAKEN_OVER = "taken over"
-"""Another one flies: the mode is no longer offboard. Nothing more is sent."""
+"""A pilot has control: the mode is no longer offboard. The companion stops sending."""
 
 DISARMED = "disarmed"
-"""The motors were stopped by somebody else. Nothing more is sent."""
+"""The motors were stopped externally. The companion stops sending."""
 
 TELEMETRY_WRONG = "telemetry wrong"
 CAMERA_FROZEN = "camera frozen"
@@ -36,7 +36,7 @@ OUT_OF_BOUNDS = "out of bounds"
 OUT_OF_TIME = "out of time"
 
 NOT_OURS = (TAKEN_OVER, DISARMED)
-"""Why a flight ended in which nothing more may be commanded."""
+"""Reasons to end a flight after which no commands may be sent."""
 
 REASONS = (
     *(*NOT_OURS, TELEMETRY_FROZEN, TELEMETRY_WRONG, CAMERA_FROZEN, CAMERA_WRONG),
@@ -44,59 +44,59 @@ REASONS = (
 )
 
 MODE_KNOWN_S = 3.0
-"""Time until a change of mode must have been reported [s]: three heartbeats of 1 Hz."""
+"""Maximum latency of the report of a mode change [s]: three heartbeats of 1 Hz."""
 
 STEP_M = 5.0
-"""A position may jump this far beyond what its velocity explains [m]. More than the resets of an
-estimator that finds its GPS again within its gates."""
+"""Maximum position jump beyond the distance explained by velocity [m]; larger than the resets of an
+estimator that regains GPS within its gates."""
 
 DRIFT_M = 8.0
-"""Most by which position and integrated velocity may part, leaking with `DRIFT_S` [m]."""
+"""Maximum difference of position and integrated velocity, leaking with `DRIFT_S` [m]."""
 
 DRIFT_S = 5.0
 
 SPEEDS = 3.0
-"""A velocity may be this many times the fastest action, and `SPEED_M_S` more: wind, overshoot."""
+"""Maximum velocity as a multiple of the fastest action, plus `SPEED_M_S`: wind, overshoot."""
 
 SPEED_M_S = 10.0
 
 NORM = 0.1
-"""Most by which the norm of an attitude quaternion may differ from 1."""
+"""Maximum deviation of an attitude quaternion's norm from 1."""
 
 CLEARANCE_M = 50.0
-"""Default radius around the start: twice the way to the goal, and this much for detours [m]."""
+"""Margin for detours in the default radius, which is twice the goal's distance plus this [m]."""
 
 CLIMB_M = 10.0
-"""Default height limit, above the altitude that is flown and the height of the goal [m]."""
+"""Margin of the default height limit above the flight altitude and the goal's height [m]."""
 
 OWN_CLOCK_S = 1.0
-"""A first frame at most so old is stamped by our clock; else the stamps count from its arrival."""
+"""Maximum age of a first frame stamped by this clock [s]; else ages count from its arrival."""
 
 GROUND_M = 10.0
-"""Ground closer than this along a ray is seen by any depth camera [m]."""
+"""Distance along a ray within which any depth camera sees the ground [m]."""
 
 GRAZING_RAD = math.radians(10.0)
-"""A ray flatter than this may miss the ground that the start lies on."""
+"""Minimum ray angle below level [rad]; a flatter ray may miss the ground at the start's height."""
 
 
 TOLD = ("position", "velocity", "attitude")
-"""What telemetry says of the vehicle, in the order of `Kinematics`."""
+"""Checked telemetry of the vehicle, in the order of `Kinematics`."""
 
 
 class Ending(NamedTuple):
-    """Why a flight may not go on."""
+    """Reason to end a flight."""
 
     reason: str
-    """One of the constants of this module or of `interfaces`."""
+    """Reason, a constant of this module or of `interfaces`."""
     detail: str
 
     def __str__(self) -> str:
-        """Return it as a note."""
+        """Return the reason and its detail as a note."""
         return f"{self.reason}: {self.detail}"
 
 
 class _Unchanged:
-    """How long values have been the same, bit for bit."""
+    """Timer of bit-identical values."""
 
     def __init__(self) -> None:
         self._last: bytes | None = None
@@ -110,7 +110,7 @@ class _Unchanged:
 
 
 class Limits:
-    """All rules, of one flight. The first that is broken stays."""
+    """All rules of one flight. The first broken rule is final."""
 
     def __init__(
         self,
@@ -120,14 +120,14 @@ class Limits:
         mount_pitch_up_rad: float = 0.0,
         mount_yaw_rad: float = 0.0,
     ) -> None:
-        """Prepare a flight to a goal north, east and, where it has a height, down [m]."""
+        """Prepare a flight to a goal north, east and, if it has a height, down [m]."""
         self.ending: Ending | None = None
-        """What has ended the flight."""
+        """Broken rule that has ended the flight; None = no rule broken."""
         self._vehicle = VehicleLimits(settings, goal, pilot)
         self._camera = CameraLimits(settings, mount_pitch_up_rad, mount_yaw_rad)
 
     def begin(self, now_us: int) -> None:
-        """Navigation begins."""
+        """Start navigation at `now_us` [µs]."""
         self._vehicle.begun_us = now_us
 
     def broken(
@@ -137,7 +137,7 @@ class Limits:
         seen: ReceivedFrame | None,
         now_us: int,
     ) -> Ending | None:
-        """Return the broken limit at `now_us`, or None; `seen` is a new frame, if any."""
+        """Return the broken limit at `now_us` [µs], or None; `seen` is a new frame, if any."""
         if self.not_ours(status, now_us) is None:
             self.ending = self._vehicle.broken(status, state, now_us)
         if self.ending is None and seen is not None:
@@ -145,25 +145,25 @@ class Limits:
         return self.ending
 
     def not_ours(self, status: VehicleStatus, now_us: int) -> Ending | None:
-        """Return why nothing may be commanded any more; None: the vehicle is ours."""
+        """Return the reason if the companion must stop commanding; None = it has control."""
         if self.ending is None:
             self.ending = self._vehicle.not_ours(status, now_us)
         return self.ending
 
 
 class VehicleLimits:
-    """Rules for what the flight controller says."""
+    """Rules for reports of the flight controller."""
 
     def __init__(self, settings: LimitSettings, goal: Goal, pilot: PilotSettings) -> None:
         self.begun_us = 0
-        """When navigation began [µs]."""
+        """Start of navigation [µs]."""
         self._silence_us = round(settings.silence_s * US_PER_S)
         radius_m, height_m = settings.radius_m, settings.height_m
         self.radius_m = 2.0 * math.hypot(*goal[:2]) + CLEARANCE_M if radius_m is None else radius_m
-        """Farthest from the start, level [m]."""
+        """Maximum horizontal distance from the start [m]."""
         highest_m = max(pilot.altitude_m, goal_height_m(goal) or 0.0)
         self.height_m = highest_m + CLIMB_M if height_m is None else height_m
-        """Highest above the start [m]."""
+        """Maximum height above the start [m]."""
         self._flight_s = settings.flight_s
         self._battery = settings.battery
         self._fastest_m_s = SPEEDS * pilot.max_speed_m_s + SPEED_M_S
@@ -173,11 +173,10 @@ class VehicleLimits:
         self._drift_m = np.zeros(2)
 
     def not_ours(self, status: VehicleStatus, now_us: int) -> Ending | None:
-        """Return why nothing may be commanded any more; None: the vehicle is ours."""
+        """Return the reason if the companion must stop commanding; None = it has control."""
         self._offboard |= status.offboard
         self._armed |= status.armed
-        # The switch to offboard was acknowledged; the heartbeat that shows it may still be on its
-        # way.
+        # After the acknowledged switch to offboard, the heartbeat that shows it may be delayed.
         late = now_us - self.begun_us > MODE_KNOWN_S * US_PER_S
         if not status.armed and (self._armed or late):
             return Ending(DISARMED, "the heartbeat says that the motors are off")
@@ -186,7 +185,7 @@ class VehicleLimits:
         return None
 
     def broken(self, status: VehicleStatus, state: Kinematics, now_us: int) -> Ending | None:
-        """Return which rule telemetry breaks; None: it can be flown on."""
+        """Return the rule that telemetry breaks; None = telemetry is plausible."""
         values = (state.position, state.velocity, state.quaternion)
         for name, unchanged, value in zip(TOLD, self._unchanged, values, strict=True):
             if not np.isfinite(value).all():
@@ -224,13 +223,13 @@ class VehicleLimits:
             return None
         last, last_us = self._before
         if (state.position == last.position).all() and (state.velocity == last.velocity).all():
-            return None  # Nothing new is told: that is no contradiction, and counted elsewhere.
+            return None  # without new telemetry; frozen telemetry is detected elsewhere
         self._before = state, now_us
         dt_s = (now_us - last_us) / US_PER_S
         explained = 0.5 * (last.velocity + state.velocity) * dt_s
         rest = (state.position - last.position - explained)[:2]
         jump_m = float(np.linalg.norm(rest))
-        # Between two looks a vehicle may brake and turn: half its speed is then unexplained.
+        # A vehicle may brake and turn between two checks, which leaves half its speed unexplained.
         speeds = np.linalg.norm(last.velocity), np.linalg.norm(state.velocity)
         if jump_m > STEP_M + max(speeds) * dt_s:
             return Ending(TELEMETRY_WRONG, f"the position jumped by {jump_m:.1f} m")
@@ -258,12 +257,12 @@ class VehicleLimits:
 
 
 class CameraLimits:
-    """Rules for what the main camera shows; further ones are not looked at."""
+    """Rules for images of the main camera; additional cameras are not checked."""
 
     def __init__(
         self, settings: LimitSettings, mount_pitch_up_rad: float, mount_yaw_rad: float
     ) -> None:
-        """Begin; the camera is mounted looking so far up and to the right of the nose."""
+        """Set the limits and the camera's mounting angles, up and to the right of the nose."""
         self._mount_rad = mount_pitch_up_rad, mount_yaw_rad
         self._silence_us = round(settings.silence_s * US_PER_S)
         self._same_us = round(settings.image_s * US_PER_S)
@@ -274,20 +273,20 @@ class CameraLimits:
         self._blank_since_us: int | None = None
 
     def broken(self, seen: ReceivedFrame, state: Kinematics, now_us: int) -> Ending | None:
-        """Return which rule a frame breaks; None: it can be decided on."""
+        """Return the rule that a frame breaks; None = the frame is usable."""
         frame = seen.frame
         if self._first is None:
             self._first = frame
         if frame.intrinsics != self._first.intrinsics:
             return Ending(CAMERA_WRONG, f"{frame.intrinsics}; before: {self._first.intrinsics}")
-        # A picture that stays is the camera's doing; late frames can be a busy host's.
+        # A frozen image is a camera fault, late frames may be due to a busy host.
         return self._pictured(frame, state, now_us) or self._stamped(seen)
 
     def _stamped(self, seen: ReceivedFrame) -> Ending | None:
         last, self._last = self._last, seen
         behind_us = seen.received_us - seen.frame.capture_time_us
         if last is None or last.frame.sequence > seen.frame.sequence:
-            # The first, or the camera was started again.
+            # The first frame, or a restart of the camera.
             own = 0 <= behind_us <= OWN_CLOCK_S * US_PER_S
             self._least_us = 0 if own else behind_us
             return None
@@ -301,7 +300,7 @@ class CameraLimits:
         return None
 
     def _pictured(self, frame: Frame, state: Kinematics, now_us: int) -> Ending | None:
-        """Return whether the image is always the same, or shows nothing where ground must be."""
+        """Return the ending for a frozen image, or a blank image that must show the ground."""
         image = frame.image
         even = bool((image == image[0, 0]).all())
         silent_us = self._image.for_us(image, now_us)
@@ -323,7 +322,7 @@ class CameraLimits:
 
 
 def _dead(image: NDArray[Any]) -> bool:
-    """Return whether a uniform picture is black or white (covered camera), not a plain wall."""
+    """Return True if a uniform image is black or white (covered camera), not a plain wall."""
     return bool((image[0, 0] == image.flat[0]).all()) and int(image.flat[0]) in (0, 255)
 
 
@@ -335,15 +334,15 @@ def _reading(frame: Frame) -> str:
 def ground_in_view(
     frame: Frame, state: Kinematics, mount_pitch_up_rad: float, mount_yaw_rad: float = 0.0
 ) -> bool:
-    """Return whether flat ground must be in view: the lowest middle ray hits within `GROUND_M`."""
+    """Return True if flat ground must be in view: the lowest middle ray hits within `GROUND_M`."""
     lens = frame.intrinsics
     below_rad = math.atan2(lens.height - 1 - lens.cy, lens.focal)
     if lens.projection == "fisheye":
         edge = np.array(max(lens.height - 1 - lens.cy, 0.0) / lens.focal)
-        # Infinite where the image is higher than the lens's circle: that row sees nothing.
+        # Infinite if the image is higher than the lens's circle, where a row sees nothing.
         below_rad = min(float(undistorted(edge, lens.distortion)), sees_to(lens.distortion))
     w, x, y, z = state.quaternion
-    # How far the body's direction below the optical axis rises: ahead, it is the pitch.
+    # Rise of the body direction below the optical axis; for a camera ahead, the pitch.
     ahead, aside = 2.0 * (w * y - z * x), -2.0 * (y * z + w * x)
     rise = ahead * math.cos(mount_yaw_rad) + aside * math.sin(mount_yaw_rad)
     pitch_rad = math.asin(min(1.0, max(-1.0, rise)))

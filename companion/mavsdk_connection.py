@@ -1,4 +1,4 @@
-"""How MAVSDK is opened, finds a flight controller, and exchanges bytes without sockets."""
+"""Connection of MAVSDK: opening, search for a flight controller, exchange of raw bytes."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from airl_mav.core.errors import UsageError
 from companion.interfaces import LinkError
 
 SLICE_S = 0.5
-"""Longest single wait for a flight controller [wall s]."""
+"""Maximum single wait for a flight controller [wall s]."""
 
 RAW_URL = "raw://"
-"""Connection without sockets: the bytes are exchanged with this process, see `exchange_raw`."""
+"""Connection without sockets: bytes are exchanged with this process, see `exchange_raw`."""
 
 RAW_CHUNK = 65_536
-"""Bytes passed at a time; MAVSDK's parser reassembles a divided frame."""
+"""Maximum bytes per call; MAVSDK's parser reassembles divided frames."""
 
 RAW_TIMEOUT_S = 3600.0
-"""MAVSDK's time-out of a command on a raw connection [wall s]. The answer is certain, but not its
-wall time: a process that was stopped must not repeat commands when it resumes."""
+"""MAVSDK's command timeout on a raw connection [wall s]. A reply is certain, but not its wall time:
+a process that was stopped must not repeat commands when it resumes."""
 
 
 def open_connection(url: str, kind: ComponentType, system_id: int | None = None) -> Mavsdk:
     """Return MAVSDK on a connection, with a component type in its heartbeat, or raise UsageError.
 
-    URLs are such as `udpin://127.0.0.1:14540`, `serial:///dev/ttyAMA0:921600` or `raw://`.
-    `system_id` is that of the component's vehicle; None: MAVSDK's own.
+    Example URLs are `udpin://127.0.0.1:14540`, `serial:///dev/ttyAMA0:921600` and `raw://`.
+    `system_id` is the system id of the component's vehicle; None = MAVSDK's default.
     """
-    # MAVSDK would log to standard output; errors are returned as results.
+    # MAVSDK logs to standard output by default; errors are returned as results.
     log_subscribe(lambda *_: True)
     configuration = Configuration.create_with_component_type(kind)
     if system_id is not None:
@@ -58,7 +58,7 @@ def first_autopilot(mavsdk: Mavsdk, timeout_s: float, stop: threading.Event | No
     while (left_s := timeout_s - stopwatch.time_us() / US_PER_S) > 0.0:
         if stop is not None and stop.is_set():
             raise LinkError("stopped")
-        # In slices: a signal is handled only between two calls into MAVSDK.
+        # Short waits: Python handles signals only between calls into MAVSDK.
         system = mavsdk.first_autopilot(min(left_s, SLICE_S))
         if system is not None:
             return system
@@ -66,14 +66,14 @@ def first_autopilot(mavsdk: Mavsdk, timeout_s: float, stop: threading.Event | No
 
 
 def exchange_raw(mavsdk: Mavsdk, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
-    """Exchange the bytes of a `raw://` connection; return what takes incoming whole frames.
+    """Exchange the bytes of a `raw://` connection; return a function for incoming whole frames.
 
-    `sent` gets every outgoing frame, in MAVSDK's thread: it must return at once and take no lock
+    `sent` receives every outgoing frame, in MAVSDK's thread: it must not block or acquire a lock
     that a feeding thread may hold. Feed from one thread at a time.
     """
     set_timeout(mavsdk, RAW_TIMEOUT_S)
     mavsdk.subscribe_raw_bytes_to_be_sent(sent)
-    # MAVSDK-Python's own function makes a ctypes array type for every length of `data`: 0.1 ms.
+    # MAVSDK-Python's function creates a ctypes array type for every length of `data`: 0.1 ms.
     buffer = (ctypes.c_uint8 * RAW_CHUNK)()
     handle, pass_bytes = mavsdk._handle, mavsdk._lib.mavsdk_pass_received_raw_bytes
 
@@ -87,7 +87,7 @@ def exchange_raw(mavsdk: Mavsdk, sent: Callable[[bytes], None]) -> Callable[[byt
 
 
 def set_timeout(mavsdk: Mavsdk, seconds: float) -> None:
-    """Set after how long MAVSDK repeats an unanswered request [wall s]; its own is 0.5 s."""
+    """Set the timeout until MAVSDK repeats a request [wall s]; MAVSDK's default is 0.5 s."""
     call = mavsdk._lib.mavsdk_set_timeout_s  # not wrapped by MAVSDK-Python 4.1
     call.argtypes = [ctypes.c_void_p, ctypes.c_double]
     call(mavsdk._handle, seconds)

@@ -1,4 +1,4 @@
-"""The companion's link to the flight controller: MAVSDK's synchronous API, without a thread hop."""
+"""Companion's link to the flight controller: MAVSDK's synchronous API, without a thread hop."""
 
 from __future__ import annotations
 
@@ -27,48 +27,48 @@ from companion.dialects import POSITION, PX4, Dialect, dialect_of
 from companion.mavsdk_connection import exchange_raw, first_autopilot, open_connection, set_timeout
 
 POLL_S = 0.1
-"""Interval at which a condition is checked while waiting for it [s]."""
+"""Interval of checks while waiting for a condition [s]."""
 
 HEALTH_SETTLE_S = 0.5
-"""Time that health must be good before arming: more than two of PX4's 5 Hz reports [s]."""
+"""Required time of good health before arming [s]; more than two of PX4's 5 Hz reports."""
 
 OFFBOARD_SETTLE_S = 0.1
-"""Wait after the switch to offboard [s]. PX4 acknowledges it before all of its parts know. A
-setpoint that comes within some 10 ms is dropped, and MAVSDK repeats it only 50 ms later."""
+"""Wait after the switch to offboard [s]. PX4 acknowledges the switch before all modules apply it. A
+setpoint sent within about 10 ms is dropped, and MAVSDK repeats it only 50 ms later."""
 
 OFFBOARD_REPEAT_S = 0.05
-"""Time between two zero setpoints while a switch to offboard is waited for [s]: MAVSDK's 20 Hz; PX4
-wants them at more than 2 Hz."""
+"""Interval of zero setpoints while waiting for a switch to offboard [s]: MAVSDK's 20 Hz; PX4
+requires more than 2 Hz."""
 
 TEXT_CHARACTERS = 50
 
 ARM_RETRY_S = 0.5
-"""Time between two requests to arm [s]."""
+"""Interval of arm requests [s]."""
 
 ORIGIN_RETRY_S = 2.0
-"""Time between two messages that tell the origin [s]."""
+"""Interval of origin messages [s]."""
 
 STREAM_TIMEOUT_S = 10.0
-"""Longest time until a flight controller that still boots grants its streams [wall s]."""
+"""Timeout of stream requests to a flight controller that is still booting [wall s]."""
 
 STREAM_RETRY_S = 0.2
-"""Time between two requests for a stream [wall s]."""
+"""Interval of requests for a stream [wall s]."""
 
 _HEADER = 10
 """Length of a MAVLink 2 header [bytes]."""
 
 _HEARTBEAT, _LOCAL_POSITION_NED = b"\x00\x00\x00", b"\x20\x00\x00"
-"""Message numbers as a frame has them."""
+"""Message numbers as encoded in a frame."""
 
 _BASE_MODE, _ARMED = 6, 0x80
-"""Offset of a HEARTBEAT's base mode, and its bit for armed."""
+"""Offset of the base mode in a HEARTBEAT, and the armed bit."""
 
 _DOWN = struct.Struct("<12xf8xf")
-"""Payload of LOCAL_POSITION_NED; its z [m]."""
+"""Payload of LOCAL_POSITION_NED: z [m] and vz [m/s]."""
 
 
 class MavsdkLink:
-    """MAVSDK over UDP, serial or raw bytes. Implements `Link`."""
+    """MAVSDK connection over UDP, serial or raw bytes. Implements `Link`."""
 
     def __init__(
         self,
@@ -78,12 +78,12 @@ class MavsdkLink:
         heard: Callable[[], bool] | None = None,
         poll: Callable[[int, interfaces.Due, interfaces.Quiet], None] | None = None,
     ) -> None:
-        """Open a connection, as `open_connection`; `connect` waits for the vehicle.
+        """Open a connection, see `open_connection`; `connect` waits for the vehicle.
 
-        `abandon`, set from another thread, ends any wait. `heard` says whether the flight
+        `abandon`, set from another thread, ends any wait. `heard` returns True if the flight
         controller is received, independent of wall time; None = MAVSDK decides. `poll` sleeps for
-        an interval [µs], and again while a condition need not be checked; None = it is checked
-        after every interval.
+        an interval [µs], and repeats while a condition need not be checked; None = check after
+        every interval.
         """
         self.url = url
         self._clock = clock
@@ -91,7 +91,7 @@ class MavsdkLink:
         self._abandon = abandon or threading.Event()
         self._heard = heard
         self.setpoints_sent = 0
-        """Setpoints handed to MAVSDK so far, its own repetitions not counted."""
+        """Number of setpoints passed to MAVSDK, without MAVSDK's repetitions."""
         self._mavsdk = open_connection(url, ComponentType.COMPANION_COMPUTER)
         self._system: Any = None
         self._telemetry: Any = None
@@ -100,9 +100,9 @@ class MavsdkLink:
         self._texts: Any = None
         self._direct: Any = None
         self.dialect: Dialect = PX4
-        """Dialect of the flight controller; PX4's before `connect`."""
+        """Dialect of the flight controller; PX4 before `connect`."""
         self._asked = False
-        """The streams have been asked for since the last mission."""
+        """True if the streams were requested since the last mission."""
 
     def connect(self, timeout_s: float, stop: threading.Event | None = None) -> None:
         """Wait for a flight controller; LinkError after a timeout [wall s] or on `stop`."""
@@ -120,10 +120,10 @@ class MavsdkLink:
         self._asked = True
 
     def prepare(self, timeout_s: float, stop: threading.Event | None = None) -> None:
-        """Prepare a connection that may have seen other missions.
+        """Prepare a connection that may have been used by earlier missions.
 
-        The flight controller may be a different one or have restarted. Cached state is dropped and
-        streams are requested anew, unless right after `connect`. Raises LinkError after a timeout
+        The flight controller may have been replaced or restarted. Cached state is dropped and
+        streams are requested again, unless right after `connect`. Raises LinkError after a timeout
         [wall s], without streams, or on `stop`.
         """
         if self._asked:
@@ -138,7 +138,7 @@ class MavsdkLink:
             self._pause_wall(stop)
         if self._offboard is None:
             self._offboard = Offboard(self._system)
-        # Telemetry of its own making knows nothing but what comes from now on.
+        # A new Telemetry plugin has no cached values.
         self._telemetry.destroy()
         self._telemetry = Telemetry(self._system)
         self._ask_for_streams(stop)
@@ -162,18 +162,18 @@ class MavsdkLink:
         WallClock().sleep_until(int(STREAM_RETRY_S * constants.US_PER_S), self._abandon)
 
     def exchange_raw(self, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
-        """Take over the bytes of a `raw://` connection; see `mavsdk_connection.exchange_raw`."""
+        """Exchange the bytes of a `raw://` connection; see `mavsdk_connection.exchange_raw`."""
         return exchange_raw(self._mavsdk, sent)
 
     def set_timeout(self, seconds: float) -> None:
-        """Set after how long MAVSDK repeats an unanswered request [wall s]; its own is 0.5 s."""
+        """Set the timeout until MAVSDK repeats a request [wall s]; MAVSDK's default is 0.5 s."""
         set_timeout(self._mavsdk, seconds)
 
     def exchange_texts(self, heard: Callable[[str], None]) -> Callable[[str], None]:
-        """Exchange STATUSTEXTs with the connected flight controller; return the sender.
+        """Exchange STATUSTEXTs with the connected flight controller; return the send function.
 
-        `heard` gets every text in a thread of MAVSDK's, after all earlier telemetry, and must
-        return at once. The sender takes up to 50 characters and keeps the order of messages.
+        `heard` receives every text in an MAVSDK thread, after all earlier telemetry, and must not
+        block. The send function accepts up to 50 characters and keeps the order of messages.
         """
         self._texts = texts = ServerUtility(self._system)
         self.hear_texts(heard)
@@ -197,21 +197,21 @@ class MavsdkLink:
 
     @property
     def connected(self) -> bool:
-        """Whether heartbeats of the flight controller arrive (MAVSDK allows gaps of 3 s)."""
+        """True while heartbeats of the flight controller arrive (MAVSDK allows gaps of 3 s)."""
         if self._system is None:
             return False
         return bool(self._system.is_connected()) if self._heard is None else self._heard()
 
     @property
     def healthy(self) -> bool:
-        """Whether the flight controller reports good sensors and that it may be armed."""
+        """True if the flight controller reports healthy sensors and ready to arm."""
         return not self.missing_health()
 
     def missing_health(self, *, by_gps: bool = True) -> list[str]:
-        """Return what the flight controller does not report as good, in words.
+        """Return the names of the health flags not reported as good.
 
-        Without GPS MAVSDK's position flags are meaningless: the global one stays false, the local
-        one alternates with contradicting messages (PX4 1.16). Armability is reported apart.
+        Without GPS, MAVSDK's position flags are meaningless: the global flag stays false, the local
+        flag alternates with contradicting messages (PX4 1.16). Armability is a separate flag.
         """
         health = self._telemetry.health()
         needed = [flag for flag in self.dialect.health if by_gps or flag not in POSITION]
@@ -220,12 +220,12 @@ class MavsdkLink:
 
     @property
     def has_local_position(self) -> bool:
-        """Whether MAVSDK's newest message on it says that the local position is good."""
+        """True if MAVSDK's newest report of the local position is good."""
         return bool(self._telemetry.health().is_local_position_ok)
 
     @property
     def armed(self) -> bool:
-        """Whether the heartbeat says armed (known up to 1 s late)."""
+        """True if the heartbeat reports armed (latency up to 1 s)."""
         return bool(self._telemetry.armed())
 
     def kinematics(self) -> Kinematics:
@@ -242,7 +242,7 @@ class MavsdkLink:
         )
 
     def status(self) -> interfaces.VehicleStatus:
-        """Return who flies."""
+        """Return armed state, flight mode and charge."""
         mode = FlightMode(self._telemetry.flight_mode())
         words = mode.name.lower().replace("_", " ")
         remaining = self.battery().remaining
@@ -253,14 +253,14 @@ class MavsdkLink:
         told = self._telemetry.battery()
         percent, current_a = _known(told.remaining_percent), _known(told.current_battery_a)
         return interfaces.BatteryState(
-            # No battery that flies has 0 V: nothing was heard of it yet.
+            # 0 V means that no battery report was received yet.
             _known(told.voltage_v) or None,
             None if current_a == constants.UNMEASURED_A else current_a,
             None if percent is None else percent / 100.0,
         )
 
     def hear_texts(self, heard: Callable[[str], None]) -> None:
-        """Call a function with the connected flight controller's texts, in a thread of MAVSDK's."""
+        """Call a function with the flight controller's texts, in an MAVSDK thread."""
         self._telemetry.subscribe_status_text(lambda status, _: heard(status.text))
 
     def arm(
@@ -271,9 +271,9 @@ class MavsdkLink:
     ) -> None:
         """Wait until the flight controller reports good health, then arm; `stop` ends the wait.
 
-        Right after a reboot a health report may be out of date. It must have been good for a while,
-        and a refused request is repeated. `origin` (latitude, longitude [deg], altitude [m]) is
-        sent to a flight controller without a position.
+        After a reboot, a health report may be out of date. Health must be good for
+        `HEALTH_SETTLE_S`, and a rejected request is repeated. `origin` (latitude, longitude [deg],
+        altitude [m]) is sent to a flight controller without a position.
         """
         deadline_us = self._deadline(timeout_s)
         good_since_us, tell_us = self._clock.time_us(), self._clock.time_us()
@@ -284,7 +284,7 @@ class MavsdkLink:
             self._check(deadline_us, late, stop)
             self._pause()
             missing = self.missing_health(by_gps=origin is None)
-            # Before it has a position of its own, an origin would move it away.
+            # An origin sent before PX4 has a local position would shift that position.
             if origin is not None and "armable" in missing and self.has_local_position:
                 tell_us = self._tell_origin(origin, tell_us)
             if missing:
@@ -298,7 +298,7 @@ class MavsdkLink:
                 self._pause(ARM_RETRY_S)
 
     def _tell_origin(self, origin: tuple[float, float, float], due_us: int) -> int:
-        """Tell the origin if it is time to; return when it is time again. None is acknowledged."""
+        """Send the origin if due; return the next due time [µs]. There is no acknowledgement."""
         now_us = self._clock.time_us()
         if now_us < due_us:
             return due_us
@@ -306,14 +306,14 @@ class MavsdkLink:
         return now_us + int(ORIGIN_RETRY_S * constants.US_PER_S)
 
     def takeoff(self, altitude_m: float, timeout_s: float, stop: threading.Event) -> None:
-        """Take off and return at an altitude above the start, or on `stop`."""
+        """Take off and wait until an altitude above the start is reached, or `stop` is set."""
         start_down = float(self.kinematics().position[2])
         self._call("take-off", lambda: self._action.set_takeoff_altitude(altitude_m))
         self._call("take-off", self._action.takeoff)
         deadline_us, least_m = self._deadline(timeout_s), altitude_m - constants.TAKEOFF_REACHED_M
 
         def left(frames: Sequence[bytes]) -> tuple[float, float]:
-            """Return how much is left of the climb [m], and its speed [m/s]; NaN = not known."""
+            """Return the remaining climb [m] and the climb speed [m/s]; NaN = unknown."""
             position = _newest(frames, _LOCAL_POSITION_NED)
             if position is None:
                 return math.nan, math.nan
@@ -324,7 +324,7 @@ class MavsdkLink:
             return left(frames)[0] < 0.0
 
         def lasts_us(frames: Sequence[bytes]) -> float:
-            """Return how long the climb takes at least, if it speeds up by 1 g."""
+            """Return the minimum remaining climb time [µs], for an acceleration of 1 g."""
             left_m, speed = left(frames)
             g = constants.GRAVITY_M_S2
             least_s = (math.sqrt(speed**2 + 2.0 * g * max(0.0, left_m)) - speed) / g
@@ -339,20 +339,20 @@ class MavsdkLink:
             self._pause_until(high, lasts_us, deadline_us, stop)
 
     def enter_offboard(self) -> None:
-        """Send a zero setpoint and switch to offboard; return when setpoints take effect."""
+        """Send a zero setpoint, switch to offboard and wait until setpoints take effect."""
         self.send_setpoint(interfaces.STOP)
         self._call("offboard", self._offboard.start)
         self._pause(OFFBOARD_SETTLE_S)
 
     def await_hover(self, altitude_m: float, timeout_s: float, stop: threading.Event) -> None:
-        """Wait until telemetry, once a second, shows a vehicle that hovers near an altitude."""
+        """Wait until telemetry, possibly at 1 Hz, shows the vehicle above half of an altitude."""
         deadline_us = self._deadline(timeout_s)
-        while not -float(self.kinematics().position[2]) > altitude_m / 2:  # NaN before the first
+        while not -float(self.kinematics().position[2]) > altitude_m / 2:  # NaN without telemetry
             self._check(deadline_us, f"not in the air after {timeout_s:g} s", stop)
             self._pause()
 
     def await_offboard(self, stop: threading.Event) -> None:
-        """Send zero velocity until a pilot has switched the vehicle to offboard, or on `stop`.
+        """Send zero velocity until a pilot switches the vehicle to offboard, or `stop` is set.
 
         PX4 rejects offboard without setpoints, and MAVSDK stops them at heartbeats of other modes.
         """
@@ -366,13 +366,13 @@ class MavsdkLink:
         return status.armed and status.offboard and bool(self._telemetry.in_air())
 
     def tell(self, text: str) -> None:
-        """Send a text of up to 50 characters, if forwarded, to the pilot and ground station."""
+        """Send a text of up to 50 characters, which may be forwarded to the ground station."""
         if self._texts is None:
             self._texts = ServerUtility(self._system)
         self._texts.send_status_text(StatusTextType.INFO, text[:TEXT_CHARACTERS])
 
     def send_message(self, name: str, fields: Mapping[str, Any]) -> bool:
-        """Send a MAVLink message by its name and fields; return whether it was sent."""
+        """Send a MAVLink message by name and fields; return True if sent."""
         if self._direct is None:
             self._direct = MavlinkDirect(self._system)
         try:
@@ -382,17 +382,17 @@ class MavsdkLink:
         return True
 
     def _hear_messages(self, name: str, heard: Callable[[Any, Any], None]) -> None:
-        """Call with every message of that name, from a thread of MAVSDK's."""
+        """Call a function with every message of a name, in an MAVSDK thread."""
         if self._direct is None:
             self._direct = MavlinkDirect(self._system)
         self._direct.subscribe_message(name, heard)
 
     def send_setpoint(self, setpoint: interfaces.Setpoint) -> None:
-        """Send a setpoint; MAVSDK repeats it at 20 Hz until the next one, of whatever kind."""
+        """Send a setpoint; MAVSDK repeats it at 20 Hz until the next setpoint of any kind."""
         self.setpoints_sent += 1
         offboard = self._offboard
         try:
-            # MAVSDK takes angles in degrees.
+            # MAVSDK uses degrees.
             if isinstance(setpoint, interfaces.BodyVelocity):
                 *velocity, yaw_rate = setpoint
                 offboard.set_velocity_body(VelocityBodyYawspeed(*velocity, math.degrees(yaw_rate)))
@@ -411,14 +411,14 @@ class MavsdkLink:
         self._call("leaving offboard", self._offboard.stop)
 
     def release(self) -> None:
-        """Send nothing more, and leave the mode as it is: somebody else flies."""
-        # MAVSDK's own end of offboard mode asks for Hold; without the plugin nothing is repeated.
+        """Stop sending setpoints without a mode change: the pilot has control."""
+        # MAVSDK's offboard stop requests Hold; destroying the plugin only stops repetitions.
         if self._offboard is not None:
             self._offboard.destroy()
             self._offboard = None
 
     def land(self, timeout_s: float) -> None:
-        """Land and return when disarmed."""
+        """Land and wait until disarmed."""
         self._call("landing", self._action.land)
         deadline_us = self._deadline(timeout_s)
         while self.armed:
@@ -443,7 +443,7 @@ class MavsdkLink:
     def _over(
         self, deadline_us: int | None, message: str = "", stop: threading.Event | None = None
     ) -> str | None:
-        """Return why nothing may be waited for any more, None if it may."""
+        """Return the reason to end a wait; None = continue."""
         if not self.connected:
             return "the flight controller is no longer heard"
         if self._abandon.is_set():
@@ -464,7 +464,7 @@ class MavsdkLink:
         deadline_us: int,
         stop: threading.Event | None = None,
     ) -> None:
-        """Wait for one `POLL_S`, or for several if `due` tells that a condition still fails."""
+        """Wait for one `POLL_S`, or for several if `due` reports that the condition still fails."""
         if self._poll is None:
             self._pause()
         else:
@@ -476,7 +476,7 @@ class MavsdkLink:
 
 
 def _newest(frames: Sequence[bytes], number: bytes) -> bytes | None:
-    """Return the last frame of a message, None if there is none."""
+    """Return the newest frame of a message; None without one."""
     for frame in reversed(frames):
         if frame[7:10] == number:
             return frame
@@ -490,14 +490,14 @@ def _disarmed(frames: Sequence[bytes]) -> bool:
 
 def _down(position: bytes) -> tuple[float, float]:
     """Return z [m] and vz [m/s] of a LOCAL_POSITION_NED."""
-    # MAVLink 2 leaves out the zeros at the end of a payload.
+    # MAVLink 2 truncates trailing zeros of a payload.
     payload = position[_HEADER : _HEADER + position[1]].ljust(_DOWN.size, b"\0")
     down_m, down_m_s = _DOWN.unpack(payload)
     return down_m, down_m_s
 
 
 def _known(value: float) -> float | None:
-    """Return what MAVSDK tells, or None for its NaN."""
+    """Return a value of MAVSDK; None for NaN."""
     return float(value) if math.isfinite(value) else None
 
 

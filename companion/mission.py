@@ -1,4 +1,4 @@
-"""One mission: arm, take off, fly the policy to the goal, land; or from a pilot and back to him."""
+"""Mission: arm, take off, fly the policy, land; or take over from a pilot and hand back."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from companion.pilot import FRAME_WAIT_S, WAITING, Decided, Pilot
 from companion.watchdog import Guard, Watchdog
 
 PREPARE_TIMEOUT_S = 10.0
-"""How long a flight controller may be silent when a mission begins [wall s]."""
+"""Maximum silence of the flight controller at the start of a mission [wall s]."""
 
 HOVER_TIMEOUT_S = 5.0
 TAKEOFF_TIMEOUT_S = 30.0
 LAND_TIMEOUT_S = 60.0
 
 FRAME_TIMEOUT_S = 5.0
-"""How long a camera may take to show a first frame [wall s]."""
+"""Timeout of the first camera frame [wall s]."""
 
 
 Start: TypeAlias = PilotedStart | Literal["hover"]
-"""Begin of a mission; hover: in Hold in the air, where the companion enters offboard."""
+"""Start of a mission; hover = in Hold in the air, where the companion enters offboard."""
 
 FIRST_PHASE: dict[Start, str] = {
     "arm": "arming",
@@ -50,11 +50,11 @@ FIRST_PHASE: dict[Start, str] = {
 
 @dataclass(frozen=True)
 class MissionResult:
-    """How a mission ended."""
+    """Result of a mission."""
 
     reason: str
-    """goal reached, stopped, link lost, camera silent, watchdog, the limit that was broken
-    (`limits.py`), or what was refused or failed."""
+    """Reason of the end: goal reached, stopped, link lost, camera silent, watchdog, the broken
+    limit (`limits.py`), or the rejected or failed request."""
     notes: tuple[str, ...]
     """Actions of the watchdog, the broken limit, failures during the landing."""
     log: DecisionLog
@@ -81,11 +81,11 @@ def fly_mission(
     start: Start = "arm",
     decided: Callable[[Decided], None] | None = None,
 ) -> MissionResult:
-    """Fly one mission on a connected link; never raises for what a flight can do.
+    """Fly one mission on a connected link; failures of a flight do not raise.
 
-    `goal` is north, east [m] from the start, and down where it has a height. `stop`, set from
-    outside, lands early; `abandon`, the link's own event, ends without landing: the vehicle has
-    crashed. `progress` gets the name of each phase as it begins; `decided` must not block.
+    `goal` is north, east [m] from the start, and down if it has a height. `stop`, set externally,
+    lands early; `abandon`, the link's event, ends without landing after a crash. `progress`
+    receives the name of each phase at its start; `decided` must not block.
     """
     watchdog = Watchdog(link, clock, watchdog_settings)
     navigating = False
@@ -107,7 +107,7 @@ def fly_mission(
     except LinkError as error:
         reason = str(error)
     except Exception as error:
-        # A policy may raise anything; the vehicle comes down all the same.
+        # A policy may raise any exception; the vehicle must still land.
         reason = f"policy failed: {type(error).__name__}: {error}"
         traceback.print_exc(file=sys.stderr)
     finally:
@@ -116,12 +116,12 @@ def fly_mission(
     if abandon.is_set():
         reason = "stopped"
     elif lost:
-        # The watchdog may have been the first to notice.
+        # The watchdog may have noticed the lost link first.
         reason = LINK_LOST
     elif reason == "watchdog" and watchdog.culprit == WAITING:
         reason = CAMERA_SILENT
     if navigating and not (watchdog.left_offboard or abandon.is_set()):
-        # A pilot may have taken over meanwhile.
+        # A pilot may have taken over in the meantime.
         limits.not_ours(link.status(), clock.time_us())
     notes = list(watchdog.notes)
     if limits.ending is not None:
@@ -129,11 +129,11 @@ def fly_mission(
     taken = limits.ending is not None and limits.ending.reason in NOT_OURS
     try:
         if taken or (start != "arm" and not navigating):
-            # Nothing may be repeated into a later switch to offboard, either.
+            # Repeated setpoints must not take effect in a later switch to offboard.
             link.release()
         elif abandon.is_set() or lost or reason == TELEMETRY_FROZEN:
-            # A lost link may be lost one way only: MAVSDK must not go on repeating the last
-            # setpoint to a vehicle that still hears it.
+            # A link may be lost in one direction only: MAVSDK must stop repeating the last
+            # setpoint to a vehicle that still receives it.
             link.leave_offboard()
         if not (taken or abandon.is_set() or lost):
             left = watchdog.left_offboard or reason == TELEMETRY_FROZEN
@@ -146,7 +146,7 @@ def fly_mission(
     except LinkError as error:
         notes.append(str(error))
         if reason == TELEMETRY_FROZEN:
-            # No answer either: all is silent, which MAVSDK takes 3 s to notice.
+            # No reply: the link is silent, which MAVSDK detects only after 3 s.
             reason = LINK_LOST
     progress("done")
     return MissionResult(reason, tuple(notes), pilot.log)
@@ -159,11 +159,11 @@ def _begin(
     stop: threading.Event,
     progress: Callable[[str], None],
 ) -> None:
-    """Return once the vehicle flies our setpoints. Raises LinkError."""
+    """Wait until the vehicle flies the companion's setpoints. Raises LinkError."""
     progress(FIRST_PHASE[start])
     link.prepare(PREPARE_TIMEOUT_S, stop)
     if settings.commands != "velocity" and link.dialect is ARDUPILOT:
-        # Its GUIDED mode takes a thrust for a climb rate, unless GUID_OPTIONS says otherwise.
+        # GUIDED mode interprets thrust as climb rate, unless changed by GUID_OPTIONS.
         words = settings.commands.replace("_", " ")
         raise LinkError(f"the policy commands {words}, which only PX4 flies with its thrust")
     if start == "offboard":
@@ -192,7 +192,7 @@ def check_camera(
     stop: threading.Event,
     compensator: Compensator | None = None,
 ) -> None:
-    """Check the first frame, if one comes before `stop`; UsageError if the policy cannot use it."""
+    """Check the first frame, if any before `stop`; UsageError if the policy cannot use it."""
     if not isinstance(policy, CameraBound) and compensator is None:
         return
     for _ in range(math.ceil(FRAME_TIMEOUT_S / FRAME_WAIT_S)):

@@ -1,4 +1,4 @@
-"""A thread that does something again and again, for as long as a context lasts."""
+"""Thread that calls a function periodically while a context is active."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from airl_mav.core.clock import Clock
 
 @contextmanager
 def every(period_us: int, act: Callable[[], object], clock: Clock, name: str) -> Iterator[None]:
-    """Call `act` at once and once per period [µs] in a named thread; missed calls are skipped."""
+    """Call `act` immediately and once per period [µs] in a named thread, skipping missed calls."""
     ended = threading.Event()
 
     def go_on() -> None:

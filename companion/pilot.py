@@ -1,8 +1,8 @@
-"""The decision loop: observe -> infer -> act, and hold; every step stamped.
+"""Decision loop: observe, infer, act and hold, with a time stamp at every step.
 
-Sequential, as in the paper, or pipelined. Then nothing is held, and the next decision begins as
-soon as the last one is ready. While a decision is computed, the last command keeps flying. Where
-that is compensated, the policy sees what will be when its action is sent.
+Decisions are sequential, as in the paper, or pipelined: without a hold, the next decision begins as
+soon as the previous one is ready. The last command stays in effect while a decision is computed.
+With latency compensation, the policy sees the state predicted for the time its action is sent.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from companion.limits import Limits
 from companion.watchdog import Watchdog
 
 FRAME_WAIT_S = 0.1
-"""How long one wait for a frame lasts before the other conditions are looked at [s]."""
+"""Maximum wait for a frame before the other conditions are checked [s]."""
 
 ONE = np.zeros(1, np.intp)
-"""The only companion of its compensator."""
+"""Index of the only companion in its compensator."""
 
 OLDEST_FRAME_US = US_PER_S
-"""A frame that claims to be older, or from the future, is stamped by another clock [µs]."""
+"""Maximum frame age [µs]; older or future frames are stamped by another clock."""
 
 WAITING = "waiting for a frame"
 """Stage of a decision, for the watchdog."""
 
 
 class Decided(NamedTuple):
-    """A decision, as soon as its command is sent; times in simulated µs."""
+    """Decision whose command was just sent; times in simulated µs."""
 
     seen: ReceivedFrame
     state: Kinematics
@@ -56,16 +56,16 @@ class Decided(NamedTuple):
     sent_us: int
     held_until_us: int
     held_before_us: int
-    """When that of the decision before ended; `NO_STAMP` for the first."""
+    """End of the previous decision's hold; `NO_STAMP` for the first decision."""
     expires_us: int | None
-    """When the velocity is zeroed unless another decision has come; None: never."""
+    """Time when the velocity is zeroed without another decision; None = never."""
     image: NDArray[Any]
-    """Image that the policy received, as `Frame.image`, compensated if asked."""
+    """Image given to the policy, as `Frame.image`, with latency compensation if enabled."""
 
 
 @dataclass
 class Pilot:
-    """Flies a policy to a goal."""
+    """Pilot that flies a policy to a goal."""
 
     link: Link
     frames: FrameSource
@@ -74,34 +74,34 @@ class Pilot:
     clock: Clock
     settings: PilotSettings
     latency: LatencySampler | None = None
-    """Where to draw t2 from, to fly as a slower computer; None = as fast as it is."""
+    """Sampler of the inference time t2, to emulate a slower computer; None = no injection."""
     compensator: Compensator | None = None
-    """Carries forward what is seen, of one companion; None = as it is."""
+    """Latency compensation of image and state, for one companion; None = no compensation."""
     limits: Limits | None = None
-    """What is believed, and how far is flown; None = everything, and anywhere."""
+    """Plausibility and flight limits; None = no limits."""
     decided: Callable[[Decided], None] | None = None
-    """Told every decision when it is sent; it must return at once."""
+    """Callback for every decision, called when its setpoint is sent. Must not block."""
     memory: DecisionMemory = field(init=False)
-    """The setpoints and latencies so far."""
+    """Setpoints and latencies so far."""
     earlier: deque[tuple[NDArray[Any], Kinematics]] = field(
         default_factory=lambda: deque(maxlen=MOST_FRAMES - 1), init=False
     )
-    """What the decisions before saw, and in what states, the newest first."""
+    """Images and states of earlier decisions, newest first."""
     further: deque[dict[str, NDArray[Any]]] = field(
         default_factory=lambda: deque(maxlen=MOST_FRAMES - 1), init=False
     )
-    """What further cameras showed them, by name."""
+    """Images of additional cameras in earlier decisions, by name."""
     log: DecisionLog = field(init=False)
     held_us: int = field(default=NO_STAMP, init=False)
 
     def __post_init__(self) -> None:
-        """Keep account of the decisions: the compensator's, where there is one."""
+        """Create the decision log and memory; a compensator's memory is shared."""
         self.log = DecisionLog(commands=self.settings.commands)
         compensator = self.compensator
         self.memory = DecisionMemory(1) if compensator is None else compensator.memory
 
     def fly(self, goal: Goal, stop: Event) -> str:
-        """Decide until the goal is reached or the flight ends; return the reason in words."""
+        """Decide until the goal is reached or the flight ends; return the reason as text."""
         sequence = -1
         if self.limits is not None:
             self.limits.begin(self.clock.time_us())
@@ -131,27 +131,27 @@ class Pilot:
         return "stopped"
 
     def _broken(self, state: Kinematics, seen: ReceivedFrame | None) -> str | None:
-        """Return the limit that ends the flight, in words."""
+        """Return the broken limit that ends the flight, as text; None = no limit broken."""
         if self.limits is None:
             return None
         if self.watchdog.left_offboard:
-            return "watchdog"  # The mode is another one by our own doing.
+            return "watchdog"  # the watchdog has changed the mode
         ending = self.limits.broken(self.link.status(), state, seen, self.clock.time_us())
         return None if ending is None else ending.reason
 
     def _decide(
         self, seen: ReceivedFrame, state: Kinematics, goal: Goal, stop: Event
     ) -> str | None:
-        """Run one decision; return why the flight has ended meanwhile, in words."""
+        """Run one decision; return the reason if the flight has ended, as text."""
         clock, settings = self.clock, self.settings
         self.watchdog.doing("inference")
-        # Before its time begins: to draw how long it shall take is no part of a computation.
+        # Sampled before the start stamp: the draw is not part of the inference time.
         lasts_us = None if self.latency is None else self.latency.sample_us()
         started_us = clock.time_us()
         observation = self._observe(seen, state, goal, started_us)
         action = flyable(self.policy.act(observation), settings.commands, settings.max_speed_m_s)
         if lasts_us is not None:
-            # Not to be interrupted: a computation is not.
+            # Not interruptible, like a real computation.
             clock.sleep_until(started_us + lasts_us)
         ready_us = clock.time_us()
         setpoint = self._setpoint(action)
@@ -159,7 +159,7 @@ class Pilot:
         sent_us = clock.time_us()
         if stop.is_set():
             return None
-        # The watchdog may have left offboard, or somebody taken over, while this was decided.
+        # During the inference, the watchdog may have left offboard, or a pilot taken over.
         if self.watchdog.left_offboard:
             return "watchdog"
         limits = self.limits
@@ -205,7 +205,7 @@ class Pilot:
             return action
         down = action.down_m_s
         if down is None:
-            # The vertical speed holds the altitude.
+            # Vertical speed for altitude hold.
             now_m = float(self.link.kinematics().position[2])
             down = vertical_speed(self.settings.altitude_m, now_m)
         return BodyVelocity(action.forward_m_s, action.right_m_s, down, action.yaw_rate_rad_s)
@@ -234,6 +234,6 @@ class Pilot:
 
 
 def age_of(seen: ReceivedFrame, now_us: int) -> int:
-    """Return a frame's age [µs], at least since its arrival if stamped by another clock."""
+    """Return a frame's age [µs]; the time since its arrival if stamped by another clock."""
     age_us = now_us - seen.frame.capture_time_us
     return age_us if 0 <= age_us <= OLDEST_FRAME_US else now_us - seen.received_us

@@ -1,7 +1,7 @@
 """Messages to the vehicle's network: ONBOARD_COMPUTER_STATUS and OBSTACLE_DISTANCE.
 
-Obstacles are those of the newest depth image around the camera's height, level at any tilt.
-Directions without a return within range are free, those beside the field of view unknown.
+Obstacles are taken from the newest depth image around the camera's height, level at any tilt.
+Directions without a return within range are free, directions outside the field of view unknown.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ MESSAGE = "ONBOARD_COMPUTER_STATUS"
 PERIOD_US = US_PER_S
 
 NOT_KNOWN_8, NOT_KNOWN_16, NOT_KNOWN_32 = 2**8 - 1, 2**15 - 1, 2**32 - 1
-"""What says "not known" in fields of uint8, int16 and uint32 (common.xml)."""
+"""Values for "not known" in fields of uint8, int16 and uint32 (common.xml)."""
 
 NO_TEMPERATURE = 2**7 - 1
-"""The same of temperatures, int8 [°C]."""
+"""Value for "not known" in temperatures, int8 [°C]."""
 
 CORES, BYTES_PER_MIB = 8, 2**20
 
@@ -42,10 +42,10 @@ LINKS = ("link_type", "link_tx_rate", "link_rx_rate", "link_tx_max", "link_rx_ma
 
 
 class Sender(Protocol):
-    """What sends MAVLink messages to the vehicle's network; `MavsdkLink` is one."""
+    """Sender of MAVLink messages to the vehicle's network, such as `MavsdkLink`."""
 
     def send_message(self, name: str, fields: Mapping[str, Any]) -> bool:
-        """Send a message by its name and fields; return whether it was sent."""
+        """Send a message by name and fields; return True if sent."""
 
 
 def computer_status(
@@ -53,7 +53,7 @@ def computer_status(
 ) -> dict[str, Any]:
     """Return the fields of the message at a time since the start [µs].
 
-    The loads of 8 cores count. `ram_bytes` is memory in use and all.
+    The loads of the first 8 cores are sent. `ram_bytes` is used and total memory [bytes].
     """
     cores = [round(percent) for percent in cores_percent[:CORES]]
     temperature = NO_TEMPERATURE if celsius is None else max(-128, min(126, round(celsius)))
@@ -84,7 +84,7 @@ def _measured(now_us: int) -> dict[str, Any]:
 def present(
     link: Sender, clock: Clock, measure: Callable[[int], dict[str, Any]] = _measured
 ) -> AbstractContextManager[None]:
-    """Send the computer's status (`measure`) from a thread while the context lasts."""
+    """Send the computer's status (`measure`) from a thread while the context is active."""
     return every(
         PERIOD_US,
         lambda: link.send_message(MESSAGE, measure(clock.time_us())),
@@ -96,14 +96,14 @@ def present(
 OBSTACLES = "OBSTACLE_DISTANCE"
 
 OBSTACLES_US = US_PER_S // 10
-"""Time between two messages [µs]; PX4 forgets distances after 0.5 s."""
+"""Interval of messages [µs]; PX4 discards distances after 0.5 s."""
 
 OLDEST_US = US_PER_S // 4
-"""An older image says nothing [µs]."""
+"""Maximum age of a used image [µs]."""
 
 BINS = 72
 BIN_RAD = math.radians(5.0)
-"""Least width of a bin: that of PX4's map."""
+"""Minimum width of a bin [rad], equal to the bins of PX4's map."""
 
 UNKNOWN_CM = 65_535
 
@@ -112,7 +112,7 @@ SENSOR_TYPE_UNKNOWN, FRAME_BODY_FRD = 4, 12
 
 
 class Vehicle(Sender, Protocol):
-    """Attitude of the vehicle, and a way to send messages; `MavsdkLink` is one."""
+    """Source of the vehicle's attitude and sender of messages, such as `MavsdkLink`."""
 
     def kinematics(self) -> Kinematics:
         """Return the newest position, velocity and attitude."""
@@ -129,8 +129,8 @@ def obstacle_distance(
     """Return the fields of the message.
 
     `depth_mm` (h, w) is a depth image, 0 = no return, up to `range_m` [m]. `quaternion` (4,) is the
-    vehicle's attitude, body to NED, `pitch_up_rad` that of the mount, `now_us` the time since the
-    start.
+    vehicle's attitude, body to NED; `pitch_up_rad` is the mounting angle of the camera; `now_us` is
+    the time since the start.
     """
     fov_rad = camera.horizontal_fov_rad
     count = min(BINS, max(1, int(fov_rad / BIN_RAD + 1e-6)))
@@ -156,7 +156,7 @@ def obstacle_distance(
 def obstacles_told(
     link: Vehicle, frames: FrameSource, range_m: float, pitch_up_rad: float, clock: Clock
 ) -> AbstractContextManager[None]:
-    """Send the message of a depth camera from a thread while the context lasts."""
+    """Send the message of a depth camera from a thread while the context is active."""
 
     def tell() -> None:
         received, now_us = frames.latest(), clock.time_us()

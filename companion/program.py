@@ -1,4 +1,4 @@
-"""The companion as a program of its own: connects, flies one mission, and says how it went."""
+"""Stand-alone companion program: connects, flies one mission and reports the result."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ if TYPE_CHECKING:
 _SETUP = TypeAdapter(Setup)
 
 FLIGHT_S = 600.0
-"""Longest navigation where nothing else is asked for [s]."""
+"""Default time limit of navigation [s]."""
 
 
 @dataclass(frozen=True)
 class Mission:
-    """What is flown, and how."""
+    """Goal, policy and settings of a mission."""
 
     goal: Goal
     """North, east of the start [m]."""
@@ -56,21 +56,21 @@ class Mission:
     watchdog: WatchdogSettings
     limits: LimitSettings
     latency: LatencySampler | None
-    """Where t2 is drawn from; None injects nothing."""
+    """Sampler of the inference time t2; None = no injection."""
     compensator: Compensator | None
-    """Carries forward what is seen; None: the policy sees what is."""
+    """Latency compensation of image and state; None = no compensation."""
     vehicle: VehicleProfile
-    """The aircraft: what its camera is, and how it is mounted."""
+    """Vehicle profile, with the camera and its mounting."""
     setup: Setup
 
     @property
     def mount_pitch_up_rad(self) -> float:
-        """How far the camera looks up, as it is mounted [rad]."""
+        """Mounting angle of the camera above the nose [rad]."""
         return math.radians(self.vehicle.camera.pitch_up_deg)
 
     @property
     def mount_yaw_rad(self) -> float:
-        """How far it looks to the right of the nose, as it is mounted [rad]."""
+        """Mounting angle of the camera to the right of the nose [rad]."""
         return math.radians(self.vehicle.camera.yaw_deg)
 
 
@@ -79,7 +79,7 @@ def prepare(asked: StandAloneCompanion) -> Mission:
     check_companion(asked)
     policy = find_policy(asked.policy, trust=asked.trust)
     pilot, watchdog = piloting.decide_piloting(asked, policy, PilotSettings.goal_radius_m)
-    # In lockstep no computer's own time counts; alone, this is the computer that is flown as.
+    # Computing time of this computer counts, except in lockstep.
     injection = piloting.select_latency(asked, policy, on_this_computer=not asked.lockstep)
     piloting.check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
     loaded = piloting.load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
@@ -94,7 +94,7 @@ def prepare(asked: StandAloneCompanion) -> Mission:
         if asked.tell_obstacles and not met:
             accepted = f"with a vehicle whose camera {need}"
             raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
-    # What its card says is held against the camera's first frame, before take-off.
+    # A policy with a card is checked against the camera's first frame, before take-off.
     if policy.card is None and (reason := camera_refused(policy, vehicle)):
         raise FieldError(
             "policy", asked.policy, problem=f"does not fit vehicle {asked.vehicle}: {reason}"
@@ -117,7 +117,7 @@ def prepare(asked: StandAloneCompanion) -> Mission:
         arena=Part("an unknown place"),
         policy=Part(policy.name, policy.description),
         computer=computer,
-        # Whatever it draws is in the current that the flight controller measures.
+        # The current measured by the flight controller includes the computer.
         computer_watts=0.0,
         injection=injection,
         speed=asked.speed,
@@ -138,7 +138,7 @@ def prepare(asked: StandAloneCompanion) -> Mission:
 
 
 def mission_camera(asked: StandAloneCompanion, mission: Mission, clock: Clock) -> OpenCamera:
-    """Open the camera that is asked for. Raises FieldError when it cannot be used."""
+    """Open the requested camera. Raises FieldError if it is unusable."""
     vehicle = mission.vehicle
     policy, cameras = mission.policy, vehicle.cameras
     if isinstance(policy, LearnedPolicy):
@@ -157,7 +157,7 @@ def obstacles_reported(
     camera: FrameSource,
     clock: Clock,
 ) -> Iterator[FrameSource]:
-    """Tell of obstacles, where that is asked for; yield the frames for the policy."""
+    """Send obstacle distances if requested; yield the frames for the policy."""
     if not asked.tell_obstacles:
         yield camera
         return
@@ -170,11 +170,11 @@ def obstacles_reported(
 def recorded(
     asked: StandAloneCompanion, mission: Mission, link: MavsdkLink, clock: Clock
 ) -> Iterator[BlackBoxRecorder | None]:
-    """Record a mission, where that is asked for. Raises FieldError when no file can be written."""
+    """Record a mission if requested. Raises FieldError if no file can be written."""
     if asked.black_box is None:
         yield None
         return
-    # Imported here: MCAP is an extra.
+    # Imported here, as MCAP is an optional extra.
     from companion.black_box import open_recorder, recording
 
     run = run_of(asked, mission)
@@ -184,7 +184,7 @@ def recorded(
 
 
 def run_of(asked: StandAloneCompanion, mission: Mission) -> dict[str, Any]:
-    """Return what flies, as `run.json` has it."""
+    """Return the setup and configuration in the format of `run.json`."""
     config = asked.model_dump(mode="json")
     config |= {"pilot": asdict(mission.pilot), "limits": mission.limits.model_dump(mode="json")}
     return {"setup": _SETUP.dump_python(mission.setup, mode="json"), "config": config}
@@ -198,7 +198,7 @@ def fly_alone(
     waiting: Callable[[], None],
     progress: Callable[[str, int], None],
 ) -> MissionResult:
-    """Fly one mission with a real flight controller; `stop` lands, `abandon` does not.
+    """Fly one mission with a real flight controller; `stop` lands, `abandon` ends without landing.
 
     `waiting` is called before waiting for the flight controller. Raises UsageError or LinkError.
     """

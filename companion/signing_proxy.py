@@ -1,4 +1,4 @@
-"""MAVLink 2 signing, which MAVSDK lacks: a UDP proxy on its own thread, in MAVSDK's place."""
+"""MAVLink 2 signing, which MAVSDK lacks: a UDP proxy between vehicle and MAVSDK, on a thread."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from airl_mav.core.signing import StoredSigning, frames_of
 from companion.interfaces import LinkError
 
 LINK_ID = 2
-"""In the signatures of a companion; the flight controller's links are 0 and 1."""
+"""Link id in signatures of a companion; the flight controller's links are 0 and 1."""
 
 MAX_DATAGRAM = 4096
 POLL_S = 0.5
-"""Longest wait before it is looked whether to end [wall s]."""
+"""Maximum wait between checks for the end [wall s]."""
 
 _URL = re.compile(r"udp(?:in)?://(?P<host>[^:/]*):(?P<port>\d+)")
 
 
 @contextmanager
 def signed(url: str, key: Path | None) -> Iterator[str]:
-    """Yield the URL for MAVSDK: the original, or that of a proxy that signs with a key."""
+    """Yield the URL for MAVSDK: the original URL, or a proxy's URL that signs with a key."""
     if key is None:
         yield url
         return
@@ -42,10 +42,10 @@ def signed(url: str, key: Path | None) -> Iterator[str]:
 
 
 class SigningProxy:
-    """Passes a flight controller's verified frames to MAVSDK, and MAVSDK's, signed, back."""
+    """Proxy that passes verified frames to MAVSDK, and MAVSDK's frames, signed, to the vehicle."""
 
     def __init__(self, url: str, key: Path) -> None:
-        """Bind and start the proxy of udpin://HOST:PORT, of this machine without a host."""
+        """Bind and start the proxy of udpin://HOST:PORT; the default host is this machine."""
         found = _URL.fullmatch(url)
         if found is None:
             raise UsageError(f"--connect {url}: with a signing key: udpin://HOST:PORT")
@@ -56,7 +56,7 @@ class SigningProxy:
         try:
             self._outer.bind((found["host"] or LOOPBACK, int(found["port"])))
             self._inner.bind((LOOPBACK, 0))
-            # Where MAVSDK will listen: it replies to who sends to it.
+            # A free port for MAVSDK to listen on; MAVSDK replies to the sender.
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
                 probe.bind((LOOPBACK, 0))
                 self._mavsdk: tuple[str, int] = probe.getsockname()
@@ -65,18 +65,18 @@ class SigningProxy:
             self._inner.close()
             raise UsageError(f"--connect {url}: {error.strerror}") from None
         self.url = f"udpin://{LOOPBACK}:{self._mavsdk[1]}"
-        """What MAVSDK connects to."""
+        """URL for MAVSDK."""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="signing", daemon=True)
         self._thread.start()
 
     @property
     def refused(self) -> int:
-        """Frames that did not come from the flight controller with the key, or came twice."""
+        """Number of frames rejected for an invalid signature or as duplicates."""
         return self._stored.signing.refused
 
     def close(self) -> None:
-        """End, and keep the newest time stamp; harmless when called again."""
+        """Stop the proxy and store the newest time stamp. Idempotent."""
         if not self._stop.is_set():
             self._stop.set()
             self._thread.join()
@@ -93,19 +93,19 @@ class SigningProxy:
                     if end is self._outer:
                         self._from_vehicle(data, address)
                     elif address == self._mavsdk:
-                        # Anybody else on this machine would have its frames signed.
+                        # Frames of other programs on this machine must not be signed.
                         self._from_mavsdk(data)
                 except OSError:
-                    continue  # nobody listens there yet
+                    continue  # no listener yet
             self._stored.save_due()
 
     def _from_vehicle(self, data: bytes, address: tuple[str, int]) -> None:
         accepted = [frame for frame in frames_of(data) if self._stored.signing.accepts(frame)]
         if any(frame[2] & 1 for frame in accepted):
-            self._vehicle = address  # not by an unsigned heartbeat
+            self._vehicle = address  # an unsigned heartbeat does not set the address
         if accepted:
-            # What comes together goes on together: in lockstep a second of telemetry comes at
-            # once, and frame by frame it would not fit into MAVSDK's socket.
+            # Frames are forwarded together: in lockstep, a second of telemetry arrives at once and
+            # would overflow MAVSDK's socket as single frames.
             self._inner.sendto(b"".join(accepted), self._mavsdk)
 
     def _from_mavsdk(self, data: bytes) -> None:

@@ -1,8 +1,8 @@
-"""The companion's end of the turns when the scheduler is another process.
+"""Companion's side of the lockstep protocol when the scheduler is another process.
 
-A turn is granted by a MAVLink STATUSTEXT behind all telemetry, and given back by one behind all
-setpoints. Both travel through MAVSDK in order. See docs/reference/lockstep-protocol.md. Frames
-arrive over ZeroMQ by the wall clock; the turn names the newest one that the companion may see.
+A MAVLink STATUSTEXT after all telemetry grants a turn, and a STATUSTEXT after all setpoints returns
+it. Both pass through MAVSDK in order. See docs/reference/lockstep-protocol.md. Frames arrive over
+ZeroMQ by the wall clock; the turn names the newest frame that the companion may see.
 """
 
 from __future__ import annotations
@@ -21,41 +21,41 @@ from companion.conducted import Abandoned, Poll
 from companion.tokens import NO_FRAME, Event, Phase, TurnBack, TurnGiven
 
 FAREWELL_S = 3
-"""Time that the companion waits at its end, in case its last text is lost [s of waiting]."""
+"""Wait of the companion at its end, in case its last text is lost [s of waiting]."""
 
 
 class TextLink(Protocol):
-    """What carries the texts; `mavsdk_link.MavsdkLink` is one."""
+    """Link for texts, such as `mavsdk_link.MavsdkLink`."""
 
     setpoints_sent: int
 
     def exchange_texts(self, heard: Callable[[str], None]) -> Callable[[str], None]:
-        """Hear the texts of the flight controller; return what sends one to it."""
+        """Receive the texts of the flight controller; return the send function."""
 
 
 class TokenTurns:
-    """Takes turns and gives them back. One flight; all but `_hear` on the companion's thread."""
+    """Turns of one flight. All methods except `_hear` run on the companion's thread."""
 
     def __init__(self, stop: threading.Event, abandon: threading.Event, patience_s: float) -> None:
-        """Prepare; `patience_s` limits the wait for a turn or its frame [wall s, while running]."""
+        """Set the timeout `patience_s` of a turn or its frame [wall s, while running]."""
         self.patience_s = patience_s
         self.frame = NO_FRAME
-        """Sequence of the newest frame that has reached the companion by now."""
+        """Sequence of the newest frame available to the companion."""
         self.frame_arrived = threading.Event()
-        """Set when there is a newer one; whoever waits for it clears it first."""
+        """Event set by a newer frame; clear it before waiting."""
         self._stop, self._abandon = stop, abandon
         self.clock = SimClock()
-        """Simulated time: it moves with the turns."""
+        """Simulated time, advanced by the turns."""
         self._inbox: SimpleQueue[TurnGiven] = SimpleQueue()
         self._link: TextLink | None = None
         self._send: Callable[[str], None] = lambda _: None
         self._number = 0
         self._sent: list[str] = []
-        """All texts of this turn, to be sent again should they be lost."""
+        """All texts of this turn, for retransmission after a loss."""
 
     @contextmanager
     def taken(self, link: TextLink) -> Iterator[None]:
-        """Take turns on a connected link while the context lasts; Abandoned when none comes."""
+        """Take turns on a connected link while the context is active; Abandoned on a timeout."""
         self._link = link
         self._send = link.exchange_texts(self._hear)
         self._await_turn()
@@ -71,14 +71,14 @@ class TokenTurns:
     def sleep(
         self, wake_us: int, interrupt: threading.Event | None = None, poll: Poll | None = None
     ) -> None:
-        """Return the turn until simulated `wake_us`, or raise Abandoned; see `conducted.Sleep`."""
+        """Return the turn until simulated `wake_us` [µs] (`conducted.Sleep`); raises Abandoned."""
         del poll
         sent = 0 if self._link is None else self._link.setpoints_sent
         self._give_back(TurnBack(self._number, wake_us, sent, self._name_of(interrupt)))
         self._await_turn()
 
     def tell(self, phase: str) -> None:
-        """Say that the mission enters a phase."""
+        """Report that the mission enters a phase."""
         self._send_text(Phase(self._number, phase).text())
 
     def _end(self) -> None:
@@ -102,14 +102,14 @@ class TokenTurns:
     # --- texts
 
     def _hear(self, text: str) -> None:
-        """Take a text of the flight controller, on MAVSDK's thread."""
+        """Handle a text of the flight controller, on MAVSDK's thread."""
         given = TurnGiven.parse(text)
         if given is not None:
             self._inbox.put(given)
 
     def _give_back(self, back: TurnBack) -> None:
         while self._next_given(0.0) is not None:
-            pass  # sent again meanwhile, because this turn took long
+            pass  # repeated by the scheduler during a long turn
         self._send_text(back.text())
 
     def _send_text(self, text: str) -> None:
@@ -129,8 +129,7 @@ class TokenTurns:
     def _await_turn(self) -> None:
         waited_s = 0
         while waited_s < self.patience_s:
-            # Counted in short waits, not by a clock: time in which the process was stopped does not
-            # count.
+            # Count short waits instead of clock time, to exclude time while the process is stopped.
             given = self._next_given(1.0)
             if given is None:
                 waited_s += 1
@@ -158,7 +157,7 @@ class TokenTurns:
 
 @dataclass
 class TokenFrameSource:
-    """Returns the frame that the turn names. Implements `camera.FrameSource`."""
+    """Source of the frame named by the turn. Implements `camera.FrameSource`."""
 
     frames: FrameSource
     turns: TokenTurns
@@ -166,7 +165,7 @@ class TokenFrameSource:
     newest: ReceivedFrame | None = field(default=None, init=False)
 
     def latest(self) -> ReceivedFrame | None:
-        """Return the turn's frame, None before the first; Abandoned when it does not come."""
+        """Return the turn's frame, None before the first frame; Abandoned on a timeout."""
         wanted = self.turns.frame
         if wanted == NO_FRAME:
             return None
@@ -188,11 +187,11 @@ class TokenFrameSource:
             clock.sleep_until(deadline_us, arrived)
 
     def _await(self, wanted: int) -> ReceivedFrame:
-        """Wait for a frame that is on its way through the operating system."""
+        """Wait for a frame that is in transit through the operating system."""
         received, patience_s = self.frames.latest(), self.turns.patience_s
         waited_s = 0
         while received is None or received.frame.sequence != wanted:
-            # It is sent again until the turn has been given back.
+            # The frame is sent repeatedly until the turn is returned.
             seen = NO_FRAME if received is None else received.frame.sequence
             newer = self.frames.wait(newer_than_sequence=seen, timeout_s=1.0)
             if newer is None:

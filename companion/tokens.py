@@ -1,4 +1,4 @@
-"""The protocol by which two processes pass the turn: texts of MAVLink STATUSTEXTs.
+"""Lockstep protocol of two processes that pass a turn, as texts of MAVLink STATUSTEXTs.
 
 See docs/reference/lockstep-protocol.md. At most 50 characters each.
 """
@@ -10,18 +10,18 @@ from dataclasses import dataclass
 from typing import Literal, cast
 
 Order = Literal["", "land", "abandon", "end"]
-"""Order to the companion: none; stop and land; abandon the flight without landing; the scheduler
-has ended."""
+"""Order to the companion: no order; stop and land; abandon the flight without landing; the
+scheduler has ended."""
 
 Event = Literal["", "frame", "stop"]
-"""Event that wakes the companion early: none; the next frame of the camera; an order."""
+"""Event that wakes the companion early: no event; the camera's next frame; an order."""
 
 NO_FRAME = -1
 
 _GIVEN = re.compile(r"F(\d+) (\d+) (-1|\d+)(?: (land|abandon|end))?")
 _BACK = re.compile(r"D(\d+)(?: (end|\d+)(?: (\d+)(?: (frame|stop))?)?)?")
 _PHASE = re.compile(r"P(\d+) ([ -~]+)")
-"""A phase is shown on a terminal: it has no control characters."""
+"""Pattern of a phase, without control characters, as a phase is shown on a terminal."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class TurnGiven:
     """`F<number> <time_us> <frame> [order]`: the companion's turn begins."""
 
     number: int
-    """Counts up by one."""
+    """Number of the turn, increases by one."""
     time_us: int
-    """Simulated time; it stands still until the turn is given back [µs]."""
+    """Simulated time [µs], constant until the turn is returned."""
     frame: int = NO_FRAME
-    """Sequence of the newest frame that has reached the companion."""
+    """Sequence of the newest frame available to the companion."""
     order: Order = ""
 
     def text(self) -> str:
@@ -42,7 +42,7 @@ class TurnGiven:
 
     @classmethod
     def parse(cls, text: str) -> TurnGiven | None:
-        """Parse a text; return None if it is another one."""
+        """Parse a text; return None for any other text."""
         match = _GIVEN.fullmatch(text)
         if match is None:
             return None
@@ -56,9 +56,9 @@ class TurnBack:
 
     number: int
     wake_us: int | None = None
-    """When it wants the next turn [µs]; None: not stated."""
+    """Requested time of the next turn [µs]; None = not specified."""
     setpoints_sent: int | None = None
-    """Setpoints that it has sent so far, without repetitions; None: not stated."""
+    """Number of setpoints sent so far, without repetitions; None = not specified."""
     event: Event = ""
     ended: bool = False
 
@@ -71,7 +71,7 @@ class TurnBack:
 
     @classmethod
     def parse(cls, text: str) -> TurnBack | None:
-        """Parse a text; return None if it is another one."""
+        """Parse a text; return None for any other text."""
         match = _BACK.fullmatch(text)
         if match is None:
             return None
@@ -87,7 +87,7 @@ class TurnBack:
 
 @dataclass(frozen=True)
 class Phase:
-    """`P<number> <name>`: within its turn the companion has entered a phase of its mission."""
+    """`P<number> <name>`: the companion has entered a phase of its mission during a turn."""
 
     number: int
     name: str
@@ -98,6 +98,6 @@ class Phase:
 
     @classmethod
     def parse(cls, text: str) -> Phase | None:
-        """Parse a text; return None if it is another one."""
+        """Parse a text; return None for any other text."""
         match = _PHASE.fullmatch(text)
         return None if match is None else cls(int(match[1]), match[2])

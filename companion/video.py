@@ -1,4 +1,4 @@
-"""What a camera sees as a video for people: H.264 over RTP, which ground stations show."""
+"""Video of a camera for ground stations: H.264 over RTP."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import US_PER_S
 
 GIMBAL_PORT: Final = 13_280
-"""Where PX4 SITL's instance 0 sends what it forwards to a gimbal (px4-rc.mavlink), and the built-in
-flight controller of `airl-firmware`, too. A link that is fast enough, and is nobody else's here."""
+"""Port to which PX4 SITL's instance 0 forwards MAVLink for a gimbal (px4-rc.mavlink), like the
+built-in flight controller of `airl-firmware`. This link is fast enough and otherwise unused."""
 
 LEAST_PX: Final = 320
-"""A picture is enlarged by a whole factor until it is at least so wide, each pixel a square."""
+"""Minimum width of the video [px]; smaller images are enlarged by an integer factor."""
 
 DARKEST: Final = 32.0
 """Grey value of the maximum range, 0 to 255; pixels without a return are darker."""
 
 KEYFRAME_S: Final = 1.0
-"""A new viewer gets a picture within this time [s]."""
+"""Interval of keyframes [s], and so the maximum wait of a new viewer."""
 
 CRF: Final = 23
-"""Quality of x264, its own default: 0 has no loss, 51 is the worst."""
+"""Quality of x264, its default: 0 = lossless, 51 = worst."""
 
 _CLOCK_HZ: Final = 90_000
-"""Time stamps of H.264 in RTP (RFC 6184)."""
+"""Clock rate of H.264 time stamps in RTP (RFC 6184)."""
 
 
 class Watcher(NamedTuple):
-    """Who is sent the video."""
+    """Receiver of the video."""
 
     host: str
     port: int
 
 
 def picture_of(frame: Frame | FurtherImage, range_m: float) -> NDArray[np.uint8]:
-    """Return an image as a picture (h, w, 3) of even sides; near is bright, no return black."""
+    """Return an image as a picture (h, w, 3) with even sides; near = bright, no return = black."""
     if frame.intrinsics.kind == "depth":
         shade = DARKEST + (255.0 - DARKEST) * nearness(frame.image, range_m)
         grey = np.where(frame.image == 0, 0.0, shade).astype(np.uint8)
@@ -51,13 +51,13 @@ def picture_of(frame: Frame | FurtherImage, range_m: float) -> NDArray[np.uint8]
         picture = rgb_of(frame.image)
     times = enlargement(frame.intrinsics)
     larger = picture.repeat(times, axis=0).repeat(times, axis=1)
-    # H.264 with subsampled colour has even sides only.
+    # H.264 with subsampled colour requires even sides.
     width, height = picture_size(frame.intrinsics)
     return np.ascontiguousarray(larger[:height, :width])
 
 
 def enlargement(lens: Intrinsics) -> int:
-    """Return by what factor a picture is enlarged each way."""
+    """Return the integer enlargement factor of a picture."""
     least = max(LEAST_PX / lens.width, 2.0 / lens.height)
     return max(1, math.ceil(least))
 
@@ -69,7 +69,7 @@ def picture_size(lens: Intrinsics) -> tuple[int, int]:
 
 
 class RtpVideo:
-    """Encodes pictures as they come, and sends them to one address."""
+    """Encoder that sends each picture immediately to one address."""
 
     def __init__(self, host: str, port: int, size: tuple[int, int], rate_hz: float) -> None:
         """Open a stream of pictures (width, height) to a UDP port; ImportError without PyAV."""
@@ -82,14 +82,14 @@ class RtpVideo:
         self._stream.pix_fmt = "yuv420p"
         self._stream.codec_context.time_base = Fraction(1, _CLOCK_HZ)
         self._stream.codec_context.gop_size = max(1, round(KEYFRAME_S * rate_hz))
-        # One slice a picture and none held back: the picture leaves as it comes.
+        # One slice per picture and no buffering, so that each picture is sent at once.
         self._stream.options = {"preset": "ultrafast", "tune": "zerolatency", "crf": f"{CRF}"}
         self._stream.codec_context.thread_count = 1
         self._first_us: int | None = None
         self._last_pts = -1
 
     def show(self, picture: NDArray[np.uint8], time_us: int) -> None:
-        """Send a picture (h, w, 3) of a time [µs] unless older than the last, or raise OSError."""
+        """Send a picture (h, w, 3) at a time [µs], unless older than the last; raises OSError."""
         if self._first_us is None:
             self._first_us = time_us
         pts = (time_us - self._first_us) * _CLOCK_HZ // US_PER_S

@@ -1,8 +1,8 @@
-"""Video of a camera as a program, announced by MAVLink's camera protocol.
+"""Video program of a camera, announced by MAVLink's camera protocol.
 
 QGroundControl and MAVSDK find the component by its heartbeat, request CAMERA_INFORMATION, and show
-the stream of VIDEO_STREAM_INFORMATION (https://mavlink.io/en/services/camera.html). It reports that
-it takes no photos and records nothing.
+the stream of VIDEO_STREAM_INFORMATION (https://mavlink.io/en/services/camera.html). The component
+reports that photos and recording are unsupported.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from companion.mavsdk_connection import open_connection
 from companion.video import RtpVideo, Watcher, picture_of, picture_size
 
 STREAM_ID: Final = 1
-"""Of the only stream; 0 asks for all of them."""
+"""Id of the only stream; a request for 0 means all streams."""
 
 CAMERA_INFORMATION: Final = 259
 CAMERA_SETTINGS: Final = 260
@@ -39,7 +39,7 @@ STORAGE_INFORMATION: Final = 261
 CAMERA_CAPTURE_STATUS: Final = 262
 VIDEO_STREAM_INFORMATION: Final = 269
 VIDEO_STREAM_STATUS: Final = 270
-"""Numbers of the messages that are sent to who asks for them (common.xml)."""
+"""Numbers of the messages sent on request (common.xml)."""
 
 STAMPED: Final = (CAMERA_INFORMATION, CAMERA_SETTINGS, STORAGE_INFORMATION, CAMERA_CAPTURE_STATUS)
 """Messages with a time stamp."""
@@ -47,7 +47,7 @@ STAMPED: Final = (CAMERA_INFORMATION, CAMERA_SETTINGS, STORAGE_INFORMATION, CAME
 REQUEST_MESSAGE: Final = 512
 VIDEO_START_STREAMING: Final = 2502
 VIDEO_STOP_STREAMING: Final = 2503
-"""Commands that are carried out."""
+"""Supported commands."""
 
 OLD_REQUESTS: Final = {
     521: CAMERA_INFORMATION,
@@ -57,13 +57,13 @@ OLD_REQUESTS: Final = {
     2504: VIDEO_STREAM_INFORMATION,
     2505: VIDEO_STREAM_STATUS,
 }
-"""Commands that asked for one message each, before REQUEST_MESSAGE: clients still send them."""
+"""Commands that request one message each, older than REQUEST_MESSAGE; clients still send them."""
 
 WITHOUT_EFFECT: Final = (
-    *(526, 529, 530, 531, 532),  # to format the storage, reset, set the mode, zoom, focus
+    *(526, 529, 530, 531, 532),  # format storage, reset, set mode, zoom, focus
     *(2000, 2001, 2004, 2005, 2010, 2500, 2501),  # photos, tracking, recording
 )
-"""Commands to cameras that this one does not carry out; MAVSDK would leave them unanswered."""
+"""Unsupported camera commands; without a handler, MAVSDK would not answer them."""
 
 ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
 """MAV_RESULT."""
@@ -78,7 +78,7 @@ NO_STORAGE: Final = 3
 """STORAGE_STATUS_NOT_SUPPORTED."""
 
 RTP_UDP: Final = 1
-"""VIDEO_STREAM_TYPE: RTP over UDP, whose URI is the port that is listened on."""
+"""VIDEO_STREAM_TYPE: RTP over UDP, with the port of the receiver as URI."""
 
 H264: Final = 1
 """VIDEO_STREAM_ENCODING."""
@@ -93,10 +93,10 @@ Fields = dict[str, Any]
 
 @dataclass(frozen=True)
 class Stream:
-    """Descriptions of camera and video."""
+    """Description of camera and video."""
 
     model: str
-    """Of the camera; at most 31 characters are told."""
+    """Camera model; at most 31 characters are sent."""
     size_px: tuple[int, int]
     rate_hz: float
     horizontal_fov_deg: float
@@ -104,7 +104,7 @@ class Stream:
 
 
 def camera_information(stream: Stream) -> Fields:
-    """Return the fields of CAMERA_INFORMATION but the time; sizes of the lens are not known: 0."""
+    """Return the fields of CAMERA_INFORMATION except the time; 0 = unknown lens sizes."""
     return {
         "vendor_name": _bytes("airl-mav"),
         "model_name": _bytes(stream.model),
@@ -130,7 +130,7 @@ def stream_status(stream: Stream, *, running: bool) -> Fields:
         "framerate": stream.rate_hz,
         "resolution_h": stream.size_px[0],
         "resolution_v": stream.size_px[1],
-        "bitrate": 0,  # as much as the quality takes
+        "bitrate": 0,  # determined by the quality
         "rotation": 0,
         "hfov": round(stream.horizontal_fov_deg),
     }
@@ -166,18 +166,18 @@ _NOT_CAPTURING: Final[Fields] = {
 
 
 def _bytes(text: str) -> list[int]:
-    """Return a name as an array of uint8, which is what these fields are."""
+    """Return a name as an array of uint8, the type of these fields."""
     name = text.encode("ascii", "replace")[: NAME_BYTES - 1]
     return list(name.ljust(NAME_BYTES, b"\0"))
 
 
 class CameraComponent:
-    """Answers those who ask for the camera, from MAVSDK's own threads."""
+    """Camera component that answers requests in MAVSDK's threads."""
 
     def __init__(self, mavsdk: Mavsdk, stream: Stream, clock: Clock) -> None:
         """Announce a stream by a MAVSDK connected as a camera component (`open_connection`)."""
         self.running = True
-        """Whether the video is wanted: clients may stop it, and start it again."""
+        """True while the video is enabled; clients may stop and restart it."""
         self._clock = clock
         self._messages: dict[int, tuple[str, Callable[[], Fields]]] = {
             CAMERA_INFORMATION: ("CAMERA_INFORMATION", lambda: camera_information(stream)),
@@ -200,11 +200,11 @@ class CameraComponent:
 
     def _asked(self, message: MavlinkMessage, _data: object) -> None:
         fields = json.loads(message.fields_json)
-        # A parameter that is left out is NaN, which JSON has no number for.
+        # An omitted parameter is NaN, which JSON cannot represent.
         one, two = (int(fields.get(name) or 0) for name in ("param1", "param2"))
         sender = message.system_id, message.component_id
         result, wanted = self._carried_out(int(fields["command"]), one, two)
-        # The acknowledgement is first: whoever asks for a message may wait for that alone.
+        # The acknowledgement is first, as a client may wait for it alone.
         acknowledged = {
             "command": fields["command"],
             "result": result,
@@ -222,7 +222,7 @@ class CameraComponent:
             self._send(name, {**stamp, **made()}, sender)
 
     def _carried_out(self, command: int, one: int, two: int) -> tuple[int, tuple[int, ...]]:
-        """Return the result of a command by its parameters, and the messages that it asks for."""
+        """Return the result of a command with its parameters, and the requested messages."""
         if command in (VIDEO_START_STREAMING, VIDEO_STOP_STREAMING):
             if one not in (0, STREAM_ID):
                 return DENIED, ()
@@ -232,7 +232,7 @@ class CameraComponent:
         if asked not in self._messages:
             return UNSUPPORTED, ()
         if asked == CAMERA_INFORMATION:
-            # MAVSDK asks for the stream only 20 s later.
+            # MAVSDK requests the stream only 20 s later.
             return ACCEPTED, (CAMERA_INFORMATION, VIDEO_STREAM_INFORMATION)
         if asked in (VIDEO_STREAM_INFORMATION, VIDEO_STREAM_STATUS):
             which = two if command == REQUEST_MESSAGE else one
@@ -244,33 +244,33 @@ class CameraComponent:
         self._server.send_message(MavlinkMessage(name, 0, 0, *to, json.dumps(fields)))
 
     def close(self) -> None:
-        """Be there no more."""
+        """Remove the component."""
         self._server.destroy()
 
 
 WAIT_S = 0.5
-"""Longest single wait for a frame [wall s]: so soon a wish to end is seen."""
+"""Maximum single wait for a frame [wall s], and so the maximum reaction time to `stop`."""
 
 DEFAULT_SYSTEM_ID = 1
-"""Of vehicles whose MAV_SYS_ID nobody has changed, and of MAVSDK's camera component."""
+"""Default MAV_SYS_ID of vehicles, and system id of MAVSDK's camera component."""
 
 
 class OnNetwork:
-    """The camera's component on the MAVLink network, once a vehicle is heard there."""
+    """Camera component on the MAVLink network, once a vehicle is received there."""
 
     def __init__(self, url: str, clock: Clock) -> None:
-        """Open a MAVSDK connection. Raises UsageError for an address that cannot be used."""
+        """Open a MAVSDK connection. Raises UsageError for an unusable address."""
         self._url, self._clock = url, clock
         self._mavsdk = open_connection(url, ComponentType.CAMERA)
         self._component: CameraComponent | None = None
 
     @property
     def running(self) -> bool:
-        """Whether the video is wanted; it is until somebody stops it."""
+        """True while the video is enabled, until a client stops it."""
         return self._component is None or self._component.running
 
     def join(self, stream: Stream) -> bool:
-        """Join the vehicle, if it is heard; return whether that has happened just now."""
+        """Join the vehicle if it is received; return True if joined by this call."""
         if self._component is not None:
             return False
         system = next((each for each in self._mavsdk.get_systems() if each.has_autopilot()), None)
@@ -278,7 +278,7 @@ class OnNetwork:
             return False
         number = system.get_system_id()
         if number != DEFAULT_SYSTEM_ID:
-            # A component says which vehicle it is part of from its first message on.
+            # All messages of a component carry the vehicle's system id, from the first one on.
             self._mavsdk.destroy()
             self._mavsdk = open_connection(self._url, ComponentType.CAMERA, number)
         self._component = CameraComponent(self._mavsdk, stream, self._clock)
@@ -292,19 +292,19 @@ class OnNetwork:
 
 
 class ShownCamera(NamedTuple):
-    """Whose images are shown."""
+    """Camera with the images to show."""
 
     camera: str
-    """As `open_named_camera` takes it."""
+    """Camera name for `open_named_camera`."""
     vehicle: str
     profile: VehicleProfile
-    """Whose camera that is: its rate, its lens and range."""
+    """Vehicle profile, with the rate, lens and range of the camera."""
     name: str | None = None
-    """Of the further camera that is shown; None: the main one is."""
+    """Name of the additional camera to show; None = the main camera."""
 
     @property
     def own(self) -> Camera:
-        """The camera of the profile. Raises FieldError for a name that is none."""
+        """Camera of the profile. Raises FieldError for an unknown name."""
         if self.name is None:
             return self.profile.camera
         if self.name not in self.profile.cameras:
@@ -313,13 +313,13 @@ class ShownCamera(NamedTuple):
         return self.profile.cameras[self.name]
 
     def open(self, clock: Clock) -> OpenCamera:
-        """Open it. Raises FieldError as `open_named_camera`."""
+        """Open the camera. Raises FieldError like `open_named_camera`."""
         further = {name: Intrinsics.of(each) for name, each in self.profile.cameras.items()}
         wanted, whose = Intrinsics.of(self.profile.camera), f"vehicle {self.vehicle}"
         return open_named_camera(self.camera, clock, wanted, whose, further)
 
     def image(self, frame: Frame) -> Frame | FurtherImage:
-        """Return its image of a frame. Raises FieldError where there is none."""
+        """Return the camera's image of a frame. Raises FieldError without such an image."""
         if self.name is None:
             return frame
         if self.name not in frame.further:
@@ -336,7 +336,7 @@ def show_video(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> int:
-    """Send a camera's video until `stop`; return the number of pictures, or raise UsageError."""
+    """Send a camera's video until `stop`; return the number of images, or raise UsageError."""
     own = camera.own
     with closing(camera.open(clock)) as source:
         say(f"waiting for images of {camera.camera}")
@@ -380,7 +380,7 @@ def _send(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> int:
-    """Send wanted frames; return their number. Network errors are reported once and skipped."""
+    """Send enabled frames; return their number. Network errors are reported once and skipped."""
     sent, seen, failing = 0, first, False
     while not stop.is_set():
         if wanted():

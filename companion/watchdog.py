@@ -3,9 +3,9 @@
 MAVSDK repeats the last setpoint at 20 Hz, so a hung policy would keep the vehicle moving and
 prevent the offboard-loss failsafe. Three lines of defence:
 
-1. A decision that is overdue zeroes the velocity.
-2. Still none: offboard is left, the flight controller holds.
-3. A policy holds Python's interpreter lock: a C-level timer ends the process, and the
+1. If a decision is overdue, the watchdog zeroes the velocity.
+2. Without a decision after that, it leaves offboard and the flight controller holds.
+3. If a policy holds Python's interpreter lock, a C-level timer ends the process and the
    offboard-loss failsafe acts.
 """
 
@@ -23,15 +23,15 @@ from companion.interfaces import STOP, BodyVelocity, Link, LinkError, Setpoint
 
 
 class Watchdog:
-    """Guards a mission's setpoints, sent by `command`; a guard calls `look` at its deadlines."""
+    """Watchdog of a mission's setpoints, sent by `command`; a guard calls `look` at deadlines."""
 
     def __init__(self, link: Link, clock: Clock, settings: WatchdogSettings) -> None:
         self.notes: list[str] = []
-        """What it had to do, in words."""
+        """Actions of the watchdog, as text."""
         self.left_offboard = False
-        """The mission is over: the flight controller holds."""
+        """True if the mission is over and the flight controller holds."""
         self.culprit: str | None = None
-        """What the pilot was at when offboard was left."""
+        """Activity of the pilot when offboard was left; None = offboard was not left."""
         self._link = link
         self._clock = clock
         self._settings = settings
@@ -43,15 +43,15 @@ class Watchdog:
         self._last: Setpoint = STOP
 
     def begin(self) -> None:
-        """The pilot takes over: the first decision is due."""
+        """Start to wait for the first decision."""
         self._fed_us = self._clock.time_us()
 
     def doing(self, activity: str) -> None:
-        """Say what the pilot is at: it names the culprit when a decision is overdue."""
+        """Set the pilot's activity, reported when a decision is overdue."""
         self._activity = activity
 
     def command(self, setpoint: Setpoint, hold_us: int) -> bool:
-        """Send a setpoint with its hold [µs]; return False if offboard was left before."""
+        """Send a setpoint with its hold time [µs]; return False if offboard was left before."""
         with self._lock:
             if self.left_offboard:
                 return False
@@ -67,24 +67,24 @@ class Watchdog:
 
     @property
     def by_velocity(self) -> bool:
-        """Whether the newest setpoint is a velocity, which is safe for seconds."""
+        """True if the newest setpoint is a velocity, which is safe for seconds."""
         return self._stopped or isinstance(self._last, BodyVelocity)
 
     @property
     def hover_after_s(self) -> float | None:
-        """Time after an action's hold at which the velocity is zeroed [s]; None: never."""
+        """Time from the end of an action's hold until the velocity is zeroed [s]; None = never."""
         return self._settings.hover_after_s
 
     @property
     def due_us(self) -> int | None:
-        """When `look` next has something to do, unless a decision comes first [µs]; None: never."""
+        """Time of the next action of `look` without another decision [µs]; None = never."""
         if self.left_offboard:
             return None
         bound_us = self._leave_us if self._stopped else self._overdue_us
         return bound_us if self._hover_us is None else min(bound_us, self._hover_us)
 
     def look(self) -> None:
-        """Do what is due now."""
+        """Perform the due action, if any."""
         with self._lock:
             now_us = self._clock.time_us()
             try:
@@ -95,7 +95,7 @@ class Watchdog:
                     if self._link.status().offboard:
                         self._link.leave_offboard()
                     else:
-                        # A pilot, or a failsafe, has taken over meanwhile.
+                        # A pilot or a failsafe has taken over.
                         self._link.release()
                 elif now_us >= self._overdue_us and not self._stopped:
                     self._stopped = True
@@ -109,10 +109,10 @@ class Watchdog:
                 self._note(str(error), now_us)
 
     def _stop(self) -> None:
-        """Have the flight controller hold the vehicle where it is."""
+        """Command the flight controller to stop the vehicle."""
         last = self._last
-        # PX4 flies a velocity after body rates, or an attitude, up to half a second later, and the
-        # last of those until then. It must neither turn on, nor lean.
+        # After body rates or an attitude, PX4 applies a velocity up to half a second later. Until
+        # then the last setpoint must neither rotate nor tilt the vehicle.
         if isinstance(last, BodyRates):
             self._link.send_setpoint(BodyRates(0.0, 0.0, 0.0, last.thrust))
         elif isinstance(last, Attitude):
@@ -136,34 +136,34 @@ class Watchdog:
 
 
 POLL_US = 10_000
-"""Interval at which deadlines are checked [µs]."""
+"""Interval of deadline checks [µs]."""
 
 CHECKS_PER_RESTART = 25
-"""Checks between two restarts of the timer that ends a starved process."""
+"""Number of checks between restarts of the timer that ends a starved process."""
 
 STDERR = 2
-"""File descriptor for the traceback of a process that is ended."""
+"""File descriptor for the traceback of an ended process."""
 
 STARVED_S = 5.0
-"""The process ends when the thread has not run for this long [wall s]."""
+"""Time without a run of the thread after which the process ends [wall s]."""
 
 TURNING_STARVED_S = 1.0
-"""The same while an attitude or body rates are commanded: MAVSDK repeats them meanwhile, and the
-flight controller's failsafe can act only when it no longer does [wall s]."""
+"""Equivalent of `STARVED_S` while an attitude or body rates are commanded [wall s]: MAVSDK repeats
+them, and the flight controller's failsafe can act only when the repetition ends."""
 
 
 class Guard(Protocol):
-    """Calls a watchdog's `look` in time."""
+    """Guard that calls a watchdog's `look` in time."""
 
     def start(self, watchdog: Watchdog) -> None:
-        """Begin to watch."""
+        """Start to watch."""
 
     def stop(self) -> None:
-        """Stop watching; harmless when it never began."""
+        """Stop watching. Allowed without a start."""
 
 
 class ThreadGuard:
-    """Checks from a thread, and ends the process when that thread is starved."""
+    """Guard with a thread; ends the process if this thread is starved."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -171,14 +171,14 @@ class ThreadGuard:
         self._thread: threading.Thread | None = None
 
     def start(self, watchdog: Watchdog) -> None:
-        """Begin to watch."""
+        """Start to watch."""
         self._thread = threading.Thread(
             target=self._run, args=(watchdog,), name="watchdog", daemon=True
         )
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop watching; harmless when it never began."""
+        """Stop watching. Allowed without a start."""
         self._done.set()
         if self._thread is not None:
             self._thread.join()

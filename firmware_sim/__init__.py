@@ -1,1 +1,1 @@
-"""Everything on the aircraft side of the MAVLink link: plant, autopilot, MAVLink services."""
+"""Aircraft side of the MAVLink link: plant, autopilot and MAVLink services."""

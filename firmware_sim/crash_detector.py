@@ -1,4 +1,4 @@
-"""Contacts that end a flight."""
+"""Detection of contacts that end a flight."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from firmware_sim.plant.plant import Collision
 from firmware_sim.simulation import Simulation
 
 TOUCHDOWN_M_S = 2.0
-"""A slower touch of the floor is a landing: PX4 lands at 0.7 to 1.5 m/s [m/s]."""
+"""Maximum speed of a landing on the floor [m/s]; PX4 lands at 0.7 to 1.5 m/s."""
 
 
 def is_crash(hit: Collision, flight: Flight) -> bool:
-    """Return whether a contact ends a flight.
+    """Return True if a contact ends a flight.
 
-    All contacts do, except with the floor while the vehicle stands, and except a gentle touch of
-    the floor in the modes that take off and land.
+    Contacts with the floor do not end a flight while the vehicle is on the ground, or if they are
+    gentle and the mode is neither Offboard nor Hold.
     """
     if hit.what != FLOOR:
         return True
@@ -25,15 +25,15 @@ def is_crash(hit: Collision, flight: Flight) -> bool:
 
 
 class CrashDetector:
-    """Remembers the first thing that was hit in flight; to be asked once a tick."""
+    """Detector of the first body hit in flight; call `look` once per tick."""
 
     def __init__(self) -> None:
         self.hit: str | None = None
-        """Name of the first body hit; None = none."""
+        """Name of the first body hit; None = no crash."""
         self._seen = 0
 
     def look(self, simulation: Simulation) -> bool:
-        """Check the contacts of this tick; return whether the first crash is among them."""
+        """Check the contacts of this tick; return True if the first crash is among them."""
         hits = simulation.plant.collisions
         if len(hits) == self._seen:
             return False

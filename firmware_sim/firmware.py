@@ -1,4 +1,4 @@
-"""The firmware process: simulation, MAVLink and camera, tick after tick."""
+"""Firmware process: runs simulation, MAVLink and camera tick by tick."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ from firmware_sim.plant.onboard_camera import CameraMaker
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 AUTOSAVE_US = 300_000
-"""Changed parameters are saved this long after the first change, as by PX4 [µs]."""
+"""Delay from the first parameter change to the save [µs]; PX4's value."""
 
 IDLE_S = 0.02
-"""How often requests are checked while no episode is loaded [s]."""
+"""Interval of checks for requests while no episode is loaded [s]."""
 
 
 class FrameServer(Protocol):
-    """Where the camera's frames go; `plant.camera_server.CameraServer` is one."""
+    """Receiver of the camera's frames, such as `plant.camera_server.CameraServer`."""
 
     endpoint: str
-    """Where subscribers connect."""
+    """Address for subscribers."""
 
     @property
     def awaited(self) -> bool:
-        """Whether somebody waits for the next frame: it must not come late."""
+        """True if a client waits for the next frame, which must then be on time."""
         ...
 
     def publish(self, frame: Frame) -> None:
-        """Offer a frame, without waiting for anybody."""
+        """Offer a frame without blocking."""
         ...
 
     def close(self) -> None:
@@ -60,31 +60,31 @@ class FrameServer(Protocol):
 
 
 class FlightStack(Protocol):
-    """A flight controller and its MAVLink links: all that is aboard besides sensors and motors.
+    """Flight controller and its MAVLink links, without sensors and motors.
 
-    The links stay open; the flight controller is booted anew for each episode. Only `boot` and
-    `connect` raise.
+    The links stay open; the flight controller reboots for each episode. Only `boot` and `connect`
+    raise.
     """
 
     def boot(self, setup: EpisodeSetup) -> FlightController:
-        """Boot the flight controller of an episode, and wait until it can be stepped.
+        """Boot the flight controller of an episode and wait until it accepts steps.
 
         Raises:
-            UsageError: The vehicle's parameters are wrong, or there is no such firmware.
+            UsageError: The vehicle's parameters are invalid, or the firmware does not exist.
             FirmwareLostError: External firmware died while it booted.
         """
         ...
 
     def connect(self, tick: Callable[[], int], truth: Callable[[], Truth]) -> None:
-        """Open its MAVLink, after its first tick.
+        """Open MAVLink after the flight controller's first tick.
 
         Args:
-            tick: Flies one more tick and returns its simulated time [µs], for firmware that needs
+            tick: Flies one tick and returns its simulated time [µs], for firmware that needs
                 simulated time to get ready.
-            truth: Returns the true state, for clients that ask for it (HIL_STATE_QUATERNION).
+            truth: Returns the true state, for clients that request it (HIL_STATE_QUATERNION).
 
         Raises:
-            UsageError: External firmware is silent, or is set up for another vehicle.
+            UsageError: External firmware is silent, or configured for another vehicle.
             FirmwareLostError: External firmware died.
         """
         ...
@@ -94,35 +94,35 @@ class FlightStack(Protocol):
         ...
 
     def receive(self, now_us: int) -> int:
-        """Take what has arrived at simulated time `now_us` [µs]; return how much took effect."""
+        """Handle messages received by simulated `now_us` [µs]; return how many took effect."""
         ...
 
     def next_send_us(self) -> float:
-        """Return the simulated time at which `send` is called next, at the latest [µs]."""
+        """Return the latest simulated time for the next call of `send` [µs]."""
         ...
 
     def send(self, now_us: int, flown: Record) -> None:
-        """Send what is due.
+        """Send the messages that are due.
 
         Args:
             now_us: Simulated time after the newest tick [µs].
-            flown: (n,) logs of the ticks since the last call; empty where the firmware is external.
+            flown: (n,) logs of the ticks since the last call; empty for external firmware.
         """
         ...
 
     def log_to(self, tlog: TlogWriter | None) -> None:
-        """Write the onboard link to a tlog from now on; None ends it."""
+        """Start to log the onboard link to a tlog; None stops logging."""
         ...
 
     def counters(self) -> dict[str, LinkCounters]:
-        """Return the traffic per link name."""
+        """Return traffic counters by link name."""
         ...
 
     def strangers(self) -> Sequence[str]:
-        """Return a line for each stranger that has commanded the vehicle in this episode.
+        """Return a line for each unidentified client that commanded the vehicle in this episode.
 
-        That is who is neither a companion nor a ground station by its heartbeat. Nobody where the
-        firmware is external: only it looks into its MAVLink.
+        The heartbeat of such a client is neither a companion's nor a ground station's. Empty for
+        external firmware, whose MAVLink is not inspected here.
         """
         ...
 
@@ -132,16 +132,16 @@ class FlightStack(Protocol):
 
 
 class BuiltinFlightStack:
-    """The built-in autopilot behind our own MAVLink server. Implements `FlightStack`."""
+    """Built-in autopilot with the built-in MAVLink server. Implements `FlightStack`."""
 
     def __init__(self, server: MavlinkServer, keeper: Keeper | None = None) -> None:
-        """Take the links; `keeper` keeps the parameters that users set, None = nobody does."""
+        """Use the server's links; `keeper` stores parameters set by users, None = not stored."""
         self._server = server
         self._keeper = keeper
         self._autopilot: BuiltinAutopilot | None = None
         self._now_us = 0
         self._save_us: int | None = None
-        """When changed parameters are saved; None = there is nothing to save."""
+        """Simulated time of the next parameter save [µs]; None = nothing to save."""
         self.filenos = server.filenos
         self.receive, self.next_send_us = server.receive, server.next_send_us
         self.send = server.send if keeper is None else self._send_and_save
@@ -150,7 +150,7 @@ class BuiltinFlightStack:
         self.strangers = server.strangers
 
     def boot(self, setup: EpisodeSetup) -> BuiltinAutopilot:
-        """Boot the autopilot of an episode. Raises UsageError for a wrong parameter."""
+        """Boot the autopilot of an episode. Raises UsageError for an invalid parameter."""
         self._autopilot = autopilot = builtin_autopilot(setup, self._keeper)
         if self._keeper is not None:
             autopilot.parameters.on_change(self._changed)
@@ -163,7 +163,7 @@ class BuiltinFlightStack:
             self._server.attach(self._autopilot, truth)
 
     def close(self) -> None:
-        """Save parameters that are not saved yet, and close the links."""
+        """Save unsaved parameters and close the links."""
         self._save()
         self._server.close()
 
@@ -187,15 +187,15 @@ class BuiltinFlightStack:
 
 @dataclass(frozen=True)
 class Loaded:
-    """An episode that has just been set up."""
+    """Start of a loaded episode."""
 
     time_us: int
     epoch_ns: int | None
-    """Host monotonic time of simulated time 0 [ns]; None when time is not paced."""
+    """Host monotonic time of simulated time 0 [ns]; None = simulated time is not paced."""
 
 
 class Firmware:
-    """Flies one episode after the other. Its links and its camera stay open."""
+    """Flight stack, camera and simulation. Links and camera stay open between episodes."""
 
     def __init__(
         self,
@@ -206,26 +206,26 @@ class Firmware:
         recording: bool = True,
         failing: FailingEndpoint | None = None,
     ) -> None:
-        """Put it together; there is no episode yet.
+        """Create the firmware without an episode.
 
-        `camera` is where frames go; None = no camera. Without `recording`, episodes cannot be
-        saved, and may last for ever. `failing` is the companion's link, where that is to fail.
+        `camera` receives the frames; None = no camera. Without `recording`, episodes cannot be
+        saved and may last indefinitely. `failing` is the companion's link if it may fail.
         """
         self.flight_stack = flight_stack
         self.clock = pacing.clock
         self.simulation: Simulation | None = None
         self.on_tick: Callable[[Simulation], None] | None = None
-        """Called after every tick, if set: then no more than one is flown at a time."""
+        """Callback after every tick; if set, ticks are flown one at a time."""
         self.on_ticks: Callable[[Simulation], None] | None = None
-        """Called after the ticks of each `step`, if set (`Simulation.truths`)."""
+        """Callback after the ticks of each `step` (see `Simulation.truths`)."""
         self.on_frame: Callable[[Frame], None] | None = None
-        """Called with every frame of the camera, before it is published, if set."""
+        """Callback for every camera frame, called before the frame is published."""
         self.on_message: Callable[[Message], None] | None = None
-        """Called with every text of the autopilot for its operator, if set."""
+        """Callback for every operator text of the autopilot."""
         self.on_log_lost: Callable[[str], None] | None = None
-        """Called when a log of the flight cannot be written any more, if set: which, and why."""
+        """Callback for a flight log that can no longer be written; receives log and reason."""
         self.logs_lost: list[str] = []
-        """What was said so of the present episode."""
+        """Messages of `on_log_lost` in the present episode."""
         self._camera = camera
         self._slow_camera = CameraProcess()
         self._pacing = pacing
@@ -236,29 +236,29 @@ class Firmware:
         self._flight_log: FlightLog | None = None
         self._log_folder: LogFolder | None = None
         self._stop_listening: Callable[[], None] = lambda: None
-        """Ends that the log hears of changed parameters."""
+        """Unsubscribe the flight log from parameter changes."""
 
     @property
     def camera_endpoint(self) -> str:
-        """Where frames are published; "" without a camera."""
+        """Address where frames are published; "" without a camera."""
         return self._camera.endpoint if self._camera is not None else ""
 
     epoch_ns = property(lambda self: self._pacing.epoch_ns)
-    """Host monotonic time of simulated time 0 [ns]; None when time is not paced."""
+    """Host monotonic time of simulated time 0 [ns]; None = simulated time is not paced."""
     slipped_us = property(lambda self: self._pacing.slipped_us)
-    """Simulated time given up since the start because the host could not keep up [µs]."""
+    """Simulated time skipped since the start because the host could not keep up [µs]."""
 
     def load(self, setup: EpisodeSetup, tlog: Path | None, start_unix_us: int) -> Loaded:
         """Replace the episode: a new arena, the vehicle at rest, the autopilot booting.
 
         Args:
             setup: The episode.
-            tlog: Where its MAVLink log goes; the vehicle's log (.ulg) is beside it. None = no log.
-            start_unix_us: Calendar time of this moment [µs since 1970].
+            tlog: Path of the MAVLink log; the vehicle's log (.ulg) is beside it. None = no logs.
+            start_unix_us: Present calendar time [µs since 1970].
 
         Raises:
-            UsageError: The episode cannot be flown, or there is no such firmware.
-            FirmwareLostError: External firmware died while it booted, or what draws images did.
+            UsageError: The episode cannot be flown, or the firmware does not exist.
+            FirmwareLostError: External firmware died during boot, or the image process died.
         """
         self.discard()
         self.logs_lost.clear()
@@ -287,7 +287,7 @@ class Firmware:
             setup.hover.fly(simulation)
         self.flight_stack.connect(self._tick_on_the_ground, simulation.plant.truth)
         if simulation.time_us > powered_us:
-            # What external firmware took to boot, or a hover start to climb, precedes the episode.
+            # The boot of external firmware and the climb of a hover start precede the episode.
             simulation.begin()
             start_us = simulation.start_us
         self._sockets = self.flight_stack.filenos()
@@ -300,17 +300,17 @@ class Firmware:
             # collection would stall the 250 Hz loop for tens of milliseconds.
             gc.collect()
             gc.freeze()
-        # All this took wall time, which is no part of the episode: it starts now.
+        # Loading took wall time that is not part of the episode.
         self._pacing.restart(simulation.time_us)
         return Loaded(start_us, self.epoch_ns)
 
     def _camera_by(self, renderer: Renderer) -> CameraMaker:
-        """Return what makes cameras: time that is the wall clock's waits for no image."""
+        """Return the camera factory; with paced time, slow renderers run in a separate process."""
         paced = self.epoch_ns is not None
         return self._slow_camera.camera if paced and renderer in SLOW else SimulatedCamera
 
     def _open_flight_log(self, path: Path, start_unix_us: int) -> None:
-        """Begin the vehicle's log. Real firmware, which shows nothing, writes its own."""
+        """Open the vehicle's log. Real firmware hides its state and writes its own log."""
         simulation = self.simulation
         internals = None if simulation is None else simulation.autopilot.internals
         if simulation is not None and internals is not None:
@@ -322,7 +322,7 @@ class Firmware:
             internals.logs = self._log_folder = LogFolder(path.parent, log)
 
     def _lose_log(self, what: str) -> None:
-        """A log cannot be written any more: the flight goes on without it."""
+        """Report a log that can no longer be written; the flight continues without it."""
         self.logs_lost.append(what)
         if self.on_log_lost is not None:
             self.on_log_lost(what)
@@ -331,7 +331,7 @@ class Firmware:
         if self.simulation is not None:
             now_us = self.simulation.time_us
             if self.epoch_ns is None and self.simulation.is_flying:
-                self.clock.sleep_until(now_us)  # it stands while a stretch of ticks is flown
+                self.clock.sleep_until(now_us)  # the clock is not advanced during `advance`
             if self._flight_log is not None:
                 self._flight_log.text(message, now_us)
         if self.on_message is not None:
@@ -347,8 +347,8 @@ class Firmware:
     def step(self) -> None:
         """Wait until the next tick is due, then run it.
 
-        Raises FirmwareLostError when external firmware does not answer, or the process has ended
-        that draws images.
+        Raises FirmwareLostError when external firmware does not respond, or the image process has
+        ended.
         """
         simulation, flight_stack = self.simulation, self.flight_stack
         if simulation is None:
@@ -361,7 +361,7 @@ class Firmware:
         receive(began_us)
         camera = self._camera
         if camera is not None:
-            # Before the tick, while its time is now: after it the state lies one tick ahead.
+            # Before the tick: after it, the state is one tick ahead of the capture time.
             publish = camera.publish if self.on_frame is None else self._show_and_publish
             simulation.capture_due(simulation.time_us, publish)
         until_us = 0.0 if self.on_tick is not None else self._pacing.quiet_until_us
@@ -387,14 +387,14 @@ class Firmware:
             self._camera.publish(frame)
 
     def save(self, path: Path) -> None:
-        """Write the episode's arrays and close its logs. The flight goes on unrecorded."""
+        """Write the episode's arrays and close its logs. The flight continues without logs."""
         if self.simulation is not None:
             strangers = np.array(self.flight_stack.strangers(), np.str_)
             save_arrays(path, {**self.simulation.arrays(), "commands/strangers": strangers})
             self.close_logs()
 
     def close_logs(self) -> None:
-        """Complete the logs of the episode; harmless when called again."""
+        """Complete the logs of the episode. Idempotent."""
         if self._flight_log is not None:
             self._stop_listening()
             self._flight_log.close()
@@ -405,7 +405,7 @@ class Firmware:
             self._tlog = None
 
     def discard(self) -> None:
-        """Forget the episode."""
+        """Close the episode without saving it."""
         self.close_logs()
         if self._log_folder is not None:
             self._log_folder.close()

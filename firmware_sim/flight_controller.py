@@ -1,4 +1,4 @@
-"""A flight controller as a simulation flies it: the built-in one, or external firmware."""
+"""Interface of flight controllers: the built-in autopilot or external firmware."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Protocol
 from airl_mav.core.errors import UsageError
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 
-if TYPE_CHECKING:  # Checking the options of external firmware must not load an estimator.
+if TYPE_CHECKING:  # Option checks of external firmware must not load the estimator.
     from firmware_sim.autopilot.autopilot import BuiltinAutopilot
     from firmware_sim.autopilot.autopilot_state import Message
     from firmware_sim.autopilot.commander import Flight
 
 
 class FirmwareLostError(Exception):
-    """The flight proves nothing: external firmware died, hangs, or sends invalid data.
+    """External firmware died, hangs or sends invalid data, so the flight is invalid.
 
-    So it is where a process has died that takes the camera's images.
+    Also raised when the process that renders the camera's images has died.
     """
 
 
@@ -26,37 +26,37 @@ class FirmwareMissingError(UsageError):
 
 
 class FlightController(Protocol):
-    """Takes a tick's sensors, returns motor commands, and tells a rehearsal what it must know.
+    """Flight controller: maps a tick's sensor sample to motor commands and reports its state.
 
-    The built-in autopilot, or a bridge to real firmware; a new one for each episode.
+    Either the built-in autopilot or a bridge to real firmware; a new object for each episode.
     """
 
     on_message: Callable[[Message], None] | None
-    """Called with every text for the operator, if set."""
+    """Callback for every operator text; None = no callback."""
 
     @property
     def rate_hz(self) -> int:
-        """Sensor samples that it needs per second of simulated time."""
+        """Required sensor samples per second of simulated time [Hz]."""
 
     @property
     def flight(self) -> Flight:
-        """Phase and mode."""
+        """Flight phase and mode."""
 
     @property
     def internals(self) -> BuiltinAutopilot | None:
-        """What the recorder reads; None for external firmware, which does not show it."""
+        """Built-in autopilot, for the recorder; None for external firmware."""
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Advance to the sample's time and return the motor commands to hold until the next.
+        """Advance to the sample's time and return the motor commands until the next sample.
 
-        Raises FirmwareLostError where it is external firmware.
+        External firmware may raise FirmwareLostError.
         """
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
-        """Accept a source of the true state.
+        """Set the source of the true state.
 
-        Simulator interfaces of external firmware send it along with the sensors.
+        Simulator interfaces of external firmware send the true state with the sensors.
         """
 
     def close(self) -> None:
-        """Release what it holds; harmless when called again."""
+        """Release all resources. Idempotent."""

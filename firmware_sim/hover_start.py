@@ -1,8 +1,8 @@
 """Hover start: an episode that begins in the air, above the start.
 
-The built-in autopilot flies its own take-off before the episode begins: without MAVLink, camera and
-record, as fast as plant and autopilot are computed. Estimator, commander, battery and wind then are
-those of a vehicle that has taken off; nothing of their state is made up.
+The built-in autopilot flies a take-off before the episode begins: without MAVLink, camera and
+recording, as fast as plant and autopilot are computed. The states of estimator, commander, battery
+and wind result from this take-off.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ GROUND_LIMIT_S = 30.0
 """Maximum time for boot, arming, spin-up and the approach of the altitude [s]."""
 
 CLIMB_LIMIT_M_S = 0.5
-"""Minimum mean speed of the climb [m/s]; PX4's take-off climbs at 1.5 m/s."""
+"""Minimum mean climb speed [m/s]; PX4 takes off at 1.5 m/s."""
 
 LOOK_US = US_PER_S // 10
-"""Time between two looks at the vehicle's state [µs]."""
+"""Interval of checks of the vehicle's state [µs]."""
 
 ARM_RETRY_US = US_PER_S
-"""Time between two requests to arm, while pre-arm checks fail [µs]."""
+"""Interval of arm requests while pre-arm checks fail [µs]."""
 
 NEVER_US = 1 << 61
-"""Begin of an episode for its faults, while the vehicle takes off [µs]."""
+"""Start of the episode for its faults during the take-off [µs]: never."""
 
 
 class HoverStart(NamedTuple):
@@ -44,17 +44,17 @@ class HoverStart(NamedTuple):
     altitude_m: float
     """Height above the start [m]."""
     origin: Geodetic | None = None
-    """Place of the start, for a vehicle without GPS; None = GPS measures it."""
+    """Geodetic start position for a vehicle without GPS; None = measured by GPS."""
 
     def fly(self, simulation: Simulation) -> bool:
-        """Fly the take-off, up to Hold at the altitude; then call `Simulation.begin`.
+        """Take off and hold at the altitude; call `Simulation.begin` afterwards.
 
-        Moving obstacles stand still and faults are inactive until then. The autopilot must be the
-        built-in one, at rest on the ground.
+        Moving obstacles are stationary and faults inactive until then. Requires the built-in
+        autopilot, at rest on the ground.
 
         Returns:
-            Whether the altitude was reached. If not, the vehicle is where the attempt ended, and
-            clients receive the texts that explain why.
+            True if the altitude was reached. Otherwise the vehicle stays where the attempt ended,
+            and clients receive the texts that explain the reason.
         """
         autopilot = simulation.autopilot.internals
         assert autopilot is not None  # noqa: S101 (`airl_mav.scenario.checks` refuses others)
@@ -73,7 +73,7 @@ class HoverStart(NamedTuple):
         return reached
 
     def _climb(self, simulation: Simulation, autopilot: BuiltinAutopilot, until_us: int) -> bool:
-        """Arm and climb; return whether the altitude is reached before `until_us` [µs]."""
+        """Arm and climb; return True if the altitude is reached before `until_us` [µs]."""
         start_m, arm_us = 0.0, simulation.time_us
         simulation.plant.hold_obstacles()
         while simulation.time_us < until_us:

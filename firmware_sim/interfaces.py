@@ -1,10 +1,10 @@
-"""The seam between plant and autopilot: PX4's simulator interface as plain data.
+"""Interface between plant and autopilot: PX4's simulator interface as plain data.
 
 A plant turns motor commands into sensor samples; an autopilot turns sensor samples into motor
-commands. Real firmware sits behind the same two messages (HIL_SENSOR / HIL_ACTUATOR_CONTROLS).
+commands. Real firmware uses the same two messages (HIL_SENSOR / HIL_ACTUATOR_CONTROLS).
 
-All are named tuples, which are faster to create than dataclasses: that counts at 250 Hz and a
-hundred times real time.
+All types are named tuples: they are faster to create than dataclasses, which matters at 250 Hz and
+a hundred times real time.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ UNKNOWN_VARIANCE = np.full(3, np.nan)
 UNKNOWN_VARIANCE.setflags(write=False)
 
 PoseFrame = Literal["ned", "frd"]
-"""What a pose is measured in: north, east, down; or forward, right, down as it was at first, with a
-heading that nobody knows."""
+"""Reference frame of a pose: north, east, down; or forward, right, down at the start, with an
+unknown heading."""
 
 DOWNWARD = 25
-"""MAV_SENSOR_ROTATION_PITCH_270: a distance sensor that looks down."""
+"""MAV_SENSOR_ROTATION_PITCH_270: downward distance sensor."""
 
 VelocityFrame = Literal["ned", "frd", "body"]
-"""What a velocity is measured in: as a pose, or in the vehicle's own axes FRD."""
+"""Reference frame of a velocity: a pose frame, or the vehicle's body axes FRD."""
 
 
 class GpsFix(NamedTuple):
-    """One GPS solution."""
+    """GPS solution."""
 
     position: Geodetic
     velocity_ned: Vector  # (3,) [m/s]
@@ -44,10 +44,10 @@ class GpsFix(NamedTuple):
 
 
 class Odometry(NamedTuple):
-    """One pose that something other than the flight controller has estimated: vision, mocap.
+    """External pose estimate, from vision or motion capture.
 
-    The fields are those of PX4's vehicle_odometry. What is None is not measured; a variance that is
-    not finite is not known.
+    Fields follow PX4's vehicle_odometry. None = not measured; a variance that is not finite is
+    unknown.
     """
 
     position: Vector | None = None  # (3,) in the pose's frame [m]
@@ -59,13 +59,13 @@ class Odometry(NamedTuple):
     velocity_variance: Vector = UNKNOWN_VARIANCE  # (3,) [m²/s²]
     orientation_variance: Vector = UNKNOWN_VARIANCE  # (3,) roll, pitch, yaw [rad²]
     reset_counter: int = 0
-    """Another number than before: what was measured has jumped."""
+    """Counter of resets; a change marks a jump of the estimate."""
     quality: int = 0
-    """Percent; 0 = not told."""
+    """Quality [%]; 0 = not reported."""
 
 
 class DistanceReading(NamedTuple):
-    """One range of a distance sensor. The fields are those of PX4's distance_sensor."""
+    """Range of a distance sensor. Fields follow PX4's distance_sensor."""
 
     distance_m: float
     least_m: float
@@ -73,9 +73,9 @@ class DistanceReading(NamedTuple):
     greatest_m: float
     """Maximum range [m]."""
     variance_m2: float = 0.0
-    """0 = not told."""
+    """Variance [m²]; 0 = not reported."""
     quality: int = -1
-    """Percent; 0 = invalid, -1 = not told."""
+    """Quality [%]; 0 = invalid, -1 = not reported."""
     orientation: int = DOWNWARD
     """MAV_SENSOR_ORIENTATION."""
     kind: int = 0
@@ -83,24 +83,24 @@ class DistanceReading(NamedTuple):
 
 
 class FlowReading(NamedTuple):
-    """How the ground below has moved in an image since the reading before, as OPTICAL_FLOW_RAD.
+    """Optical flow of the ground since the previous reading, as OPTICAL_FLOW_RAD.
 
-    A turn of the vehicle about an axis is a positive flow about it, and so is a motion forward
-    about y. A motion to the right is a negative flow about x.
+    A positive rotation of the vehicle about an axis gives a positive flow about this axis. Forward
+    motion gives a positive flow about y, motion to the right a negative flow about x.
     """
 
     flow: Vector
-    """(2,) about the body's x and y axes [rad]."""
+    """(2,) flow about the body's x and y axes [rad]."""
     interval_s: float
-    """How long it took; 0 = nothing was measured."""
+    """Integration time [s]; 0 = no measurement."""
     quality: int
-    """0 = invalid to 255 = best."""
+    """Quality, 0 = invalid to 255 = best."""
     turned: Vector
-    """(3,) how far its own gyro has turned meanwhile, FRD [rad]; NaN = it has none."""
+    """(3,) angle integrated by the flow sensor's gyro, FRD [rad]; NaN = no gyro."""
 
 
 class BatterySample(NamedTuple):
-    """A sample of the power module."""
+    """Sample of the power module."""
 
     voltage_v: float
     current_a: float
@@ -110,7 +110,7 @@ class BatterySample(NamedTuple):
 
 
 class SensorSample(NamedTuple):
-    """Everything measured at one tick; slower sensors are None between their samples."""
+    """Sensor values of one tick; slower sensors have None between their samples."""
 
     time_us: int
     accel: Vector  # (3,) specific force FRD [m/s²], (0, 0, -9.81) at rest
@@ -122,14 +122,14 @@ class SensorSample(NamedTuple):
     """Static pressure [hPa]."""
     gps: GpsFix | None = None
     esc_outputs: tuple[float, float, float, float] | None = None
-    """What the speed controllers report that their motors do, as commands 0..1 of healthy ones;
-    None: what they are told."""
+    """Motor outputs reported by the ESCs, as equivalent commands 0..1 of healthy motors; None =
+    equal to the commands."""
     odometry: Odometry | None = None
-    """Of external vision that is part of the vehicle."""
+    """Pose from the vehicle's own vision system."""
     distance: DistanceReading | None = None
-    """Of a rangefinder that is part of the vehicle."""
+    """Range of the vehicle's own rangefinder."""
     flow: FlowReading | None = None
-    """Of an optical flow sensor that is part of the vehicle."""
+    """Reading of the vehicle's own optical flow sensor."""
 
 
 class ActuatorControls(NamedTuple):
@@ -142,7 +142,7 @@ class ActuatorControls(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """The true state; never shown to the autopilot."""
+    """True state; hidden from the autopilot."""
 
     time_us: int
     position: Vector  # (3,) NED [m]

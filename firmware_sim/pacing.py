@@ -1,4 +1,4 @@
-"""How simulated time relates to the wall clock: paced by it, or as fast as possible."""
+"""Pacing of simulated time: by the wall clock, or as fast as possible."""
 
 from __future__ import annotations
 
@@ -12,82 +12,81 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.scheduling import ask_for_short_slices
 
 MAX_LAG_US = 200_000
-"""A greater lag is given up instead of caught up: a burst of ticks would outrun the companion
-[µs]."""
+"""Maximum lag to catch up [µs]; a larger lag is skipped: a burst of ticks would outrun the
+companion."""
 
 MAX_WAKES = 16
-"""So often in one tick is the wait for it broken by what arrives; more waits for the tick."""
+"""Maximum wake-ups by arriving data in the wait for one tick; later data wait for the tick."""
 
 READ_AFTER_S = 300e-6
-"""What arrives so shortly before a tick is read when it has begun, and taken by it all the same.
-What many clients send takes as long to be carried out, and must not make it late [s]."""
+"""Time before a tick in which arriving data are left until the tick begins, and still used by it.
+Handling the data of many clients takes as long, and must not delay the tick [s]."""
 
 PR_SET_TIMERSLACK = 29
-"""Option of prctl(2) (linux/prctl.h): how late the kernel may wake the calling thread [ns]."""
+"""Option of prctl(2) (linux/prctl.h): maximum wake-up delay of the calling thread [ns]."""
 
 
 class Arrivals(Protocol):
-    """Messages to the flight controller whose times are known ahead."""
+    """Messages to the flight controller with arrival times known in advance."""
 
     @property
     def next_us(self) -> float:
-        """Simulated time of the next one [µs]; inf = none."""
+        """Simulated time of the next message [µs]; inf = no message."""
 
     def arrive(self, tick_us: int) -> None:
-        """Let the flight controller receive everything up to simulated `tick_us` [µs]."""
+        """Deliver all messages up to simulated `tick_us` [µs] to the flight controller."""
 
 
 class Pacing(Protocol):
-    """Decides when the next tick runs."""
+    """Scheduler of the next tick."""
 
     slipped_us: int
-    """Simulated time given up because the host could not keep up [µs]."""
+    """Simulated time skipped because the host could not keep up [µs]."""
 
     @property
     def clock(self) -> Clock:
-        """Simulated time; between ticks it advances only where it is paced by the wall clock."""
+        """Simulated time; advances between ticks only when paced by the wall clock."""
 
     @property
     def epoch_ns(self) -> int | None:
-        """Host monotonic time of simulated time 0 [ns]; None when it is not paced."""
+        """Host monotonic time of simulated time 0 [ns]; None = simulated time is not paced."""
 
     @property
     def quiet_until_us(self) -> float:
-        """Simulated time before which only `arrivals` can arrive [µs]; 0 = at any tick."""
+        """Simulated time before which only `arrivals` can arrive [µs]; 0 = any tick has input."""
 
     @property
     def arrivals(self) -> Arrivals | None:
-        """Messages that arrive before then; None = none."""
+        """Messages that arrive before `quiet_until_us`; None = no messages."""
 
     def restart(self, tick_us: int) -> None:
-        """Declare that it is simulated `tick_us` now: time before that belongs to no episode."""
+        """Set simulated time to `tick_us` [µs]; earlier time belongs to no episode."""
 
     def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
         """Wait until simulated `tick_us` is due and return the time then [µs].
 
-        When a socket becomes readable before, `readable` is called with the time of that.
+        When a socket becomes readable earlier, `readable` is called with that time.
         """
 
     def read_by(self, began_us: int) -> int:
-        """Return a time by which what was just read had arrived, reading began at `began_us` [µs].
+        """Return a time by which the data of a read begun at `began_us` had arrived [µs].
 
-        Never before `began_us`, nor before a time that was handed out.
+        Never earlier than `began_us` or a time returned before.
         """
 
 
 class WallPacing:
-    """Runs every tick at its wall time."""
+    """Pacing by the wall clock: every tick runs at its wall time."""
 
     quiet_until_us = 0.0
     arrivals = None
 
     def __init__(self, speed: float) -> None:
-        """Take the speed: simulated seconds per wall second, > 0.
+        """Set the speed: simulated seconds per wall second, > 0.
 
-        The calling thread is woken as soon as its waits end; by default Linux takes up to 50 µs
-        more, to wake several threads at once. Then it runs before what has the processor for
-        longer: a tick that waits for a whole slice of somebody else's is late by more than its
-        length.
+        Minimizes the timer slack of the calling thread; the default of Linux delays a wake-up by
+        up to 50 µs to batch it with others. Requests short scheduler slices, to run before threads
+        with longer ones: waiting for a whole foreign slice delays a tick by more than its length.
         """
         ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
         ask_for_short_slices()
@@ -101,7 +100,7 @@ class WallPacing:
         return self.clock.epoch_ns
 
     def restart(self, tick_us: int) -> None:
-        """Declare that it is simulated `tick_us` now, whatever the wall clock says.
+        """Set simulated time to `tick_us` [µs] at the present wall time.
 
         External firmware boots as fast as possible, far ahead of the wall clock.
         """
@@ -111,18 +110,17 @@ class WallPacing:
     def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
         """Wait until the wall time of simulated `tick_us`; return the time then [µs].
 
-        What arrives early is handled at once, stamped with its own time, and waits for the tick; in
-        the last moments before it (`READ_AFTER_S`) it is left to be read then. A quiet tick
-        has one wait: a second one costs as much processor time as all the rest of it.
-        Every time handed out is read once and checked for lag first. A process that was stopped
-        while it waited must not stamp what has arrived with a time that is about to be given up.
+        Early data are read at once, stamped with their arrival time, and wait for the tick. Data
+        of the last `READ_AFTER_S` are read when the tick begins. A tick without data has one wait:
+        a second wait costs as much processor time as the rest of the tick.
+        Every returned time is read once and checked for lag first. A process that was stopped
+        during the wait must not stamp data with a time that is about to be skipped.
         """
         clock = self.clock
         wall_s = 1.0 / (clock.speed * US_PER_S)
         now_us, woken = clock.time_us(), 0
         while now_us < tick_us:
-            # A flood must not keep the processor busy until the tick: what it lacks then is missed
-            # by the companion.
+            # A flood of data must not take the processor time that the companion needs.
             reads = woken < MAX_WAKES and (tick_us - now_us) * wall_s > READ_AFTER_S
             ready, _, _ = select.select(
                 sockets if reads else (), (), (), (tick_us - now_us) * wall_s
@@ -132,7 +130,7 @@ class WallPacing:
                 readable(self._stamp(now_us))
                 now_us = clock.time_us()
         if now_us - tick_us > MAX_LAG_US:
-            # Back to the tick that is due, but not behind a time that was handed out.
+            # Return to the due tick, but not to before a time that was already returned.
             resumed_us = max(tick_us, self._stamp_us)
             lost_us = now_us - resumed_us
             clock.slip(lost_us)
@@ -141,22 +139,22 @@ class WallPacing:
         return self._stamp(now_us)
 
     def read_by(self, began_us: int) -> int:
-        """Return the time now [µs]; `began_us` where so much passed since that it is given up.
+        """Return the time now [µs], or `began_us` if the lag since then is large enough to skip.
 
-        Between its reading of the clock and of the sockets a process can lose the processor: what
-        arrived meanwhile would bear a time from before it was sent.
+        A process can be preempted between reading the clock and the sockets: data that arrived in
+        between would get a time stamp from before they were sent.
         """
         now_us = self.clock.time_us()
         return self._stamp(now_us if now_us - began_us <= MAX_LAG_US else began_us)
 
     def _stamp(self, now_us: int) -> int:
-        """Return a time that never goes back."""
+        """Return a monotonic time [µs]."""
         self._stamp_us = max(self._stamp_us, now_us)
         return self._stamp_us
 
 
 class Unpaced:
-    """No pacing: simulated time runs as fast as the ticks are computed."""
+    """No pacing: simulated time advances as fast as ticks are computed."""
 
     epoch_ns = None
     slipped_us = 0
@@ -171,11 +169,11 @@ class Unpaced:
         self.clock.sleep_until(tick_us)
 
     def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
-        """Set the clock to `tick_us`; sockets are read once a tick by the caller anyway."""
+        """Set the clock to `tick_us` [µs]; the caller reads the sockets once per tick."""
         del sockets, readable
         self.clock.sleep_until(tick_us)
         return tick_us
 
     def read_by(self, began_us: int) -> int:
-        """Return `began_us`: time stands still while sockets are read."""
+        """Return `began_us`: time does not advance while sockets are read."""
         return began_us

@@ -1,4 +1,4 @@
-"""The record of a flight: path, setpoints, estimates, tick lateness."""
+"""Flight record: path, setpoints, estimates and tick lateness."""
 
 from __future__ import annotations
 
@@ -20,42 +20,42 @@ from firmware_sim.faults.timeline import Acted
 
 
 class SetpointLog:
-    """When each offboard setpoint was accepted, and when the motors first reflected it."""
+    """Times when each offboard setpoint was accepted and first reached the motors."""
 
     def __init__(self, read_by: Callable[[int], int] | None = None) -> None:
-        """Start empty.
+        """Create an empty log.
 
-        `read_by` tells of what was read from a time on [µs] by when it had arrived [µs]; None = no
-        time passes while it is read.
+        `read_by` maps the start of a read [µs] to a time by which the data had arrived [µs]; None =
+        reads take no time.
         """
         self._read_by = read_by
         self._accepted: list[tuple[int, Wire]] = []
         self._motor_us: list[int] = []
-        """`NO_STAMP` of those that are not flown yet."""
+        """Times when setpoints reached the motors [µs]; `NO_STAMP` = not yet."""
         self.under_way: list[tuple[int, int, int]] = []
-        """First and last setpoint that were taken in a tick, and after how many more they are
-        flown: of body rates that is sooner than of a velocity that came before them."""
+        """First and end index of the setpoints taken in a tick, and the ticks until they reach the
+        motors. Body rates reach the motors sooner than an earlier velocity."""
         self._taken = 0
 
     @property
     def fresh(self) -> bool:
-        """Whether setpoints were accepted that no tick has taken yet."""
+        """True if a tick has yet to take accepted setpoints."""
         return len(self._accepted) > self._taken
 
     def accepted(self, setpoint: Wire, time_us: int) -> None:
-        """Note an accepted setpoint, read from `time_us` on [µs]."""
+        """Record an accepted setpoint whose read began at `time_us` [µs]."""
         if self._read_by is not None:
             time_us = self._read_by(time_us)
         self._accepted.append((time_us, setpoint))
         self._motor_us.append(NO_STAMP)
 
     def take(self, ticks_to_motors: int) -> None:
-        """Note that the coming tick takes what was accepted, to be flown so many ticks later."""
+        """Record that the next tick takes the accepted setpoints, and the ticks to the motors."""
         self.under_way.append((self._taken, len(self._accepted), ticks_to_motors))
         self._taken = len(self._accepted)
 
     def flown(self, first_us: int, n: int) -> None:
-        """Note that the motor commands of the newest n ticks were computed from `first_us` on."""
+        """Record the motor commands of the newest n ticks, computed from `first_us` on [µs]."""
         entries, self.under_way = self.under_way, []
         for first, end, ticks in entries:
             if ticks < n:
@@ -76,7 +76,7 @@ class SetpointLog:
 
 
 def fault_arrays(acted: Sequence[Acted]) -> dict[str, NDArray[Any]]:
-    """Return the faults that have acted, by the names of an episode's file; nothing for none."""
+    """Return past and present faults by array name of the episode file; {} without faults."""
     if not acted:
         return {}
     return {
@@ -87,9 +87,9 @@ def fault_arrays(acted: Sequence[Acted]) -> dict[str, NDArray[Any]]:
 
 
 class FlightRecorder:
-    """Collects one episode: its true path, its setpoints, the estimates, how late its ticks were.
+    """Record of one episode: true path, setpoints, estimates and tick lateness.
 
-    It grows by some 100 kB per simulated second, so a flight that nobody reads has none.
+    Grows by about 100 kB per simulated second. Flights without a reader are not recorded.
     """
 
     def __init__(
@@ -97,48 +97,48 @@ class FlightRecorder:
         internals: BuiltinAutopilot | None,
         read_by: Callable[[int], int] | None = None,
     ) -> None:
-        """Start empty.
+        """Create an empty record.
 
         Args:
-            internals: Those of the flight controller; None = nothing.
-            read_by: As `SetpointLog` takes it.
+            internals: Built-in flight controller; None = external firmware.
+            read_by: See `SetpointLog`.
         """
         self.setpoints = SetpointLog(read_by)
-        """Stays empty where nobody can look into the flight controller."""
+        """Setpoint log; empty for external firmware."""
         self._internals = internals
         if internals is not None:
             internals.on_setpoint = self.setpoints.accepted
         self.begin()
 
     def begin(self) -> None:
-        """Forget the path so far: the episode begins now."""
+        """Start the episode: discard the path so far."""
         self._trajectory = TrajectoryRecorder()
         self._estimates: list[Vector] = []
-        """Blocks (m, 10) of position, velocity, attitude at which the motors were commanded."""
+        """Blocks (m, 10) of estimated position, velocity and attitude at the motor commands."""
         self._estimated_us: list[int] = []
         self._lateness_us: list[int] = []
         self._slips: list[tuple[int, int]] = []
 
     def began_tick(self, due_us: int, began_us: int, slipped_us: int) -> None:
-        """Note a tick that is paced by the wall clock: when it was due, and when it began [µs].
+        """Record the due time and the begin of a tick that is paced by the wall clock [µs].
 
-        Simulated time `slipped_us` [µs] was given up right before it.
+        `slipped_us` is the simulated time skipped right before the tick [µs].
         """
         self._lateness_us.append(began_us - due_us)
         if slipped_us:
             self._slips.append((began_us, slipped_us))
 
     def before_controls(self, ticks: int = 0) -> None:
-        """Note that the flight controller takes what was accepted, after so many further ticks."""
+        """Record that the flight controller takes the accepted setpoints after `ticks` ticks."""
         if self._internals is not None and self.setpoints.fresh:
             self.setpoints.take(self._internals.ticks_to_motors + ticks)
 
     def flown(self, truths: Record, flown: Record) -> None:
-        """Take ticks.
+        """Record ticks.
 
         Args:
             truths: (n,) log of the aircraft.
-            flown: (n,) log of the flight controller; nothing is in it for external firmware.
+            flown: (n,) log of the flight controller; without content for external firmware.
         """
         times, powers_w = truths["time_us"].tolist(), truths["power_w"].tolist()
         kept = self._trajectory.extend(times, powers_w, truths["motion"])
@@ -147,7 +147,7 @@ class FlightRecorder:
             self._estimated_us += flown["time_us"][kept].tolist()
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return what was recorded so far, by the names of its file (docs/run-folder.md)."""
+        """Return the recorded arrays by name in the episode file (docs/run-folder.md)."""
         arrays: dict[str, NDArray[Any]] = {
             "tick/lateness_us": np.array(self._lateness_us, np.int64),
             "tick/slips_us": np.array(self._slips, np.int64).reshape(-1, 2),

@@ -1,4 +1,4 @@
-"""One vehicle in one arena, tick by tick: plant, autopilot and what is recorded of them."""
+"""Simulation of one vehicle in one arena: plant, autopilot and flight recorder."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ from firmware_sim.recording import FlightRecorder, fault_arrays
 from firmware_sim.simulation_snapshot import SimulationSnapshot
 
 MOST_TICKS = US_PER_S // TICK_US
-"""Maximum number of ticks that are flown at once."""
+"""Maximum number of ticks in one call of `advance`."""
 
 LOG_TICKS = 2 * MOST_TICKS
-"""Ticks in the logs. What they hold is recorded when there is no room for more."""
+"""Capacity of the logs [ticks]; full logs are moved to the recorder."""
 
 _ENDS = (COLLIDED, ALIGN, HEALTH, EMPTY)
-"""Events that end a stretch whatever follows from them."""
+"""Events that always end a call of `advance`."""
 
 
 @dataclass(frozen=True)
@@ -62,22 +62,22 @@ class EpisodeSetup:
 
     vehicle: VehicleProfile
     arena: Arena | None
-    """None = an endless floor."""
+    """Arena; None = an endless floor."""
     seed: int
-    """Of sensors, wind, and what is drawn of the aircraft."""
+    """Seed of sensors, wind and domain randomization."""
     aircraft: Aircraft = field(default_factory=Aircraft)
-    """Wind, spread, sensors, estimator, charge of the battery."""
+    """Wind, domain randomization, sensors, estimator and battery charge."""
     computer_w: float = 0.0
     """Power of the onboard computer [W]."""
     hover: HoverStart | None = None
-    """How the episode begins in a hover; None = on the ground."""
+    """Hover start of the episode; None = start on the ground."""
 
 
 def builtin_autopilot(setup: EpisodeSetup, keeper: Keeper | None = None) -> BuiltinAutopilot:
     """Boot the built-in autopilot.
 
-    `keeper` keeps the parameters that users set. Raises UsageError for a wrong parameter of the
-    vehicle's, or when what is kept cannot be read.
+    `keeper` stores parameters set by users. Raises UsageError for an invalid parameter of the
+    vehicle, or when stored parameters cannot be read.
     """
     overrides = dict(setup.vehicle.autopilot_parameters())
     if instance := setup.aircraft.real.instance:
@@ -85,14 +85,14 @@ def builtin_autopilot(setup: EpisodeSetup, keeper: Keeper | None = None) -> Buil
     parameters = Parameters(overrides, keeper)
     if setup.aircraft.estimator == "kernel":
         return BuiltinAutopilot(parameters)
-    # The library's filter, equal to rounding. Imported late: it brings scipy's statistics along.
+    # FilterPy's filter, equal up to rounding. Imported late, as it imports scipy.stats.
     from firmware_sim.autopilot.filter_filterpy import FilterpyFilter
 
     return BuiltinAutopilot(parameters, FilterpyFilter)
 
 
 class Simulation:
-    """Plant and autopilot of one episode. Knows nothing of MAVLink, sockets or pacing."""
+    """Plant and autopilot of one episode, independent of MAVLink, sockets and pacing."""
 
     def __init__(
         self,
@@ -108,17 +108,17 @@ class Simulation:
         """Put the vehicle at the start.
 
         Args:
-            setup: Vehicle, arena, seed, and what was asked of the aircraft.
+            setup: Vehicle, arena, seed and aircraft options.
             start_us: Simulated time of the first sample [µs], a multiple of the tick.
-            clock: Read for stamps only; time moves by `tick`.
-            autopilot: Who flies, just booted; None = the built-in autopilot, booted here.
-            recording: Whether the flight is recorded; if not, it may go on for ever.
-            read_by: Tells of what was read from a time on [µs] by when it had arrived [µs], for
-                the record; None = no time passes while it is read.
-            camera_by: Makes the camera.
+            clock: Clock for time stamps only; `tick` and `advance` advance the time.
+            autopilot: Booted flight controller; None = boot the built-in autopilot.
+            recording: True to record the flight; unrecorded flights may last indefinitely.
+            read_by: For the record, maps the start of a read [µs] to a time by which the data had
+                arrived [µs]; None = reads take no time.
+            camera_by: Camera factory.
 
         Raises:
-            UsageError: The vehicle's parameter overrides are wrong.
+            UsageError: The vehicle's parameter overrides are invalid.
         """
         asked, nominal = setup.aircraft, Airframe.from_profile(setup.vehicle)
         wind = wind_of_episode(asked.wind, setup.seed)
@@ -136,17 +136,17 @@ class Simulation:
         )
         self.autopilot.use_truth(self.plant.truth)
         self.faults: FaultTimeline | None = None
-        """Faults of this episode; None = none."""
+        """Faults of this episode; None = no faults."""
         self._fly: Callable[[SensorSample], ActuatorControls] = self.autopilot.step
         self._unaltered = self._fly
-        """The step without faults."""
+        """The flight controller's step, without faults."""
         self._setup = setup
         if asked.faults:
             self._let_fail(start_us)
         if self.autopilot.internals is not None:
             self.autopilot.internals.failures = ClientFaults(self._faults_now)
         self._camera: OnboardCamera | None = None
-        """None on an endless floor."""
+        """Camera; None on an endless floor."""
         if setup.arena is not None:
             vehicle = setup.vehicle
             self._camera = camera_by(
@@ -156,28 +156,28 @@ class Simulation:
             if self.faults is not None:
                 self._camera = FailingCamera(self._camera, self.faults, setup.seed)
         self.recorder: FlightRecorder | None = None
-        """None = nothing is recorded."""
+        """Flight recorder; None = no recording."""
         if recording:
             self.recorder = FlightRecorder(self.autopilot.internals, read_by)
         self.start_us = start_us
         self.time_us = start_us
-        """Simulated time of the newest sample."""
+        """Simulated time of the newest sample [µs]."""
         self.is_flying = False
-        """Whether `advance` is under way."""
+        """True during `advance`."""
         self._truths = np.zeros(LOG_TICKS, TRUE_TICK)
         self._flown = np.zeros(LOG_TICKS, FLOWN_TICK)
         self._logged = self._recorded = 0
-        """Ticks that are in the logs, and how many of them the recorder has taken."""
+        """Number of ticks in the logs, and of those already recorded."""
         self.truths = self._truths[:0]
         """Log of the aircraft in the newest ticks (`engine.record.TRUE_TICK`)."""
         self.flown = self._flown[:0]
-        """Log of the built-in flight controller in them (`engine.record.FLOWN_TICK`)."""
+        """Log of the built-in flight controller in these ticks (`engine.record.FLOWN_TICK`)."""
         self._clock = clock
         self._sample: SensorSample | None = self.plant.sense()
-        """The newest; None = that of the newest compiled tick."""
+        """Newest sample; None = the newest tick was compiled, its sample is in the plant."""
 
     def begin(self) -> None:
-        """Say that the episode begins now: what was flown and recorded so far is no part of it."""
+        """Start the episode: discard everything flown and recorded so far."""
         self.start_us = self.time_us
         self._recorded = self._logged
         if self.recorder is not None:
@@ -189,7 +189,7 @@ class Simulation:
             self._camera.restart(self.start_us)
 
     def _let_fail(self, start_us: int) -> FaultTimeline:
-        """Put between plant and flight controller what may fail, and return its faults."""
+        """Insert the fault layer between plant and flight controller; return its timeline."""
         setup = self._setup
         self.faults = FaultTimeline(setup.aircraft.faults, setup.seed, start_us)
         self._fly = FailingParts(self.autopilot, self.plant, setup.vehicle, self.faults).step
@@ -202,7 +202,7 @@ class Simulation:
 
     @property
     def truth(self) -> Truth:
-        """The true state now; made anew at every call."""
+        """The true state now; a new object at every call."""
         return self.plant.truth()
 
     def tick(self) -> None:
@@ -210,10 +210,10 @@ class Simulation:
         self.advance(self.time_us)
 
     def advance(self, until_us: float, arrivals: Arrivals | None = None) -> None:
-        """Fly ticks as long as they begin before simulated `until_us` [µs], and one at least.
+        """Fly all ticks that begin before simulated `until_us` [µs], at least one.
 
-        It may end earlier: when something is detected, or has to be decided. `arrivals` arrive
-        between two of the ticks; None = nothing does.
+        Ends earlier after an event or a decision of the autopilot. `arrivals` are delivered
+        between ticks; None = no messages.
         """
         plant, recorder, autopilot = self.plant, self.recorder, self._internals
         first_us, self.is_flying = self._clock.time_us(), True
@@ -240,14 +240,14 @@ class Simulation:
             recorder.setpoints.flown(first_us, done)
 
     def _record(self) -> None:
-        """Let the recorder take what it has not taken yet of the logs."""
+        """Pass the unrecorded ticks of the logs to the recorder."""
         new = slice(self._recorded, self._logged)
         if self.recorder is not None:
             self.recorder.flown(self._truths[new], self._flown[new])
         self._recorded = self._logged
 
     def _tick_by_python(self, autopilot: BuiltinAutopilot | None) -> int:
-        """Fly a tick whose sample or commands are not the engine's; return 1."""
+        """Fly one tick in Python, with faults or external firmware for example; return 1."""
         before = self.plant.newest() if self._sample is None else self._sample
         self._sample = sample = self.plant.step(self._fly(before))
         truths, flown = self._truths[self._logged :], self._flown[self._logged :]
@@ -256,13 +256,13 @@ class Simulation:
             log_flown_record(autopilot.record, flown)
             flown["battery"][0] = sample.battery
             if self._fly is self._unaltered:
-                autopilot.take(sample)  # as compiled ticks do
+                autopilot.take(sample)  # compiled ticks do the same
         return 1
 
     def _stretch(
         self, autopilot: BuiltinAutopilot, until_us: float, arrivals: Arrivals | None
     ) -> int:
-        """Fly compiled ticks; return how many."""
+        """Fly compiled ticks; return their number."""
         if self._sample is not None:
             autopilot.take(self._sample)
             self._sample = None
@@ -279,17 +279,17 @@ class Simulation:
             ticks = max(1, math.ceil(min((due_us - self.time_us) / TICK_US, most - done)))
             flown, event = self._glide(autopilot, done, done + ticks)
             done += flown
-            # Texts of a landing have the time of the tick in which it is detected.
+            # Texts about a landing bear the time of the tick that detects it.
             self.time_us += (flown - 1) * TICK_US
             changed = autopilot.flown(plant.newest, event)
             self.time_us += TICK_US
-            # After what Python fuses, other aids may be in use.
+            # Measurements fused in Python can change the aids in use.
             if changed or event in _ENDS or (event == FUSE and not autopilot.estimator.compiled):
                 break
         return done
 
     def _glide(self, autopilot: BuiltinAutopilot, first: int, end: int) -> tuple[int, int]:
-        """Fly ticks at a constant demand into the logs; return how many, and the last event."""
+        """Fly ticks at a constant demand into the logs; return their number and the last event."""
         plant, record = self.plant, autopilot.record
         first, end = self._logged + first, self._logged + end
         flown, event = plant.glide(
@@ -302,13 +302,13 @@ class Simulation:
 
     @property
     def next_frame_us(self) -> float:
-        """When the camera exposes its next frame [µs]; inf on an endless floor."""
+        """Simulated time of the camera's next exposure [µs]; inf on an endless floor."""
         return math.inf if self._camera is None else self._camera.next_us
 
     def capture_due(self, until_us: int, publish: Callable[[Frame], None]) -> None:
         """Publish the frames that are due by simulated `until_us` [µs], now or in the newest ticks.
 
-        An endless floor has none.
+        Publishes no frames on an endless floor.
         """
         camera, truths = self._camera, self.truths
         while camera is not None and camera.next_us <= until_us:
@@ -322,7 +322,7 @@ class Simulation:
             camera.offer(time_us, motion, publish)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return what was recorded so far, by the names of its file (docs/run-folder.md)."""
+        """Return the recorded arrays by name in the episode file (docs/run-folder.md)."""
         self._record()
         if self.recorder is None:
             return {}
@@ -330,9 +330,9 @@ class Simulation:
         return self.recorder.arrays() | fault_arrays(acted)
 
     def snapshot(self) -> SimulationSnapshot:
-        """Return the present state; `restore` makes simulations of it that fly on bit-identically.
+        """Return a snapshot; simulations from its `restore` continue bit-identically.
 
-        Raises ValueError for real firmware, and for a simulation whose flight is logged or linked.
+        Raises ValueError for real firmware, and for a simulation with open logs or links.
         """
         setup = self._setup
         return SimulationSnapshot(self, setup, setup.vehicle, setup.arena, self._clock)

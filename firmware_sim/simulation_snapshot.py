@@ -1,7 +1,7 @@
-"""Snapshots of a simulation, to fly on from one state as often as needed.
+"""Snapshots of a simulation, to continue from one state any number of times.
 
-A simulation is pickled in memory. What never changes (setup, arena, functions without a closure)
-and the clock are shared. Views of arrays stay views: a copy would no longer follow its array.
+A simulation is pickled in memory. Constant objects (setup, arena, functions without a closure) and
+the clock are shared. Array views remain views: a copy would no longer follow its base array.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class SimulationSnapshot:
     """State of a simulation: plant, built-in autopilot, camera, faults and record."""
 
     def __init__(self, simulation: Simulation, *shared: object) -> None:
-        """Copy the state all but `shared`; see `Simulation.snapshot`."""
+        """Copy the state except for `shared` objects; see `Simulation.snapshot`."""
         internals = simulation.autopilot.internals
         if internals is None:
             raise ValueError("a snapshot needs the built-in autopilot")
@@ -38,7 +38,7 @@ class SimulationSnapshot:
         self._state = state.getvalue()
 
     def restore(self) -> Simulation:
-        """Return a new simulation in this state, independent of all others but for the clock.
+        """Return a new simulation in this state, which shares only the clock with others.
 
         Callbacks for texts of the autopilot are not restored. Close the simulation after use.
         """
@@ -53,7 +53,7 @@ class _Pickler(pickle.Pickler):
         self._numbers = {id(each): number for number, each in enumerate(shared)}
 
     def persistent_id(self, obj: object) -> int | None:
-        """Return the number of a shared object; None = it is copied."""
+        """Return the number of a shared object; None = the object is copied."""
         number = self._numbers.get(id(obj))
         if number is None and isinstance(obj, FunctionType) and obj.__closure__ is None:
             number = self._numbers[id(obj)] = len(self._shared)
@@ -61,7 +61,7 @@ class _Pickler(pickle.Pickler):
         return number
 
     def reducer_override(self, obj: Any) -> Any:
-        """Pickle a view as a view of its array."""
+        """Pickle an array view as a view of its base array."""
         if not isinstance(obj, np.ndarray) or not isinstance(obj.base, np.ndarray):
             return NotImplemented
         address, base = obj.__array_interface__["data"][0], obj.base

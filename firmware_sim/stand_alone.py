@@ -1,4 +1,4 @@
-"""Stand-alone firmware: ticks until it is stopped. Then a summary."""
+"""Stand-alone firmware: runs until stopped, then prints a summary."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def fly(
     duration_s: float | None,
     say: Callable[[str], None],
 ) -> None:
-    """Fly until told to stop, or for a duration of simulated time [s]; say how it went.
+    """Fly until `stop` is set, or for a duration of simulated time [s]; report a summary.
 
-    Without a duration it never ends by itself; `say` takes a line at a time. Raises
-    FirmwareLostError when real firmware is gone.
+    Without a duration, only `stop` ends the flight. `say` receives one line at a time. Raises
+    FirmwareLostError when real firmware is lost.
     """
     start_us, stopwatch = firmware.clock.time_us(), WallClock()
     end_us = None if duration_s is None else start_us + int(duration_s * US_PER_S)

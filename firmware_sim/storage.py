@@ -1,4 +1,4 @@
-"""The vehicle's memory card: one folder, which nothing reaches out of."""
+"""Memory card of the vehicle: one folder that confines all paths."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ import tempfile
 from pathlib import Path
 
 GREATEST_BYTES = 64 * 1024 * 1024
-"""What clients may store altogether: a stranger cannot fill the disk [bytes]."""
+"""Maximum total size of clients' files [bytes], so that no client can fill the disk."""
 
 GREATEST_FILES = 1_000
-"""How many files and folders clients may store: they are counted and listed within a tick."""
+"""Maximum number of files and folders: they are counted and listed within a tick."""
 
 
 class Storage:
-    """Files of one vehicle, in a given folder, or in a temporary one that ends with it."""
+    """Files of one vehicle, in a given folder or in a temporary folder removed on close."""
 
     def __init__(self, folder: Path | None = None) -> None:
-        """Use a folder that exists; None: a temporary one, made when it is first used."""
+        """Use an existing folder; None = a temporary folder, created on first use."""
         self._folder = folder
         self._temporary = folder is None
 
     @property
     def folder(self) -> Path:
-        """The folder itself."""
+        """Path of the folder."""
         if self._folder is None:
             self._folder = Path(tempfile.mkdtemp(prefix="airl-storage-"))
         return self._folder
 
     def path(self, name: str) -> Path:
-        """Return where a file of clients lies: "/log/a.ulg", "log/a.ulg", ".", "/".
+        """Return the path of a client's file name: "/log/a.ulg", "log/a.ulg", ".", "/".
 
         Raises:
-            PermissionError: It would lie outside, or a part of it is a link.
+            PermissionError: The path is outside the folder, or contains a symbolic link.
         """
         path = self.folder
         for part in name.split("/"):
@@ -48,7 +48,7 @@ class Storage:
         return path
 
     def check_room(self, more_bytes: int) -> None:
-        """Raise OSError (ENOSPC) when clients have stored too much to store this many bytes."""
+        """Raise OSError (ENOSPC) if `more_bytes` more would exceed the limits."""
         used = count = 0
         folders = [os.fspath(self.folder)]
         while folders:

@@ -1,7 +1,7 @@
-"""Load or compile every kernel before the first tick that counts: a tick has 4 ms.
+"""Warm-up: load or compile all kernels before the first paced tick, which has 4 ms.
 
-The first start after an install compiles, in the processes of `airl_mav.core.first_start`; later
-ones load the compiled code from disk.
+The first start after an install compiles in the processes of `airl_mav.core.first_start`; later
+starts load the compiled code from disk.
 """
 
 from __future__ import annotations
@@ -39,28 +39,29 @@ from firmware_sim.plant.camera_server import SimulatedCamera
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 LONGEST_TICKS = 1300
-"""At most so many: the vehicle is ready to arm after 200, without GPS after 400."""
+"""Maximum number of ticks; the vehicle is ready to arm after 200, without GPS after 400."""
 
 ARMED_TICKS = 60
-"""Enough for the vehicle to spin up, and for every stream to tell of it."""
+"""Number of ticks for the rotors to spin up and every stream to be sent."""
 
 GROUND_STEPS, GROUND_STEP_US = 30, 50_000
-"""Ranges on the ground, and as many in the air: more than EKF2_RNG_QLTY_T."""
+"""Number of ranges on the ground and in the air, and their interval [µs]; longer than
+EKF2_RNG_QLTY_T."""
 
 HIGH_M = 20.0
-"""Above all obstacles [m]."""
+"""Altitude above all obstacles [m]."""
 
 HOVER = np.array([0.0, 0.0, -GRAVITY_M_S2])
-"""Specific force (3,) of a vehicle that hovers level, FRD [m/s²]."""
+"""Specific force (3,) in level hover, FRD [m/s²]."""
 
 
 def warm_up(vehicle: VehicleProfile, plant: PlantName = DEFAULT_PLANT) -> None:
-    """Fly a moment in simulated time, through everything that a real flight on a plant uses."""
+    """Fly briefly in simulated time, through all code that a real flight on a plant uses."""
     _fly(vehicle, plant, _arena(vehicle))
 
 
 def compile_flight(vehicle: str, plant: PlantName) -> None:
-    """Compile the whole of it, for a vehicle profile in JSON."""
+    """Compile everything for a vehicle profile in JSON."""
     warm_up(VehicleProfile.model_validate_json(vehicle), plant)
 
 
@@ -90,7 +91,7 @@ def _fly(vehicle: VehicleProfile, plant: PlantName, arena: Arena | None) -> None
     setup = EpisodeSetup(vehicle, arena, 0, Aircraft(plant=plant))
     autopilot = builtin_autopilot(setup)
     if (origin := vehicle.told_origin) is not None:
-        autopilot.set_origin(origin)  # without it there is no take-off
+        autopilot.set_origin(origin)  # required for the take-off
     simulation = Simulation(setup, start_us=0, clock=SimClock(), autopilot=autopilot)
     links = [onboard_link(MemoryEndpoint()), gcs_link(MemoryEndpoint())]
     server = MavlinkServer(links, autopilot, boot_unix_us=0)
@@ -105,7 +106,7 @@ def _fly(vehicle: VehicleProfile, plant: PlantName, arena: Arena | None) -> None
                 armed += 1
             if armed == ARMED_TICKS:
                 break
-        # Away from everything that it could touch.
+        # Away from all obstacles.
         simulation.plant.put((0.0, 0.0, -HIGH_M))
         for _ in range(ARMED_TICKS):
             simulation.tick()
@@ -120,7 +121,7 @@ def _fly(vehicle: VehicleProfile, plant: PlantName, arena: Arena | None) -> None
 
 
 def _fly_every_kind(value: Callable[[str], float]) -> None:
-    """Run the cascade once for every kind of demand: some modes fly by attitude or rates."""
+    """Run the cascade once per kind of demand; some modes demand attitudes or rates."""
     controller = Controller(Gains.from_parameters(value))
     state = np.zeros(13)
     state[6] = 1.0
@@ -131,14 +132,14 @@ def _fly_every_kind(value: Callable[[str], float]) -> None:
 
 
 def _fuse_in_the_air() -> None:
-    """Give the yaw estimator a velocity in flight: to climb there would take ten times as long."""
+    """Fuse a velocity in flight into the yaw estimator; a real climb takes ten times as long."""
     estimator = YawEstimator()
     estimator.feel(np.zeros(3), HOVER)
     estimator.observe(np.zeros(3), 0.5, np.zeros(3), flying=True)
 
 
 def _measure_the_ground(value: Callable[[str], float]) -> None:
-    """Take ranges on the ground and in the air: any client may send some at any time."""
+    """Fuse ranges on the ground and in the air: any client may send them at any time."""
     state = new_state()
     terrain = TerrainFilter(KernelFilter(np.diag(INITIAL_SIGMA**2), np.zeros(len(INITIAL_SIGMA))))
     finder = RangeFinder(value, state, terrain, 0)

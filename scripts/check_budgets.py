@@ -3,8 +3,8 @@
     python scripts/check_budgets.py [--calls] [--lower]
 
 `make lint` runs it without options; tests/flight/test_call_budgets.py checks the calls per tick.
-Prints a line for each budget that is exceeded; exit status 1 if there is one. Budgets only fall:
-`--lower` writes the measured value where it is below the budget, and adds missing budgets.
+Prints a line for each exceeded budget; exit status 1 if there is one. Budgets only fall: `--lower`
+lowers budgets to smaller measured values, and adds missing budgets.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def excess(measured: Table, budgets: Table) -> list[str]:
 
 
 def lowered(measured: Table, budgets: Table) -> Table:
-    """Return the budgets, those above the measured values lowered and missing ones added."""
+    """Return the budgets, lowered to smaller measured values, with missing ones added."""
     merged = {section: dict(values) for section, values in budgets.items()}
     for section, values in measured.items():
         section_budgets = merged.setdefault(section, {})
@@ -126,7 +126,7 @@ def lowered(measured: Table, budgets: Table) -> Table:
 
 
 def read_budgets(path: Path) -> Table:
-    """Return the budgets of a file; none if there is no file."""
+    """Return the budgets of a file; empty without the file."""
     return tomllib.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
 

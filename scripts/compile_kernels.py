@@ -1,4 +1,4 @@
-"""Compile every kernel of plant and batch twin, before many processes need them at once.
+"""Compile every kernel of plant and vectorized simulator, before many processes need them.
 
 numba's cache is shared, but has no lock: processes that start together compile the same code each.
 `compile_kernels.py plant` and `compile_kernels.py twin` share little, and may run side by side.
@@ -18,14 +18,14 @@ from firmware_sim.warm_up import warm_up
 
 
 def compile_plant() -> None:
-    """Compile what flight controller and plant fly with."""
+    """Compile the kernels of flight controller and plant."""
     for plant in get_args(PlantName):
         if plant == "kernel" or HAS_PYBULLET:
             warm_up(load_vehicle("quad"), plant)
 
 
 def compile_twin() -> None:
-    """Compile what the batch twin flies and sees with."""
+    """Compile the kernels of the vectorized simulator and its cameras."""
     for kind in KINDS:
         short = {"episode": {"time_limit_s": 1.0}, "camera": {"kind": kind}}
         spec = EnvironmentSpec.model_validate(short)

@@ -1,10 +1,10 @@
-"""Writes the generated parts of the documentation site; mkdocs runs it as a hook.
+"""Generator of reference sections in the documentation site, run by mkdocs as a hook.
 
-A page asks for them with a comment on a line of its own:
+A page requests a section with a comment on a separate line:
 
 - `<!-- fields: MODULE:MODEL -->` becomes a table of the fields of a pydantic model and of the
   models inside it: name, meaning, unit and range, default.
-- `<!-- help: COMMAND -->` becomes what `COMMAND --help` prints.
+- `<!-- help: COMMAND -->` becomes the output of `COMMAND --help`.
 - `<!-- tables: MODULE:FUNCTION -->` becomes the Markdown that a function returns.
 """
 
@@ -24,7 +24,7 @@ from unittest import mock
 
 ROOT = Path(__file__).resolve().parent.parent
 if str(ROOT) not in sys.path:
-    # So that `mkdocs build` documents this checkout, whatever is installed.
+    # Documents this checkout instead of an installed version.
     sys.path.insert(0, str(ROOT))
 
 from pydantic import BaseModel  # noqa: E402 (from here on the checkout is found)
@@ -33,13 +33,13 @@ from pydantic.fields import FieldInfo  # noqa: E402
 from airl_mav.core.fields import range_of, unit_of  # noqa: E402
 
 HELP_COLUMNS = "100"
-"""Width that help texts are wrapped at."""
+"""Width of wrapped help texts."""
 
 _WHERE = re.compile(r"([\w.]+):(\w+)(?:\[(.+)\]\.(\w+))?")
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace the comments of a page (mkdocs calls this for every page)."""
+    """Replace the comments of a page; called by mkdocs for every page."""
     return re.sub(
         r"^<!-- (fields|help|tables): (.+?) -->$", _generated, markdown, flags=re.MULTILINE
     )
@@ -70,7 +70,7 @@ def field_tables(where: str) -> str:
 
 
 def _models(model: type[BaseModel], path: str) -> Iterator[tuple[str, type[BaseModel]]]:
-    """Yield a model and those inside it, each with the dotted path of its table."""
+    """Yield a model and its inner models, each with the dotted path of its table."""
     yield path, model
     for name, field in model.model_fields.items():
         inner, suffix = _inner(field.annotation)
@@ -79,7 +79,7 @@ def _models(model: type[BaseModel], path: str) -> Iterator[tuple[str, type[BaseM
 
 
 def _inner(annotation: Any) -> tuple[type[BaseModel] | None, str]:
-    """Return the model that a field holds, with what its path in TOML gets appended."""
+    """Return the model inside a field's type, and the suffix of its TOML path."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation, ""
     origin = get_origin(annotation)
@@ -118,12 +118,12 @@ def _accepted(field: FieldInfo) -> str:
     unit = unit_of(field)
     unit = f" {unit}" if unit and unit != "1" else ""
     limits = range_of(field).replace("<=", "≤")
-    # In one line: the spaces do not break.
+    # Keep the range in one line with non-breaking spaces.
     return limits.replace(" ", "\u00a0") or _type(field.annotation) + unit
 
 
 def _type(annotation: Any) -> str:
-    """Return a type in a reader's words."""
+    """Return a type as text for readers."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Literal:
         return ", ".join(f"`{value}`" for value in arguments)
@@ -154,7 +154,7 @@ def _default(field: FieldInfo) -> str:
 
 
 def help_text(command: str) -> str:
-    """Return what a command prints for `--help`, as a block of text."""
+    """Return the output of a command's `--help` as a text block."""
     program, *rest = command.split()
     entry: Callable[[], Any] = getattr(
         importlib.import_module("airl_mav.cli.entry"), program.removeprefix("airl-")

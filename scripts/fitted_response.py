@@ -1,8 +1,8 @@
-"""The first-order response of a vehicle to velocity setpoints, from its step responses.
+"""First-order response of a vehicle to velocity setpoints, from its step responses.
 
-After a dead time d a first-order lag with time constant T has done the share p of a step at
-d - T ln(1 - p). Dead time and time constants are the least-squares fit of that to when the flown
-steps were at 10, 50 and 90 %.
+After a dead time d a first-order lag with time constant T has completed the share p of a step at d
+- T ln(1 - p). Dead time and time constants are the least-squares fit to the times of 10, 50 and 90
+% in the flown steps.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ VELOCITY_STEPS: tuple[StepName, ...] = (
     "east-2",
     "forward-2",
 )
-"""Horizontal ones: a policy commands no others."""
+"""Horizontal steps: policies command only these."""
 
 YAW_RATE_STEP: StepName = "yawspeed-30"
 
 DIGITS = 3
-"""Of the times [s] and of the drag: telemetry has no finer ones."""
+"""Decimals of the times [s] and of the drag, limited by telemetry."""
 
 
 class _FlownStep(BaseModel):
-    """A step of a result, as far as it is needed."""
+    """Required fields of a flown step."""
 
     name: StepName
     median: dict[str, float | None]
 
 
 class _Flown(BaseModel):
-    """A result of `airl conformance`, as far as it is needed."""
+    """Required fields of a result of `airl conformance`."""
 
     steps: list[_FlownStep]
 
 
 def load_steps(source: str) -> Mapping[StepName, StoredStep]:
-    """Return the steps of a stored reference (name, .toml) or a result (.json); else UsageError."""
+    """Return the steps of a stored reference (name, .toml) or result (.json). Raises UsageError."""
     path = Path(source)
     if path.suffix != ".json":
         return load_profile("conformance", source, Reference).steps
@@ -69,10 +69,10 @@ def load_steps(source: str) -> Mapping[StepName, StoredStep]:
 
 
 def fit_response(steps: Mapping[StepName, StoredStep], vehicle: VehicleProfile) -> Response:
-    """Return the response of a vehicle that flew such steps.
+    """Return the response of a vehicle from its steps.
 
-    The dead time is that of the velocity; the yaw rate is fitted with its own, shorter one, so that
-    its time constant is right. Lean at constant velocity gives the linear drag.
+    The dead time belongs to the velocity; the yaw rate is fitted with a separate, shorter one, so
+    that its time constant is correct. Lean at constant velocity gives the linear drag.
 
     Raises:
         UsageError: A velocity step or the yaw rate's did not reach 90 %.

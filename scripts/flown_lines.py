@@ -1,4 +1,4 @@
-"""A file of flights that long comparisons append to, a line (CSV) each, and go on from."""
+"""Resumable CSV file of flights, one per line, for long comparisons."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from airl_mav.core.files import replace_file
 
 
 class FlownLines:
-    """The rows of a file, and what appends to it."""
+    """Rows of a file, with an append function."""
 
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
-        """Read what is there; a line that was cut off by a kill is dropped.
+        """Read the existing rows; drop a line truncated by a kill.
 
         Raises:
             UsageError: The file has other columns.
         """
         self.rows: list[dict[str, str]] = []
-        """Of all flights, by column."""
+        """Rows of all flights, by column."""
         self._path, self._columns = path, tuple(columns)
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists():
@@ -37,7 +37,7 @@ class FlownLines:
             replace_file(path, whole.encode())
 
     def add(self, row: Mapping[str, object]) -> None:
-        """Append a row at once."""
+        """Append a row immediately."""
         told = {column: str(row[column]) for column in self._columns}
         with self._path.open("a", encoding="utf-8", newline="") as file:
             file.write(self._line(tuple(told.values())))

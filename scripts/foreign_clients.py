@@ -1,10 +1,10 @@
-"""Install the clients that the nightly tests fly with, each in an environment of its own.
+"""Install the clients of the nightly tests, each in a separate environment.
 
     python scripts/foreign_clients.py ~/foreign-clients
     AIRL_FOREIGN_CLIENTS=~/foreign-clients python -m pytest tests/flight/test_foreign_clients.py
 
-MAVSDK's gRPC API, dronekit and MAVProxy want other versions of what this project uses, or a great
-deal that no flight needs. What is there already is left as it is.
+MAVSDK's gRPC API, dronekit and MAVProxy require other versions of this project's dependencies, or
+many packages that no flight needs. Existing environments stay unchanged.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ CLIENTS: dict[str, tuple[tuple[str, ...], ...]] = {
     # Without its dependencies: they are maps, plots and videos.
     "mavproxy": (("--no-deps", "MAVProxy"), ("pymavlink", "pyserial", "numpy")),
 }
-"""What pip installs for each, call by call."""
+"""Arguments of each pip call, by client."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class Install:
     """Install foreign clients for the nightly tests."""
 
     folder: tyro.conf.Positional[Path]
-    """Gets a virtual environment for each."""
+    """Folder of the virtual environments."""
 
 
 def install(folder: Path, client: str) -> None:
-    """Make a client's environment, unless it is there. Raises CalledProcessError."""
+    """Create a client's environment if missing. Raises CalledProcessError."""
     home = folder / client
     done = home / "installed"
     if done.exists():

@@ -1,14 +1,14 @@
-"""Hostile input beside MAVLink: user files, camera frames, PX4's simulator port.
+"""Fuzz test of inputs other than MAVLink: user files, camera frames, PX4's simulator port.
 
     python scripts/fuzz_inputs.py --seconds 600
 
-Files that users write (vehicles, arenas, computers, scenarios, trainings, sweeps, parameters, keys)
-are damaged at random, in their bytes and in their values, and read as the commands read them: each
-must be taken, and flown a little where it can be, or refused with one line. Depth frames with wrong
-lengths, sizes, numbers and stamps are published to the camera of a companion, whose policy decides
-on what passes. A PX4 that sends garbage, half a frame, or ends its connection after any byte, must
-end the flight with its own error. It stops at the first anything else, and names the case, which
-`--what WHAT --first NUMBER` does again.
+User files (vehicles, arenas, computers, scenarios, trainings, sweeps, parameters, keys) are damaged
+at random, in bytes and values, and read as the commands read them. Each must be accepted, with a
+short flight if possible, or rejected with one line. Depth frames with wrong lengths, sizes, numbers
+and stamps are published to the camera of a companion, whose policy decides on valid frames. A PX4
+that sends garbage, half a frame, or ends its connection after any byte, must end the flight with a
+defined error. The test stops at the first other result, and prints the case, which `--what WHAT
+--first NUMBER` repeats.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ VALUES = (
     "{}", "{a = 1}", "99999999999999999999", "9" * 30, "-9223372036854775808", "2147483648",
     "1979-05-27", "07:32:00", "[" * 40 + "]" * 40, "",
 )  # fmt: skip
-"""What is written in place of values."""
+"""Replacement values."""
 
 LINES = ("[", "]", "=", "a", "a = ", "[a]", "[[a]]", "[size]", 'base = "quad"', "\t", "\r", '"""')
 
@@ -86,7 +86,7 @@ at_s = 2.0
 
 
 def damaged(rng: np.random.Generator, text: bytes) -> bytes:
-    """Return a text with one to three wounds: of its values, its lines or its bytes."""
+    """Return a text with one to three random defects in its values, lines or bytes."""
     for _ in range(1 + int(rng.integers(3))):
         lines = text.split(b"\n")
         at = int(rng.integers(len(lines)))
@@ -116,7 +116,7 @@ def damaged(rng: np.random.Generator, text: bytes) -> bytes:
 
 
 def _fly(asked: StandAloneVehicle) -> None:
-    """Build all that `airl-firmware` would fly, and fly three ticks of it."""
+    """Build the setup of `airl-firmware`, and fly three ticks."""
     check_vehicle(asked)
     vehicle, computer_w = aircraft_of(asked)
     setup, _goal = episode_of(asked, vehicle, computer_w)
@@ -145,7 +145,7 @@ READERS: Mapping[str, Callable[[Path], object]] = {
     "parameters": _parameters,
     "key": read_key,
 }
-"""How each kind of file is read, and used as far as no process is started."""
+"""Reader of each kind of file; flies if possible without starting a process."""
 
 
 def _shipped(kind: str) -> list[bytes]:
@@ -160,10 +160,10 @@ def _shipped(kind: str) -> list[bytes]:
 
 
 def read_damaged_file(number: int, kind: str | None = None) -> str:
-    """Damage a file of a kind (None: any), and read it; return what came of it.
+    """Read a damaged file of a kind (None: any); return the result.
 
     Raises:
-        Exception: It was neither read nor refused with one line.
+        Exception: The file was neither accepted nor rejected with one line.
     """
     rng = np.random.default_rng((number, 1))
     kind = kind or list(READERS)[number % len(READERS)]
@@ -179,7 +179,7 @@ def read_damaged_file(number: int, kind: str | None = None) -> str:
             assert str(error).strip(), "refused without a word"
             assert "\n" not in str(error), f"more than one line: {error}"
             return f"{kind} refused"
-        except SystemExit as end:  # The words of a command line are tyro's to refuse.
+        except SystemExit as end:  # tyro rejects command-line words.
             assert end.code == 2, f"exit status {end.code}"
             return f"{kind} refused"
         except BaseException:
@@ -206,7 +206,7 @@ SIDES = (0, 1, 2, 12, 16, 17, 255, 65_535)
 
 
 def hostile_frame(rng: np.random.Generator, lens: Intrinsics = LENSES[0]) -> bytes:
-    """Return the bytes of a frame: a sound one, or with something wrong in it."""
+    """Return the bytes of a frame, valid or with one defect."""
     image = rng.integers(0, np.iinfo(lens.dtype).max + 1, lens.shape, lens.dtype)
     frame = bytearray(Frame(int(rng.integers(1 << 62)), 0, image, lens).to_bytes())
     kind = int(rng.integers(8))
@@ -232,7 +232,7 @@ def hostile_frame(rng: np.random.Generator, lens: Intrinsics = LENSES[0]) -> byt
 
 
 def hostile_rig(rng: np.random.Generator, lens: Intrinsics) -> bytes:
-    """Return the bytes of a frame of two cameras: a sound one, or with something wrong in it."""
+    """Return the bytes of a frame of two cameras, valid or with one defect."""
     image = np.zeros(lens.shape, lens.dtype)
     sequence = int(rng.integers(1 << 62))
     further = {"side": FurtherImage(image, lens)}
@@ -255,10 +255,10 @@ def hostile_rig(rng: np.random.Generator, lens: Intrinsics) -> bytes:
 
 
 def see_hostile_frames(number: int, frames: int = 50) -> str:
-    """Publish frames to a companion's camera and decide on each that passes; return the tally.
+    """Publish frames to a companion's camera and decide on each valid one; return the tally.
 
     Raises:
-        Exception: A frame broke something, or an action is no number.
+        Exception: A frame caused an error, or an action is NaN or infinite.
     """
     rng = np.random.default_rng((number, 2))
     lens = LENSES[number % len(LENSES)]
@@ -284,7 +284,7 @@ def see_hostile_frames(number: int, frames: int = 50) -> str:
                 k = seen.frame.intrinsics
                 assert seen.frame.image.shape == k.shape
                 if k.kind != "depth":
-                    continue  # Before take-off a companion refuses its policy such a camera.
+                    continue  # A companion rejects such a camera for its policy before take-off.
                 action = limited(policy.act(encode(seen.frame, still, (20.0, 5.0))), 5.0)
                 numbers = (action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s)
                 assert all(map(math.isfinite, numbers)), action
@@ -294,7 +294,7 @@ def see_hostile_frames(number: int, frames: int = 50) -> str:
 # --- PX4's simulator port ------------------------------------------------------------------------
 
 ANSWER_S = 0.05
-"""How long an answer is waited for: none comes from who has only sent garbage [wall s]."""
+"""Answer timeout: garbage gets no answer [wall s]."""
 
 
 def _sample(time_us: int, accel: np.ndarray) -> SensorSample:
@@ -302,7 +302,7 @@ def _sample(time_us: int, accel: np.ndarray) -> SensorSample:
 
 
 def answers(samples: int) -> list[bytes]:
-    """Return what a PX4 sends that answers so many samples: a piece for each."""
+    """Return the messages of a PX4 that answers a number of samples: a piece for each."""
     encoder = Encoder(1, 1)
     ask = dialect.MAVLink_command_long_message(0, 0, 511, 0, 115.0, 5e3, 0.0, 0.0, 0.0, 0.0, 0.0)
     pieces = [encoder.pack(ask)]
@@ -315,7 +315,7 @@ def answers(samples: int) -> list[bytes]:
 
 
 def hostile_px4(rng: np.random.Generator, samples: int) -> list[bytes]:
-    """Return what a broken PX4 sends before it ends its connection: a piece for each sample."""
+    """Return the messages of a faulty PX4 before it disconnects: a piece for each sample."""
     pieces = [bytearray(piece) for piece in answers(samples)]
     which = int(rng.integers(len(pieces)))
     piece, kind = pieces[which], int(rng.integers(4))
@@ -333,10 +333,10 @@ def hostile_px4(rng: np.random.Generator, samples: int) -> list[bytes]:
 
 
 def be_connected_to(pieces: list[bytes]) -> str:
-    """Let a PX4 send a piece with each sample, then end; return what the bridge made of it.
+    """Send a piece with each sample from a PX4, then disconnect; return the bridge's result.
 
     Raises:
-        Exception: Anything but the two errors of a firmware that is gone, or was none.
+        Exception: Any error except lost or missing firmware.
     """
     rest = np.array([0.0, 0.0, -9.81])
     with closing(Px4Bridge(0, answer_s=ANSWER_S, start_s=ANSWER_S)) as bridge:
@@ -360,7 +360,7 @@ def be_connected_to(pieces: list[bytes]) -> str:
 
 
 def meet_hostile_px4(number: int) -> str:
-    """Be connected to a broken PX4; see `be_connected_to`."""
+    """Connect to a faulty PX4; see `be_connected_to`."""
     return be_connected_to(hostile_px4(np.random.default_rng((number, 3)), 4))
 
 
@@ -373,12 +373,12 @@ CASES: Mapping[What, Callable[[int], str]] = {
 
 @dataclass(frozen=True)
 class Fuzz:
-    """Feed hostile files, frames and answers to what reads them."""
+    """Feed hostile files, frames and answers to their readers."""
 
     seconds: float = 20.0
-    """How long, for each of them [wall s]."""
+    """Duration of each kind of test [wall s]."""
     what: tuple[What, ...] = ("files", "camera", "simulator")
-    """Which of them."""
+    """Kinds of test."""
     first: int = 0
     """First case; its number is its seed."""
 

@@ -1,15 +1,14 @@
-"""Hostile MAVLink in flight: random bytes, damaged frames, and valid ones with absurd contents.
+"""MAVLink fuzz test in flight: random bytes, damaged frames, and valid ones with absurd contents.
 
     python scripts/fuzz_mavlink.py --frames 10000000
     python scripts/fuzz_mavlink.py --steering --frames 200000
 
-Flies the built-in flight controller, one short flight after the other, while both links are fed as
-much as a client may send, and logs are written. Every message that a service reads is drawn, with
-values from the ends of their types, and with commands, parameters, files, shell words and
-addressees that exist. With `--steering` it draws only what tells the vehicle where to fly, a frame
-every few ticks, so that it flies what it is told before it is told something else. It ends at the
-first exception or motor command that is no number in 0..1,
-and names the flight, which `--first` flies again.
+Flies the built-in flight controller in short flights, with logs, while both links receive the
+maximum rate of a client. Draws every message that a service reads, with values from the limits of
+their types, and with existing commands, parameters, files, shell words and addressees. With
+`--steering` it draws only steering messages, a frame every few ticks, so that the vehicle executes
+each before the next. It ends at the first exception or motor command outside 0..1 or NaN, and
+prints the flight, which `--first` repeats.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ from firmware_sim.pacing import Unpaced
 from firmware_sim.simulation import EpisodeSetup
 
 FRAMES_PER_TICK = 8
-"""On each link: what one client may send."""
+"""Frames on each link: the maximum of one client."""
 
 STEERING = (
     *("COMMAND_LONG", "COMMAND_INT", "COMMAND_LONG", "COMMAND_INT", "LANDING_TARGET"),
@@ -49,7 +48,7 @@ STEERING = (
     *("SET_ATTITUDE_TARGET", "SET_GPS_GLOBAL_ORIGIN", "MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"),
     *("MISSION_ITEM_INT", "MISSION_COUNT", "MISSION_SET_CURRENT", "SET_MODE"),
 )
-"""Messages that steer; what is named twice is drawn twice as often."""
+"""Steering messages; repeated names are drawn more often."""
 
 STEERING_COMMANDS = (
     *(16, 17, 20, 21, 22, 23, 34, 48, 176, 178, 179, 186, 192, 193, 195, 197, 201, 252, 300, 400),
@@ -77,7 +76,7 @@ KNOWN: Mapping[str, tuple[int, ...]] = {
     "coordinate_frame": (1, 5, 6, 7, 8, 9, 11, 12),
     "type_mask": (0, 0x9C7, 0x5C7, 0x9F8, 0xDC7, 0xFFF, 0x7, 0x38, 0x1C0),
 }
-"""What fields hold that mean something, beside small numbers."""
+"""Valid field values, beside small numbers."""
 
 FTP_HEADER = struct.Struct("<HBBBBBxI")
 PATHS = (
@@ -94,7 +93,7 @@ _T = TypeVar("_T")
 
 
 class Dice:
-    """Draws of a seeded generator, taken from it in blocks: one by one costs ten times as much."""
+    """Draws of a seeded generator, in blocks: single draws cost ten times as much."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -107,11 +106,11 @@ class Dice:
         return self._left.pop()
 
     def below(self, end: int) -> int:
-        """Return a whole number from 0 to `end` - 1."""
+        """Return an integer from 0 to `end` - 1."""
         return int(self.random() * end)
 
     def one_of(self, choices: Sequence[_T]) -> _T:
-        """Return one of some things."""
+        """Return a random choice."""
         return choices[self.below(len(choices))]
 
     def bytes(self, longest: int, shortest: int = 0) -> bytes:
@@ -120,11 +119,11 @@ class Dice:
 
 
 class Fuzzer:
-    """Draws what a hostile or broken client may send."""
+    """Generator of frames from a hostile or faulty client."""
 
     def __init__(self, rng: np.random.Generator, *, steering: bool = False) -> None:
         self._dice = dice = Dice(rng)
-        # A key that is set refuses all that comes after it.
+        # A signing key would reject all later frames.
         names = STEERING if steering else [name for name in HANDLERS if name != "SETUP_SIGNING"]
         known = {**KNOWN, "command": STEERING_COMMANDS} if steering else KNOWN
         self._kinds = [_Kind(dialect.mavlink_map[message_id(name)], dice, known) for name in names]
@@ -145,7 +144,7 @@ class Fuzzer:
         return frame
 
     def steering(self) -> bytes:
-        """Return a valid frame, often one that asks for a mode."""
+        """Return a valid frame, often a mode request."""
         if self._dice.random() < 0.3:
             main, sub = self._dice.one_of(MODES)
             return self._encoders[0].pack(
@@ -161,7 +160,7 @@ class Fuzzer:
 
 
 class _Kind:
-    """One message: its layout, and what draws its fields."""
+    """Message type: its layout, and the generators of its fields."""
 
     def __init__(self, kind: Any, dice: Dice, known: Mapping[str, tuple[int, ...]]) -> None:
         self.layout = Layout(kind)
@@ -184,7 +183,7 @@ def _drawn(
     dice: Dice,
     known: Mapping[str, tuple[int, ...]],
 ) -> Callable[[], Iterable[Any]]:
-    """Return what draws one field of a message."""
+    """Return the generator of a field's values."""
     special = {
         ("FILE_TRANSFER_PROTOCOL", "payload"): _ftp_request,
         ("SERIAL_CONTROL", "data"): _typed,
@@ -212,7 +211,7 @@ def _real(dice: Dice) -> float:
 
 
 def _whole(listed: tuple[int, ...], of: str) -> Callable[[Dice], int]:
-    """Return what draws a whole number: one that exists, an end of the type, or any."""
+    """Return a generator of integers: a known one, a limit of the type, or any."""
     bits = int("".join(c for c in of if c.isdigit()))
     low, high = (0, 2**bits - 1) if of[0] == "u" else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
     ends = (low, high, low + 1, high - 1)
@@ -228,7 +227,7 @@ def _whole(listed: tuple[int, ...], of: str) -> Callable[[Dice], int]:
 
 
 def _ftp_request(dice: Dice) -> bytes:
-    """Return a request of MAVLink FTP: real operations, on files that are there and elsewhere."""
+    """Return a request of MAVLink FTP: real operations, on existing and other files."""
     path = dice.one_of(PATHS)
     data = dice.one_of((path, path + b"\0" + dice.one_of(PATHS), dice.bytes(239)))
     size = min(len(data), 255) if dice.random() < 0.7 else dice.below(256)
@@ -239,19 +238,19 @@ def _ftp_request(dice: Dice) -> bytes:
 
 
 def _typed(dice: Dice) -> bytes:
-    """Return what somebody may type into the shell."""
+    """Return random shell input."""
     words = [dice.one_of(WORDS) for _ in range(1 + dice.below(12))]
     return b" ".join(words)[:70].ljust(70, b"\n")
 
 
 def fly(seed: int, frames: int, *, steering: bool = False) -> int:
-    """Fly once with so many hostile frames; return how many of them took effect.
+    """Fly once with a number of hostile frames; return the number of frames with effect.
 
-    The vehicle keeps its logs, which clients may list and download.
+    The vehicle saves its logs, which clients may list and download.
 
     Raises:
-        AssertionError: A motor command is no number in 0..1, or the vehicle is nowhere.
-        Exception: Whatever else breaks.
+        AssertionError: A motor command is outside 0..1, or the position is not finite.
+        Exception: Any other failure.
     """
     fuzzer = Fuzzer(np.random.default_rng(seed), steering=steering)
     setup = EpisodeSetup(load_vehicle("quad"), None, seed)
@@ -280,7 +279,7 @@ def fly(seed: int, frames: int, *, steering: bool = False) -> int:
             quiet = sum(link.rx - link.ignored for link in server.counters().values())
             for number in range(frames if steering else -(-frames // (2 * FRAMES_PER_TICK))):
                 if steering:
-                    if number % 100 == 0:  # it may have landed, or crashed
+                    if number % 100 == 0:  # It may have landed or crashed
                         autopilot.arm(force=True)
                         autopilot.takeoff(3.0)
                     ends[0].inbox.append(fuzzer.steering())
@@ -302,13 +301,13 @@ class Fuzz:
     """Feed hostile MAVLink to the flight controller in flight."""
 
     frames: int = 100_000
-    """Frames in all."""
+    """Total number of frames."""
     per_flight: int = 20_000
-    """Frames of one flight: parameters that were set last as long."""
+    """Frames per flight, which limits the life of set parameters."""
     first: int = 0
     """First flight; its number is its seed."""
     steering: bool = False
-    """Only what tells the vehicle where to fly, slowly; some 500 frames a flight do."""
+    """Send only steering messages, slowly; about 500 frames per flight suffice."""
 
 
 def main(asked: Fuzz) -> None:

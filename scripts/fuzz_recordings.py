@@ -1,12 +1,12 @@
-"""Damaged recordings and meshes, read as the commands read them.
+"""Fuzz test of recordings and meshes, read by the commands.
 
     python scripts/fuzz_recordings.py --seconds 600
 
 A vehicle's log, a black box and a run folder, flown once at the start, and meshes in every format
-are damaged in their bytes, most often near the beginning, where their headers are. `airl refit`,
-`airl report`, `airl export-log` and `airl asset` must take each, or refuse it with one line. It
-stops at the first anything else, keeps the file, and names the case, which `--what WHAT --first
-NUMBER` does again.
+are damaged in their bytes, most often in the headers near the beginning. `airl refit`, `airl
+report`, `airl export-log` and `airl asset` must accept each, or reject it with one line. The test
+stops at the first other result, keeps the file, and prints the case, which `--what WHAT --first
+NUMBER` repeats.
 """
 
 from __future__ import annotations
@@ -36,16 +36,17 @@ from airl_mav.scenario.resolve import resolve
 from tests.support.recorded_flights import fly_recorded
 
 SEED = 3
-"""Of the flight that is recorded."""
+"""Seed of the recorded flight."""
 
 HEADER_BYTES = 4_000
-"""Of a recording, about: where its formats and its first records are described."""
+"""Approximate size of a recording's header: its formats and first records."""
 
 MOST_BYTES = 8 << 30
-"""Address space that reading a damaged file may take; what asks for more has believed it."""
+"""Maximum address space for reading a damaged file; exceeding it means that a damaged size was
+used."""
 
 WORDS = (b"\xff\xff\xff\xff", b"\0\0\0\0", b"\xff\xff\xff\x7f", b"\0\0\xc0\x7f", b"\0\0\x80\x7f")
-"""Numbers that lengths and places can become: the greatest, none, not a number, infinite."""
+"""Replacement numbers for lengths and positions: maximum, zero, NaN, infinity."""
 
 MESH_FORMATS = ("stl", "obj", "glb", "ply", "off")
 TEXT_FORMATS = ("obj", "off", "json", "jsonl", "toml")
@@ -53,7 +54,7 @@ READ_OF_A_RUN = (".json", ".jsonl", ".toml", ".npz")
 
 
 def damaged_bytes(rng: np.random.Generator, whole: bytes) -> bytes:
-    """Return bytes with one to five wounds, more than half of the time all near the beginning."""
+    """Return bytes with one to five defects, in over half of the cases all near the beginning."""
     end = HEADER_BYTES if rng.random() < 0.6 else len(whole)
     raw, rest = bytearray(whole[:end]), whole[end:]
     for _ in range(1 + int(rng.integers(5))):
@@ -76,7 +77,7 @@ def damaged_bytes(rng: np.random.Generator, whole: bytes) -> bytes:
 
 
 def damaged_file(rng: np.random.Generator, path: Path) -> bytes:
-    """Return the damaged content of a file; one of text may be damaged in its lines."""
+    """Return the damaged content of a file; text may be damaged by lines."""
     whole = path.read_bytes()
     if path.suffix[1:] in TEXT_FORMATS and rng.random() < 0.5:
         return damaged(rng, whole)
@@ -85,7 +86,7 @@ def damaged_file(rng: np.random.Generator, path: Path) -> bytes:
 
 @cache
 def _folder() -> Path:
-    """Return the folder of what is damaged: it stays as long as this process."""
+    """Return the folder of damaged files, which lives as long as this process."""
     held = tempfile.TemporaryDirectory(prefix="fuzz-recordings-")
     _HELD.append(held)
     return Path(held.name)
@@ -162,14 +163,14 @@ CASES: Mapping[str, Callable[[np.random.Generator, Path], tuple[str, list[str]]]
     "run": _run_folder,
     "mesh": _mesh_file,
 }
-"""What is damaged, and the command that reads it."""
+"""Damaged inputs, each with the command that reads it."""
 
 
 def read_damaged(what: str, number: int) -> str:
-    """Damage something, and give it to its command; return what came of it.
+    """Damage an input, and read it with its command; return the result.
 
     Raises:
-        Exception: It was neither taken nor refused with one line.
+        Exception: The input was neither accepted nor rejected with one line.
     """
     rng = np.random.default_rng((number, list(CASES).index(what)))
     folder = Path(tempfile.mkdtemp(prefix="fuzz-case-"))
@@ -197,9 +198,9 @@ class Fuzz:
     """Give damaged recordings and meshes to the commands that read them."""
 
     seconds: float = 60.0
-    """How long, for each of them [wall s]."""
+    """Duration of each kind of test [wall s]."""
     what: tuple[str, ...] = tuple(CASES)
-    """Which of them."""
+    """Kinds of test."""
     first: int = 0
     """First case; its number is its seed."""
 

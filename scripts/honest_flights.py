@@ -1,13 +1,13 @@
-"""How often do the companion's limits end a flight in which nothing is wrong?
+"""False alarm rate of the companion's limits in flights without faults.
 
     python scripts/honest_flights.py [--flights 1000] [--out DIR]
 
-Flies honest flights in lockstep, with real MAVSDK, the full flight controller and the shipped
-policy of each arena, in a steady wind of 6 m/s whose direction is another in every flight, as late
-as a Raspberry Pi 4 that runs the paper's network. Nobody takes over and nothing fails, so whatever
-`companion/limits.py` ends is a false alarm. Every flight is a line of flights.csv in --out, and the
-same command goes on from there: with more --flights, too. Leaves table.json, which results.py
-publishes.
+Flies honest flights in lockstep, with real MAVSDK, the full flight controller and the built-in
+policy of each arena, in a steady wind of 6 m/s with a random direction per flight, and with the
+latency of a Raspberry Pi 4 that runs the paper's network. There is no pilot takeover and no fault,
+so any stop by `companion/limits.py` is a false alarm. Every flight is a line of flights.csv in
+--out, and the same command resumes from there, also with more --flights. Writes table.json, which
+results.py publishes.
 """
 
 from __future__ import annotations
@@ -45,36 +45,36 @@ FLIGHTS_FILE = "flights.csv"
 
 @dataclass(frozen=True)
 class Command:
-    """Fly, and count."""
+    """Fly the flights and count false alarms."""
 
     flights: int = 1000
-    """All together, the arenas in turn."""
+    """Total number of flights, distributed over the arenas."""
 
     seed: int = 1
     """First seed."""
 
     out: Path = Path("runs/honest-flights")
-    """Where flights.csv and table.json go."""
+    """Folder of flights.csv and table.json."""
 
 
 @dataclass(frozen=True)
 class Honest:
-    """What a flight showed."""
+    """Result of a flight."""
 
     seed: int
     arena: str
     outcome: str
     navigated_s: float
-    """From the start of navigation to the verdict."""
+    """Time from the start of navigation to the verdict."""
     decisions: int
     alarm: str
-    """The limit that was broken, as the flight's notes tell it; empty: none was."""
+    """Violated limit, from the flight's notes; empty: none."""
     behaviour: str
-    """Fingerprint of the flight behaviour that it was flown with."""
+    """Fingerprint of the flight behaviour."""
 
 
 COLUMNS = tuple(field.name for field in fields(Honest))
-"""Of flights.csv, in which a line is a flight."""
+"""Columns of flights.csv, one flight per line."""
 
 
 def row_of(flight: Honest) -> dict[str, object]:
@@ -83,7 +83,7 @@ def row_of(flight: Honest) -> dict[str, object]:
 
 
 def scenario_of(arena: str, policy: str, seed: int) -> Scenario:
-    """Return what a flight is: the direction of the wind is drawn with its seed."""
+    """Return the scenario of a flight: the seed determines the wind direction."""
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * math.pi)
     wind = WindSettings(north_m_s=WIND_M_S * math.cos(angle), east_m_s=WIND_M_S * math.sin(angle))
     return Scenario(
@@ -98,12 +98,12 @@ def scenario_of(arena: str, policy: str, seed: int) -> Scenario:
 
 
 def alarm_of(record: EpisodeRecord) -> str:
-    """Return the limit that was broken in a flight, as its notes tell it; empty: none was."""
+    """Return the violated limit of a flight, from its notes; empty: none."""
     return next((note for note in record.notes if note.split(":")[0] in REASONS), "")
 
 
 def honest(arena: str, policy: str, seed: int, behaviour: str) -> Honest:
-    """Fly a seed."""
+    """Fly one seed."""
     resolved = resolve(scenario_of(arena, policy, seed))
     flown = fly(resolved, resolved.fresh_policy(seed), 0, seed)
     record = flown.record
@@ -115,7 +115,7 @@ def honest(arena: str, policy: str, seed: int, behaviour: str) -> Honest:
 
 
 def view_of(rows: Sequence[dict[str, str]]) -> TableView:
-    """Return the counts by arena. After a collision an alarm is none: the vehicle tumbles."""
+    """Return the counts by arena. Alarms after a collision do not count: the vehicle tumbles."""
     counted = []
     arenas = [arena for arena, _ in PAIRS]
     for arena in [*arenas, "all"]:
@@ -149,7 +149,7 @@ def view_of(rows: Sequence[dict[str, str]]) -> TableView:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Fly what is missing, and count."""
+    """Fly missing flights, and count."""
     asked, console = tyro.cli(Command, args=words, description=__doc__), new_console()
     behaviour, deciding = behaviour_today(), dict(PAIRS)
     path = asked.out / FLIGHTS_FILE

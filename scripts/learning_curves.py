@@ -1,14 +1,13 @@
-"""Learning curves: several configurations, several seeds each, one picture and one table.
+"""Learning curves: several configurations and seeds, in one picture and one table.
 
     python scripts/learning_curves.py [--configs NAME ...] [--seeds N] [--steps N] [--out DIR]
 
-By default the paper's algorithm exploration (DQN and PPO, with and without curriculum), and the
-`static-obstacles`' training. Each run is
-an `airl train` of its own that survives a kill: start the script again and it goes on where it was.
-The picture shows the success rate on the selection seeds, mean over the training seeds with a 95 %
-interval (Student's t); the table says after how many decisions each configuration reached 97 %, not
-how long that took: other work on the machine changes nothing. Leaves curves.png, curves.md and
-table.json.
+Defaults to the paper's algorithm exploration (DQN and PPO, with and without curriculum), and the
+training of `static-obstacles`. Each run is a separate `airl train` that survives a kill: start the
+script again to resume. The picture shows the success rate on the selection seeds, mean over the
+training seeds with a 95 % interval (Student's t). The table shows the decisions until each
+configuration reached 97 %, not the time, which depends on the machine's load. Writes curves.png,
+curves.md and table.json.
 """
 
 from __future__ import annotations
@@ -37,29 +36,29 @@ CONFIGS = (
     *("paper-dqn", "paper-dqn-curriculum", "paper-ppo", "paper-ppo-curriculum"),
     "static-obstacles",
 )
-"""The paper's exploration, and what `static-obstacles` was trained with."""
+"""The paper's exploration, and the training of `static-obstacles`."""
 
 REACHED = 0.97
 
 
 @dataclass(frozen=True)
 class Command:
-    """Train, collect, draw."""
+    """Train, collect results and draw."""
 
     configs: tuple[str, ...] = CONFIGS
-    """Training configurations: shipped names or paths."""
+    """Training configurations: built-in names or paths."""
 
     seeds: int = 5
     """Training seeds of each, 1 to N."""
 
     steps: int | None = None
-    """Decisions of each run. None: the configuration's."""
+    """Decisions of each run; None = the configuration's."""
 
     jobs: int = 1
-    """Runs at a time; each takes one core."""
+    """Number of parallel runs; each takes one core."""
 
     out: Path = Path("runs/learning-curves")
-    """Where the runs, curves.png, curves.md and table.json go."""
+    """Folder of the runs, curves.png, curves.md and table.json."""
 
 
 def main() -> None:
@@ -103,7 +102,7 @@ def collect(command: Command, name: str) -> list[list[Evaluation]]:
 
 
 def grid(runs: Sequence[Sequence[Evaluation]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return steps (k,) and success rates (seeds, k) at the evaluations that all runs have."""
+    """Return steps (k,) and success rates (seeds, k) at the evaluations common to all runs."""
     k = min(len(run) for run in runs)
     steps = np.array([each.steps for each in runs[0][:k]], np.float64)
     return steps, np.array([[each.success_rate for each in run[:k]] for run in runs])
@@ -131,7 +130,7 @@ def draw(curves: dict[str, list[list[Evaluation]]], path: Path) -> None:
 
 
 def table(curves: dict[str, list[list[Evaluation]]]) -> TableView:
-    """Return what each configuration reached, over its training seeds."""
+    """Return the results of each configuration, over its training seeds."""
     rows = []
     for name, runs in curves.items():
         best = [100.0 * max(each.success_rate for each in run) for run in runs]
@@ -163,7 +162,7 @@ def table(curves: dict[str, list[list[Evaluation]]]) -> TableView:
 
 
 def made_with(folders: Iterable[Path]) -> dict[str, Any]:
-    """Return with what the last of the trainings was made. Raises UsageError: not all with one."""
+    """Return the provenance of the latest training. Raises UsageError for different commits."""
     made = [read_json(each / CONFIG_FILE, SCHEMA, "training run") for each in folders]
     commits = {None if each["git"] is None else each["git"]["commit"] for each in made}
     if len(commits) > 1:

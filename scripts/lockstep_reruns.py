@@ -1,10 +1,10 @@
-"""Fly the same episode again and again in lockstep, whatever the machine does, and compare.
+"""Repeat an episode in lockstep under different loads, and compare.
 
     python scripts/lockstep_reruns.py --idle 50 --loaded 30 --stopped 20
 
 Idle: nothing else runs. Loaded: twice as many busy processes as cores. Stopped: the process gets
-SIGSTOP at a random moment of the flight and goes on ten seconds later. Prints every distinct
-fingerprint with its count; exit status 0 when all flights are the same.
+SIGSTOP at a random time of the flight and resumes ten seconds later. Prints every distinct hash
+with its count; exit status 0 if all flights are equal.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ class Reruns:
     """Flights beside busy processes."""
 
     stopped: int = 20
-    """Flights that are stopped for a while."""
+    """Flights with a temporary stop."""
 
     stop_s: float = 10.0
-    """How long, s."""
+    """Duration of a stop [s]."""
 
     policy: str = "static-obstacles"
     """Policy that decides."""
@@ -54,7 +54,7 @@ class Reruns:
     """Seed of the episode."""
 
     fly: int | None = None
-    """Only fly so many times and print each flight's fingerprint: what this script starts."""
+    """Fly this many flights and print their hashes; used internally by this script."""
 
 
 def main() -> int:
@@ -83,7 +83,7 @@ def main() -> int:
 
 
 def fingerprints(command: Reruns, flights: int, stop_s: float | None) -> Iterator[str]:
-    """Yield the fingerprint of each flight of a process of its own."""
+    """Yield the hash of each flight of a child process."""
     if not flights:
         return
     moments = np.random.default_rng(command.seed)
@@ -105,7 +105,7 @@ def fingerprints(command: Reruns, flights: int, stop_s: float | None) -> Iterato
 
 
 BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"
-"""Ends with its parent, however that ends."""
+"""Busy loop that ends with its parent process."""
 
 
 @contextmanager
@@ -120,7 +120,7 @@ def busy(processes: int) -> Iterator[None]:
 
 
 def fly(command: Reruns, flights: int) -> None:
-    """Fly, and print when each flight begins and what its fingerprint is."""
+    """Fly, and print the start and the hash of each flight."""
     from airl_mav.lockstep.flight import fly as fly_episode
     from airl_mav.rehearsal.progress import Observer
     from airl_mav.scenario.model import Scenario
@@ -135,7 +135,7 @@ def fly(command: Reruns, flights: int) -> None:
         def episode(self, *_: object) -> None:
             say(BEGINS)
 
-    # What is compiled or loaded late is so before the first that counts.
+    # Compile and load everything before the first counted flight.
     fly_episode(resolved, resolved.fresh_policy(command.seed + 1), 0, command.seed + 1)
     for _ in range(flights):
         policy = resolved.fresh_policy(command.seed)

@@ -1,11 +1,11 @@
-"""Fly the same episodes in lockstep on both plants, pybullet and kernel, and compare them.
+"""Comparison of the same episodes in lockstep on both plants, pybullet and kernel.
 
     python scripts/plants_compared.py --flights 100 --out runs/plants.csv
 
-Every flight is flown twice, from the same seeds, by real MAVSDK and the shipped policy of the
-arena. Positions are compared at 50 Hz until the flight is judged. Prints a row for each
-arena, and each pair that parts. With --out every pair is a line of that file, and the same command
-goes on from there. Exit status 0: every pair ends alike, and within the limit.
+Every flight is flown twice, from the same seeds, by real MAVSDK and the built-in policy of the
+arena. Positions are compared at 50 Hz until the verdict. Prints a row for each arena, and each
+deviating pair. With --out every pair is a line of that file, and the same command resumes from
+there. Exit status 0: every pair has equal outcomes, within the limit.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PAIRS = (
     ("dynamic-obstacles", "dynamic-obstacles"),
     ("crowded", "crowded"),
 )
-"""Arenas, and who decides in them."""
+"""Arenas and their policies."""
 
 
 @dataclass(frozen=True)
@@ -54,25 +54,25 @@ class Comparison:
     """Arenas."""
 
     limit_mm: float = 1.0
-    """How far positions may part, mm."""
+    """Maximum position difference [mm]."""
 
     out: Path | None = None
-    """Append a line for each pair to this file (.csv), and go on from what it holds."""
+    """CSV file with a line per pair; an existing file is resumed."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """What a pair of flights showed."""
+    """Result of a pair of flights."""
 
     arena: str
     seed: int
     outcomes: tuple[str, str]
     samples: tuple[int, int]
-    """Of the trajectories, 50 a second."""
+    """Samples of the trajectories, 50 a second."""
     apart_mm: float
-    """Greatest distance between the two positions until the flight was judged."""
+    """Maximum distance between the two positions until the verdict."""
     landed_mm: float
-    """The same to the end of the recording: what moves may run into a vehicle that lands."""
+    """Maximum distance to the end of the recording: moving obstacles may hit a landing vehicle."""
 
 
 def compared(arena: str, policy: str, seed: int) -> Pair:
@@ -87,7 +87,7 @@ def compared(arena: str, policy: str, seed: int) -> Pair:
 
 
 def farthest_mm(here: NDArray[np.float64], there: NDArray[np.float64]) -> float:
-    """Return the greatest distance between two paths (n, 3) [m] at the same time, in mm."""
+    """Return the maximum distance between two paths (n, 3) [m] at the same time, in mm."""
     common = min(len(here), len(there))
     apart = np.linalg.norm(here[:common] - there[:common], axis=1)
     return 1e3 * float(apart.max(initial=0.0))
@@ -101,14 +101,14 @@ def flown(arena: str, policy: str, seed: int, plant: PlantName) -> FlownEpisode:
 
 
 def until_judged(flight: FlownEpisode) -> NDArray[np.float64]:
-    """Return the true positions NED (n, 3) [m] at 50 Hz, until the flight was judged."""
+    """Return the true positions NED (n, 3) [m] at 50 Hz, until the verdict."""
     path = flight.trajectory
     before: NDArray[np.float64] = path.position[path.time_us < flight.record.ended_us]
     return before
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Compare, and print what was found."""
+    """Compare, and print the results."""
     asked, console = tyro.cli(Comparison, args=words), new_console()
     deciding = dict(PAIRS)
     lines = None if asked.out is None else FlownLines(asked.out, COLUMNS)
@@ -136,7 +136,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def parted(pair: Pair, limit_mm: float) -> bool:
-    """Return whether two flights ended differently, or went further apart than the limit [mm]."""
+    """Return True if two flights ended differently, or deviated by more than the limit [mm]."""
     return pair.outcomes[0] != pair.outcomes[1] or pair.apart_mm > limit_mm
 
 
@@ -144,7 +144,7 @@ COLUMNS = (
     *("arena", "seed", "pybullet", "kernel", "samples_pybullet", "samples_kernel"),
     *("apart_mm", "landed_mm"),
 )
-"""Of the file, in which a line is a pair."""
+"""Columns of the file, one pair per line."""
 
 
 def row_of(pair: Pair) -> dict[str, object]:

@@ -4,8 +4,8 @@
     python scripts/px4_walk.py                              # ours
     python scripts/px4_walk.py --connect udpin://0.0.0.0:14540 --slow   # or a real PX4's
 
-Prints a line for each call, with the wall time that it took; exit status 1 when one answer differs.
-Calls that a real PX4 does not answer take seconds each, and are made with --slow.
+Prints a line for each call, with its wall time; exit status 1 if an answer differs. Calls that a
+real PX4 does not answer take seconds each, and require --slow.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tests.support.px4_walk.vehicle import Vehicle
 
 
 def main() -> int:
-    """Fly the walk. Returns the exit status."""
+    """Make the calls; return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--connect", default="udpin://127.0.0.1:14540", help="MAVSDK connection")
     parser.add_argument("--system", type=int, default=1, help="MAVLink system id of the vehicle")

@@ -1,12 +1,12 @@
-"""Fly the same flight over a box on a real PX4 and on the built-in autopilot, and compare heights.
+"""Comparison of height estimates over a box: a real PX4 and the built-in autopilot.
 
     python scripts/rangefinder_compared.py --px4-dir ~/PX4-Autopilot/build/px4_sitl_default
     python scripts/rangefinder_compared.py --px4-dir ... --parameters EKF2_HGT_REF=2 EKF2_RNG_CTRL=2
 
-Both are told the same by MAVLink, in simulated time: climb to 2.5 m, 12 m north over a box that is
-1 m high, and land. What they say of the ground below (ALTITUDE.bottom_clearance) and of their
-height (LOCAL_POSITION_NED) is held against the truth wherever the ray meets floor or box by 0.5 m
-or more. A line for each flight.
+Both receive the same MAVLink commands, in simulated time: climb to 2.5 m, 12 m north over a box of
+1 m height, and land. Their estimates of the ground below (ALTITUDE.bottom_clearance) and of height
+(LOCAL_POSITION_NED) are compared with the truth if the ray meets floor or box 0.5 m or more from an
+edge. Prints a line for each flight.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from firmware_sim.simulation import EpisodeSetup
 BOX_NORTH_M, BOX_HALF_M, BOX_HIGH_M = 6.0, 1.5, 1.0
 FLOWN_AT_M, WAY_M, SPEED_M_S = 2.5, 12.0, 1.0
 EDGE_M = 0.5
-"""So near to an edge of the box nothing is compared: a tilted ray may meet the other side."""
+"""Excluded distance from an edge of the box, because a tilted ray may meet the other side."""
 CLIMB_S, HOVER_S, LIMIT_S = 8.0, 3.0, 60.0
 SETPOINT_US, COMMAND_US = US_PER_S // 20, US_PER_S
 PLACE_AND_YAW = 0b1001_1111_1000
@@ -47,48 +47,48 @@ US = (255, 190)
 
 @dataclass(frozen=True)
 class Asked:
-    """Compare what is estimated by a rangefinder."""
+    """Compare the estimates with a rangefinder."""
 
     px4_dir: Path | None = None
-    """A real PX4; left out: the built-in autopilot alone."""
+    """Build folder of a real PX4; None = the built-in autopilot alone."""
 
     vehicle: str = "quad-indoor"
-    """Who flies."""
+    """Vehicle profile."""
 
     seeds: int = 3
-    """Flights of each."""
+    """Flights of each autopilot."""
 
     seed: int = 1
     """First seed."""
 
     parameters: tuple[str, ...] = field(default=())
-    """Set on both, as NAME=VALUE."""
+    """Parameters for both, as NAME=VALUE."""
 
     faults: tuple[str, ...] = field(default=())
-    """What fails on both, as "rangefinder stuck at 12s"."""
+    """Faults for both, as "rangefinder stuck at 12s"."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a flight showed; errors are estimated less true."""
+    """Result of a flight; errors are estimated minus true."""
 
     over_floor_m: float
-    """Mean of bottom_clearance over the floor, less the true height there."""
+    """Mean of bottom_clearance over the floor, minus the true height."""
     over_box_m: float
-    """The same over the box."""
+    """Mean of bottom_clearance over the box, minus the true height."""
     clearance_rms_m: float
     height_rms_m: float
-    """Of local z, from its value on the ground on."""
+    """RMS error of local z, from its value on the ground."""
     known: float
-    """Share of ALTITUDE that told a clearance, in flight."""
+    """Share of ALTITUDE messages with a clearance, in flight."""
     landing_s: float
-    """From the command to land until it was disarmed; NaN = not within a minute."""
+    """Time from the land command to disarming; NaN = not within a minute."""
     crawl_m_s: float
     """Mean true speed of descent between 0.6 and 0.2 m above the ground."""
 
 
 def arena() -> Arena:
-    """Return a room with one box in it."""
+    """Return a room with one box."""
     return Arena(
         "one-box",
         0,
@@ -106,7 +106,7 @@ def arena() -> Arena:
 
 
 class Flight:
-    """One flight, told what to do by MAVLink."""
+    """Flight controlled by MAVLink."""
 
     def __init__(self, vehicle: VehicleProfile, aircraft: Aircraft, seed: int) -> None:
         pacing = Unpaced()
@@ -122,10 +122,10 @@ class Flight:
         self._z: float = math.nan
         self._z0: float = math.nan
         self._rows: list[tuple[int, float, float, float, float]] = []
-        """Time [µs], true north and down, local z less that on the ground, clearance [m]."""
+        """Time [µs], true north and down, local z minus its value on the ground, clearance [m]."""
 
     def fly(self) -> Found:
-        """Fly it."""
+        """Fly the flight; return its result."""
         firmware = self._firmware
         try:
             firmware.load(self._setup, None, 0)
@@ -179,12 +179,12 @@ class Flight:
             row = (self._now_us, north, down, self._z - self._z0, message.bottom_clearance)
             self._rows.append(row)
 
-    # --- what it is told
+    # --- commands
 
     def _take_off(self) -> None:
         if self._now_us % COMMAND_US < SETPOINT_US:
             if not self._is_real and (place := self._setup.vehicle.told_origin) is not None:
-                # A real PX4 has been told by whoever watches it boot.
+                # A real PX4 gets its origin from the observer of its boot.
                 degrees = round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7)
                 height_mm = round(place.altitude_m * 1e3)
                 self._send(dialect.MAVLink_set_gps_global_origin_message(1, *degrees, height_mm, 0))
@@ -224,7 +224,7 @@ class Flight:
         firmware = self._firmware
         self._end.deliver(frame, lambda: firmware.flight_stack.receive(self._now_us), echo=False)
 
-    # --- what it showed
+    # --- results
 
     def _found(self, aloft: int, landing_s: float) -> Found:
         rows = np.array(self._rows)
@@ -266,7 +266,7 @@ def changed(vehicle: VehicleProfile, words: Sequence[str]) -> VehicleProfile:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Compare, and print what was found."""
+    """Compare, and print the results."""
     asked, console = tyro.cli(Asked, args=words), new_console()
     vehicle = changed(load_vehicle(asked.vehicle), asked.parameters)
     failing = {"faults": asked.faults}

@@ -1,9 +1,9 @@
-"""Two Ray nodes on one machine, one of which is killed: the flights stay the same.
+"""Flights on two Ray nodes of one machine stay equal if one node is killed.
 
     sudo python scripts/ray_two_nodes.py [--episodes 24] [--out DIR]
 
-Makes two network namespaces joined by a veth pair, starts a Ray head in one and a Ray node in the
-other, and runs a lockstep evaluation and a small sweep over both. On the way every process of the
+Creates two network namespaces joined by a veth pair, starts a Ray head in one and a Ray node in the
+other, and runs a lockstep evaluation and a small sweep over both. During each, every process of the
 second node is killed (kill -9); in between it joins again. Afterwards it compares with the same
 work done by worker processes: SHA-256 of every flight and of every trained policy, no episode lost,
 none twice. Needs Linux, root, iproute2 and `pip install 'airl-mav[sim,train,ray]'`.
@@ -49,10 +49,10 @@ RAY = {
     "RAY_AUTH_MODE": "token",
     "RAY_AUTH_TOKEN": secrets.token_hex(32),
 }
-"""Of this cluster: its machines, and nobody else, know its token."""
+"""Environment of this cluster: only its machines know the token."""
 PATIENCE_S = 200.0
 STEPS = 2_000
-"""Decisions of each training: long enough to be killed in."""
+"""Decisions of each training: long enough for a kill."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def lockstep_cell(episodes: int) -> Cell:
 
 
 def work(what: str, out: Path, episodes: int, address: str | None) -> int:
-    """Fly the evaluation or carry out the sweep; return the exit status."""
+    """Fly the evaluation or run the sweep; return the exit status."""
     settings = ExecutorSettings(workers=2)
     if address is not None:
         settings = ExecutorSettings(executor="ray", ray_address=address)
@@ -107,7 +107,7 @@ def ip(*words: str) -> str:
 
 @contextmanager
 def namespaces() -> Iterator[tuple[str, str]]:
-    """Make two network namespaces that see nothing but each other."""
+    """Create two network namespaces connected only to each other."""
     names = f"airl-a{os.getpid()}", f"airl-b{os.getpid()}"
     links = f"va{os.getpid()}", f"vb{os.getpid()}"
     with ExitStack() as stack:
@@ -164,7 +164,7 @@ def ray_start(namespace: str, address: str, log: Path) -> subprocess.Popen[bytes
 
 
 def at_work(namespace: str) -> bool:
-    """Return whether a process of a namespace carries out a job."""
+    """Return True if a process of a namespace executes a job."""
     for pid in pids(namespace):
         with suppress(OSError):
             if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::_carry_out"):
@@ -209,7 +209,7 @@ def over_two_nodes(command: Command, console: Console) -> None:
 
 
 def on_the_head(what: str, out: str, episodes: int) -> None:
-    """Do some work from the head's namespace, as soon as the cluster has two nodes."""
+    """Do some work from the head's namespace, once the cluster has two nodes."""
     when_both_are_there()
     sys.exit(work(what, Path(out), episodes, f"{HEAD}:{PORT}"))
 
@@ -230,7 +230,7 @@ def when_both_are_there() -> None:
     raise SystemExit("the two nodes did not find each other")
 
 
-# --- what came out
+# --- results
 
 
 def lines(path: Path) -> int:
@@ -238,7 +238,7 @@ def lines(path: Path) -> int:
 
 
 def flights(out: Path) -> dict[int, str]:
-    """Return the digest of each flight by its index; ends if one is there twice."""
+    """Return the digest of each flight by its index; exit on duplicates."""
     found: dict[int, str] = {}
     for line in (out / "lockstep" / "episodes.jsonl").read_text().splitlines():
         record = json.loads(line)

@@ -1,11 +1,11 @@
-r"""The pictures of the report in the documentation, as Chromium shows them.
+r"""Pictures of the report for the documentation, rendered by Chromium.
 
     airl evaluate static-obstacles --level lockstep --computer ras-pi-4 --workload template-5x32 \
         --episodes 20 --out RUN
     airl report RUN
     python scripts/report_pictures.py RUN    # writes docs/images/rehearsal.png and report.png
 
-The first is the first screen, the second the worst flight and how it followed its commands.
+The first shows the first screen, the second the worst flight with commands and motion.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ WAIT_S = 120.0
 
 
 def main() -> None:
-    """Write the pictures of a run that has its report."""
+    """Write the pictures of a run that has a report."""
     page_file = Path(sys.argv[1]).resolve() / "report.html"
     with (
         tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def wait_until_drawn(page: Page) -> None:
-    """Wait for the page's script; exit where it does not come to its end."""
+    """Wait for the page's script; exit on timeout."""
     deadline = time.monotonic() + WAIT_S
     while not page.evaluate("performance.getEntriesByName('drawn').length"):
         if time.monotonic() > deadline:

@@ -1,12 +1,11 @@
-"""What passes between a velocity setpoint and the velocity: the vehicle's part of it, taken apart.
+"""Delays of the vehicle between a velocity setpoint and the velocity.
 
     python scripts/response_taken_apart.py [--flights 10] [--out DIR]
 
-The built-in autopilot hovers on the shipped quad and accepts a step of its velocity setpoint, to
-the north or upwards. Nothing is transported: time counts from the tick that accepts the setpoint,
-and the truth is looked at with every tick of 4 ms. Prints how long the vehicle takes to tilt, to
-move, and until its own estimate shows it, mean over the flights. Leaves table.json, which
-results.py publishes.
+The built-in autopilot hovers on the built-in quad and accepts a step of its velocity setpoint, to
+the north or upwards. There is no transport: time counts from the tick that accepts the setpoint,
+and the truth is sampled at every tick of 4 ms. Prints the time until the vehicle tilts, moves, and
+shows it in its estimate, mean over the flights. Writes table.json, which results.py publishes.
 """
 
 from __future__ import annotations
@@ -34,28 +33,28 @@ from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 STEPS = {"north": np.array([2.0, 0.0, 0.0]), "up": np.array([0.0, 0.0, -2.0])}
-"""Velocity setpoints NED [m/s], from standing still."""
+"""Velocity setpoints NED [m/s], from a hover."""
 
 ALTITUDE_M, SETTLE_S, WATCHED_S = 5.0, 6.0, 2.0
 EVERY_US = 50_000
-"""MAVSDK repeats its setpoint at 20 Hz."""
+"""Period of MAVSDK's setpoints: 20 Hz [µs]."""
 TILTED_DEG, MOVED_M_S = 1.0, 0.05
-"""What counts as a reaction; the velocity is that of `airl conformance`."""
+"""Reaction thresholds; the velocity is from `airl conformance`."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """Take the response apart."""
+    """Measure the response stages."""
 
     flights: int = 10
-    """Of each step, by seed."""
+    """Flights of each step, by seed."""
 
     out: Path = Path("runs/response-taken-apart")
-    """Where table.json goes."""
+    """Folder of table.json."""
 
 
 class Vehicle:
-    """The simulated vehicle and its autopilot, tick by tick."""
+    """Simulated vehicle and its autopilot, stepped by ticks."""
 
     def __init__(self, seed: int) -> None:
         setup = EpisodeSetup(load_vehicle("quad"), None, seed)
@@ -69,7 +68,7 @@ class Vehicle:
         self.simulation.close()
 
     def command(self, velocity: NDArray[np.float64]) -> None:
-        """Offer a velocity NED [m/s] with the next tick and at 20 Hz from then on."""
+        """Send a velocity NED [m/s] with the next tick and at 20 Hz after."""
         self._velocity, self._next_us = velocity, self.simulation.time_us
 
     def tick(self) -> None:
@@ -93,7 +92,7 @@ class Vehicle:
             self.tick()
 
     def hover(self) -> None:
-        """Take off, and stand still in Offboard."""
+        """Take off, and hover in Offboard."""
         self.until(lambda: self.autopilot.flight.phase > 0)
         accepted = [self.autopilot.arm(force=False), self.autopilot.takeoff(ALTITUDE_M)]
         self.until(lambda: self.autopilot.flight.mode is Mode.HOLD)
@@ -112,7 +111,7 @@ class Vehicle:
 
 
 def taken_apart(step: NDArray[np.float64], seed: int) -> list[float]:
-    """Return when tilt, true velocity, its half and estimated velocity came [ms]; NaN: never."""
+    """Return the times of tilt, true velocity, its half and estimated velocity [ms]; NaN: never."""
     with closing(Vehicle(seed)) as vehicle:
         vehicle.hover()
         way, size = step / np.linalg.norm(step), float(np.linalg.norm(step))

@@ -1,11 +1,11 @@
-"""Published results: fly what is out of date, and write pages and cards from it.
+"""Published results: fly outdated ones, and write pages and cards.
 
-python scripts/results.py fingerprint            # does this code fly as the one of the results?
-python scripts/results.py fingerprint --accept   # yes, it flies otherwise, and that is meant
-python scripts/results.py list                   # what is published, and what is out of date
-python scripts/results.py fly [NAME ...]         # fly again what is; hours for all
+python scripts/results.py fingerprint            # does this code fly as the results' code?
+python scripts/results.py fingerprint --accept   # accept a changed behaviour
+python scripts/results.py list                   # published and outdated results
+python scripts/results.py fly [NAME ...]         # repeat outdated results; hours for all
 python scripts/results.py fly --quick [NAME ...] # few flights, minutes; never published
-python scripts/results.py collect NAME DIR       # take a result from a folder flown elsewhere
+python scripts/results.py collect NAME DIR       # import a result from another folder
 python scripts/results.py docs [--check]         # write pages and cards from results/*.json
 """
 
@@ -19,7 +19,7 @@ from typing import TextIO
 
 ROOT = Path(__file__).resolve().parent.parent
 if str(ROOT) not in sys.path:
-    # So that this checkout flies, whatever is installed.
+    # Use this checkout instead of an installed version.
     sys.path.insert(0, str(ROOT))
 
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, EXIT_USAGE, UsageError  # noqa: E402
@@ -43,7 +43,7 @@ from published.record import (  # noqa: E402
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Carry out a command line; return the exit status."""
+    """Execute a command line; return the exit status."""
     options = _parser().parse_args(words)
     try:
         code: int = options.run(options)
@@ -56,7 +56,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def fingerprint(options: argparse.Namespace) -> int:
-    """Fly the fingerprint, and compare it or write it down."""
+    """Fly the behaviour flights, and compare or store them."""
     if options.accept:
         flown = fly_behaviour()
         write_behaviour(BEHAVIOUR_FILE, flown)
@@ -73,7 +73,7 @@ def fingerprint(options: argparse.Namespace) -> int:
 
 
 def show(options: argparse.Namespace) -> int:
-    """Say what is published, and what is out of date."""
+    """Print the published results and their status."""
     del options
     for declared in read_declared().values():
         why = why_out_of_date(declared)
@@ -82,7 +82,7 @@ def show(options: argparse.Namespace) -> int:
 
 
 def fly(options: argparse.Namespace) -> int:
-    """Fly what is out of date, once it is known that today's code is that of the fingerprint."""
+    """Fly outdated results, after a check that today's code has the stored behaviour."""
     asked = _named(options.names)
     if found := behaviour_differs(BEHAVIOUR_FILE):
         raise UsageError(
@@ -99,14 +99,14 @@ def fly(options: argparse.Namespace) -> int:
 
 
 def take(options: argparse.Namespace) -> int:
-    """Take a result from a folder in which its command was flown."""
+    """Import a result from the output folder of its command."""
     (declared,) = _named([options.name])
     say(_short(take_result(declared, options.folder, options.behaviour or behaviour_today())))
     return 0
 
 
 def docs(options: argparse.Namespace) -> int:
-    """Write pages and cards, or say which are not as the results are."""
+    """Write pages and cards, or list the outdated ones."""
     records = all_records()
     if not options.check:
         for path in write_all(records):
@@ -123,7 +123,7 @@ def docs(options: argparse.Namespace) -> int:
 
 
 def say(line: str, to: TextIO | None = None) -> None:
-    """Print a line at once: commands that fly print between."""
+    """Print a line immediately, because child commands print in between."""
     print(line, file=to or sys.stdout, flush=True)
 
 

@@ -1,12 +1,12 @@
-"""Does the flight controller's memory stay flat? Flies `airl-firmware` for a simulated day.
+"""Memory soak test of the flight controller: a simulated day of `airl-firmware`.
 
     python scripts/soak.py --hours 24
 
-The program itself, alone, as fast as it goes: a vehicle with a pack of a thousand ampere hours
-takes off and is sent from place to place by a client, which also downloads parameters, lists logs
-and files, changes rates and uploads missions all the while. Writes a line of JSON for each half an
-hour: resident memory, open files, threads, and what the client got. Exit status 1 when the memory
-after the first hour grows by more than is allowed, the vehicle comes down, or nobody answers.
+Runs the program alone, as fast as possible: a vehicle with a pack of a thousand ampere hours takes
+off and is sent to changing positions by a client, which also downloads parameters, lists logs and
+files, changes rates and uploads missions. Writes a line of JSON every half hour: resident memory,
+open files, threads, and the client's message counts. Exit status 1 if the memory grows after the
+first hour by more than allowed, the vehicle comes down, or the firmware stops answering.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from firmware_sim.mavlink.codec import dialect
 
 HOUR_S = 3_600.0
 EVERY_S = 0.5 * HOUR_S
-"""Between two lines [simulated s]."""
+"""Interval between two lines [simulated s]."""
 SETTLED_S = HOUR_S
-"""When all that is allocated once has been: caches, kernels, the first lists [simulated s]."""
+"""Time until one-time allocations are complete: caches, kernels, the first lists [simulated s]."""
 
 ALTITUDE_M = 30.0
 RADIUS_M = 15.0
 SILENT_S = 300.0
-"""Nobody answers: the soak has failed [wall s]."""
+"""Timeout without answers, after which the soak fails [wall s]."""
 
 Said = Any
-"""A MAVLink message."""
+"""MAVLink message."""
 
 
 @dataclass(frozen=True)
 class Soak:
-    """Fly airl-firmware for long, and see whether its memory stays flat."""
+    """Fly airl-firmware for a long time, and check for memory growth."""
 
     hours: float = 24.0
     """Simulated time [h]."""
@@ -55,14 +55,14 @@ class Soak:
     """Instance number, which moves the ports."""
 
     allowed_mb: float = 4.0
-    """How much the resident memory may grow after the first hour [MB]."""
+    """Maximum growth of the resident memory after the first hour [MB]."""
 
     out: Path = Path("soak.jsonl")
-    """Where the lines go."""
+    """Output file of the lines."""
 
 
 class Client:
-    """A ground station that never rests."""
+    """Ground station with continuous requests."""
 
     def __init__(self, instance: int) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -75,7 +75,7 @@ class Client:
         self.boot_s = 0.0
         """Simulated time of the newest message [s]."""
         self.altitude_m = 0.0
-        """Above home."""
+        """Altitude above home [m]."""
         self.home: tuple[int, int, int] | None = None
         """Latitude and longitude [1e-7 deg], altitude [mm]."""
         self.heard = time.monotonic()
@@ -92,7 +92,7 @@ class Client:
         self.send(dialect.MAVLink_command_long_message(*self._ids, number, 0, *filled))
 
     def listen(self) -> None:
-        """Take what has come."""
+        """Process received messages."""
         while True:
             try:
                 data = self._socket.recv(4_096)
@@ -114,7 +114,7 @@ class Client:
             self._send_item(message.seq)
 
     def work(self) -> None:
-        """Do what is next in turn."""
+        """Execute the next request in turn."""
         self._turn += 1
         self.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
         turn = self._turn % 11
@@ -138,7 +138,7 @@ class Client:
             name = b"MPC_XY_VEL_MAX"
             self.send(dialect.MAVLink_param_set_message(*ids, name, value, 9))
         elif turn == 7:
-            # Refused with a text and an event, each time another one.
+            # Rejected with a text and an event, each time a different one.
             self.command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 2.0 + self._turn % 1000)
         elif turn == 8:
             self.send(dialect.MAVLink_request_event_message(*ids, 0, 0xFFFF))
@@ -178,7 +178,7 @@ class Client:
 
 
 def tireless(folder: Path) -> Path:
-    """Write a vehicle whose pack lasts for days; return its file."""
+    """Write a vehicle with a pack for days; return its file."""
     path = folder / "tireless.toml"
     path.write_text('base = "quad"\n[battery]\ncapacity_mah = 1_000_000.0\n', encoding="utf-8")
     return path
@@ -194,12 +194,12 @@ def memory_mb(pid: int) -> float:
 
 
 def entries(pid: int, folder: str) -> int:
-    """Return how much a folder of a process in /proc holds."""
+    """Return the number of entries in a folder of a process in /proc."""
     return sum(1 for _ in Path(f"/proc/{pid}", folder).iterdir())
 
 
 def line_of(pid: int, client: Client, wall_s: float) -> dict[str, float | int]:
-    """Return what there is to say of a moment."""
+    """Return the figures of the current moment."""
     got = client.got
     return {
         "simulated_h": round(client.boot_s / HOUR_S, 3),
@@ -215,7 +215,7 @@ def line_of(pid: int, client: Client, wall_s: float) -> dict[str, float | int]:
 
 
 def verdict(lines: list[dict[str, float | int]], allowed_mb: float) -> str | None:
-    """Return what is wrong, None if nothing is."""
+    """Return the problem, or None."""
     settled = [line for line in lines if line["simulated_h"] * HOUR_S >= SETTLED_S]
     if len(settled) < 2:
         return "less than an hour and a half was flown"
@@ -230,7 +230,7 @@ def verdict(lines: list[dict[str, float | int]], allowed_mb: float) -> str | Non
 
 
 def main(asked: Soak) -> int:
-    # However it is ended, the vehicle ends with it.
+    # The vehicle ends with this program in any case.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
     lines: list[dict[str, float | int]] = []
@@ -248,7 +248,7 @@ def main(asked: Soak) -> int:
         try:
             while client.boot_s < asked.hours * HOUR_S:
                 client.work()
-                for _ in range(50):  # often enough that the socket's buffer does not overflow
+                for _ in range(50):  # Frequent reads prevent an overflow of the socket's buffer
                     client.listen()
                     time.sleep(0.002)
                 now = time.monotonic()

@@ -1,12 +1,12 @@
-"""Rehearse beside busy processes: is a flight that the host disturbed ever counted, or dropped?
+"""Rehearsals beside busy processes: disturbed flights must be neither counted nor dropped.
 
     python scripts/validity_under_load.py --runs 20 --episodes 5 --busy 8 --speed 4
 
-Flies runs of `airl-sitl`, each on seeds of its own, while other processes keep all cores busy;
-further options are handed to it. A run keeps the rule if it exits with 0 and all its flights are
-there and valid, or exits with another status and says why: 4 names every flight that stayed
-invalid, 1 what was lost. Prints a line for each run; exit status 0 when all keep the rule. The busy
-processes end with this one, however it ends.
+Flies runs of `airl-sitl`, each on separate seeds, while other processes keep all cores busy;
+additional options are passed on. A run keeps the rule if it exits with 0 and all its flights are
+present and valid, or exits with another status and reports the reason: 4 names every flight that
+stayed invalid, 1 the loss. Prints a line for each run; exit status 0 if all keep the rule. The busy
+processes always end with this one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from airl_mav.rehearsal.run_folder import RUN_FILE
 
 @dataclass(frozen=True)
 class UnderLoad:
-    """Rehearse beside busy processes, and see that no disturbed flight is counted or dropped."""
+    """Rehearse beside busy processes, and check that no disturbed flight is counted or dropped."""
 
     runs: int = 20
     """Runs of airl-sitl, one after the other."""
@@ -41,7 +41,7 @@ class UnderLoad:
     """Flights of each."""
 
     busy: int = 8
-    """Processes beside it that never wait."""
+    """Number of parallel busy processes."""
 
     speed: float = 4.0
     """Simulated seconds per wall second."""
@@ -71,7 +71,7 @@ def main() -> int:
 
 
 def rehearse(asked: UnderLoad, number: int, more: Sequence[str]) -> tuple[list[str], str]:
-    """Fly a run; return its line of the table, and how it breaks the rule."""
+    """Fly a run; return its table row, and its violation of the rule."""
     out, seed = asked.out / f"{number:02d}", 1 + number * asked.episodes
     words = [sys.executable, "-m", "airl_mav.cli.sitl", f"--episodes={asked.episodes}"]
     words += [f"--seed={seed}", f"--speed={asked.speed}", f"--out={out}", *more]
@@ -92,7 +92,7 @@ def rehearse(asked: UnderLoad, number: int, more: Sequence[str]) -> tuple[list[s
 def problem(
     code: int, said: str, flown: Sequence[EpisodeRecord], episodes: int, rate: Estimate
 ) -> str:
-    """Return how a run breaks the rule; empty: it keeps it."""
+    """Return the violation of the rule; empty: none."""
     invalid = [each for each in flown if each.invalid]
     # The terminal's lines are wrapped.
     said = " ".join(said.split())

@@ -1,10 +1,10 @@
-"""The pictures of the live view in the documentation, as Chromium shows them.
+"""Pictures of the live view for the documentation, rendered by Chromium.
 
     python scripts/view_pictures.py        # writes docs/images/view.png and view.gif
 
-Rehearsals in lockstep fly with --view, and a headless Chromium watches. For the picture it pauses
-one in the middle of the way to the goal. For the film it flies slowly: a browser without a GPU
-draws some frames a second. There the latency is set to 400 ms by hand, and compensated later.
+Rehearsals in lockstep fly with --view, and a headless Chromium shows them. The picture pauses a
+flight halfway to the goal. The film's flight is slow, because a browser without a GPU draws only
+some frames a second. There the latency is set to 400 ms in the view, and compensated later.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ FLIGHT = (
 LATE = ("--computer", "ras-pi-4", "--workload", "template-5x32", "--compensate")
 
 PAUSE_S = 14.5
-"""When the flight of the picture is paused [simulated s]."""
+"""Pause time of the picture's flight [simulated s]."""
 
 SIZE = (1280, 800)
 COLOURS = 256
-"""Of the picture's palette: more are not seen, and weigh."""
+"""Palette size of the picture: more colours are invisible, and increase the file."""
 
 SETTLE_S = 4.0
-"""What a browser that draws without a GPU needs to draw all [wall s]."""
+"""Time for a browser without a GPU to draw all [wall s]."""
 
 SLOWLY = 0.15
-"""Pace of the film's flight [simulated s a wall s]."""
+"""Speed of the film's flight [simulated s per wall s]."""
 
 FILM_SIZE, FILM_WIDTH, FILM_COLOURS = (1060, 880), 600, 64
-"""Of the page, and what becomes of it."""
+"""Size of the page, and width and colours of the film."""
 
 FROM_S, LATE_S, COMPENSATED_S, TO_S = 11.2, 12.2, 15.2, 19.5
-"""When the film begins, the latency is set, compensation is switched on, and the film ends."""
+"""Times of the film's start, the latency setting, the compensation and the film's end."""
 
 FRAME_S = 0.14
-"""Least time between two frames [simulated s]."""
+"""Minimum time between two frames [simulated s]."""
 
 
 def main() -> None:
@@ -74,7 +74,7 @@ def main() -> None:
 
 
 def film(page: Page) -> io.BytesIO:
-    """Return the film: each frame stands as long as it was in the flight."""
+    """Return the film, with each frame's duration from the flight."""
     wait_until_flown(page, FROM_S)
     due = {LATE_S: "Set t2 by hand", COMPENSATED_S: "Compensate"}
     frames: list[Image.Image] = []
@@ -102,7 +102,7 @@ def film(page: Page) -> io.BytesIO:
 
 @contextmanager
 def page_of(words: tuple[str, ...], size: tuple[int, int]) -> Iterator[Page]:
-    """Fly a rehearsal for a while and give the page that shows it."""
+    """Fly a rehearsal for the context's duration and yield the page that shows it."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         printed = folder / "printed.txt"
@@ -118,7 +118,7 @@ def page_of(words: tuple[str, ...], size: tuple[int, int]) -> Iterator[Page]:
                 while not page.press("Go on"):
                     time.sleep(0.2)
                 time.sleep(SETTLE_S)
-                # It says that there is no GPU here.
+                # Dismisses the note on the missing GPU.
                 page.evaluate("document.querySelector('[role=alert] button')?.click()")
                 yield page
             finally:
@@ -137,19 +137,19 @@ def address(printed: Path, flight: subprocess.Popen[bytes]) -> str:
 
 
 def seconds(page: Page) -> float:
-    """Return how much of the flight is flown, as the page shows it [simulated s]."""
+    """Return the flown time shown by the page [simulated s]."""
     told = re.search(r"^time\s+([\d.]+) s", page.text(), re.M)
     return float(told[1]) if told else 0.0
 
 
 def wait_until_flown(page: Page, flown_s: float) -> None:
-    """Return when so much of the flight is flown [simulated s]."""
+    """Wait until this much of the flight is flown [simulated s]."""
     while seconds(page) < flown_s:
         time.sleep(0.05)
 
 
 def shot(page: Page) -> Image.Image:
-    """Return what is seen now."""
+    """Return the current screenshot."""
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "page.png"
         page.screenshot(path)

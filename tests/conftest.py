@@ -46,13 +46,13 @@ settings.register_profile("thorough", deadline=None, max_examples=3000)
 settings.load_profile("kernels")
 
 
-# What is imported and collected stays to the end: the collector of garbage would go through it, a
-# million objects, again and again, for a third of the time of collecting the tests.
+# Imported and collected objects live until exit. Without this, the garbage collector scans a
+# million of them repeatedly, a third of the collection time.
 gc.disable()
 
 
 def pytest_collection_finish() -> None:
-    """Let garbage be collected of what the tests make, more seldom: most of it has no cycles."""
+    """Collect the tests' garbage again, at higher thresholds: most garbage has no cycles."""
     gc.freeze()
     gc.set_threshold(5_000, 10, 10)
     gc.enable()
@@ -60,11 +60,11 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep the tests of a module on one worker: what they share is made once.
+    """Keep the tests of a module on one worker: module fixtures are created once.
 
-    Tests that name a group of their own fly in real time, the longest of all: they begin.
-    A machine that stands still for a second alters such a flight, so that what fails among them
-    and among the slow ones is run once more; the summary lists it (RERUN).
+    Tests with a custom group fly in real time and take longest: they run first. A machine that
+    stalls for a second alters such a flight. Failures of these tests and of slow tests are
+    therefore retried once; the summary lists the retry (RERUN).
     """
     named = [item.get_closest_marker("xdist_group") is not None for item in items]
     for item, group in zip(items, named, strict=True):
@@ -80,10 +80,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _operators_are_read_once() -> Iterator[None]:
-    """Keep torch's table of operators: each export reads it anew from onnxscript's sources.
+    """Cache torch's operator table: each export parses onnxscript's sources again.
 
-    That is half of the time of exporting a small network. Nobody who has not loaded torch by now
-    exports any in this process.
+    Parsing takes half of the time of exporting a small network. A process that has not loaded torch
+    by now exports no network.
     """
     if "torch" not in sys.modules:
         yield
@@ -99,11 +99,11 @@ def _operators_are_read_once() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_worker_unless_asked() -> Iterator[None]:
-    """Let experiments in this process have one worker, itself, where a test asks for no number.
+    """Run experiments in this process with one worker unless a test requests a number.
 
-    Another one is a process that imports all and loads the kernels, for seconds; the tests keep the
-    cores busy without them. That the flights are the same is the subject of
-    test_evaluate_lockstep.py.
+    Another worker is a process that imports all modules and loads the kernels, for seconds. Tests
+    keep the cores busy without workers. test_evaluate_lockstep.py tests that workers do not change
+    flights.
     """
     from airl_mav.experiments import experiment, fly
     from airl_mav.experiments.process_executor import open_executor
@@ -120,6 +120,6 @@ def _one_worker_unless_asked() -> Iterator[None]:
 
 @pytest.fixture
 def px4_instance() -> Iterator[int]:
-    """Give an instance number of PX4's that no other test uses meanwhile."""
+    """Yield a PX4 instance number that is reserved for this test."""
     with reserved_instance() as instance:
         yield instance

@@ -1,1 +1,1 @@
-"""The environment generator: (spec, seed) -> a concrete arena with walls, obstacles and a goal."""
+"""Environment generator: (spec, seed) -> a concrete arena with walls, obstacles and a goal."""

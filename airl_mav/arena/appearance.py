@@ -1,4 +1,4 @@
-"""What a seed draws of an arena's appearance: a material for each surface, and the light."""
+"""Appearance drawn from a seed: a material for each surface, and the light."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TEXTURES: tuple[str, ...] = get_args(TextureName)
 """Texture of each number in `Finish.texture`."""
 
 SURFACES: tuple[str, ...] = get_args(SurfaceName)
-"""How the surfaces with each number in `Finish.surface` reflect."""
+"""Reflection model of each number in `Finish.surface`."""
 
 FLOOR, WALLS, OBSTACLE = 0, 1, 2
 """Rows of a `Finish`: obstacle i has row OBSTACLE + i."""
@@ -32,7 +32,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 class _Part(IntEnum):
-    """Independent draws of one appearance: a change of one kind leaves the others alone."""
+    """Independent draws of one appearance: changing one kind leaves the others unchanged."""
 
     SUN = 0
     SKY = 1
@@ -45,12 +45,12 @@ class _Part(IntEnum):
 
 @dataclass(frozen=True)
 class Finish:
-    """The materials of m surfaces: floor, walls, then the obstacles in their order."""
+    """Materials of m surfaces: floor, walls, then the obstacles in their order."""
 
     texture: NDArray[np.int8]  # (m,) number in TEXTURES, or of an image: `image_number`
     albedo: Floats  # (m, 2, 3) linear RGB 0..1 where the texture is 0, and where it is 1
     size_m: Floats  # (m,) `Material.size_m`
-    offset: Floats  # (m, 2) where the pattern begins, in its periods, 0..1
+    offset: Floats  # (m, 2) offset of the pattern in its periods, 0..1
     surface: NDArray[np.int8]  # (m,) number in SURFACES
     roughness: Floats  # (m,) `Material.roughness`
     images: tuple[ImageFile, ...] = ()
@@ -62,21 +62,21 @@ class Finish:
 
 @dataclass(frozen=True)
 class Statics:
-    """What the primitives that stand belong to, where some are parts of one asset."""
+    """Owners of the static primitives, where some are parts of one asset."""
 
-    names: tuple[str, ...]  # (k,) a shape's or an asset's, of each thing that stands
+    names: tuple[str, ...]  # (k,) name of the shape or asset of each owner
     of: Annotated[NDArray[np.int64], ArrayField(np.int64)]
-    """(n_static,) the thing that each primitive is a part of, ascending."""
-    materials: tuple[str | None, ...]  # (n_static,) None: the one that is drawn for the thing
+    """(n_static,) index of the owner of each primitive, ascending."""
+    materials: tuple[str | None, ...]  # (n_static,) None = the owner's drawn material
 
     def name_of(self, i: int) -> str:
-        """Return what primitive i is a part of."""
+        """Return the name of the owner of primitive i."""
         return self.names[int(self.of[i])]
 
 
 @dataclass(frozen=True)
 class Inside:
-    """What surfaces below a ceiling get of its light, in the mean."""
+    """Mean irradiance of surfaces below a ceiling."""
 
     floor: Floats  # (3,) linear RGB irradiance of the floor
     walls: Floats  # (3,) the same of upright surfaces
@@ -91,13 +91,13 @@ class Light:
     zenith: Floats  # (3,) linear RGB of the sky overhead, as an image shows it
     horizon: Floats  # (3,) the same at the horizon; the colour of fog
     extinction: float
-    """Of fog [1/m]."""
+    """Extinction coefficient of fog [1/m]."""
     inside: Inside | None = None
-    """None: there is no ceiling. Else zenith and horizon are what it looks like, and no sun is."""
+    """Light below a ceiling, which zenith and horizon show, without a sun; None = no ceiling."""
 
     @property
     def sky(self) -> Floats:
-        """Linear RGB irradiance (3,) of a level surface by the whole sky.
+        """Linear RGB irradiance (3,) of a level surface from the sky.
 
         2 ∫ (horizon + (zenith - horizon) x) x dx over x, the sine of the elevation, 0 to 1.
         """
@@ -123,7 +123,7 @@ def draw_appearance(
     """Draw the appearance of an arena; deterministic.
 
     `appearance.period` consecutive seeds share their draws. `wall_colour` is the sRGB of the
-    material of that name, 0-255; `statics` are groups of static primitives, None = each on its own.
+    material of this name, 0-255; `statics` groups static primitives, None = each is separate.
     """
     draw = seed // appearance.period
     kinds: list[tuple[_Part, Surfaces, int]] = [
@@ -169,8 +169,8 @@ def _surfaces(
 ) -> tuple[Floats, ...]:
     """Draw n surfaces of a kind: texture, albedos, size, offset, ..., in the order of `Finish`.
 
-    Everything is drawn surface by surface, used or not, so that settings and counts do not change
-    other draws. The parts of a group share its draws.
+    All values are drawn for every surface, used or not, so that settings and counts do not change
+    other draws. The parts of a group share draws.
     """
     draws = rng.random((n, 7))
     materials = [appearance.material(name, wall_colour) for name in kind.materials]
@@ -201,7 +201,7 @@ def _surfaces(
 
 
 def image_number(k: int) -> int:
-    """Return the number of image k as a texture; its red, green and blue are three patterns."""
+    """Return the texture number of image k; its red, green and blue are three patterns."""
     return len(TEXTURES) + 3 * k
 
 
@@ -213,7 +213,7 @@ def _number(material: Material, appearance: Appearance) -> int:
 
 
 def _albedos(material: Material) -> Floats:
-    """Return both albedos (2, 3), linear RGB; of an image those of its black and its white."""
+    """Return both albedos (2, 3), linear RGB. An image has the albedos of its black and white."""
     if material.image is not None:
         return np.stack([np.zeros(3), linear_of(np.array(material.albedo) / 255.0)])
     second = material.albedo if material.albedo_2 is None else material.albedo_2

@@ -1,4 +1,4 @@
-"""Draw what stands where some of it is made of parts: which asset, its heading and its scale."""
+"""Draws of static obstacles with assets of several parts: asset, heading and scale."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from airl_mav.profiles.assets import Asset
 _BOX, _SPHERE = int(Shape.BOX), int(Shape.SPHERE)
 
 NUMBERS = 5
-"""Numbers that are drawn for each body."""
+"""Uniform numbers drawn for each body."""
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """n primitives that have no place yet. Fields as in Obstacles."""
+    """n primitives without a position. Fields as in Obstacles."""
 
     shape: NDArray[np.int8]  # (n,)
     half_size: Floats  # (n, 3) [m]
@@ -41,7 +41,7 @@ class Bodies:
         return len(self.shape)
 
     def at(self, places: Floats) -> Obstacles:
-        """Return obstacles that stand at `places` (n, 2) north, east [m]."""
+        """Return obstacles placed at `places` (n, 2) north, east [m]."""
         center = np.empty((len(self), 3))
         center[:, :2], center[:, 2] = places, -self.center_height
         return Obstacles(self.shape, center, self.half_size, self.yaw)
@@ -50,10 +50,10 @@ class Bodies:
 def draw_bodies(
     rng: np.random.Generator, n: int, kind: StaticObstacles, altitude_m: float
 ) -> Bodies:
-    """Draw n bodies, widest first because they are hardest to place; spheres cross `altitude_m`."""
+    """Draw n bodies, widest first as they are hardest to place; spheres cross `altitude_m`."""
     allowed = _shapes(kind.shapes)
     shape = allowed[rng.integers(len(allowed), size=n)]
-    # Drawn here: numba needs longer to take a generator than numpy to draw all of them.
+    # One numpy call is faster than passing a generator to numba.
     bodies = bodies_of(rng.random(NUMBERS * n), shape, kind, altitude_m)
     _widest_first(
         bodies.shape, bodies.half_size, bodies.yaw, bodies.center_height, bodies.bounding_half
@@ -64,7 +64,7 @@ def draw_bodies(
 def bodies_of(
     numbers: Floats, shape: NDArray[np.int8], kind: StaticObstacles, altitude_m: float
 ) -> Bodies:
-    """Return bodies of a shape (n,) as `numbers` (NUMBERS n,) make them; see `_size`."""
+    """Return bodies of a shape (n,) scaled from `numbers` (NUMBERS n,); see `_size`."""
     n = len(shape)
     half_size, yaw, center_height = np.empty((n, 3)), np.empty(n), np.empty(n)
     _size(
@@ -126,14 +126,14 @@ def _widest_first(
 
 @lru_cache
 def _shapes(names: tuple[str, ...]) -> NDArray[np.int8]:
-    """Return the numbers of shapes; looking up members by name is slow."""
+    """Return the numbers of shapes, cached: looking up enum members by name is slow."""
     return np.array([Shape[name.upper()] for name in names], np.int8)
 
 
 def generate_own(
     spec: ArenaSpec, seed: int, *, name: str, vehicle_width_m: float, zone: int | None
 ) -> Arena:
-    """Make a seed's arena with a custom generator, arguments as of `generate`; else UsageError."""
+    """Generate an arena with a custom generator; arguments as in `generate`. Raises UsageError."""
     make = plugins.load_part(plugins.GENERATORS, spec.generator)
     told = f"generator {spec.generator!r}, seed {seed}"
     try:
@@ -145,13 +145,13 @@ def generate_own(
         raise UsageError(f"{told}: makes {type(arena).__name__}; accepted: airl_mav's Arena")
     if (problem := _problem(arena)) is not None:
         raise UsageError(f"{told}: {problem}")
-    if arena.appearance == DEFAULT:  # The generator says nothing of it: the profile does.
+    if arena.appearance == DEFAULT:  # The generator set no appearance: use the profile's.
         return replace(arena, appearance=spec.appearance)
     return arena
 
 
 def _problem(arena: Arena) -> str | None:
-    """Return why nobody can fly in an arena; None: somebody can."""
+    """Return the first error of a custom arena, or None if it can be flown."""
     obstacles, b = arena.obstacles, arena.bounds
     n = len(obstacles)
     shapes = {"center": (n, 3), "half_size": (n, 3), "yaw": (n,)}
@@ -181,7 +181,7 @@ def _problem(arena: Arena) -> str | None:
 
 @dataclass(frozen=True)
 class _Seen:
-    """A mesh that cameras see of a thing."""
+    """A mesh that cameras render in place of an asset's primitives."""
 
     file: MeshFile
     yaw: float
@@ -190,21 +190,21 @@ class _Seen:
 
 @dataclass(frozen=True)
 class Things:
-    """n things that have no place yet, made of m primitives."""
+    """n obstacles without a position, made of m primitives."""
 
     parts: Bodies
-    """m primitives, those of a thing one after the other."""
-    offset: Floats  # (m, 2) of a primitive from its thing's place, north, east [m]
+    """m primitives, grouped by obstacle."""
+    offset: Floats  # (m, 2) of a primitive from its obstacle's position, north, east [m]
     statics: Statics
-    bounding_half: Floats  # (n, 2) half extents north, east about the thing's place [m]
-    seen: tuple[_Seen | None, ...]  # (n,) None: cameras see the primitives
+    bounding_half: Floats  # (n, 2) half extents north, east about the position [m]
+    seen: tuple[_Seen | None, ...]  # (n,) None = cameras render the primitives
 
     def at(self, places: Floats) -> Obstacles:
-        """Return the primitives of things that stand at `places` (n, 2) north, east [m]."""
+        """Return the primitives of obstacles placed at `places` (n, 2) north, east [m]."""
         return self.parts.at(places[self.statics.of] + self.offset)
 
     def meshes_at(self, places: Floats) -> tuple[PlacedMesh, ...]:
-        """Return the meshes of things that stand at `places` (n, 2) north, east [m]."""
+        """Return the meshes of obstacles placed at `places` (n, 2) north, east [m]."""
         ends = np.searchsorted(self.statics.of, np.arange(len(self.seen)), side="right").tolist()
         begins = [0, *ends[:-1]]
         return tuple(
@@ -218,7 +218,7 @@ class Things:
 
 @dataclass(frozen=True)
 class _Thing:
-    """One thing, of k primitives."""
+    """One obstacle of k primitives."""
 
     name: str
     parts: Bodies
@@ -228,13 +228,13 @@ class _Thing:
 
     @property
     def reach(self) -> Floats:
-        """Half extents (2,) north, east about its place [m]."""
+        """Half extents (2,) north, east about its position [m]."""
         reach: Floats = (np.abs(self.offset) + self.parts.bounding_half).max(axis=0)
         return reach
 
 
 def draw_things(rng: np.random.Generator, n: int, spec: ArenaSpec) -> Things:
-    """Draw n things of `spec.static.shapes`, widest first; assets take as many draws as shapes."""
+    """Draw n obstacles of `spec.static.shapes`, widest first; assets take equally many draws."""
     kinds = spec.static.shapes
     names = [kinds[i] for i in rng.integers(len(kinds), size=n).tolist()]
     numbers = rng.random(NUMBERS * n)

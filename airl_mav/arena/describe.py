@@ -1,4 +1,4 @@
-"""An arena as a table for people."""
+"""Description of an arena as a table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from airl_mav.profiles.arena import ArenaSpec
 
 
 def arena_table(arena: Arena, spec: ArenaSpec) -> Table:
-    """Return what is in the arena."""
+    """Return the contents of the arena as a table."""
     b = arena.bounds
     table = Table(title=f"{arena.name}, seed {arena.seed}", caption=spec.description)
     table.add_column("what")
@@ -63,13 +63,13 @@ def arena_table(arena: Arena, spec: ArenaSpec) -> Table:
 
 
 def _openings(arena: Arena) -> tuple[Floats, Floats]:
-    """Return the middles (k, 3) NED and half sizes (k, 3) [m] of the openings of gates."""
+    """Return the centres (k, 3) NED and half sizes (k, 3) [m] of the gates' openings."""
     openings = openings_of(arena)
     return openings.center, openings.half_size
 
 
 def _shapes(arena: Arena, *, moving: bool) -> str:
-    """Return how many obstacles of each kind there are: "7 (4 box, 3 sphere)"."""
+    """Return the number of obstacles by kind: "7 (4 box, 3 sphere)"."""
     n, statics = arena.n_static, arena.statics
     if statics is not None and not moving:
         counts = sorted(Counter(statics.names).items())
@@ -81,7 +81,7 @@ def _shapes(arena: Arena, *, moving: bool) -> str:
 
 
 def _speed_m_s(tour: Tour) -> float:
-    """Return the speed on the legs of a tour [m/s], stops left out; it was drawn once."""
+    """Return the constant speed of a moving obstacle between stops [m/s]."""
     length = np.hypot(*np.diff(tour.points, axis=0).T)
     moves = length > 0.0
     return float(length[moves].sum() / np.diff(tour.times_s)[moves].sum())

@@ -34,18 +34,18 @@ TEXT_COLOUR = "#3a3f45"
 STATIC_COLOURS = ("#5b6670", "#2f363d")
 MOVING_COLOURS = ("#f0932b", "#9c5a0c")
 OPENING, OPENING_COLOUR = "opening", "#cfe3f5"
-"""What is below and above the opening of a gate, or a door: from above, the way leads through."""
+"""Legend label and colour of boxes above and below gate openings, and of lintels above doors."""
 LOW_COLOUR, HIGH_COLOUR, CONTOUR_COLOUR = "#f2efe6", "#b39b6d", "#a08a5e"
-"""Of ground that hardly rises, of the highest, and of the lines of equal height."""
+"""Colours of the lowest and the highest ground, and of contour lines."""
 START_COLOUR = "#1f4e8c"
 GOAL_COLOUR = "#1b8a3f"
 ZONE_COLOUR = "#8d8a83"
 
 WALL_SHARE = 0.012
-"""Drawn thickness of the walls, of the longer side. Arenas have walls without thickness."""
+"""Drawn wall thickness as a share of the longer side. Simulated walls have no thickness."""
 
 ARROW_S = 2.0
-"""A moving obstacle's arrow ends where it would be after this time."""
+"""Prediction time [s] of a moving obstacle's arrow."""
 
 
 def draw_arena(
@@ -69,7 +69,7 @@ def draw_arena(
 
 
 def add_legend(figure: Figure, ax: Axes) -> None:
-    """Put the legend of `ax` below everything. The figure's layout must be "constrained"."""
+    """Add the legend of `ax` below the figure. The figure's layout must be "constrained"."""
     handles, labels = ax.get_legend_handles_labels()
     figure.legend(
         handles,
@@ -92,7 +92,7 @@ def save_png(
     goal_radius_m: float | None = None,
     zone_radii_m: Sequence[float] = (),
 ) -> None:
-    """Write a picture of the arena; the arguments are those of `draw_arena`."""
+    """Write a picture of the arena; arguments as in `draw_arena`."""
     b = arena.bounds
     tall = (b.north_max - b.north_min) / (b.east_max - b.east_min)
     width = 6.4 / max(1.0, tall / 1.4)
@@ -108,7 +108,7 @@ def save_png(
 
 
 def write_png(figure: Figure, path: Path, dpi: int = 150) -> None:
-    """Write a figure: never half a picture."""
+    """Write a figure atomically."""
     picture = io.BytesIO()
     FigureCanvasAgg(figure)
     figure.savefig(picture, format="png", dpi=dpi)
@@ -149,7 +149,7 @@ def _draw_ground(ground: Ground, ax: Axes) -> None:
     step = _round_step(ground.top_m / 8.0)
     levels = np.arange(0.0, ground.top_m + step, step)
     tones = LinearSegmentedColormap.from_list("ground", [LOW_COLOUR, HIGH_COLOUR])
-    # The lowest tone begins where the ground does rise: the rest is the floor.
+    # The lowest tone starts at rising ground: level ground keeps the floor's colour.
     filled = [1e-3, *levels[1:]]
     ax.contourf(east, north, ground.heights, filled, cmap=tones, zorder=0.25)
     lines: dict[str, Any] = {"colors": CONTOUR_COLOUR, "linewidths": 0.6, "zorder": 0.35}
@@ -165,13 +165,13 @@ def _floor(arena: Arena) -> tuple[tuple[float, float], float, float]:
 
 
 def _round_step(target: float) -> float:
-    """Return the first of 1, 2, 5, 10, 20, ... that is not below `target`."""
+    """Return the first of 1, 2, 5, 10, 20, ... at or above `target`."""
     power = 10.0 ** math.floor(math.log10(target))
     return next(power * m for m in (1.0, 2.0, 5.0, 10.0) if power * m >= target)
 
 
 def _draw_zones(arena: Arena, ax: Axes, radii_m: Sequence[float]) -> None:
-    """Draw zone limits, cut off at the walls, each with its name as near to due north as fits."""
+    """Draw zone limits, clipped at the walls, labelled as near to due north as fits."""
     floor = Rectangle(*_floor(arena), transform=ax.transData)
     for k, radius in enumerate(radii_m):
         ring = Circle(
@@ -246,7 +246,7 @@ def _footprint(arena: Arena, i: int, center: NDArray[np.float64]) -> Patch:
 
 
 def _draw_arrow(ax: Axes, center: NDArray[np.float64], tour: Tour, time_us: int) -> None:
-    """Draw where a moving obstacle is heading, as long as it moves in ARROW_S."""
+    """Draw the motion of an obstacle over ARROW_S as an arrow."""
     t = (time_us / US_PER_S) % tour.times_s[-1]
     k = int(np.searchsorted(tour.times_s, t, side="right")) - 1
     step = np.diff(tour.points, axis=0)

@@ -1,4 +1,4 @@
-"""What obstacles cover of the floor, from above: bounding boxes along north and east, areas."""
+"""Footprints of obstacles on the floor: bounding boxes along north and east, areas."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Boxes:
         return len(self.center)
 
     def grown(self, margin: float | Floats) -> Boxes:
-        """Return them with `margin` [m] (a number, or (2,)) added on every side."""
+        """Return the boxes with `margin` [m] (a number, or (2,)) added on every side."""
         return Boxes(self.center, self.half + margin)
 
 
@@ -41,7 +41,7 @@ def join(*parts: Boxes) -> Boxes:
 
 
 def with_room(boxes: Boxes, halves: Floats) -> Boxes:
-    """Return the boxes, and behind them others of half extents (n, 2) [m] without a place yet."""
+    """Return the boxes, followed by unplaced boxes of half extents (n, 2) [m]."""
     center = np.empty((len(boxes) + len(halves), 2))
     center[: len(boxes)] = boxes.center
     return Boxes(center, np.concatenate([boxes.half, halves]))
@@ -67,7 +67,7 @@ def _bounding_half(
 
 
 def bounding_boxes(obstacles: Obstacles) -> Boxes:
-    """Return the bounding boxes of all obstacles; of moving ones at time 0."""
+    """Return the bounding boxes of all obstacles, of moving obstacles at time 0."""
     half = bounding_half(obstacles.shape, obstacles.half_size, obstacles.yaw)
     return Boxes(obstacles.center[:, :2], half)
 
@@ -84,7 +84,7 @@ def outside(point: Floats, center: Floats, half: Floats) -> bool:
 
 
 def segments_clear(start: Floats, ends: Floats, boxes: Boxes) -> NDArray[np.bool_]:
-    """Return (q,) whether the straight ways from `start` (2,) to `ends` (q, 2) touch no box."""
+    """Return (q,) True where the segment from `start` (2,) to `ends` (q, 2) touches no box."""
     clear = np.empty(len(ends), np.bool_)
     _segments_clear(start, ends, boxes.center, boxes.half, clear)
     return clear
@@ -106,7 +106,7 @@ def segment_clear(start: Floats, end: Floats, center: Floats, half: Floats) -> b
         for axis in range(2):
             step = end[axis] - start[axis]
             if abs(step) < 1e-12:
-                # It never leaves, or never reaches, the slab.
+                # A segment along the slab is either always inside or always outside.
                 step = 1e-12
             low = (center[j, axis] - half[j, axis] - start[axis]) / step
             high = (center[j, axis] + half[j, axis] - start[axis]) / step
@@ -118,14 +118,14 @@ def segment_clear(start: Floats, end: Floats, center: Floats, half: Floats) -> b
 
 @kernel
 def draw_numbers(rng: np.random.Generator, numbers: Floats) -> None:
-    """Draw numbers (n, 2), uniform in [0, 1): those of `rng.random((n, 2))`."""
+    """Draw numbers (n, 2), uniform in [0, 1), equal to `rng.random((n, 2))`."""
     for i in range(len(numbers)):
         for axis in range(2):
             numbers[i, axis] = rng.random()
 
 
 def inner(bounds: Bounds, margin: float | Floats) -> tuple[Floats, Floats]:
-    """Return the corners of the floor shrunk by `margin` [m]; reversed when nothing is left."""
+    """Return the corners of the floor shrunk by `margin` [m]; reversed if the area is empty."""
     low = np.array([bounds.north_min, bounds.east_min]) + margin
     high = np.array([bounds.north_max, bounds.east_max]) - margin
     return low, high

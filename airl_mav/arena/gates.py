@@ -1,7 +1,7 @@
-"""Gates: walls across the arena with an opening, that the vehicle has to fly through.
+"""Gates: walls across the arena with an opening that the vehicle has to fly through.
 
 A gate is four boxes around its opening: west and east of it up to the top, below and above it
-between these. No other code needs to know gates.
+between these. All other code treats the boxes as obstacles.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Openings:
 
 
 def draw_openings(rng: np.random.Generator, spec: ArenaSpec) -> Openings:
-    """Draw the gates' openings, uniform within `spec.gates`, whose every value fits."""
+    """Draw the openings of the gates, uniform within `spec.gates`; every value fits."""
     gates = spec.gates
     k = int(rng.integers(*gates.count, endpoint=True))
     numbers = rng.random((k, NUMBERS))
@@ -81,7 +81,7 @@ def frames(openings: Openings, bounds: Bounds) -> Obstacles:
 
 
 def with_gates(statics: Statics | None, standing: Obstacles, k: int) -> Statics | None:
-    """Return the groups of static primitives with k gates appended; None = single primitives."""
+    """Return the groups of static primitives with k gates appended; None = no groups."""
     if k == 0:
         return statics
     gates = Statics((GATE,) * k, np.repeat(np.arange(k), PARTS), (None,) * (PARTS * k))
@@ -89,7 +89,7 @@ def with_gates(statics: Statics | None, standing: Obstacles, k: int) -> Statics 
 
 
 def with_walls(statics: Statics | None, standing: Obstacles, walls: Statics) -> Statics:
-    """Return the groups of static primitives with those of walls appended."""
+    """Return the groups of static primitives with groups of walls appended."""
     if statics is None:
         names = tuple(Shape(int(shape)).name.lower() for shape in standing.shape)
         statics = Statics(names, np.arange(len(names)), (None,) * len(names))
@@ -101,7 +101,7 @@ def with_walls(statics: Statics | None, standing: Obstacles, walls: Statics) -> 
 
 
 def openings_of(arena: Arena) -> Openings:
-    """Return the openings of an arena's gates, as its bodies have them."""
+    """Return the openings of an arena's gates, from its obstacles."""
     first = np.flatnonzero(_part_of_gate(arena) == 0)
     center, half = arena.obstacles.center, arena.obstacles.half_size
     west, below, above = first, first + 2, first + 3
@@ -114,13 +114,13 @@ def openings_of(arena: Arena) -> Openings:
 
 
 def over_openings(arena: Arena) -> NDArray[np.bool_]:
-    """Return (n_static,) which static primitives lie above or below a gate's opening."""
+    """Return a mask (n_static,) of the static primitives above or below a gate's opening."""
     crossing: NDArray[np.bool_] = _part_of_gate(arena) >= 2
     return crossing
 
 
 def _part_of_gate(arena: Arena) -> NDArray[np.int64]:
-    """Return (n_static,) which of the PARTS of a gate each primitive is; -1: of none."""
+    """Return the part of a gate (n_static,) of each primitive, 0 to PARTS - 1; -1 = no gate."""
     parts = np.full(arena.n_static, -1, np.int64)
     boxes = PARTS * arena.n_gates
     parts[arena.n_static - boxes :] = np.arange(boxes) % PARTS
@@ -128,13 +128,13 @@ def _part_of_gate(arena: Arena) -> NDArray[np.int64]:
 
 
 def closed_from_above(frame: Obstacles) -> Obstacles:
-    """Return of the boxes of gates those that close the way at any height: at the sides."""
+    """Return the gates' boxes that block every height: west and east of the opening."""
     keep = np.arange(len(frame)) % PARTS < 2
     return Obstacles(frame.shape[keep], frame.center[keep], frame.half_size[keep], frame.yaw[keep])
 
 
 def behind(openings: Openings, bounds: Bounds, clearance_m: float) -> Boxes:
-    """Return the floor (one box, or none) that is not `clearance_m` [m] behind the last gate."""
+    """Return the floor (at most one box) up to `clearance_m` [m] behind the last gate."""
     if not len(openings):
         return Boxes(np.zeros((0, 2)), np.zeros((0, 2)))
     last = float((openings.center[:, 0] + openings.half_size[:, 0]).max()) + clearance_m

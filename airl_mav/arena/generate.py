@@ -33,14 +33,14 @@ from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.rooms import HEADROOM_M
 
 LAYOUTS = 20
-"""Whole layouts drawn before a request is refused."""
+"""Layouts drawn before generation fails."""
 
 GOALS_PER_LAYOUT = 4
-"""Goals drawn in a layout before it is given up for want of a way to one."""
+"""Goals drawn in a layout before the layout is discarded for lack of a passage."""
 
 
 class _Stream(IntEnum):
-    """Independent random streams of one seed: a change to one draw leaves the others alone."""
+    """Independent random streams of a seed: changing one draw leaves the others unchanged."""
 
     COUNT = 0
     STATIC = 1
@@ -54,7 +54,7 @@ class _Stream(IntEnum):
 
 @dataclass(frozen=True)
 class _Request:
-    """What stays the same over all layouts of one call."""
+    """Values shared by all layouts of one call."""
 
     spec: ArenaSpec
     bounds: Bounds
@@ -64,50 +64,50 @@ class _Request:
     openings: Openings
     plan: Plan | None
     ground: Ground | None
-    """Where it rises above the floor; None: nowhere."""
+    """Hills; None = flat floor."""
 
     @cached_property
     def walls(self) -> Obstacles:
-        """The boxes of the gates, or of the walls between rooms."""
+        """Boxes of the gates, or of the walls between rooms."""
         if self.plan is None:
             return frames(self.openings, self.bounds)
         return room_walls(self.plan, self.bounds)[0]
 
     def with_walls(self, statics: Statics | None, standing: Obstacles) -> Statics | None:
-        """Return what primitives that stand belong to, with the boxes of walls behind them."""
+        """Return the owners of static primitives, followed by the boxes of walls."""
         if self.plan is None:
             return with_gates(statics, standing, len(self.openings))
         return with_walls(statics, standing, room_walls(self.plan, self.bounds)[1])
 
     @property
     def building(self) -> Building | None:
-        """What the arena says of its rooms."""
+        """Summary of the rooms for the arena; None = no rooms."""
         if self.plan is None:
             return None
         return Building(len(self.plan.rooms), len(self.plan.doors), len(self.walls))
 
     @property
     def hills(self) -> Hills | None:
-        """Ground that is in the way of what flies at the flight altitude; None: none is."""
+        """Ground that obstructs flight at the flight altitude; None = flat floor."""
         if self.ground is None:
             return None
         return Hills(self.ground, self.spec.flight_altitude_m - HEADROOM_M)
 
     @cached_property
     def start_box(self) -> Boxes:
-        """What obstacles leave free around the start."""
+        """Box around the start that stays free of obstacles."""
         return _around(np.zeros(2), self.spec.start.clearance_m)
 
 
 def generate(
     spec: ArenaSpec, seed: int, *, name: str, vehicle_width_m: float, zone: int | None = None
 ) -> Arena:
-    """Make the arena of a seed, deterministic on any machine with this numpy.
+    """Generate the arena of a seed, deterministic on any machine with the same numpy.
 
-    `spec.count_period` consecutive seeds, from 0 on, share their obstacle counts. The way from
-    start to goal is at least `vehicle_width_m` wide. The curriculum `zone` bounds the goal, None =
-    the largest. The obstacles depend on it only if a first layout had no room for the goal. Raises
-    UsageError with the reason if an argument is invalid or LAYOUTS layouts had no arena.
+    `spec.count_period` consecutive seeds, from 0 on, share their obstacle counts. A passage at
+    least `vehicle_width_m` wide joins start and goal. The curriculum `zone` bounds the goal, None =
+    the largest. The obstacles depend on the zone only if a first layout had no room for the goal.
+    Raises UsageError with the reason if an argument is invalid or LAYOUTS layouts failed.
     """
     if seed < 0:
         raise UsageError(f"seed = {seed}: accepted: value >= 0")
@@ -177,9 +177,9 @@ def local_bounds(spec: ArenaSpec) -> Bounds:
 
 
 def free_area_fraction(arena: Arena) -> float:
-    """Return the share of the floor that no static obstacle covers, seen from above."""
+    """Return the share of the floor not covered by static obstacles, seen from above."""
     b, n = arena.bounds, arena.n_static
-    if arena.statics is not None:  # Parts of one thing are above each other.
+    if arena.statics is not None:  # Parts of one asset may overlap.
         return free_share(b, arena.obstacles, n)
     floor = (b.north_max - b.north_min) * (b.east_max - b.east_min)
     return 1.0 - float(footprint_areas(arena.obstacles)[:n].sum()) / floor
@@ -198,7 +198,7 @@ def _draw_counts(spec: ArenaSpec, seed: int) -> tuple[int, int]:
 
 
 def _check_fixed_goal(request: _Request, zone: int | None) -> None:
-    """Refuse a fixed goal outside the asked zone; the spec has checked it against the walls."""
+    """Reject a fixed goal outside the requested zone; the spec has checked it against the walls."""
     fixed, radius = request.spec.goal.fixed, request.ring_m[1]
     if fixed is None or zone is None:
         return
@@ -212,7 +212,7 @@ def _check_fixed_goal(request: _Request, zone: int | None) -> None:
 def _draw_rooms(
     spec: ArenaSpec, seed: int, bounds: Bounds, name: str, vehicle_width_m: float
 ) -> Plan | None:
-    """Draw the rooms; None: there are none. Raises UsageError where they cannot be flown in."""
+    """Draw the rooms; None = no rooms. Raises UsageError for narrow doors or if no plan fits."""
     if not spec.rooms.drawn:
         return None
     least = least_gap_m(bounds, vehicle_width_m)
@@ -229,7 +229,7 @@ def _draw_rooms(
 
 
 def _check_openings(openings: Openings, name: str, seed: int, vehicle_width_m: float) -> None:
-    """Refuse an opening that the vehicle does not fit through, whatever way it leans."""
+    """Reject an opening too small for the vehicle at any attitude."""
     if not len(openings):
         return
     least = 2.0 * float(openings.half_size[:, 1:].min())
@@ -255,7 +255,7 @@ def _draw_height(request: _Request, seed: int, goal: Floats) -> float | None:
 def _draw_static(
     rng: np.random.Generator, request: _Request
 ) -> tuple[Obstacles, Boxes, Statics | None, tuple[PlacedMesh, ...]]:
-    """Draw and place the static obstacles; return their bounding boxes, parts and meshes, too."""
+    """Draw and place the static obstacles; return bounding boxes, groups and meshes, too."""
     spec, (n, _) = request.spec, request.counts
     bodies: Bodies | Things
     if spec.has_assets:
@@ -295,7 +295,7 @@ def _draw_static(
 def _draw_reachable_goal(
     rng: np.random.Generator, request: _Request, static: Obstacles, standing: Boxes
 ) -> Floats:
-    """Return the fixed goal, or draw a free one, with a way to it."""
+    """Return the fixed goal, or draw a free and reachable one."""
     spec, progress = request.spec, len(static)
     keep_off = standing.grown(spec.goal.clearance_m)
     boxes: Boxes | None = standing
@@ -342,7 +342,7 @@ def _draw_moving(
     if len(request.walls):
         standing = join(standing, bounding_boxes(request.walls))
     always = request.start_box
-    if request.plan is not None:  # They stay in their rooms.
+    if request.plan is not None:  # Moving obstacles stay in their rooms.
         always = join(always, request.plan.grown_passages(spec.rooms.door_clearance_m))
     on_the_way = join(always, standing.grown(walking_gap))
     at_first = on_the_way
@@ -368,7 +368,7 @@ def _draw_moving(
 
 
 def _around(center: Floats, clearance: float) -> Boxes:
-    """Return the box that reaches `clearance` [m] from one point."""
+    """Return the box that extends `clearance` [m] from a point."""
     return Boxes(center[None], np.full((1, 2), clearance))
 
 

@@ -1,13 +1,13 @@
-"""A concrete arena as plain arrays: what the plant, the camera, training and the report share.
+"""Concrete arena as plain arrays, shared by plant, camera, training and report.
 
 Frame: local NED, origin at the vehicle's start on the floor, x north. The floor is z = 0; heights
-are negative z. The four walls stand on the edges of `bounds`. Hills rise above the floor where
-there is a `ground`.
+are negative z. The four walls are at the edges of `bounds`. Hills rise above the floor if `ground`
+is set.
 
-A camera without global illumination needs to know what the floor and the walls get of it in the
-mean. That is a balance of three surfaces, floor, walls and ceiling, of a square room with the same
-height and the same share of walls (radiosity method: Goral et al., Modeling the interaction of
-light between diffuse surfaces, SIGGRAPH 1984). The ceiling reflects nothing.
+A camera without global illumination needs the mean irradiance of floor and walls. The balance of
+floor, walls and ceiling is solved for a square room with the same height and the same share of
+walls (radiosity method: Goral et al., Modeling the interaction of light between diffuse surfaces,
+SIGGRAPH 1984). The ceiling reflects nothing.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from airl_mav.profiles.asset_files import MeshFile
 
 
 def indoors(look: Drawn, floor_m2: float, walls: tuple[tuple[int, float], ...]) -> Drawn:
-    """Return a look with the sky's light from the ceiling and no sun.
+    """Return an appearance lit by a ceiling of the sky's colour, without a sun.
 
-    The mean luminance on the floor equals that of a level surface outdoors, interreflections of
-    walls and floor included. `walls` are row in the `Finish` and visible area [m²] of each wall
-    surface.
+    The mean luminance on the floor equals the luminance of a level surface outdoors, including
+    interreflections of walls and floor. `walls` are row in the `Finish` and visible area [m²] of
+    each wall surface.
     """
     light, albedo = look.light, look.finish.albedo.mean(axis=1)
     areas = np.array([area for _, area in walls])
@@ -99,7 +99,7 @@ Points = Annotated[Floats, ArrayField(np.float64, 3)]
 
 
 class Shape(IntEnum):
-    """Primitive kinds of an obstacle; the numbers are what the numba kernels see."""
+    """Primitive shapes of obstacles; the numba kernels use the numbers."""
 
     BOX = 0
     CYLINDER = 1
@@ -117,11 +117,11 @@ class Bounds:
     height: float
     """Wall height above the floor [m], positive."""
     ceiling: bool = False
-    """Whether there is one, at that height."""
+    """True if there is a ceiling at that height."""
 
     def as_array(self) -> NDArray[np.float64]:
-        """Return (6,) all fields in their order for the kernels; 1: there is a ceiling, 0: none."""
-        # By name: `dataclasses.astuple` copies every number, which takes longer than a depth image.
+        """Return all fields (6,) in order for the kernels; the last is 1 with a ceiling, else 0."""
+        # By name: `dataclasses.astuple` copies every number and takes longer than a depth image.
         rectangle = (self.north_min, self.north_max, self.east_min, self.east_max)
         return np.array([*rectangle, self.height, self.ceiling], np.float64)
 
@@ -144,26 +144,26 @@ class Obstacles:
 
 @dataclass(frozen=True)
 class PlacedMesh:
-    """A mesh that cameras see in place of obstacles, which stay what is hit."""
+    """A mesh that cameras render in place of obstacles; collisions use the obstacles."""
 
     file: MeshFile
-    """Its triangles: forward, right and down from its place."""
+    """Triangles: forward, right and down from the mesh's position."""
     place: tuple[float, float]
-    """Of its origin on the floor: north, east [m]."""
+    """Position of the origin on the floor: north, east [m]."""
     yaw: float
-    """Heading of its forward axis [rad]."""
+    """Heading of the forward axis [rad]."""
     scale: float
     first: int
-    """The first of the obstacles that stand for it. It has the number and the material of this."""
+    """First obstacle of the mesh; the mesh has the obstacle's number and material."""
     count: int
-    """Number of these obstacles, one after the other."""
+    """Number of consecutive obstacles of the mesh."""
     base_m: float = 0.0
-    """Height of its place above the floor [m]."""
+    """Height of the origin above the floor [m]."""
 
 
 @dataclass(frozen=True)
 class Tour:
-    """The closed way of one moving obstacle: way-points passed at given times, over and over."""
+    """Periodic path of one moving obstacle: way-points with times."""
 
     times_s: Numbers  # (k,) from 0 to the tour's period, increasing
     points: Annotated[
@@ -173,18 +173,18 @@ class Tour:
 
 @dataclass(frozen=True)
 class Building:
-    """What there is of rooms in an arena (`arena.rooms`)."""
+    """Summary of the rooms in an arena (`arena.rooms`)."""
 
     rooms: int
-    """Of which one may be a corridor."""
+    """Number of rooms, including a corridor."""
     doors: int
     boxes: int
-    """So many boxes of walls between rooms are the last of those obstacles that stand."""
+    """Number of interior wall boxes, stored after all other static obstacles."""
 
 
 @dataclass(frozen=True)
 class Arena:
-    """One concrete arena. The same object makes bodies, depth images, episodes and pictures."""
+    """A concrete arena, the source of bodies, depth images, episodes and pictures."""
 
     name: str
     seed: int
@@ -196,29 +196,29 @@ class Arena:
     tours: tuple[Tour, ...]
     goal: Numbers  # (2,) north, east [m] from the start
     appearance: Appearance = DEFAULT
-    """What the look is drawn from; geometry knows none of it, and depth nothing but glass."""
+    """Distribution of the appearance. Geometry is independent of it, and depth except for glass."""
     statics: Statics | None = None
-    """None: every primitive that stands is a thing of its own."""
+    """Groups of static primitives; None = every primitive is separate."""
     meshes: tuple[PlacedMesh, ...] = ()
-    """Those that cameras see, in the order of their obstacles, all of which stand still."""
+    """Meshes for cameras, in the order of their obstacles; all are static."""
     goal_height_m: float | None = None
-    """Of the goal, above the floor; None: it has none, and is reached at any height."""
+    """Height of the goal above the floor [m]; None = reached at any height."""
     n_gates: int = 0
-    """The boxes of so many gates are the last of those obstacles that stand (`arena.gates`)."""
+    """Number of gates; their boxes are stored after all other static obstacles (`arena.gates`)."""
     building: Building | None = None
-    """Of its rooms; None: it is not divided into any."""
+    """Rooms; None = no rooms."""
     ground: Ground | None = None
-    """Where it rises above the floor; None: nowhere."""
+    """Hills; None = flat floor."""
 
     @property
     def goal_point(self) -> Goal:
-        """The goal as flights are told of it."""
+        """Goal as reported to flights: north, east [m], and down [m] if the goal has a height."""
         north, east = self.goal.tolist()
         return (north, east) if self.goal_height_m is None else (north, east, -self.goal_height_m)
 
     @cached_property
     def look(self) -> Drawn:
-        """Materials of all surfaces, and the light; drawn when it is first asked for."""
+        """Materials of all surfaces, and the light; drawn on first access."""
         look = draw_appearance(
             self.appearance,
             self.seed,
@@ -231,7 +231,7 @@ class Arena:
 
     @cached_property
     def clear(self) -> NDArray[np.bool_] | None:
-        """Which obstacles (n,) are of glass, that depth passes through; None: there are none."""
+        """Mask (n,) of glass obstacles, which depth cameras see through; None = no glass."""
         parts = () if self.statics is None else self.statics.materials
         if not self.appearance.may_have("glass", (name for name in parts if name is not None)):
             return None
@@ -239,36 +239,36 @@ class Arena:
         return glass if glass.any() else None
 
     def _indoors(self, look: Drawn) -> Drawn:
-        """Return a look with the light that there is below the ceiling."""
+        """Return an appearance with the light below the ceiling."""
         b, n = self.bounds, self.n_static
         length, width = b.north_max - b.north_min, b.east_max - b.east_min
         walls = [(WALLS, 2.0 * (length + width) * b.height)]
         boxes = 0 if self.building is None else self.building.boxes
         for i in range(n - boxes, n):
-            # Both sides of it are seen.
+            # Both sides are visible.
             half = self.obstacles.half_size[i]
             walls.append((OBSTACLE + i, float(8.0 * half[:2].max() * half[2])))
         return indoors(look, length * width, tuple(walls))
 
     def mesh_of(self, i: int) -> PlacedMesh | None:
-        """Return the mesh that cameras see in place of obstacle i; None: they see the obstacle."""
+        """Return the mesh that cameras render in place of obstacle i, or None."""
         owners = (each for each in self.meshes if each.first <= i < each.first + each.count)
         return next(owners, None)
 
     @property
     def n_static(self) -> int:
-        """Number of obstacles that stand still."""
+        """Number of static obstacles."""
         return len(self.obstacles) - len(self.tours)
 
     def name_of(self, i: int) -> str:
-        """Return what obstacle i is called where it is hit: "static-box-3", "static-tree-7"."""
+        """Return the name of obstacle i in collision reports: "static-box-3", "static-tree-7"."""
         shape = Shape(int(self.obstacles.shape[i])).name.lower()
         if i >= self.n_static:
             return f"moving-{shape}-{i}"
         return f"static-{shape if self.statics is None else self.statics.name_of(i)}-{i}"
 
     def centers_at(self, time_us: int) -> NDArray[np.float64]:
-        """Return all obstacle centres (n, 3) NED [m], `time_us` after the episode's start."""
+        """Return all obstacle centres (n, 3) NED [m], `time_us` [us] after the episode's start."""
         centers = self.obstacles.center.copy()
         for i, tour in enumerate(self.tours, start=self.n_static):
             t = (time_us / US_PER_S) % tour.times_s[-1]

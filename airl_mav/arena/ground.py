@@ -1,7 +1,7 @@
 """Ground that rises above the floor: heights on a grid, and the triangles between them.
 
 Each cell is two triangles, split from south-west to north-east, listed by `Ground.faces` and used
-by everything. The kernels of `arena.relief` are imported late, for programs without numba.
+everywhere. The kernels of `arena.relief` are imported lazily, for programs without numba.
 """
 
 from __future__ import annotations
@@ -19,48 +19,48 @@ from airl_mav.core.fields import ArrayField
 Floats = NDArray[np.float64]
 
 GRID_SIZE = 8
-"""Numbers that say where a grid lies; see `Relief.grid`."""
+"""Length of a grid description; see `Relief.grid`."""
 
 TOP, STEEPEST, ROWS, COLUMNS = 4, 5, 6, 7
 
 
 class Relief(NamedTuple):
-    """The ground as kernels take it."""
+    """Ground as arrays for kernels."""
 
     heights: Floats  # (r c,) of the grid's points above the floor, row by row, south to north [m]
-    """(0,): there are no hills, the ground is the floor."""
+    """(0,) = no hills, the ground is the floor."""
     grid: Floats
-    """(GRID_SIZE,) north and east of the first point [m], steps north and east [m], the greatest
-    height [m], the greatest slope, r and c."""
+    """(GRID_SIZE,) north and east of the first point [m], steps north and east [m], maximum height
+    [m], maximum slope, r and c."""
 
 
 def no_relief() -> Relief:
-    """Return ground that is the floor."""
+    """Return flat ground at floor level."""
     return Relief(np.zeros(0), np.zeros(GRID_SIZE))
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Ground of an arena with hills. Two of them are the same where they are one object."""
+    """Ground of an arena with hills. Compared by identity."""
 
     heights: Annotated[Floats, ArrayField(np.float64)]
-    """(r, c) above the floor, not below 0 [m]; r and c are 2 at least."""
+    """(r, c) heights above the floor, not below 0 [m]; r and c are at least 2."""
     south: float
     """North of the first row [m]."""
     west: float
     """East of the first column [m]."""
     step_north: float
-    """From one row to the next [m]."""
+    """Distance between rows [m]."""
     step_east: float
-    """From one column to the next [m]."""
+    """Distance between columns [m]."""
 
     @cached_property
     def relief(self) -> Relief:
-        """The ground as kernels take it."""
+        """Ground as arrays for kernels."""
         step_n, step_e = self.step_north, self.step_east
         rise_n = np.diff(self.heights, axis=0) / step_n
         rise_e = np.diff(self.heights, axis=1) / step_e
-        # Of the triangle north-west of a cell's diagonal, and of that south-east of it.
+        # Slopes of the triangles north-west, then south-east, of each cell's diagonal.
         steepest = max(
             float(np.hypot(rise_n[:, :-1], rise_e[1:]).max()),
             float(np.hypot(rise_n[:, 1:], rise_e[:-1]).max()),
@@ -70,7 +70,7 @@ class Ground:
 
     @property
     def top_m(self) -> float:
-        """The greatest height [m]."""
+        """Maximum height [m]."""
         return float(self.heights.max())
 
     @property
@@ -94,7 +94,7 @@ class Ground:
         return rising
 
     def height_at(self, north: float, east: float) -> float:
-        """Return how high the ground is above the floor at a place [m]; 0 beyond the walls."""
+        """Return the height of the ground above the floor at a position [m]; 0 beyond the walls."""
         from airl_mav.arena.relief import plane_at
 
         return float(plane_at(self.relief, north, east)[0])
@@ -104,7 +104,7 @@ class Ground:
         return np.array([self.height_at(float(each[0]), float(each[1])) for each in places])
 
     def coarser(self, most: int) -> Ground:
-        """Return ground of so many cells at most, for pictures: its own where it has no more."""
+        """Return the ground with at most `most` cells, for pictures."""
         rows, columns = (count - 1 for count in self.heights.shape)
         if rows * columns <= most:
             return self
@@ -116,13 +116,13 @@ class Ground:
         return Ground(self.sampled(north, east), self.south, self.west, step_n, step_e)
 
     def lowest_within(self, north: float, east: float, radius: float) -> float:
-        """Return the least height of the ground within a radius [m] of a place on the floor."""
+        """Return the ground's minimum height within a radius [m] of a position on the floor."""
         from airl_mav.arena.relief import extreme_within
 
         return -float(extreme_within(self.relief, north, east, radius, -1.0))
 
     def sampled(self, north: Floats, east: Floats) -> Floats:
-        """Return the heights (rows, columns) [m] at places north (rows,) by east (columns,)."""
+        """Return the heights (rows, columns) [m] at positions north (rows,) by east (columns,)."""
         from airl_mav.arena.relief import sample
 
         heights = np.empty((len(north), len(east)))

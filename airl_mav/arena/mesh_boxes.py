@@ -1,7 +1,7 @@
-"""An asset from a mesh: boxes along its axes that cover its surface.
+"""Conversion of a mesh to an asset: axis-aligned boxes that cover the mesh's surface.
 
-The mesh is cut into cubic cells. Those at its surface and inside a closed one are joined to boxes,
-which exceed it by at most `MeshBoxes.beyond_m`. Cameras see the mesh itself (`triangles`).
+The mesh is divided into cubic cells. Cells at the surface and inside a closed mesh are joined to
+boxes, which exceed it by at most `MeshBoxes.beyond_m`. Cameras see the mesh itself (`triangles`).
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ from airl_mav.profiles.assets import MOST_PARTS, Asset, BoxPart
 Up = Literal["auto", "y", "z"]
 
 Y_UP = (".glb", ".gltf")
-"""Formats whose specification says that y points up."""
+"""Formats specified with y up."""
 
 FORMATS = (".stl", ".obj", ".glb", ".gltf", ".ply", ".off")
 
 COARSEST, FINEST = 1.0, 1 / 48
-"""Cells that are tried, as shares of the longest side."""
+"""Cell sizes tried, as shares of the longest side."""
 
 FINER = 0.88
-"""Factor from one size of cells to the next."""
+"""Factor from one cell size to the next."""
 
 EDGE_SHARE = 0.5
-"""Edges of the triangles that the surface is cut into, as a share of a cell."""
+"""Maximum edge of the subdivided surface triangles, as a share of a cell."""
 
 MOST_CUTS = 20
-"""So often an edge is halved at most."""
+"""Maximum subdivisions of an edge."""
 
 PATIENCE = 3
-"""So many sizes in a row that take too many boxes end the search: finer ones take more, mostly."""
+"""Consecutive sizes with too many boxes that end the search: finer cells mostly need more."""
 
 LEAST_M, GREATEST_M = 0.01, 20.0
-"""Least side of a part and longest side of an asset [m]."""
+"""Minimum side of a part and maximum side of an asset [m]."""
 
 _Y_TO_Z = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
-"""A quarter turn about x: y up becomes z up."""
+"""Rotation of 90 degrees about x: y up becomes z up."""
 
 Cells = NDArray[np.bool_]
 
@@ -59,14 +59,14 @@ class MeshBoxes:
     asset: Asset
     cell_m: float
     size_m: tuple[float, float, float]
-    """Of the mesh: forward, right, up [m]."""
+    """Size of the mesh: forward, right, up [m]."""
     closed: bool
-    """Whether it has an inside, which is filled."""
+    """True if the mesh is watertight; its inside is filled."""
     surface: Triangles
 
     @property
     def beyond_m(self) -> float:
-        """How far the boxes reach beyond the mesh at most [m]."""
+        """Maximum distance of the boxes beyond the mesh [m]."""
         return math.sqrt(3.0) * self.cell_m + EDGE_SHARE * self.cell_m
 
 
@@ -75,10 +75,10 @@ def boxes_of_mesh(
 ) -> MeshBoxes:
     """Return a mesh as an asset of at most `most` boxes, with the finest possible cells.
 
-    The middle of the mesh's footprint is the asset's origin. Its lowest point stands on the floor.
-    Its x axis points forward. The file is STL, OBJ, GLB, glTF, PLY or OFF. `scale` is metres per
-    unit of it, `up` its axis that points up; "auto": y for GLB and glTF, else z. Raises UsageError
-    if it cannot be read, holds no surface, or is too large for an asset.
+    The origin is the middle of the mesh's footprint. The lowest point is at floor level. The x axis
+    points forward. The file is STL, OBJ, GLB, glTF, PLY or OFF. `scale` is metres per unit of the
+    file, `up` the axis that points up; "auto" = y for GLB and glTF, else z. Raises UsageError if
+    the file cannot be read, has no surface, or is too large for an asset.
     """
     mesh = _read(path)
     if up == "y" or (up == "auto" and path.suffix.lower() in Y_UP):
@@ -101,7 +101,7 @@ def boxes_of_mesh(
 
 
 def _surface(mesh: trimesh.Trimesh) -> Triangles:
-    """Return the triangles of a mesh in its place; those without an area are left out."""
+    """Return the triangles of a mesh in its pose, without degenerate ones."""
     vertices = (np.asarray(mesh.vertices, np.float64) * [1.0, 1.0, -1.0]).astype(np.float32)
     faces = np.asarray(mesh.faces, np.int32)
     return Triangles(vertices, faces[areas(vertices[faces]) > 0.0])
@@ -110,15 +110,15 @@ def _surface(mesh: trimesh.Trimesh) -> Triangles:
 def _finest(
     mesh: trimesh.Trimesh, side_m: float, closed: bool, most: int
 ) -> tuple[float, tuple[BoxPart, ...]]:
-    """Return the edge of the finest cells that take no more than `most` boxes, and these."""
-    # One box around the mesh always covers it.
+    """Return the edge of the finest cells that need at most `most` boxes, and the boxes."""
+    # One box around the mesh is always a solution.
     low, high = (np.asarray(each, np.float64) for each in mesh.bounds)
     found: tuple[float, tuple[BoxPart, ...]] = side_m, (_box(low, high),)
     vertices, faces = mesh.vertices, mesh.faces
     failed, share = 0, COARSEST
     while share >= FINEST and failed < PATIENCE:
         cell_m = share * side_m
-        # The coarser cut is cut on; trimesh has no types for the function.
+        # Subdivide the previous result; trimesh has no types for the function.
         vertices, faces = trimesh.remesh.subdivide_to_size(  # type: ignore[no-untyped-call]
             vertices, faces, EDGE_SHARE * cell_m, max_iter=MOST_CUTS
         )
@@ -134,9 +134,9 @@ def _finest(
 
 
 def joined(cells: Cells, most: int) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]] | None:
-    """Return boxes that are exactly the set cells, first and one past last; None above `most`.
+    """Return boxes that equal the set cells, first and one past last; None above `most`.
 
-    Each begins at the first free cell and is the largest that grows along the axes in any order.
+    Each box starts at the first free cell. The largest box over all orders of the axes is used.
     """
     left = cells.copy()
     boxes: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
@@ -152,7 +152,7 @@ def joined(cells: Cells, most: int) -> list[tuple[NDArray[np.int64], NDArray[np.
 
 
 def _grown(left: Cells, first: NDArray[np.int64], order: tuple[int, ...]) -> NDArray[np.int64]:
-    """Return one past the last cell of a box that grows from its first along axes in an order."""
+    """Return the end (exclusive) of a box grown from its first cell along axes in an order."""
     end = first + 1
     for axis in order:
         begin = first.copy()
@@ -170,12 +170,12 @@ def _read(path: Path) -> trimesh.Trimesh:
     if path.suffix.lower() not in FORMATS:
         raise FieldError("mesh", str(path), f"a file that ends in {', '.join(FORMATS)}")
     try:
-        # Its readers compare places that need not be numbers.
+        # trimesh compares coordinates that may be NaN.
         with np.errstate(all="ignore"):
             mesh = trimesh.load(path, force="mesh")
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
-    except Exception as error:  # what its readers raise for a damaged file is their own
+    except Exception as error:  # trimesh raises arbitrary exceptions for damaged files
         why = " ".join(str(error).split())
         raise UsageError(f"{path}: cannot be read as a mesh: {why}") from None
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
@@ -195,8 +195,8 @@ def _cells(
 ) -> tuple[Cells, NDArray[np.float64]]:
     """Return the cells (a, b, c) that a mesh fills, and the corner of the first (3,) [m].
 
-    `corners` (n, 3) belong to triangles with edges of at most e = `EDGE_SHARE` of a cell, so no
-    point is further than e / sqrt(3) from a corner; cubes of that reach cover the surface.
+    `corners` (n, 3) belong to triangles with edges of at most e = `EDGE_SHARE` of a cell, so each
+    point is at most e / sqrt(3) from a corner; cubes of that half side cover the surface.
     """
     reach_m = EDGE_SHARE * cell_m / math.sqrt(3.0)
     first = corners.min(axis=0) - reach_m

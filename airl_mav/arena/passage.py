@@ -1,4 +1,4 @@
-"""Conservative search for a way from start to goal around static footprints and hills."""
+"""Conservative search for a passage from start to goal around static footprints and hills."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from airl_mav.arena.ground import STEEPEST, Ground
 from airl_mav.core.kernels import kernel
 
 CELL_M = 0.25
-"""Raster pitch; coarser on a floor of more than CELLS_MAX cells."""
+"""Raster pitch [m]; coarser on a floor of more than CELLS_MAX cells."""
 
 CELLS_MAX = 250_000
 
 
 class Hills(NamedTuple):
-    """Ground that is in the way where it rises above a height."""
+    """Ground that obstructs where it rises above a height."""
 
     ground: Ground
     most_m: float
-    """Ground that is no higher can be flown over [m]."""
+    """Maximum height of ground that can be overflown [m]."""
 
 
 def passage_exists(
@@ -38,8 +38,8 @@ def passage_exists(
 ) -> bool:
     """Return whether a disc `width_m` [m] wide can be moved from the origin to `goal` (2,) [m].
 
-    `boxes` bound all obstacles, with one box per group; None = one per obstacle. Hills are
-    bypassed.
+    `boxes` bound all obstacles, with one box per group; None = one per obstacle. The passage leads
+    around hills.
     """
     if hills is not None and hills.ground.top_m <= hills.most_m:
         hills = None
@@ -53,8 +53,8 @@ def gaps_suffice(
 ) -> bool:
     """Return whether all gaps are wider than the vehicle, so that every free place is reachable.
 
-    A rectangle's interior minus finitely many disjoint closed boxes is connected, and that is the
-    space of the vehicle's centre when no two boxes grown by half its width touch.
+    A rectangle's interior minus finitely many disjoint closed boxes is connected. The vehicle's
+    centre moves in such a space when no two boxes grown by half its width touch.
     """
     boxes = bounding_boxes(obstacles) if boxes is None else boxes
     low, high = inner(bounds, 0.0)
@@ -88,7 +88,7 @@ def _gaps_suffice(
 
 
 def least_gap_m(bounds: Bounds, width_m: float) -> float:
-    """Return how wide a gap along north or east must be for `raster_passage` to find it [m]."""
+    """Return the minimum gap along north or east that `raster_passage` finds [m]."""
     return width_m + (1.0 + math.sqrt(2.0)) * _cell_m(bounds)
 
 
@@ -106,7 +106,7 @@ def raster_passage(
 ) -> bool:
     """Return whether free cells join the start's cell to the goal's, stepping along the axes.
 
-    A free cell's centre keeps half the width plus half a cell diagonal from everything, so that
+    A free cell's centre keeps half the width plus half a cell diagonal from all obstacles, so that
     steps between free cells are safe.
     """
     cell = _cell_m(bounds)
@@ -135,8 +135,7 @@ def raster_passage(
 def _to_hills(hills: Hills, north: Floats, east: Floats, cell: float) -> Floats:
     """Return the distance (rows, columns) [m] of cells from obstructing ground, a lower bound.
 
-    Points of the ground rise above their cell's centre by at most the steepest slope over half the
-    diagonal.
+    The ground in a cell exceeds its centre by at most the maximum slope times half the diagonal.
     """
     half_diagonal = cell / math.sqrt(2.0)
     low = hills.most_m - half_diagonal * float(hills.ground.relief.grid[STEEPEST])
@@ -172,7 +171,7 @@ def _window(axis: Floats, center: float, reach: float) -> slice:
 
 
 def _distance(obstacles: Obstacles, i: int, north: Floats, east: Floats) -> NDArray[np.float64]:
-    """Return the distance (rows, columns) [m] of cells to a footprint; not above 0 inside."""
+    """Return the distance (rows, columns) [m] of cells to a footprint; 0 or less inside."""
     dn = north[:, None] - obstacles.center[i, 0]
     de = east[None, :] - obstacles.center[i, 1]
     along, across = obstacles.half_size[i, :2]

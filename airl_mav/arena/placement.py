@@ -1,4 +1,4 @@
-"""Find free places for obstacles by bounded rejection sampling."""
+"""Placement of obstacles by bounded rejection sampling."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from airl_mav.profiles.arena import ArenaSpec
 BATCH = 64
 BATCHES = 32
 TRIES = BATCH * BATCHES
-"""Places tried for one obstacle before its layout is given up."""
+"""Positions tried for one obstacle before its layout is discarded."""
 
 
 class NoRoomError(Exception):
-    """A draw that did not fit. Internal: `generate` tries again, then tells the user."""
+    """Failed draw. Internal: `generate` retries, then reports an error to the user."""
 
     def __init__(self, message: str, progress: int) -> None:
-        """Keep what failed and how far it got (greater is farther)."""
+        """Store the failure and its progress (higher is better)."""
         super().__init__(message)
         self.progress = progress
 
@@ -39,11 +39,11 @@ def draw_place(
     gap_m: float,
     place: Floats,
 ) -> bool:
-    """Draw a free place for a bounding box, uniform over all; return whether TRIES sufficed.
+    """Draw a free position for a bounding box, uniform over all; return whether TRIES sufficed.
 
-    It must not overlap the boxes `center`, `taken` (k, 2), any clearance already added. It keeps
-    `gap_m` to the walls of the floor `low`..`high`. All are north, east [m]. `half` and `taken` are
-    half extents. `place` (2,) is written.
+    The box must not overlap the boxes `center`, `taken` (k, 2), which include any clearance. It
+    keeps `gap_m` to the walls of the floor `low`..`high`. All are north, east [m]. `half` and
+    `taken` are half extents. `place` (2,) is written.
     """
     lowest = low + (half + gap_m)
     span, grown = high - (half + gap_m) - lowest, taken + half
@@ -61,11 +61,11 @@ def draw_place(
 def _first_free(
     numbers: Floats, lowest: Floats, span: Floats, center: Floats, grown: Floats, place: Floats
 ) -> bool:
-    """Write the first point of a rectangle that is in no box. Return whether there is one.
+    """Write the first point outside all boxes. Return whether there is one.
 
-    The rectangle has the south-west corner `lowest` and the sides `span` (2,) [m], in which
-    `numbers` (k, 2) in [0, 1) are the points. The boxes have `center` and half extents `grown` (m,
-    2) [m].
+    The rectangle has the south-west corner `lowest` and the sides `span` (2,) [m]. `numbers` (k, 2)
+    in [0, 1) are points in the rectangle. The boxes have `center` and half extents `grown` (m, 2)
+    [m].
     """
     for number in numbers:
         for axis in range(2):
@@ -80,15 +80,15 @@ def place_all(
 ) -> Floats:
     """Draw places (n, 2) [m] of bounding boxes (n, 2) `gap_m` apart from each other and the walls.
 
-    `keep_off` are other boxes, any clearance already added. Raises NoRoomError: one found no place
+    `keep_off` are other boxes, including any clearance. Raises NoRoomError if a box found no place
     in TRIES tries; `progress` is the number of placed boxes.
     """
     n, boxes = len(halves), with_room(keep_off, halves + gap_m)
     low, high = inner(bounds, 0.0)
     placed, tried = 0, 0
     while placed < n and tried < BATCHES:
-        # Drawn here: numba needs longer to take a generator than numpy to draw all of them. Each
-        # that has no place yet needs a batch at least.
+        # One numpy call is faster than passing a generator to numba. Each unplaced box needs at
+        # least one batch.
         batches = rng.random((n - placed, BATCH, 2))
         placed, tried, used = _place_all(
             batches, halves, boxes.center, boxes.half, low, high, gap_m, placed, tried
@@ -112,11 +112,11 @@ def _place_all(
     placed: int,
     tried: int,
 ) -> tuple[int, int, int]:
-    """Place boxes one by one, into the last rows of `center`, while there are numbers.
+    """Place boxes one by one, into the last rows of `center`, until the numbers are used up.
 
-    `batches` (k, BATCH, 2) in [0, 1) are for one try of a box each. `center` and `half` are the
-    boxes to avoid, any clearance added, and the placed ones [m]. `placed` boxes have a place, the
-    next one has tried `tried` batches; the rest as of `place_all` and `draw_place`.
+    `batches` (k, BATCH, 2) in [0, 1) each serve one try of a box. `center` and `half` are the boxes
+    to avoid, including clearance, and the placed ones [m]. `placed` boxes have a position, the next
+    one has tried `tried` batches; the rest as in `place_all` and `draw_place`.
 
     Returns:
         New `placed` and `tried`, at most BATCHES, and the number of used batches.
@@ -137,9 +137,9 @@ def _place_all(
 
 
 def _give_back(rng: np.random.Generator, count: int) -> None:
-    """Let a generator draw its last `count` uniform numbers once more."""
-    bits: Any = rng.bit_generator  # One that can go back: that of `default_rng`.
-    # Half of a number may wait to be drawn as a whole number; `advance` forgets it.
+    """Rewind a generator by `count` uniform numbers."""
+    bits: Any = rng.bit_generator  # PCG64 of `default_rng` can advance backwards.
+    # A buffered 32-bit half must survive; `advance` discards it.
     waiting = bits.state
     bits.advance(-count)
     bits.state = {**waiting, "state": bits.state["state"]}
@@ -158,7 +158,7 @@ def zone_radius_m(spec: ArenaSpec, zone: int | None) -> float:
 
 
 def zone_of(spec: ArenaSpec, goal: Floats) -> int | None:
-    """Return the smallest zone that holds a goal (2,) [m from the start]; None: beyond them all."""
+    """Return the smallest zone that contains a goal (2,) [m from the start]; None = beyond all."""
     distance = math.hypot(goal[0], goal[1])
     return next((k for k, radius in enumerate(spec.zones_m) if distance <= radius), None)
 
@@ -178,7 +178,7 @@ def draw_goal(
         return None
     goal, span = np.empty(2), high - low
     for _ in range(BATCHES):
-        # Drawn here: numba needs longer to take a generator than numpy to draw all of them.
+        # One numpy call is faster than passing a generator to numba.
         numbers = rng.random((BATCH, 2))
         if _find_goal(numbers, low, span, nearest, farthest, keep_off.center, keep_off.half, goal):
             return goal
@@ -196,7 +196,7 @@ def _find_goal(
     half: Floats,
     goal: Floats,
 ) -> bool:
-    """Write the first of the points `numbers` (n, 2), scaled, in the ring and outside all boxes."""
+    """Write the first of the scaled points `numbers` (n, 2) in the ring and outside all boxes."""
     for number in numbers:
         for axis in range(2):
             goal[axis] = low[axis] + span[axis] * number[axis]

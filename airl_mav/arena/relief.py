@@ -1,11 +1,11 @@
-"""How high the ground is, for kernels: at a place, and at most within a disc.
+"""Ground heights for kernels: at a position, and the maximum within a disc.
 
-Between the points of its grid it is the triangles that `arena.ground` defines.
+Between grid points the ground is the triangles of `arena.ground`.
 
 Random numbers on a coarse lattice are joined by a uniform cubic B-spline (de Boor, A practical
-guide to splines, 1978), which has no steps in its slope nor in its curvature. What lies above the
-middle of them rises as its square, so that hills begin without an edge. There are only sums and
-products of the numbers drawn. A seed gives the same bits on any machine.
+guide to splines, 1978), with continuous slope and curvature. Values above the mean are squared, so
+that hills begin without an edge. The height uses only sums and products of the drawn numbers, so a
+seed is bit-identical on any machine.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.profiles.terrain import Terrain
 
 TRIES = 20
-"""Hills are drawn anew, so often at most, while the highest ones are where the ground is level."""
+"""Maximum draws of the hills; redrawn while the level area removes the highest ones."""
 
 
 def draw_ground(rng: np.random.Generator, terrain: Terrain, bounds: Bounds) -> Ground:
-    """Draw the hills of an arena; arguments as of `check_terrain`, which has passed them."""
+    """Draw the hills of an arena; arguments as in `check_terrain`, which must have passed."""
     least, greatest = terrain.relief_m
     relief_m = least + (greatest - least) * float(rng.random())
     length, width = bounds.north_max - bounds.north_min, bounds.east_max - bounds.east_min
@@ -40,7 +40,7 @@ def draw_ground(rng: np.random.Generator, terrain: Terrain, bounds: Bounds) -> G
     away = np.sqrt(
         (bounds.north_min + north[:, None]) ** 2 + (bounds.east_min + east[None, :]) ** 2
     )
-    # A triangle that rises reaches as far as its cell: none does where the ground is level.
+    # A rising triangle spans its cell: keep the entire cell outside the level area.
     level = terrain.flat_m + math.sqrt(step_n * step_n + step_e * step_e)
     share = _smooth((away - level) / terrain.scale_m)
     hills = np.zeros_like(away)
@@ -64,7 +64,7 @@ def stand_on(
 ) -> tuple[Obstacles, tuple[PlacedMesh, ...]]:
     """Return obstacles and meshes moved from the floor onto the ground.
 
-    Each thing stands on the lowest ground below its bounding box, so that nothing floats. Spheres
+    Each obstacle stands on the lowest ground below its bounding box, so that none floats. Spheres
     keep their height above the start.
     """
     if statics is None:
@@ -93,7 +93,7 @@ def _smooth(x: Floats) -> Floats:
 
 
 def _noise(rng: np.random.Generator, north: Floats, east: Floats, lattice_m: float) -> Floats:
-    """Draw smooth noise at places north (r,) by east (c,) [m], both from 0 on, about 0."""
+    """Draw smooth noise around 0 at positions north (r,) by east (c,) [m], both from 0 on."""
     n_index, n_weights = _spline(north / lattice_m + float(rng.random()))
     e_index, e_weights = _spline(east / lattice_m + float(rng.random()))
     values = rng.random((int(n_index[-1]) + 4, int(e_index[-1]) + 4)) - 0.5
@@ -107,7 +107,7 @@ def _noise(rng: np.random.Generator, north: Floats, east: Floats, lattice_m: flo
 
 
 def _spline(at: Floats) -> tuple[NDArray[np.int64], tuple[Floats, Floats, Floats, Floats]]:
-    """Return the first of the four knots (n,) of each place, and the weights (n,) of the four."""
+    """Return the first of the four knots (n,) of each position, and their four weights (n,)."""
     index = np.floor(at).astype(np.int64)
     t = at - index
     s = 1.0 - t
@@ -128,7 +128,7 @@ def plane_at(relief: Relief, north: float, east: float) -> tuple[float, float, f
         return 0.0, 0.0, 0.0
     rows, columns = int(grid[ROWS]), int(grid[COLUMNS])
     x, y = (north - grid[0]) / grid[2], (east - grid[1]) / grid[3]
-    # What rounding puts beyond the last row is on it.
+    # Rounding may exceed the last row.
     if not (-1e-9 <= x <= rows - 1 + 1e-9 and -1e-9 <= y <= columns - 1 + 1e-9):
         return 0.0, 0.0, 0.0
     i, j = min(max(int(x), 0), rows - 2), min(max(int(y), 0), columns - 2)
@@ -146,7 +146,7 @@ def plane_at(relief: Relief, north: float, east: float) -> tuple[float, float, f
 
 @kernel
 def sample(relief: Relief, north: Floats, east: Floats, out: Floats) -> None:
-    """Write the heights (rows, columns) [m] at places north (rows,) by east (columns,)."""
+    """Write the heights (rows, columns) [m] at positions north (rows,) by east (columns,)."""
     for i in range(len(north)):
         for j in range(len(east)):
             out[i, j] = plane_at(relief, north[i], east[j])[0]
@@ -170,14 +170,14 @@ def extreme_within(relief: Relief, north: float, east: float, radius: float, sig
     first_column, last_column = math.floor((y - radius) / step_e), math.floor((y + radius) / step_e)
     for i in range(max(int(first_row), 0), min(int(last_row), rows - 2) + 1):
         for j in range(max(int(first_column), 0), min(int(last_column), columns - 2) + 1):
-            # From the disc's middle to the cell's south-west corner.
+            # From the disc's centre to the cell's south-west corner.
             s, w = i * step_n - x, j * step_e - y
             n, e = s + step_n, w + step_e
             at = i * columns + j
             h00, h01 = sign * heights[at], sign * heights[at + 1]
             h10, h11 = sign * heights[at + columns], sign * heights[at + columns + 1]
-            # The diagonal, the west and south sides; those to the north and east are the
-            # neighbours', but where there are none, or the disc ends before them.
+            # Diagonal, west and south sides. The next cell covers the north and east sides, except
+            # at the border of the grid or the disc.
             best = _on_edge(s, w, h00, n, e, h11, radius, best)
             best = _on_edge(s, w, h00, n, w, h10, radius, best)
             best = _on_edge(s, w, h00, s, e, h01, radius, best)
@@ -194,7 +194,7 @@ def extreme_within(relief: Relief, north: float, east: float, radius: float, sig
 def _on_edge(
     x0: float, y0: float, h0: float, x1: float, y1: float, h1: float, radius: float, best: float
 ) -> float:
-    """Return the greatest height of an edge's part within a radius of the origin, or `best`."""
+    """Return the maximum height of an edge within a radius of the origin, or `best`."""
     dx, dy = x1 - x0, y1 - y0
     a, b = dx * dx + dy * dy, x0 * dx + y0 * dy
     root = b * b - a * (x0 * x0 + y0 * y0 - radius * radius)
@@ -222,7 +222,7 @@ def _in_middle(
 ) -> float:
     """Return a triangle's maximum height on the disc's edge, or `best`.
 
-    `s` and `w` are the distances [m] from the disc's middle to the south-west corner of its cell,
+    `s` and `w` are the distances [m] from the disc's centre to the south-west corner of its cell,
     of height `low` and sides `step_n`, `step_e`; `up` and `across` are the slopes north and east.
     """
     steep = math.sqrt(up * up + across * across)

@@ -1,8 +1,8 @@
-"""Rooms: walls inside an arena with doors, so that every room can be reached from every other.
+"""Rooms: interior walls with doors; every room is reachable from every other.
 
 The floor is halved until there are enough rooms; or a corridor runs along it, with a row of rooms
 on either side. Doors join rooms along a random spanning tree, and some other neighbours. Walls and
-the lintels above doors are boxes, so that no other code needs to know rooms.
+the lintels above doors are boxes; all other code treats them as obstacles.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.rooms import EDGE_M, ROOM_WALL, Rooms
 
 TRIES = 500
-"""Plans drawn before a request is refused."""
+"""Plans drawn before generation fails."""
 
 MIDDLE = (0.35, 0.65)
-"""Where a part of the floor is cut, as a share of its length, if rooms fit on both sides."""
+"""Range of the cut as a share of a part's length, if rooms fit on both sides."""
 
 _LEAST_M = 1e-9
-"""A shorter piece of wall is none."""
+"""Minimum length of a wall piece [m]."""
 
 
 @dataclass(frozen=True)
 class Rect:
-    """A part of the floor, its sides along north and east."""
+    """A part of the floor with sides along north and east."""
 
     low: tuple[float, float]
     """South-west corner: north, east [m]."""
@@ -39,11 +39,11 @@ class Rect:
     """North-east corner [m]."""
 
     def side(self, axis: int) -> float:
-        """Return its length along north, 0, or east, 1 [m]."""
+        """Return the length along north, 0, or east, 1 [m]."""
         return self.high[axis] - self.low[axis]
 
     def between(self, axis: int, low: float, high: float) -> Rect:
-        """Return the part of it between two places on an axis [m]."""
+        """Return the part between two positions on an axis [m]."""
         corners = [list(self.low), list(self.high)]
         corners[0][axis], corners[1][axis] = low, high
         (a, b), (c, d) = corners
@@ -56,12 +56,12 @@ class Door:
 
     wall: int
     rooms: tuple[int, int]
-    """Numbers of the rooms that it joins."""
+    """Numbers of the two joined rooms."""
     low: float
-    """Where it begins along the wall [m]."""
+    """Start of the door along the wall [m]."""
     high: float
     height: float
-    """[m]"""
+    """Height of the door [m]."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ class Plan:
     """Rooms, the walls between them, and their doors."""
 
     rooms: tuple[Rect, ...]
-    """A corridor is the first."""
+    """Rooms, a corridor first."""
     walls: tuple[tuple[int, Rect], ...]
-    """Each with the axis across it: 0, one that runs from west to east, 1, from south to north."""
+    """Walls with the axis across: 0 for a wall from west to east, 1 from south to north."""
     doors: tuple[Door, ...]
 
     def passages(self) -> Boxes:
@@ -83,7 +83,7 @@ class Plan:
         return _boxes(rects)
 
     def grown_passages(self, clearance_m: float) -> Boxes:
-        """Return the same, and `clearance_m` [m] before and behind each door."""
+        """Return the passages extended by `clearance_m` [m] before and behind each door."""
         passages = self.passages()
         across = [self.walls[door.wall][0] for door in self.doors]
         margin = np.zeros((len(across), 2))
@@ -117,7 +117,7 @@ _Found = tuple[tuple[Rect, ...], tuple[tuple[int, Rect], ...]]
 
 
 def _divided(rng: np.random.Generator, rooms: Rooms, floor: Rect, count: int) -> _Found:
-    """Cut the floor into rooms, again and again, mostly across its longer side."""
+    """Divide the floor into rooms recursively, mostly across the longer side."""
     done: list[Rect] = []
     walls: list[tuple[int, Rect]] = []
     todo = [(floor, count)]
@@ -140,7 +140,7 @@ def _divided(rng: np.random.Generator, rooms: Rooms, floor: Rect, count: int) ->
 def _cut(
     rng: np.random.Generator, rooms: Rooms, part: Rect, axis: int, n: int
 ) -> tuple[float, int]:
-    """Return where a part of the floor is cut [m], and how many of its n rooms lie before."""
+    """Return the position of the cut [m], and the number of the n rooms before it."""
     length, low = part.side(axis), part.low[axis]
     rows = rooms.slots(part.side(1 - axis))
     share = MIDDLE[0] + (MIDDLE[1] - MIDDLE[0]) * float(rng.random())
@@ -151,7 +151,7 @@ def _cut(
     before = rows * rooms.slots(cut)
     behind = rows * rooms.slots(length - rooms.thickness_m - cut)
     if before + behind < n:
-        # The slack of the whole is on one side: no row of rooms is lost.
+        # Put all slack on one side, so that no row of rooms is lost.
         fit = rooms.slots(length)
         step = rooms.least_side_m + rooms.thickness_m
         slack = length + rooms.thickness_m - fit * step
@@ -192,7 +192,7 @@ def _on_a_corridor(
 def _row(
     rng: np.random.Generator, rooms: Rooms, low: float, length: float, n: int
 ) -> list[tuple[float, float, bool]]:
-    """Return where n rooms of a row begin and end [m], and whether each is the last."""
+    """Return begin and end [m] of n rooms in a row, and whether each is the last."""
     slack = length - n * rooms.least_side_m - (n - 1) * rooms.thickness_m
     marks = np.concatenate([[0.0], np.sort(rng.random(n - 1)), [1.0]])
     sides = rooms.least_side_m + max(slack, 0.0) * np.diff(marks)
@@ -264,7 +264,7 @@ def _neighbours(
 def _adjoins(
     part: Rect, wall: Rect, axis: int, edge: tuple[float, float], face: tuple[float, float]
 ) -> bool:
-    """Return whether an edge of a room lies on a face of a wall, somewhere along it."""
+    """Return whether an edge of a room touches a face of a wall."""
     along = 1 - axis
     overlap = min(part.high[along], wall.high[along]) - max(part.low[along], wall.low[along])
     return abs(edge[axis] - face[axis]) < _LEAST_M and overlap > _LEAST_M
@@ -303,20 +303,20 @@ def _solid(parts: list[tuple[int, Rect, float]], top_m: float) -> Obstacles:
 
 
 def over_doors(arena: Arena) -> NDArray[np.bool_]:
-    """Return (n_static,) which primitives that stand are above a door."""
+    """Return a mask (n_static,) of the primitives above a door."""
     n, boxes = arena.n_static, 0 if arena.building is None else arena.building.boxes
     over: NDArray[np.bool_] = _hang(arena.obstacles)[:n] & (np.arange(n) >= n - boxes)
     return over
 
 
 def standing_on_the_floor(walls: Obstacles) -> Obstacles:
-    """Return of the boxes of walls those that are no lintels."""
+    """Return the wall boxes without lintels."""
     keep = ~_hang(walls)
     return Obstacles(walls.shape[keep], walls.center[keep], walls.half_size[keep], walls.yaw[keep])
 
 
 def _hang(obstacles: Obstacles) -> NDArray[np.bool_]:
-    """Return (n,) which obstacles do not reach down to the floor."""
+    """Return a mask (n,) of the obstacles that do not reach the floor."""
     hang: NDArray[np.bool_] = obstacles.center[:, 2] + obstacles.half_size[:, 2] < -_LEAST_M
     return hang
 

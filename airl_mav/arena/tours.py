@@ -1,7 +1,7 @@
-"""Tours of moving obstacles: random way-point walks that close, free of everything that stands.
+"""Closed tours of moving obstacles: random way-point walks clear of static obstacles.
 
-The paper's movers walk to a random reachable point within 30 m, wait 0.2 s and go on, at a speed
-drawn once (Air Learning's BP_AISpawner). Theirs do not repeat with the seed; these do.
+The paper's movers walk to a random reachable point within 30 m, wait 0.2 s and continue, at a speed
+drawn once (Air Learning's BP_AISpawner). Unlike those, these tours repeat with the seed.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.profiles.arena import MovingObstacles
 
 LEG_MIN_M = 1.0
-"""Shorter legs would only twitch."""
+"""Minimum leg [m]; shorter legs would only twitch."""
 
 BATCH = 32
 BATCHES = 8
 STARTS_PER_TOUR = 16
-"""Places tried for an obstacle that cannot leave where it stands."""
+"""Start positions tried for an obstacle that cannot move."""
 
 HOMING_LEGS = 16
-"""Legs tried for a free way home before the walk goes back the way it came."""
+"""Legs tried for a free return to the start before the walk is retraced."""
 
 ROUNDING_S = 1e-9
-"""Way-points that are passed closer to each other are one."""
+"""Minimum time between way-points [s]; closer ones are merged."""
 
 
 def draw_tours(
@@ -43,15 +43,15 @@ def draw_tours(
     gap_m: float,
     kind: MovingObstacles,
 ) -> list[Tour]:
-    """Draw closed tours, clear of each other at time 0; fewer where one finds no place.
+    """Draw closed tours, clear of each other at time 0; fewer if one finds no place.
 
-    `halves` (n, 2) are half extents [m]. `keep_off` are boxes to avoid at time 0, `walls` on the
-    way, any clearance included, `gap_m` is the minimum gap at time 0 [m].
+    `halves` (n, 2) are half extents [m]. `keep_off` are boxes to avoid at time 0, `walls` during
+    the tour, including any clearance, `gap_m` is the minimum gap at time 0 [m].
     """
     boxes = with_room(keep_off, halves + gap_m)
     low, high = inner(bounds, 0.0)
     slowest, fastest = kind.speed_m_s
-    # Floats, whatever a profile has: the kernel would be compiled for whole numbers, too.
+    # Convert to float: integers would compile a second version of the kernel.
     points, counts, speeds = _walk_all(
         rng,
         halves,
@@ -70,7 +70,7 @@ def draw_tours(
         float(kind.tour_min_s),
     )
     way = points.tolist()
-    # One too many between two tours; not the kernel's hypot, whose last bit is the platform's.
+    # One extra leg between two tours. The last bit of the kernel's hypot depends on the platform.
     legs = np.fromiter(map(math.dist, way, way[1:]), np.float64)
     times, places, ends = _timed(points, counts, speeds, legs, kind.dwell_s)
     return [
@@ -175,10 +175,10 @@ def set_out_later(arena: Arena, later_s: float) -> Arena:
 
 
 def _begun_at(tour: Tour, at_s: float) -> Tour:
-    """Return the same closed way, begun where it is at `at_s` [s] of 0 to its period."""
+    """Return the tour shifted to start at `at_s` [s], between 0 and its period."""
     period = float(tour.times_s[-1])
     here = [[np.interp(at_s, tour.times_s, axis) for axis in tour.points.T]]
-    # The first point is the last one again.
+    # The first point equals the last one.
     times, points = (tour.times_s[1:] - at_s) % period, tour.points[1:]
     order = np.argsort(times, kind="stable")
     order = order[(times[order] > ROUNDING_S) & (times[order] < period - ROUNDING_S)]
@@ -199,7 +199,7 @@ def _draw_waypoint(
     half: Floats,
     there: Floats,
 ) -> bool:
-    """Write the first point that is drawn at the end of a free leg."""
+    """Write the first drawn point that is the end of a free leg."""
     numbers = np.empty((BATCH, 2))
     for _ in range(BATCHES):
         draw_numbers(rng, numbers)
@@ -216,10 +216,10 @@ def _draw_waypoint(
 def _timed(
     points: Floats, counts: NDArray[np.int64], speeds: Floats, legs: Floats, dwell_s: float
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
-    """Return times [s] and places [m] of tours at constant speeds, and where each ends.
+    """Return times [s] and positions [m] of tours at constant speeds, and the end index of each.
 
     `points` (k, 2) are the way-points of all tours [m], `counts` (m,) their numbers, `speeds` (m,)
-    [m/s], `legs` (k - 1,) the distances [m]. A stop at each point but the first takes `dwell_s`.
+    [m/s], `legs` (k - 1,) the distances [m]. Each way-point but the first has a stop of `dwell_s`.
     """
     stops = 1 if dwell_s > 0.0 else 0
     times, places = np.empty(len(points) * (1 + stops)), np.empty((len(points) * (1 + stops), 2))

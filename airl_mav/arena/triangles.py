@@ -1,7 +1,7 @@
 """Triangles of a visible mesh, in a file beside the arena's profile, which has its SHA-256.
 
 A NumPy archive (.npz) without pickled objects holds `vertices` (n, 3) float32, forward, right and
-down from the asset's place on the floor [m], and `faces` (m, 3) int32, the triangles' corners.
+down from the asset's position on the floor [m], and `faces` (m, 3) int32, the triangles' corners.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from airl_mav.core.errors import UsageError
 from airl_mav.profiles.asset_files import GREATEST_M, MOST_TRIANGLES, MeshFile, read_checked
 
 KEPT = 16
-"""Meshes that a process keeps in memory."""
+"""Meshes cached in a process."""
 
 MOST_DRAWN = 100_000
-"""Triangles of one scene in a browser."""
+"""Maximum triangles of one scene in a browser."""
 
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """m triangles. Two of them are the same where they are one object: they are large."""
+    """m triangles. Compared by identity, as they are large."""
 
     vertices: NDArray[np.float32]  # (n, 3) forward, right, down [m]
     faces: NDArray[np.int32]  # (m, 3) numbers of vertices
@@ -75,7 +75,7 @@ def drawn(meshes: Iterable[PlacedMesh], most: int = MOST_DRAWN) -> list[PlacedMe
 
 
 def encoded(triangles: Triangles) -> bytes:
-    """Return the file of triangles: the same triangles, the same bytes."""
+    """Return the file contents of triangles, deterministic."""
     held = io.BytesIO()
     np.savez(held, vertices=triangles.vertices, faces=triangles.faces)
     return held.getvalue()
@@ -97,7 +97,7 @@ def decoded(data: bytes, source: str) -> Triangles:
 
 
 def _problem(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> str | None:
-    """Return what is wrong with the arrays of a file; None: nothing."""
+    """Return the first error in the arrays of a file, or None."""
     for name, array, kind in (("vertices", vertices, np.float32), ("faces", faces, np.int32)):
         if array.dtype != kind or array.ndim != 2 or array.shape[1] != 3:
             return f"{name} {array.dtype} {array.shape}: accepted: {np.dtype(kind)} (n, 3)"
@@ -105,7 +105,7 @@ def _problem(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> str | N
         return f"{len(faces):,} triangles: accepted: 1 to {MOST_TRIANGLES:,}"
     if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
         return f"faces: accepted: numbers of its {len(vertices):,} vertices"
-    if not (np.abs(vertices) <= GREATEST_M).all():  # NaN is not, either
+    if not (np.abs(vertices) <= GREATEST_M).all():  # also rejects NaN
         return f"vertices: accepted: places within {GREATEST_M:g} m of the asset's"
     if not areas(vertices[faces]).any():
         return "faces: accepted: triangles, at least one of which has an area"

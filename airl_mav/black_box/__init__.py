@@ -1,1 +1,1 @@
-"""The black box of a flight: an MCAP file that the companion writes while it flies."""
+"""Black box of a flight: an MCAP file written by the companion in flight."""

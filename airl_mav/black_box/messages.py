@@ -1,9 +1,9 @@
-"""Topics and messages of a black box, and their bytes.
+"""Topics, messages and encoding of a black box.
 
-Messages are JSON with a JSON Schema, made of the classes here, for any reader of MCAP (Foxglove,
-`mcap cat`, pandas). Images and texts have Foxglove's schemas
+Messages are JSON. Their JSON Schemas are generated from the classes of this module. Any MCAP reader
+works (Foxglove, `mcap cat`, pandas). Images and texts use Foxglove's schemas
 (https://docs.foxglove.dev/docs/visualization/message-schemas/introduction). Times `*_us` count from
-the companion's start [µs]. World frames are NED from the start of the flight, bodies FRD.
+the companion's start [µs]. World frames are NED from the start of the flight, body frames FRD.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Whole: TypeAlias = Annotated[int, Field(ge=0, lt=2**62)]
 Base64: TypeAlias = Annotated[str, Field(json_schema_extra={"contentEncoding": "base64"})]
 
 Number: TypeAlias = float | None
-"""None: not a number, or infinite, which JSON cannot say."""
+"""Float; None = NaN or infinite, which JSON does not support."""
 
 Vector3: TypeAlias = tuple[Number, Number, Number]
 Vector4: TypeAlias = tuple[Number, Number, Number, Number]
@@ -36,68 +36,68 @@ Vector4: TypeAlias = tuple[Number, Number, Number, Number]
 
 @dataclass(frozen=True)
 class Decision:
-    """A decision, as soon as its command is sent."""
+    """Decision, written as soon as its command is sent."""
 
     capture_us: Microseconds
-    """Exposure of the frame that it saw; -1: stamped by another clock than the companion's."""
+    """Exposure time of the input frame; -1 = stamped by a clock other than the companion's."""
     decoded_us: Microseconds
     infer_start_us: Microseconds
     action_ready_us: Microseconds
     sent_us: Microseconds
     held_until_us: Microseconds
-    """Until when the action is to be held; `held_before_us` of the next says when it ended."""
+    """Planned end of the action's hold; `held_before_us` of the next decision is the actual end."""
     held_before_us: Microseconds
-    """When the hold of the decision before had ended; -1: this is the first."""
+    """End of the previous decision's hold; -1 for the first decision."""
     position: Vector3
-    """Of the vehicle, as the decision saw it [m]."""
+    """Position of the vehicle as input of the decision [m]."""
     velocity: Vector3
-    """[m/s]."""
+    """Velocity of the vehicle NED [m/s]."""
     quaternion: Vector4
-    """w, x, y, z, body to world."""
+    """Attitude w, x, y, z, body to world."""
     goal_away_m: Number
-    """Distance to the goal: seen from above, if it has no height [m]."""
+    """Distance to the goal [m]; horizontal for a goal without a height."""
     setpoint: Vector4
-    """Forward, right, down [m/s] and yaw rate [rad/s], in the heading frame."""
+    """Setpoint. Velocity commands: forward, right, down [m/s], yaw rate [rad/s], heading frame."""
 
 
 @dataclass(frozen=True)
 class Telemetry:
-    """What the flight controller says of the vehicle."""
+    """State of the vehicle as reported by the flight controller."""
 
     time_us: Microseconds
     position: Vector3
-    """[m]."""
+    """Position NED [m]."""
     velocity: Vector3
-    """[m/s]."""
+    """Velocity NED [m/s]."""
     quaternion: Vector4
-    """w, x, y, z, body to world."""
+    """Attitude w, x, y, z, body to world."""
 
 
 @dataclass(frozen=True)
 class Truth(Telemetry):
-    """What the simulator knows of the vehicle; in files that are exported from a run."""
+    """True state of the vehicle in the simulator; only in files exported from a run."""
 
     power_w: Number
-    """Electrical power, without the companion computer's."""
+    """Electrical power without the companion computer [W]."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """The velocity that is commanded now, as the vehicle's heading turns it."""
+    """Current velocity command, rotated by the vehicle's heading."""
 
     time_us: Microseconds
     velocity: Vector3
-    """NED [m/s]."""
+    """Commanded velocity NED [m/s]."""
     yaw_rate: Number
-    """[rad/s]."""
+    """Commanded yaw rate [rad/s]."""
 
 
 @dataclass(frozen=True)
 class Latency:
-    """How long each stage of a decision took [ms]; None: one of its two ends is not known."""
+    """Duration of each stage of a decision [ms]; None = its start or end is unknown."""
 
     sent_us: Microseconds
-    """Which decision."""
+    """Send time that identifies the decision."""
     t1_ms: Number
     wait_ms: Number
     t2_ms: Number
@@ -111,37 +111,37 @@ class Latency:
 
 @dataclass(frozen=True)
 class Status:
-    """Who flies, and the battery."""
+    """Flight mode, arming state and battery."""
 
     time_us: Microseconds
     armed: bool
     offboard: bool
     mode: str
     voltage_v: float | None
-    """None of this and the following: the flight controller does not tell."""
+    """Battery voltage [V]. None here and below = not reported by the flight controller."""
     current_a: float | None
     battery_remaining: float | None
-    """1 to 0."""
+    """Remaining charge, 1 to 0."""
 
 
 @dataclass(frozen=True)
 class Resources:
-    """What the companion takes of its computer, and how warm that is."""
+    """Load, memory and temperature of the companion computer."""
 
     time_us: Microseconds
     process_cores: float
-    """Cores that the companion kept busy since the message before."""
+    """CPU load of the companion in cores since the previous message."""
     machine_percent: float
-    """Share of all cores that everything kept busy since then."""
+    """Total CPU load in percent of all cores since the previous message."""
     memory_bytes: Whole
-    """Resident set of the companion."""
+    """Resident set size of the companion."""
     temperature_c: float | None
-    """Of the warmest sensor; None: the machine has none."""
+    """Temperature of the warmest sensor [°C]; None without sensors."""
 
 
 @dataclass(frozen=True)
 class Phase:
-    """A phase of the mission begins."""
+    """Start of a phase of the mission."""
 
     time_us: Microseconds
     phase: str
@@ -149,7 +149,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class End:
-    """The mission has ended."""
+    """End of the mission."""
 
     time_us: Microseconds
     reason: str
@@ -158,7 +158,7 @@ class End:
 
 @dataclass(frozen=True)
 class Time:
-    """Calendar time, as Foxglove's schemas have it."""
+    """Calendar time as in Foxglove's schemas."""
 
     sec: int
     nsec: int
@@ -166,23 +166,23 @@ class Time:
 
 @dataclass(frozen=True)
 class RawImage:
-    """foxglove.RawImage: a depth image that a decision saw, before any compensation."""
+    """foxglove.RawImage: input image of a decision before compensation."""
 
     timestamp: Time
     frame_id: str
     width: Whole
     height: Whole
     encoding: str
-    """`mono16`: depth in millimetres, 0 = no return."""
+    """Key of `ENCODINGS`; `mono16` is depth in millimetres, 0 = no return."""
     step: Whole
-    """Bytes of a row."""
+    """Row length in bytes."""
     data: Base64
-    """The rows, little endian."""
+    """Pixel rows, little endian."""
 
 
 @dataclass(frozen=True)
 class Log:
-    """foxglove.Log: a text."""
+    """foxglove.Log: a text message."""
 
     timestamp: Time
     level: int
@@ -234,11 +234,11 @@ ENCODINGS: dict[str, tuple[str, int]] = {
     "rgb8": ("u1", 3),
     "mono8": ("u1", 1),
 }
-"""Of depth, colour and grey: type of the numbers, and channels; 0: no axis of them."""
+"""Data type and channels of depth, colour and grey images; 0 = no channel axis."""
 
 
 def image_message(image: NDArray[Any], unix_us: int, camera: str = "camera") -> RawImage:
-    """Return the message of a depth (h, w) [mm] or colour (h, w, c) image at calendar time."""
+    """Return the message of a depth (h, w) [mm] or colour (h, w, c) image at a calendar time."""
     height, width, *channels = image.shape
     encoding = "mono16" if not channels else "rgb8" if channels == [3] else "mono8"
     rows = np.ascontiguousarray(image, ENCODINGS[encoding][0])
@@ -247,7 +247,7 @@ def image_message(image: NDArray[Any], unix_us: int, camera: str = "camera") -> 
 
 
 def image_of(image: RawImage) -> NDArray[Any]:
-    """Return the image of a message; raise ValueError for a wrong size or unknown encoding."""
+    """Return the image of a message; raise ValueError for a wrong size or unsupported encoding."""
     if image.encoding not in ENCODINGS:
         raise ValueError(f"encoding {image.encoding!r}; accepted: {', '.join(ENCODINGS)}")
     number, channels = ENCODINGS[image.encoding]
@@ -257,12 +257,12 @@ def image_of(image: RawImage) -> NDArray[Any]:
 
 
 def text(message: str, name: str, unix_us: int, level: int = INFO) -> Log:
-    """Return the message of a text that somebody said at a calendar time [µs]."""
+    """Return the message of a text from source `name` at a calendar time [µs]."""
     return Log(time_of(unix_us), level, message, name)
 
 
 def time_of(unix_us: int) -> Time:
-    """Return a calendar time [µs since 1970] as Foxglove's schemas have it."""
+    """Convert a calendar time [µs since 1970] to Foxglove's schema."""
     seconds, rest_us = divmod(unix_us, US_PER_S)
     return Time(seconds, rest_us * NS_PER_US)
 
@@ -271,7 +271,7 @@ UNKNOWN = "null: not known"
 
 
 def foxglove_schema(kind: type[Any]) -> dict[str, Any]:
-    """Return the JSON schema of a message class; a description says which fields are nullable.
+    """Return the JSON schema of a message class; nullable fields are marked by a description.
 
     Foxglove's parser (packages/mcap-support/src/parseJsonSchema.ts in foxglove/studio) requires one
     plain `type` per property, one `items` per array and base64 bytes.
@@ -302,7 +302,7 @@ JSON = "json"
 
 
 class Channel(NamedTuple):
-    """What a reader needs to understand the messages of a topic; the terms are MCAP's."""
+    """Topic, schema and encoding of a channel in MCAP's terms."""
 
     topic: str
     schema_name: str
@@ -317,12 +317,12 @@ def _channel(kind: type[Message]) -> Channel:
 
 
 CHANNELS = {kind: _channel(kind) for kind in TOPICS}
-"""Of our own messages, by their kind."""
+"""Channels of the message classes above."""
 
 _ADAPTERS: dict[type[Message], TypeAdapter[Any]] = {kind: TypeAdapter(kind) for kind in TOPICS}
 
 
 def encoded(message: Message) -> tuple[Channel, bytes]:
-    """Return the channel and the bytes of a message of ours."""
+    """Return the channel and the bytes of a message."""
     kind = type(message)
     return CHANNELS[kind], _ADAPTERS[kind].dump_json(message)

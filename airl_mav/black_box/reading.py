@@ -1,4 +1,4 @@
-"""Reading a black box, also one that a crash has cut short."""
+"""Reader of black boxes, including files truncated by a crash."""
 
 from __future__ import annotations
 
@@ -20,34 +20,34 @@ from airl_mav.black_box.writing import METADATA, RUN
 from airl_mav.core.errors import UsageError
 
 _RECORD_BYTES = 64 * 2**20
-"""No record is longer: a damaged length must not ask for gigabytes."""
+"""Maximum record length; keeps a damaged length field from allocating gigabytes."""
 
 _TORN = (McapError, struct.error, UnicodeDecodeError, ValidationError)
-"""What a file that ends in the midst of a record, or is damaged there, leads to."""
+"""Exceptions raised for a truncated or damaged record."""
 
 M = TypeVar("M", bound=Message)
 
 
 @dataclass
 class BlackBox:
-    """What a black box holds."""
+    """Contents of a black box."""
 
     path: Path
     run: dict[str, Any]
-    """What flew, as `run.json` has it."""
+    """Description of the run as in `run.json`."""
     messages: dict[type[Any], list[Any]] = field(default_factory=dict)
     whole: bool = False
-    """Whether it was closed, or ends somewhere: the program, the computer or the power failed."""
+    """True if the file was closed; False after a crash or power failure."""
     damaged: bool = False
-    """Whether it was closed, and is no longer what was written."""
+    """True if the file was closed but its checksum does not match."""
 
     def all_of(self, kind: type[M]) -> list[M]:
-        """Return the messages of a kind, in their order."""
+        """Return the messages of a kind in file order."""
         return self.messages.get(kind, [])
 
 
 def read_black_box(path: Path) -> BlackBox:
-    """Read a black box up to its end or first damage; UsageError if it is none."""
+    """Read a black box up to its end or first damage; raise UsageError for other files."""
     box = None
     try:
         with path.open("rb") as file:
@@ -71,9 +71,9 @@ def read_black_box(path: Path) -> BlackBox:
 
 
 def _whole_records(reader: StreamReader) -> Iterator[Any]:
-    """Yield metadata, the end, and messages with their kinds, up to the first torn record.
+    """Yield metadata, the end record, and messages with their kinds, up to the first damaged one.
 
-    A wrong checksum of all records replaces the end.
+    A CRCValidationError replaces the end record if the file's checksum does not match.
     """
     kinds = {topic: kind for kind, topic in TOPICS.items()}
     adapters: dict[int, tuple[type[Message], TypeAdapter[Any]]] = {}
@@ -96,7 +96,7 @@ def _whole_records(reader: StreamReader) -> Iterator[Any]:
             return
         except InvalidMagic:
             if adapters:
-                return  # At the end of the file: torn there.
+                return  # The file is truncated before its closing magic.
             raise
         except (StopIteration, *_TORN):
             return

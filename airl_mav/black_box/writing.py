@@ -1,4 +1,4 @@
-"""Writing MCAP files: a black box, message by message, or a flight that is exported as a whole."""
+"""Writer of MCAP files: a black box in flight, or the export of a complete flight."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from airl_mav.black_box.messages import Channel, Message, encoded
 from airl_mav.core.clock import NS_PER_US
 
 METADATA = "airl-mav"
-"""Name of the metadata record that says what flies."""
+"""Name of the metadata record that describes the run."""
 
 RUN = "run"
-"""Its only key: the object of a `run.json`."""
+"""Only key of the metadata record; its value is the object of a `run.json`."""
 
 
 class McapFile:
-    """An MCAP file with the messages of a flight."""
+    """MCAP file with the messages of a flight."""
 
     def __init__(self, file: IO[bytes], run: Mapping[str, Any], *, in_chunks: bool = True) -> None:
-        """Begin an empty file; chunks are compressed and indexed, but lost by a crash."""
+        """Start an empty file; chunks are compressed and indexed, but lost in a crash."""
         self._writer = Writer(
             file,
             compression=CompressionType.ZSTD if in_chunks else CompressionType.NONE,
@@ -39,11 +39,11 @@ class McapFile:
         self._sequence = 0
 
     def write(self, message: Message, unix_us: int) -> None:
-        """Add a message of ours, of a calendar time [µs]. Raises OSError."""
+        """Add a message at a calendar time [µs]. Raises OSError."""
         self.add(*encoded(message), unix_us)
 
     def add(self, channel: Channel, data: bytes, unix_us: int) -> None:
-        """Add a message of a channel, of a calendar time [µs]. Raises OSError."""
+        """Add the encoded message of a channel at a calendar time [µs]. Raises OSError."""
         if channel not in self._channels:
             self._channels[channel] = self._register(channel)
         self._sequence += 1
@@ -57,12 +57,12 @@ class McapFile:
         return self._writer.register_channel(channel.topic, channel.encoding, number)
 
     def finish(self) -> None:
-        """Write what is left, and the index. Raises OSError."""
+        """Write pending data and the index. Raises OSError."""
         self._writer.finish()  # type: ignore[no-untyped-call]
 
 
 class BlackBoxFile(McapFile):
-    """A growing MCAP file without chunks, its index last: readable after a power failure."""
+    """MCAP file without chunks and with the index last; readable after a power failure."""
 
     def __init__(self, path: Path, run: Mapping[str, Any]) -> None:
         """Open a new file; raise OSError if it exists or cannot be written."""
@@ -71,17 +71,17 @@ class BlackBoxFile(McapFile):
         super().__init__(self._file, run, in_chunks=False)
 
     def sync(self) -> None:
-        """Put onto the disk what was written so far. Raises OSError."""
+        """Flush all written data to the disk. Raises OSError."""
         self._file.flush()
         os.fsync(self._file.fileno())
 
     def finish(self) -> None:
-        """Write the index, and close the file. Raises OSError."""
+        """Write the index and close the file. Raises OSError."""
         super().finish()
         self.sync()
         self._file.close()
 
     def abandon(self) -> None:
-        """Close the file as it is; what a full disk no longer takes is lost."""
+        """Close the file as it is; data that a full disk rejects are lost."""
         with suppress(OSError):
             self._file.close()

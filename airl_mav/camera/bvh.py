@@ -1,9 +1,9 @@
-"""A bounding volume hierarchy over the triangles of a mesh, built once for each mesh.
+"""Bounding volume hierarchy over the triangles of a mesh, built once for each mesh.
 
-A binary tree of boxes along the mesh's axes (Wald, On fast construction of SAH-based bounding
-volume hierarchies, 2007). Each split is the one of least expected cost of a ray, by the surface
-areas of both sides, among `BINS` places along each axis. The tree lies in flat arrays, depth first.
-The left child of an inner node is the next node.
+The tree is binary, with boxes along the mesh's axes (Wald, On fast construction of SAH-based
+bounding volume hierarchies, 2007). Each node is split where the expected cost of a ray is lowest,
+from the surface areas of both sides, among `BINS` positions along each axis. The tree is stored in
+flat arrays, depth first. The left child of an inner node is the next node.
 """
 
 from __future__ import annotations
@@ -28,33 +28,33 @@ from airl_mav.profiles.asset_files import MeshFile
 from airl_mav.vehicle.rotation import Vec
 
 BINS: Final = 16
-"""Places of splits along an axis."""
+"""Candidate split positions along an axis."""
 
 LEAF: Final = 4
-"""A leaf has at most so many triangles."""
+"""Maximum number of triangles in a leaf."""
 
 DEEPEST: Final = 32
-"""Below this level nodes are split in halves, so that no tree is deeper than twice as much."""
+"""Level below which nodes are split in halves; the depth is at most twice this value."""
 
 SPARE_M: Final = 1e-6
-"""A node is larger than its triangles by this, to each side [m]."""
+"""Margin by which a node's box exceeds its triangles, on each side [m]."""
 
 STACK: Final = 2 * DEEPEST
-"""Nodes that wait while a tree is walked through, at most."""
+"""Maximum number of pending nodes during a traversal."""
 
 
 class Bvh(NamedTuple):
-    """Trees over the triangles of meshes, one after the other; a tuple, so that kernels take it."""
+    """Concatenated trees over the triangles of meshes; a tuple, because kernels require one."""
 
     boxes: NDArray[np.float32]  # (k, 6) centre and half size of each node along the axes [m]
     links: NDArray[np.int32]
-    """(k, 2) of an inner node: its right child, 0. Of a leaf: its first triangle, their number."""
+    """(k, 2) inner node: right child, 0; leaf: first triangle, number of triangles."""
     corners: NDArray[np.float32]  # (m, 9) three corners of each triangle, in the leaves' order [m]
     normals: NDArray[np.float32]  # (m, 3) unit vectors, to either side
 
 
 def build_bvh(triangles: Triangles) -> Bvh:
-    """Return the tree over triangles with an area; deterministic."""
+    """Return the tree over triangles of non-zero area; deterministic."""
     corners = triangles.corners.astype(np.float64)
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(across, axis=1)
@@ -69,7 +69,7 @@ def build_bvh(triangles: Triangles) -> Bvh:
     bounds, links = bounds[:count], links[:count].copy()
     centre = (0.5 * (bounds[:, :3] + bounds[:, 3:])).astype(np.float32)
     reach = np.maximum(bounds[:, 3:] - centre, centre - bounds[:, :3])
-    # Neither in float32 nor to a ray that is rounded a node is smaller than what is in it.
+    # The margin and the next float32 up keep every triangle inside its box despite rounding.
     half = np.nextafter((reach + SPARE_M).astype(np.float32), np.float32(np.inf))
     return Bvh(
         np.concatenate([centre, half], axis=1),
@@ -89,13 +89,13 @@ def _build(
 ) -> int:
     """Write the tree over m boxes, `low` and `high` (m, 3); return its number of nodes.
 
-    `order` (m,) are the boxes' numbers, sorted by leaf. Written are `bounds` (2 m - 1, 6), lowest
-    and highest corner of each node, and `links` (2 m - 1, 2), as of `Bvh`.
+    `order` (m,) contains the boxes' indices and is sorted by leaf. The outputs are `bounds` (2 m -
+    1, 6), the lowest and highest corner of each node, and `links` (2 m - 1, 2), as in `Bvh`.
     """
     waiting = np.empty((STACK + 1, 4), np.int64)  # begin, end, parent of a right child, level
     waiting[0] = (0, len(order), -1, 0)
     tops, count = 1, 0
-    from_low, from_high = np.empty(3), np.empty(3)  # of the centres
+    from_low, from_high = np.empty(3), np.empty(3)  # of twice the centres
     while tops > 0:
         tops -= 1
         begin, end, parent, level = waiting[tops]
@@ -195,7 +195,7 @@ def _grown_area(
     bin_high: NDArray[np.float64],
     at: int,
 ) -> float:
-    """Put a bin into a side; return half the surface of its box, 0 where it holds nothing."""
+    """Extend a side by a bin; return half the surface area of its box, 0 if the side is empty."""
     for each in range(3):
         side_low[each] = min(side_low[each], bin_low[at, each])
         side_high[each] = max(side_high[each], bin_high[at, each])
@@ -213,14 +213,14 @@ def bvh_of(file: MeshFile) -> Bvh:
 def ground_tree(ground: Ground) -> Bvh:
     """Return the tree of the ground's triangles along east, south and down (`GROUND_POSE`).
 
-    The floor's pattern begins along these axes and continues on hills (`surfaces.shade_floor`).
+    The floor's pattern starts along these axes and continues on hills (`surfaces.shade_floor`).
     """
     corners = ground.points[:, [1, 0, 2]] * (1.0, -1.0, 1.0)
     return build_bvh(Triangles(corners.astype(np.float32), ground.faces))
 
 
 class Forest(NamedTuple):
-    """The trees of several meshes, and where each begins; None: that of the ground."""
+    """Trees of several meshes, and the root of each; the key None is the ground."""
 
     bvh: Bvh
     roots: dict[MeshFile | None, int]
@@ -239,7 +239,7 @@ NO_TREES: Final = Forest(
 
 @lru_cache(maxsize=4)
 def forest_of(files: tuple[MeshFile, ...], ground: Ground | None = None) -> Forest:
-    """Return the joint trees of meshes and ground; raises as `triangles_of`."""
+    """Return the joint trees of meshes and ground. Raises as `triangles_of`."""
     names: list[MeshFile | None] = [*files]
     trees = [bvh_of(file) for file in files]
     if ground is not None:
@@ -272,16 +272,16 @@ GROUND_POSE: Final = (0.0, 0.0, 0.0, 1.0, 1.0, 0.0)
 
 
 UNSEEN: Final = 1 << 30
-"""`Meshes.owner` of an obstacle that depth passes through: nothing is seen in its place."""
+"""`Meshes.owner` of an obstacle that depth rays pass through; it is invisible."""
 
 
 class Meshes(NamedTuple):
-    """The k placed meshes of an arena for kernels; hills are the last, without an obstacle."""
+    """The k placed meshes of an arena for kernels; hills come last and have no obstacle."""
 
     bvh: Bvh
     owner: NDArray[np.int32]
-    """(n,) the mesh that each obstacle is a part of; -1: of none; UNSEEN."""
-    first: NDArray[np.int32]  # (k,) the obstacle whose number and material it has; GROUND_FIRST
+    """(n,) index of the mesh that contains each obstacle; -1 = no mesh; UNSEEN."""
+    first: NDArray[np.int32]  # (k,) obstacle with the mesh's number and material; GROUND_FIRST
     root: NDArray[np.int32]  # (k,) root of its tree
     pose: NDArray[np.float64]
     """(k, 6) north, east [m], cosine and sine of its heading, scale, down [m]."""
@@ -290,7 +290,7 @@ class Meshes(NamedTuple):
 
 @borrowing_kernel
 def count_of(meshes: Meshes | None) -> int:
-    """Return how many meshes there are."""
+    """Return the number of meshes."""
     return 0 if meshes is None else len(meshes.first)
 
 
@@ -303,7 +303,7 @@ def material_row(meshes: Meshes, k: int) -> int:
 
 @borrowing_kernel
 def raised(meshes: Meshes | None, position: Vec | NDArray[np.float64]) -> Vec:
-    """Return a camera's place NED [m], raised to `MIN_DEPTH_M` above the ground below it."""
+    """Return a camera's position NED [m], raised to `MIN_DEPTH_M` above the ground."""
     lowest = -MIN_DEPTH_M
     if meshes is not None:
         lowest -= plane_at(meshes.relief, position[0], position[1])[0]
@@ -312,7 +312,7 @@ def raised(meshes: Meshes | None, position: Vec | NDArray[np.float64]) -> Vec:
 
 @borrowing_kernel
 def is_owned(meshes: Meshes | None, i: int) -> bool:
-    """Return whether cameras see a mesh in place of obstacle i, or nothing."""
+    """Return True if cameras see a mesh, or nothing, in place of obstacle i."""
     return False if meshes is None else meshes.owner[i] >= 0
 
 
@@ -324,8 +324,8 @@ def meshes_of(
 ) -> Meshes | None:
     """Return an arena's meshes, hills included; None without meshes, hills and glass.
 
-    Depth passes through the obstacles `clear` (n,), `Arena.clear`; None = none, as for colour.
-    Raises UsageError if a file is missing or has changed.
+    Depth rays pass through the obstacles `clear` (n,), see `Arena.clear`; None = through none of
+    them, as for colour. Raises UsageError if a file is missing or has changed.
     """
     if not placed and ground is None and clear is None:
         return None
@@ -340,7 +340,7 @@ def placed_in(
     n_obstacles: int,
     clear: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-    """Return `owner`, `first`, `root` and `pose` of `Meshes`, with hills if in `roots`."""
+    """Return `owner`, `first`, `root` and `pose` of `Meshes`, with hills if `roots` has them."""
     owner = np.full(n_obstacles, -1, np.int32)
     if clear is not None:
         owner[clear] = UNSEEN

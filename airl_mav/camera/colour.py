@@ -1,8 +1,8 @@
-"""Colour image of an arena: bodies of `raycast`, then shadows, then what each body looks like.
+"""Colour image of an arena: bodies of `raycast`, then shadows, then the shading of each body.
 
-One ray a pixel. Like depth it is drawn obstacle by obstacle: each shades the pixels of its
-rectangles that see it. Depth, light and colour of the lines are planes of 32 bits, so that every
-loop along a line vectorises.
+Each pixel is sampled by one ray. As with depth, the image is drawn obstacle by obstacle: each
+obstacle shades its visible pixels within its rectangles. Depth, light and colour are stored as
+planes of 32 bits, so that every loop along a line vectorizes.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from airl_mav.vehicle.rotation import Quat, Vec
 U32 = np.uint32
 
 RANGE_M: Final = 10_000.0
-"""How far a colour camera sees [m]: beyond every arena."""
+"""Range of a colour camera [m]; exceeds every arena."""
 
 
 class Work(NamedTuple):
-    """Room to work in for images of n lines of m pixels; nothing in it outlasts a call."""
+    """Work buffers for images of n lines of m pixels; valid during one call only."""
 
     lines: NDArray[np.float64]  # (n, 2)
     xs: NDArray[np.float64]  # (m,)
@@ -62,7 +62,7 @@ class Work(NamedTuple):
 
     @classmethod
     def of(cls, width: int, height: int, cylindrical: bool) -> Work:
-        """Return the room for images of a size; lines are rows, or columns of a cylinder."""
+        """Return buffers for an image size; lines are rows, or columns of a cylinder."""
         n, m = (width, height) if cylindrical else (height, width)
         block = max(surfaces.BLOCK, m)
 
@@ -110,16 +110,16 @@ def render_colour(
     atlas: Plane,
     bent: Bent | None,
 ) -> None:
-    """Render the colour image of an arena; arguments not listed as of `render_depth`.
+    """Render the colour image of an arena; arguments not listed as in `render_depth`.
 
-    `rgb` (height, width, 3) sRGB, `depth` (height, width) unlimited [m], 0 = no surface, and `seen`
-    are written. The image is black from inside an obstacle. `seen` is CEILING, SKY, ... of
-    `primitives`, FLOOR also for hills, OBSTACLE + the number of an obstacle or of a mesh's first.
-    `texture` (2 + n,), `offset` (2 + n, 2) and `albedo` (2 + n, 2, 3) are those of `Finish`,
-    `per_m` (2 + n,) periods of the pattern per metre, `atlas` is `textures.atlas()`. `gloss`
-    describes surfaces that are not matt; None costs nothing. `lights` (7, 3): direction of the sun,
-    its irradiance, that of the sky, the floor's mean radiosity, zenith, horizon, and the fog's
-    extinction [1/m] in the first column.
+    The outputs are `rgb` (height, width, 3) sRGB, `depth` (height, width) unlimited [m], 0 = no
+    surface, and `seen`. Inside an obstacle the image is black. `seen` is CEILING, SKY, ... of
+    `primitives`, FLOOR also for hills, or OBSTACLE + the number of an obstacle or of a mesh's
+    first. `texture` (2 + n,), `offset` (2 + n, 2) and `albedo` (2 + n, 2, 3) are fields of
+    `Finish`, `per_m` (2 + n,) is the number of pattern periods per metre, `atlas` is
+    `textures.atlas()`. `gloss` describes surfaces that are not matt; None has no cost. `lights` (7,
+    3): direction of the sun, irradiance of sun and sky, the floor's mean radiosity, zenith,
+    horizon, and the fog's extinction [1/m] in the first column.
     """
     camera = raised(meshes, position)
     lines, xs = work.lines, work.xs
@@ -147,7 +147,7 @@ def render_colour(
 def _show_inside(
     rgb: NDArray[np.uint8], depth: Plane, seen: Ids, inside: int, bent: Bent | None
 ) -> None:
-    """Write what is seen from inside an obstacle."""
+    """Write the image of a camera inside an obstacle."""
     rgb[:, :, :] = 0
     depth[:, :] = MIN_DEPTH_M
     seen[:, :] = OBSTACLE + inside
@@ -172,11 +172,11 @@ def _show(
     look: Look,
     gloss: Gloss | None,
 ) -> None:
-    """Write the colours of what `draw_bodies` has drawn.
+    """Write the colours of the bodies drawn by `draw_bodies`.
 
-    `far` (n, m) is depth [m], `ids` what each pixel sees (hills become floor), `rectangles`
-    (obstacles + meshes, 3, 4) where bodies were drawn, `faces` (n, m) the meshes' triangles;
-    `gloss` is that of `look`.
+    `far` (n, m) is depth [m], `ids` the body of each pixel (hills become floor), `rectangles`
+    (obstacles + meshes, 3, 4) the bodies' bounds, `faces` (n, m) the meshes' triangles. `gloss` is
+    `look.gloss`.
     """
     camera, view, light, count = optics.camera, optics.lens, look.light, ids.size
     lit, out, rays = work.lit, work.out, work.rays
@@ -228,7 +228,7 @@ def _tell_ground(ids: Ids, meshes: Meshes | None) -> None:
 
 @borrowing_kernel
 def _blacken(out: Packed, bent: Bent | None) -> None:
-    """Write black where a fisheye's pixels see nothing at all."""
+    """Write black into fisheye pixels outside the field of view."""
     if bent is None:
         return
     n, m = bent.forward.shape
@@ -241,7 +241,7 @@ def _blacken(out: Packed, bent: Bent | None) -> None:
 
 @borrowing_kernel
 def _lit(lights: NDArray[np.float32]) -> Lit:
-    """Return the light of its array."""
+    """Return the light from its array."""
     return Lit(
         (lights[0, 0], lights[0, 1], lights[0, 2]),
         (lights[1, 0], lights[1, 1], lights[1, 2]),
@@ -255,7 +255,7 @@ def _lit(lights: NDArray[np.float32]) -> Lit:
 
 @borrowing_kernel
 def unpack(rgb: NDArray[np.uint8], out: Packed, cylindrical: bool) -> None:
-    """Write the image of its packed pixels, line after line."""
+    """Write the image from its packed pixels, line by line."""
     height, width, _ = rgb.shape
     if cylindrical:
         for v in range(height):

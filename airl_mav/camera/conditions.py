@@ -1,4 +1,4 @@
-"""What a camera refuses to be asked for: a light import, so that commands can refuse early."""
+"""Checks of camera settings; imports little, so that commands can reject bad settings early."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _check_drawn(camera: Camera, renderer: Renderer, arena: ArenaSpec) -> None:
 
 
 def check_twin_imaging(camera: Camera, name: str = "") -> None:
-    """Raise FieldError for auto-exposure lag, where only decisions take frames."""
+    """Raise FieldError for auto-exposure lag, unsupported where only decisions take frames."""
     auto = None if camera.imaging is None else camera.imaging.auto_exposure
     if auto is not None and auto.time_constant_s > 0.0:
         raise FieldError(

@@ -1,8 +1,8 @@
-"""An image with any rays, resampled from pinhole images of the faces of a cube about the camera.
+"""Resampling of an image with arbitrary rays from pinhole images of a cube's faces.
 
-For renderers that have pinholes alone. A pixel is divided into `side` x `side` places. Each has a
-ray, which leaves the cube through one face, and takes what the nearest pixel of that face shows.
-Only faces, and of them only the rectangles, that a ray goes through are rendered.
+For renderers that only support pinholes. A pixel is divided into `side` x `side` samples. Each
+sample's ray leaves the cube through one face and takes the value of the nearest pixel there. Only
+faces with rays are rendered, and only the rectangle that the rays cover.
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ from airl_mav.profiles.distortion import sees_to, steepness
 Floats = NDArray[np.float64]
 
 FACES = tuple((axis, sign) for axis in range(3) for sign in (1.0, -1.0))
-"""Axis of the camera (forward, right, down) that a face lies across, and to which side."""
+"""Camera axis (forward, right, down) perpendicular to a face, and the side of the face."""
 
 MOST_SIDE = 4
-"""A pixel is divided into so many places a side, at most."""
+"""Maximum samples along each side of a pixel."""
 
 MOST_PLACES = 1 << 24
-"""Places of an image, at most: each takes some hundred bytes while they are found."""
+"""Maximum samples of an image; the search takes about a hundred bytes for each sample."""
 
 
 class Face(NamedTuple):
-    """One face of the cube: the axes of its image, and which part of it is rendered."""
+    """One face of the cube: the axes of its image, and the rendered part."""
 
     axes: Floats
-    """(3, 3) rows forward, right, down of the face's own camera, in the camera's axes forward,
-    right, down."""
+    """(3, 3) rows forward, right, down of the face's camera, in the camera's axes forward, right,
+    down."""
     pixels: int
-    """Of its whole image, a pinhole of 90 degrees, along each side."""
+    """Pixels along each side of the whole face, a pinhole of 90 degrees."""
     left: int
     top: int
     width: int
     height: int
     places: NDArray[np.intp]
-    """(n,) numbers of the places (h side, w side), flattened, that look through this face."""
+    """(n,) indices of the samples (h side, w side), flattened, that look through this face."""
     source: NDArray[np.intp]
-    """(n,) the pixel of the rendered part, flattened, that each of them sees."""
+    """(n,) pixel of the rendered part, flattened, for each sample."""
 
 
 class Cube(NamedTuple):
-    """How an image is made of faces."""
+    """Cube faces of an image and their mapping to pixels."""
 
     shape: tuple[int, int]
     """Rows and columns of the image."""
@@ -57,7 +57,7 @@ class Cube(NamedTuple):
 
 
 def side_for(camera: Intrinsics, samples: int) -> int:
-    """Return into how many places a side a pixel of so many samples is divided."""
+    """Return the samples along each side of a pixel for a total number of samples."""
     side = min(MOST_SIDE, math.isqrt(samples))
     while side > 1 and side * side * camera.width * camera.height > MOST_PLACES:
         side -= 1
@@ -67,12 +67,12 @@ def side_for(camera: Intrinsics, samples: int) -> int:
 def cube_of(camera: Intrinsics, side: int) -> Cube:
     """Return the cube faces of a camera's image with side x side samples per pixel.
 
-    The middle of a face, where it is coarsest, is as fine as the image's middle so divided. Around
-    it a fisheye's image is finer, by half at 90 degrees.
+    Faces are coarsest in the middle, where they match the resolution of the image's middle times
+    `side`. Around it a fisheye's image is finer, by half at 90 degrees.
     """
     k, fine = camera, finer(camera, side)
     rays = rays_of(fine)
-    # A pixel that sees nothing is black as a whole.
+    # A pixel outside the field of view is entirely black.
     blind = ~rays_of(k).any(axis=0)
     rays[:, np.repeat(np.repeat(blind, side, axis=0), side, axis=1)] = 0.0
     rays = rays.reshape(3, -1)
@@ -88,7 +88,7 @@ def cube_of(camera: Intrinsics, side: int) -> Cube:
 
 
 def resampled(cube: Cube, images: list[Floats]) -> Floats:
-    """Return the image (h, w, channels) of faces: the mean of each pixel's samples; 0: none."""
+    """Return the image (h, w, channels) from faces: mean of each pixel's samples, 0 without any."""
     height, width = cube.shape
     side, channels = cube.side, images[0].shape[-1] if images else 3
     light = np.zeros((height * side * width * side, channels))
@@ -104,7 +104,7 @@ def resampled(cube: Cube, images: list[Floats]) -> Floats:
 
 
 def _finest(k: Intrinsics) -> float:
-    """Return the most pixels that an image has on an angle, in shares of its focal length."""
+    """Return the maximum pixels per angle of an image, relative to the focal length."""
     if k.projection != "fisheye":
         return 1.0
     angles = np.linspace(0.0, min(0.5 * k.horizontal_fov_rad, sees_to(k.distortion)), 65)
@@ -112,10 +112,10 @@ def _finest(k: Intrinsics) -> float:
 
 
 def _face(rays: Floats, places: NDArray[np.intp], axis: int, sign: float, pixels: int) -> Face:
-    """Return the face that rays (3, n), of these places, go through."""
+    """Return the face for rays (3, n) of these samples."""
     forward, right = np.zeros(3), np.zeros(3)
     forward[axis] = sign
-    # Any turn about its own axis will do.
+    # The rotation about the optical axis is arbitrary.
     right[(axis + 1) % 3] = 1.0
     axes = np.stack([forward, right, np.cross(forward, right)])
     ahead, aside, below = axes @ rays

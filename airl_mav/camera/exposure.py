@@ -1,4 +1,4 @@
-"""What a camera of any kind takes from a pose: depth, colour or grey, without noise."""
+"""Images of any camera kind from a pose: depth, colour or grey, without noise."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.vehicle.rotation import Quat, Vec
 
 PATHS = 16
-"""Paths that Mitsuba traces through a pixel: their noise is that of a sensor in daylight."""
+"""Mitsuba paths per pixel; the noise resembles a sensor in daylight."""
 
 
 _SEEDS = 1 << 32
 
 
 class Exposure(Protocol):
-    """Takes images; see `expose`."""
+    """Interface of image functions; see `expose`."""
 
     def __call__(
         self,
@@ -40,16 +40,16 @@ class Exposure(Protocol):
 
 
 def exposure_by(renderer: Renderer, name: str = "") -> Exposure:
-    """Return what takes the images of a camera with this renderer; "" is the main camera."""
+    """Return the image function of a camera for a renderer; "" is the main camera."""
     return expose if renderer == "raycast" else PathTraced(1 + sum(words_of(name)))
 
 
 class PathTraced:
-    """Takes colour images by Mitsuba's path tracer, each number with noise of its own."""
+    """Colour images from Mitsuba's path tracer; each image number has different noise."""
 
     def __init__(self, first: int = 0) -> None:
-        """Take the seed of image 0's noise; those of the next numbers follow, modulo 2^32."""
-        # Imported here: what it draws with is an extra.
+        """Store the noise seed of image 0; later images count up from it, modulo 2^32."""
+        # Imported here because Mitsuba is an optional dependency.
         from airl_mav.camera.mitsuba import PathTracer
 
         self._tracer = PathTracer(PATHS)
@@ -81,9 +81,9 @@ def expose(
     quaternion: Quat | NDArray[np.float64],
     number: int = 0,  # noqa: ARG001 (nothing is drawn by lot)
 ) -> NDArray[Any]:
-    """Return the image that a camera takes of an arena, as in `Frame.image`; see `render.render`.
+    """Return a camera's image of an arena, as in `Frame.image`; see `render.render`.
 
-    Colour has no maximum depth. `number`: the image's in the episode, for renderers with noise.
+    Colour has no maximum depth. `number`: image number in the episode, for renderers with noise.
     """
     if intrinsics.kind == "depth":
         return depth_to_z16(render(arena, centers, intrinsics, max_range, position, quaternion))

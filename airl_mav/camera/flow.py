@@ -1,9 +1,9 @@
-"""Optical flow: how fast what a pixel shows moves over the image, in closed form.
+"""Optical flow: the image velocity of the point that each pixel shows, in closed form.
 
 A point p in the camera's axes moves by p' = R^T (v_point - v_camera) - w x p, where R are these
-axes, and w is their angular velocity; its place in the image moves by the derivative of the
-projection along p' (Longuet-Higgins and Prazdny, "The interpretation of a moving retinal image",
-1980). What is infinitely far moves by the rotation alone.
+axes, and w is their angular velocity. Its image moves by the derivative of the projection along p'
+(Longuet-Higgins and Prazdny, "The interpretation of a moving retinal image", 1980). Infinitely
+distant points move by the rotation only.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from airl_mav.profiles.distortion import distorted, steepness
 Floats = NDArray[np.float64]
 
 MOVED_OVER_US = 1_000
-"""Velocities of moving obstacles are those between so long before and after a moment [µs]."""
+"""Half interval of the central difference for velocities of moving obstacles [µs]."""
 
 _ON_AXIS = 1e-9
 
 
 class CameraMotion(NamedTuple):
-    """How a camera moves at a moment."""
+    """Pose and velocity of a camera."""
 
     position: Floats
     """(3,) NED [m]."""
@@ -45,7 +45,7 @@ class CameraMotion(NamedTuple):
 
 
 def motion_of_camera(vehicle: Motion, mount: Mount) -> CameraMotion:
-    """Return how a camera moves that sits on a vehicle."""
+    """Return the motion of a camera mounted on a vehicle."""
     at, attitude = camera_pose(vehicle.position, vehicle.quaternion, mount)
     body = quat_to_matrix(vehicle.quaternion)
     lever = np.cross(vehicle.rates, np.array(mount.offset))
@@ -66,7 +66,7 @@ def velocities_of(arena: Arena, elapsed_us: int) -> Floats:
 def optical_flow(
     picture: Picture, camera: Intrinsics, motion: CameraMotion, velocities: Floats
 ) -> NDArray[np.float32]:
-    """Return the flow (h, w, 2) of a picture [px/s], NaN where a fisheye sees nothing."""
+    """Return the flow (h, w, 2) of a picture [px/s]; NaN outside a fisheye's field of view."""
     rays = rays_of(camera)
     axes = quat_to_matrix(motion.quaternion)
     depth = picture.depth_m.astype(np.float64)
@@ -85,7 +85,7 @@ def optical_flow(
 
 
 def _pushed(camera: Intrinsics, points: Floats, moves: Floats) -> tuple[Any, Any]:
-    """Return how fast points (3, h, w), which move so (3, h, w), move over the image [px/s]."""
+    """Return the image velocity [px/s] of points (3, h, w) with velocities `moves` (3, h, w)."""
     (z, x, y), (dz, dx, dy), f = points, moves, camera.focal
     with np.errstate(invalid="ignore", divide="ignore"):
         if camera.projection == "pinhole":

@@ -1,4 +1,4 @@
-"""A camera's frame and its wire format: one ZeroMQ message, header then pixels."""
+"""Camera frame and its wire format: one ZeroMQ message, header then pixels."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def image_of(data: bytes, height: int, width: int, channels: int) -> NDArray[np.
     """Return the image (h, w, channels) of a JPEG file of this size.
 
     Raises:
-        ValueError: It is damaged, or has another size or other channels.
+        ValueError: The file is damaged, or has another size or other channels.
         UsageError: Pillow is not installed.
     """
     try:
@@ -70,8 +70,8 @@ MAGICS: dict[tuple[CameraKind, Projection], bytes] = {
     ("rgb", "fisheye"): b"ARE1",
     ("grey", "fisheye"): b"AGE1",
 }
-"""How a frame begins: air-learning depth, RGB or grey; frame, cylinder, or equidistant fisheye;
-version 1."""
+"""Magic numbers of a frame: air-learning depth, RGB or grey; frame, cylinder, or equidistant
+fisheye; version 1."""
 
 JPEG_MAGICS: dict[tuple[CameraKind, Projection], bytes] = {
     ("rgb", "pinhole"): b"JRF1",
@@ -81,7 +81,7 @@ JPEG_MAGICS: dict[tuple[CameraKind, Projection], bytes] = {
     ("rgb", "fisheye"): b"JRE1",
     ("grey", "fisheye"): b"JGE1",
 }
-"""The same where a JPEG file follows the header in place of pixels."""
+"""Magic numbers of frames with a JPEG file after the header instead of pixels."""
 
 _DISTORTED: dict[bytes, bytes] = {
     b"ADE1": b"ADK1",
@@ -90,8 +90,8 @@ _DISTORTED: dict[bytes, bytes] = {
     b"JRE1": b"JRK1",
     b"JGE1": b"JGK1",
 }
-"""How those of a fisheye begin where its four coefficients follow the header, before the pixels:
-Kannala and Brandt's lens."""
+"""Magic numbers of fisheye frames with four coefficients between header and pixels (Kannala and
+Brandt's lens)."""
 
 _CAMERA_OF = {magic: camera for camera, magic in MAGICS.items()}
 _JPEG_CAMERA_OF = {magic: camera for camera, magic in JPEG_MAGICS.items()}
@@ -101,7 +101,7 @@ _PIXELS: dict[CameraKind, tuple[str, int]] = {
     "rgb": ("u1", 3),
     "grey": ("u1", 1),
 }
-"""Type of the numbers on the wire, and bytes of a pixel."""
+"""Number type on the wire, and bytes per pixel."""
 
 _UNDISTORTED_AS = {magic: plain for plain, magic in _DISTORTED.items()}
 
@@ -112,34 +112,34 @@ _HEADER = struct.Struct("<4sQqHHddd")
 _COEFFICIENTS = struct.Struct("<4d")
 
 RIG_MAGIC = b"AMF1"
-"""How a frame of several cameras begins: air-learning, many frames; version 1."""
+"""Magic number of a frame of several cameras: air-learning, many frames; version 1."""
 
 # magic, images; then for each image: bytes of its name, bytes of its message; little endian
 _RIG_HEADER, _PART_HEADER = struct.Struct("<4sH"), struct.Struct("<BI")
 
 MOST_IMAGES = 64
-"""Images of a frame, at most."""
+"""Maximum number of images in a frame."""
 
 MOST_NAME = 255
-"""Bytes of a camera's name, at most."""
+"""Maximum length of a camera's name in bytes."""
 
 MOST_PIXELS = 4096 * 4096
 _MOST_ADDED = _HEADER.size + _COEFFICIENTS.size + _PART_HEADER.size + MOST_NAME
 MOST_BYTES = _RIG_HEADER.size + MOST_IMAGES * _MOST_ADDED + 3 * MOST_PIXELS
-"""Size of the largest frame, 50 MB: whoever receives them need not take in more."""
+"""Maximum size of a frame, 50 MB; bounds a receiver's buffer."""
 
 MM_PER_M = 1000.0
 MAX_MM = 65_535
 
 LEAST_PX, MOST_PX = 1e-3, 1e6
-"""Bounds of a focal length, and of how far the optical axis is from the image's corner [px]."""
+"""Limits of the focal length, and of the offset of the optical axis from the image corner [px]."""
 
 _TURN = 1.0 + 1e-9
-"""A cylinder's image is at most one turn wide, but for rounding."""
+"""Maximum width of a cylinder's image, in turns; above 1 for rounding."""
 
 
 class FrameError(ValueError):
-    """Bytes that are no frame of this version."""
+    """Error: the bytes are not a frame of this version."""
 
 
 @dataclass(frozen=True)
@@ -153,26 +153,26 @@ class FurtherImage:
 
 @dataclass(frozen=True)
 class Frame:
-    """One image of a camera, and those that its vehicle's further cameras took with it."""
+    """Image of a camera, with the simultaneous images of the vehicle's additional cameras."""
 
     sequence: int
-    """Counts up by one per captured frame."""
+    """Frame counter; increments by one per captured frame."""
     capture_time_us: int
     """Simulated time of the exposure [µs]."""
     image: NDArray[Any]
-    """Of depth uint16 (height, width), RealSense Z16 convention [mm]; 0 = no return. Along the
-    optical axis of a pinhole, in the camera's horizontal plane of a cylinder, along the ray of a
-    fisheye. Of colour uint8 (height, width, 3) sRGB, or (height, width, 1) grey."""
+    """Pixels. Depth: uint16 (height, width), RealSense Z16 convention [mm]; 0 = no return. Measured
+    along the optical axis of a pinhole, in the camera's horizontal plane of a cylinder, along the
+    ray of a fisheye. Colour: uint8 (height, width, 3) sRGB, or (height, width, 1) grey."""
     intrinsics: Intrinsics
-    """Of its camera; its `kind` says what the pixels are."""
+    """Intrinsics of the camera; `kind` defines the pixel format."""
     jpeg: bytes | None = None
-    """The JPEG file that `image` was decoded from; None: it was never compressed."""
+    """JPEG file that `image` was decoded from; None = never compressed."""
     further: Mapping[str, FurtherImage] = field(default_factory=dict)
-    """By the name of the camera; empty where there is only the main one."""
+    """Additional images by camera name; empty with the main camera only."""
 
     @property
     def lenses(self) -> dict[str, Intrinsics]:
-        """The further cameras, by name."""
+        """Intrinsics of the additional cameras by name."""
         return {name: each.intrinsics for name, each in self.further.items()}
 
     @property
@@ -185,7 +185,7 @@ class Frame:
         return self.depth_mm.astype(np.float32) / np.float32(MM_PER_M)
 
     def to_bytes(self) -> bytes:
-        """Return the wire form: of one image as if there were no further cameras."""
+        """Return the wire form; a single image uses the format without additional cameras."""
         if not self.further:
             return self._message()
         parts = [("", self._message())]
@@ -201,7 +201,7 @@ class Frame:
         return b"".join(wire)
 
     def _message(self) -> bytes:
-        """Return the wire form of the main image alone."""
+        """Return the wire form of the main image only."""
         k = self.intrinsics
         magic = (MAGICS if self.jpeg is None else JPEG_MAGICS)[k.kind, k.projection]
         distorts = k.distortion != UNDISTORTED
@@ -221,8 +221,8 @@ class Frame:
         """Read the wire form.
 
         Raises:
-            FrameError: Not a frame, values out of bounds, a damaged or misfit JPEG, or images of
-                different moments or equal names.
+            FrameError: Not a frame, values out of bounds, a damaged or misfit JPEG, or images with
+                different timestamps or equal names.
             UsageError: A JPEG without Pillow.
         """
         if data[: len(RIG_MAGIC)] == RIG_MAGIC:
@@ -263,7 +263,7 @@ class Frame:
 
 
 def _coefficients(data: bytes) -> Distortion:
-    """Return the coefficients that follow a header. Raises FrameError."""
+    """Return the coefficients after a header. Raises FrameError."""
     if len(data) < _HEADER.size + _COEFFICIENTS.size:
         raise FrameError(f"{len(data)} bytes are too short for the coefficients of a lens")
     k1, k2, k3, k4 = _COEFFICIENTS.unpack_from(data, _HEADER.size)
@@ -314,7 +314,7 @@ def _of_several(kind: type[Frame], data: bytes) -> Frame:
 
 
 def depth_only(image: NDArray[Any], intrinsics: Intrinsics) -> NDArray[np.uint16]:
-    """Return an image of a depth camera as it is. Raises UsageError for one of colours."""
+    """Return an image of a depth camera unchanged. Raises UsageError for colour images."""
     if intrinsics.kind != "depth":
         raise UsageError(f"{intrinsics.kind} camera: it gives no depth; accepted: depth")
     return image
@@ -326,12 +326,12 @@ def rgb_of(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def nearness(depth_mm: NDArray[Any], range_m: float) -> NDArray[np.float64]:
-    """Return the root of nearness of depth [mm]: 1 at the camera, 0 at a range [m]."""
+    """Return 1 - sqrt(depth / range), clipped: 1 at the camera, 0 at a range [m]; depth in mm."""
     near: NDArray[np.float64] = 1.0 - np.sqrt(np.clip(depth_mm / (MM_PER_M * range_m), 0.0, 1.0))
     return near
 
 
 def depth_to_z16(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:
-    """Turn metres (0 = no return) into Z16 millimetres, rounded, clipped to 65,535 mm."""
+    """Convert metres (0 = no return) to Z16 millimetres, rounded, clipped to 65,535 mm."""
     z16: NDArray[np.uint16] = np.clip(np.rint(depth_m * MM_PER_M), 0, MAX_MM).astype(np.uint16)
     return z16

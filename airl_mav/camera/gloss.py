@@ -1,9 +1,9 @@
-"""How surfaces reflect beside Lambert's law: Fresnel's equations and microfacets.
+"""Reflection models in addition to Lambert's law: Fresnel's equations and microfacets.
 
-Rough surfaces are those of Walter et al., Microfacet models for refraction through rough surfaces,
-2007: facets whose slopes have the distribution GGX, which shadow each other as Smith has it, in
-both directions apart. The directions that they mirror are sampled by the facets that are seen
-(Heitz, Sampling the GGX distribution of visible normals, 2018).
+Rough surfaces follow Walter et al., Microfacet models for refraction through rough surfaces, 2007:
+facets with GGX-distributed slopes and Smith's shadowing, separately for both directions. Reflected
+directions are sampled from the visible facets (Heitz, Sampling the GGX distribution of visible
+normals, 2018).
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ INDEX: Final = 1.5
 """Refractive index of varnish and of glass."""
 
 _SMOOTH: Final = 1e-3
-"""A surface whose `alpha` is less than this is a mirror."""
+"""Value of `alpha` below which a surface is a mirror."""
 
 VARNISH_ADMITS: Final = 0.908222
 """Share of light from all sides that enters varnish: 1 - 0.091778, the mean of Fresnel's
 reflectance at the index 1.5 over the cosine."""
 
 SAMPLES: Final = 8
-"""Directions that a rough surface mirrors, at each of its points; `spread` has eight."""
+"""Reflected directions sampled at each point of a rough surface; `spread` provides eight."""
 
 
 class Gloss(NamedTuple):
-    """What surfaces are, beside matt; a tuple, so that kernels take it. Rows as of `Finish`."""
+    """Properties of non-matt surfaces; a tuple, as kernels require. Rows as in `Finish`."""
 
     surface: NDArray[np.int8]  # (m,) MATT, GLOSSY, ...
     alpha: NDArray[np.float32]  # (m,) width of the slopes of the facets; 0: a mirror
@@ -47,12 +47,12 @@ class Gloss(NamedTuple):
 
     @classmethod
     def of(cls, finish: Finish) -> Gloss | None:
-        """Return what the surfaces of an arena are; None: all are matt."""
+        """Return the surface properties of an arena; None if all surfaces are matt."""
         if not finish.surface.any():
             return None
         mean = finish.albedo.mean(axis=1) @ LUMINANCE
         sheet = (1.0 - pane_reflects(1.0)) * mean
-        # Through a body both of its sides; a wall is one sheet.
+        # Light crosses both sides of a body, but only one sheet of a wall.
         lets = np.where(finish.surface == GLASS, sheet**2, 0.0)
         lets[WALLS] = sheet[WALLS] if finish.surface[WALLS] == GLASS else 0.0
         alpha = finish.roughness**2
@@ -61,7 +61,7 @@ class Gloss(NamedTuple):
 
 @borrowing_kernel
 def let_through(gloss: Gloss | None, row: int) -> np.float32:
-    """Return the share of the sun's light that passes through a body; 0 where all is matt."""
+    """Return the share of sunlight that passes through a body; 0 if all surfaces are matt."""
     return np.float32(0.0) if gloss is None else gloss.lets[row]
 
 
@@ -76,20 +76,20 @@ def fresnel(cosine: float) -> float:
 
 @kernel
 def pane_reflects(cosine: float) -> float:
-    """Return the share that a thin pane reflects: both of its sides, to and fro between them."""
+    """Return the reflectance of a thin pane, including multiple internal reflections."""
     once = fresnel(cosine)
     return 2.0 * once / (1.0 + once)
 
 
 @kernel
 def is_smooth(alpha: float) -> bool:
-    """Return whether a surface is a mirror."""
+    """Return True if a surface is a mirror."""
     return alpha < _SMOOTH
 
 
 @kernel
 def _visible(alpha: float, cosine: float) -> float:
-    """Return the share of facets that is seen from a side (Smith's G1 for GGX)."""
+    """Return the share of facets visible from a direction (Smith's G1 for GGX)."""
     tangent2 = 1.0 / max(cosine * cosine, 1e-12) - 1.0
     return 2.0 / (1.0 + math.sqrt(1.0 + alpha * alpha * tangent2))
 
@@ -108,7 +108,7 @@ def highlight(alpha: float, normal: Vec, ray: Vec, to_sun: Vec) -> tuple[float, 
     per = 1.0 / max(math.sqrt(dot(h, h)), 1e-12)
     half = per * dot(normal, h)
     spread = half * half * (alpha * alpha - 1.0) + 1.0
-    # The distribution is this over pi, and a white matt surface has pi times less: they cancel.
+    # The distribution's 1/pi cancels with the radiance of a white matt surface, also 1/pi.
     facets = alpha * alpha / (spread * spread)
     value = facets * _visible(alpha, sun) * _visible(alpha, eye) / (4.0 * eye)
     return value, -per * dot(h, ray)
@@ -116,7 +116,7 @@ def highlight(alpha: float, normal: Vec, ray: Vec, to_sun: Vec) -> tuple[float, 
 
 @kernel
 def mirrored(ray: Vec, normal: Vec) -> Vec:
-    """Return the direction that a ray is mirrored to, a unit vector however often it is."""
+    """Return the mirrored direction of a ray, normalized against accumulated rounding."""
     twice = 2.0 * dot(ray, normal)
     a, b, c = (
         ray[0] - twice * normal[0],
@@ -129,14 +129,14 @@ def mirrored(ray: Vec, normal: Vec) -> Vec:
 
 @kernel
 def spread(number: int) -> tuple[float, float]:
-    """Return one of `SAMPLES` points that lie evenly in the unit square (Hammersley's)."""
+    """Return one of `SAMPLES` evenly distributed points in the unit square (Hammersley)."""
     mirrored_bits = 4 * (number & 1) + (number & 2) + ((number & 4) >> 2)
     return (number + 0.5) / SAMPLES, (mirrored_bits + 0.5) / SAMPLES
 
 
 @kernel
 def facet(alpha: float, normal: Vec, ray: Vec, u: float, v: float) -> Vec:
-    """Return the normal of a visible facet; even (u, v) in the unit square give their density."""
+    """Return the normal of a visible facet, sampled by uniform (u, v) in the unit square."""
     # Axes about the normal (Duff et al., Building an orthonormal basis, revisited, 2017).
     sign = math.copysign(1.0, normal[2])
     a = -1.0 / (sign + normal[2])
@@ -167,6 +167,6 @@ def facet(alpha: float, normal: Vec, ray: Vec, u: float, v: float) -> Vec:
 
 @kernel
 def facet_gives(alpha: float, normal: Vec, away: Vec) -> float:
-    """Return what a direction `away`, mirrored by a sampled facet, counts: 0 below the surface."""
+    """Return the weight of a direction `away` mirrored by a sampled facet; 0 below the surface."""
     cosine = dot(normal, away)
     return _visible(alpha, cosine) if cosine > 0.0 else 0.0

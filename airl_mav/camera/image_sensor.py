@@ -1,4 +1,4 @@
-"""Lens and image sensor: vignetting, colour mosaic, photon noise, numbers; linear, 1 is white."""
+"""Lens and image sensor: vignetting, Bayer mosaic, photon noise, sRGB codes; linear, 1 is white."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from airl_mav.arena.appearance import linear_of
 from airl_mav.camera.intrinsics import Intrinsics
 
 Light = NDArray[np.float32]
-"""(h, w) or (h, w, channels), linear."""
+"""Image (h, w) or (h, w, channels), linear."""
 
 _NUMBERS = np.arange(256, dtype=np.float64)
 
 LIGHT_OF: Final[Light] = linear_of(_NUMBERS / 255.0).astype(np.float32)
-"""(256,) the light of each sRGB number."""
+"""(256,) light of each sRGB code."""
 
 _EDGES: Final[Light] = linear_of((_NUMBERS[:-1] + 0.5) / 255.0).astype(np.float32)
-"""(255,) light from which on each number but 0 is the nearest."""
+"""(255,) lower bound of light for each code from 1 on, by rounding to the nearest."""
 
 
 def codes_of(light: Light) -> NDArray[np.uint8]:
-    """Return the nearest sRGB numbers of light of any shape; beyond white there is 255."""
+    """Return the nearest sRGB codes of light of any shape; 255 beyond white."""
     return np.searchsorted(_EDGES, light, side="right").astype(np.uint8)
 
 
 def vignette(camera: Intrinsics, share: float) -> Light:
     """Return a lens's transmission (h, w).
 
-    1 - share (r / R)² at a distance r from the optical axis, R that of the farthest pixel: the
-    first term of the even polynomials that lenses are calibrated with (Goldman, Chen, "Vignette and
+    1 - share (r / R)² at a distance r from the optical axis, with R at the most distant pixel: the
+    first term of the even polynomials used to calibrate lenses (Goldman, Chen, "Vignette and
     exposure calibration and compensation", ICCV 2005).
     """
     across = np.arange(camera.width) - camera.cx
@@ -44,12 +44,12 @@ def vignette(camera: Intrinsics, share: float) -> Light:
 def noisy(
     light: Light, gain: float, full_well_e: float, read_noise_e: float, rng: np.random.Generator
 ) -> Light:
-    """Return light (...) as a photon-counting sensor measures it.
+    """Return light (...) as measured by a photon-counting sensor.
 
-    A pixel that reads x holds N = x full_well_e / max(gain, 1) electrons. A gain above 1 multiplies
-    what was counted, one below 1 is a darker exposure. Their number has the variance N (Poisson's,
-    in its normal approximation), reading it adds read_noise_e² (EMVA 1288, release 4.0, section 2).
-    The light is after the gain. Above 1 the sensor is full.
+    A pixel with the value x holds N = x full_well_e / max(gain, 1) electrons. A gain above 1
+    multiplies the count, a gain below 1 is a darker exposure. The count has the variance N
+    (Poisson, in its normal approximation), and reading adds read_noise_e² (EMVA 1288, release 4.0,
+    section 2). The light is after the gain. Above 1 the sensor saturates.
     """
     full = np.minimum(light, np.float32(1.0))
     per_light = full_well_e / max(gain, 1.0)
@@ -60,7 +60,7 @@ def noisy(
 
 
 def mosaic(light: Light) -> Light:
-    """Return what the pixels (h, w) measure behind a Bayer filter RGGB, of RGB light (h, w, 3)."""
+    """Return the pixel values (h, w) behind a Bayer filter RGGB, from RGB light (h, w, 3)."""
     raw = light[..., 1].copy()
     raw[::2, ::2] = light[::2, ::2, 0]
     raw[1::2, 1::2] = light[1::2, 1::2, 2]
@@ -82,7 +82,7 @@ def demosaiced(raw: Light) -> Light:
 
 
 def _around(plane: Light, *, cross: bool) -> Light:
-    """Return sums of a plane's neighbours: those beside, above and below; or all, corners half."""
+    """Return sums over neighbours: beside, above and below; or all eight, corners by half."""
     p = np.pad(plane, 1)
     beside = p[1:-1, :-2] + p[1:-1, 2:] + p[:-2, 1:-1] + p[2:, 1:-1]
     if cross:

@@ -1,12 +1,12 @@
-"""How a colour camera's image is formed: exposed while the vehicle moves, metered, noisy, coded.
+"""Image formation of a colour camera: motion blur, exposure control, sensor noise, JPEG.
 
-An exposure that takes time is the mean of images of shorter ones, from where vehicle and obstacles
-are then. Its middle is the frame's stamp, and velocity and angular rates are those of that moment.
-With a rolling shutter the rows are exposed one after the other, the first at the top, and the stamp
-is the middle of the middle row's exposure.
-A gain is light: the scene is drawn with all light times the gain, so that dark ones keep their
-shades. Light beyond white is cut in each of the shorter exposures. Then lens and sensor
-(`image_sensor`), and JPEG. The light of a grey pixel is that of its number.
+A finite exposure is the mean of shorter ones along the motion of vehicle and obstacles. Its middle
+is the timestamp; velocity and angular rates are constant. A rolling shutter exposes the rows from
+the top; the timestamp is the middle of the middle row's exposure.
+
+The gain scales the scene's light before rendering, which preserves the shades of dark scenes. Each
+shorter exposure clips light beyond white. Then follow lens and sensor (`image_sensor`), and JPEG. A
+grey pixel's light follows from its sRGB code.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.imaging import AutoExposure, Imaging
 
 MOST_METERED: Final = 5
-"""Images that a gain is settled by, at most: where all is white or black, one says little."""
+"""Maximum images to settle a gain: an all-white or all-black image contains little information."""
 
 SETTLED: Final = 0.01
-"""A gain that is due to change by less than this share is settled."""
+"""Relative change below which a gain is settled."""
 
 LEAST_LIGHT: Final = 1e-5
-"""Of a dark image: a thirtieth of the least number in every pixel."""
+"""Minimum mean light of an image: a thirtieth of code 1 in every pixel."""
 
 
 class Taken(NamedTuple):
-    """An image, as `Frame` has it."""
+    """Image as in `Frame`."""
 
     image: NDArray[Any]
     jpeg: bytes | None
 
 
 class ImageFormation:
-    """Takes the images of one camera with a table `imaging`; its gain may follow the light."""
+    """Image formation of one camera with a table `imaging`, with optional auto-exposure."""
 
     def __init__(self, camera: Camera, name: str = "") -> None:
         """Prepare a camera of kind rgb or grey; `name` seeds an additional camera's noise."""
@@ -63,18 +63,18 @@ class ImageFormation:
 
     @property
     def follows(self) -> bool:
-        """Whether an image depends on the one before: the gain takes time to change."""
+        """True if an image depends on the previous one: auto-exposure with lag."""
         auto = self._imaging.auto_exposure
         return auto is not None and auto.time_constant_s > 0.0
 
     def restart(self) -> None:
-        """Begin an episode: the gain is that of the first image at once."""
+        """Start an episode: the first image sets the gain without lag."""
         self.gain: float | None = None
-        """That of the newest image; None: there is none yet."""
+        """Gain of the newest image; None before the first image."""
         self._frame = 0
 
     def take(self, arena: Arena, elapsed_us: int, motion: Motion, seed: int, frame: int) -> Taken:
-        """Return an image in the middle of its exposure and rows, `elapsed_us` after the start.
+        """Return an image; `elapsed_us` is the time of its mid-exposure and middle row.
 
         `motion` is the vehicle's then, `seed` the episode's, `frame` the number by the camera's
         rate, skipped frames included. Raises UsageError if a mesh's file is missing or has changed.
@@ -92,7 +92,7 @@ class ImageFormation:
     def _exposed(
         self, arena: Arena, elapsed_us: int, motion: Motion, gain: float
     ) -> image_sensor.Light:
-        """Return the light (h, w, channels) of all rows, each exposed when the shutter has it."""
+        """Return the light (h, w, channels) of all rows, each at its time in the readout."""
         readout_us = US_PER_MS * self._imaging.readout_ms
         if not readout_us:
             return self._exposed_at(arena, elapsed_us, motion, 0.0, gain)
@@ -102,7 +102,7 @@ class ImageFormation:
         light = np.empty((height, self._camera.width, channels), np.float32)
         for k in range(bands):
             first, end = k * height // bands, (k + 1) * height // bands
-            # The mean of its rows' moments, of which row r's is (r + 1/2) / h of the readout.
+            # Mean time of the band's rows; row r is read at (r + 1/2) / h of the readout.
             middle_us = readout_us * (0.5 * (first + end) / height - 0.5)
             seen = self._exposed_at(arena, elapsed_us, motion, middle_us, gain)
             light[first:end] = seen[first:end]
@@ -111,7 +111,7 @@ class ImageFormation:
     def _exposed_at(
         self, arena: Arena, elapsed_us: int, motion: Motion, middle_us: float, gain: float
     ) -> image_sensor.Light:
-        """Return the light (h, w, channels) of an exposure, its middle so long after the stamp."""
+        """Return the light (h, w, channels) of an exposure centred at timestamp + `middle_us`."""
         asked = self._imaging
         count = asked.samples if asked.exposure_ms else 1
         moments_us = (
@@ -128,7 +128,7 @@ class ImageFormation:
     def _codes(
         self, arena: Arena, elapsed_us: int, motion: Motion, since_us: int, gain: float
     ) -> NDArray[np.uint8]:
-        """Return the sRGB numbers (h, w, channels) of one moment, `since_us` after the stamp."""
+        """Return the sRGB codes (h, w, channels) at one time, `since_us` after the timestamp."""
         position, quaternion = carried_on(motion, since_us / US_PER_S)
         at, attitude = camera_pose(np.array(position), np.array(quaternion), self._mount)
         centers = arena.centers_at(elapsed_us)
@@ -164,7 +164,7 @@ class ImageFormation:
         return float(gain)
 
     def _formed(self, light: image_sensor.Light, gain: float, seed: int, frame: int) -> Taken:
-        """Return the image that lens and sensor make of light (h, w, channels)."""
+        """Return the image of light (h, w, channels) after lens and sensor."""
         asked, channels = self._imaging, light.shape[2]
         if self._through is not None:
             light = light * self._through
@@ -183,7 +183,7 @@ class ImageFormation:
 
 
 def _off_by(asked: Imaging, seed: int, own: tuple[int, ...]) -> float:
-    """Return the factor by which the light of an episode is off; `own` as `streams.words_of`."""
+    """Return the random gain factor of an episode; `own` as in `streams.words_of`."""
     if not asked.gain_spread_ev:
         return 1.0
     share = 2.0 * stream(seed, Stream.EXPOSURE, *own).random() - 1.0
@@ -191,7 +191,7 @@ def _off_by(asked: Imaging, seed: int, own: tuple[int, ...]) -> float:
 
 
 def _mean_light(codes: NDArray[np.uint8]) -> float:
-    """Return the mean luminance of sRGB or grey numbers (h, w, channels); 1 is white."""
+    """Return the mean luminance of sRGB or grey codes (h, w, channels); 1 is white."""
     weights = LUMINANCE if codes.shape[2] == 3 else np.ones(1)
     mean = 0.0
     for channel, weight in enumerate(weights.tolist()):

@@ -1,4 +1,4 @@
-"""The models of a camera: a pinhole, a cylinder that sees all round, a fisheye; and its pixels."""
+"""Camera models (pinhole, 360 degree cylinder, fisheye) and their pixel formats."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 from airl_mav.profiles.camera_kind import CameraKind, Projection, shape_of
 from airl_mav.profiles.distortion import UNDISTORTED, Distortion, distorted, sees_to, undistorted
 
-if TYPE_CHECKING:  # A frame source needs no models of profiles.
+if TYPE_CHECKING:  # A frame source does not depend on profile models.
     from airl_mav.profiles.camera import Camera
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Intrinsics with square pixels. Pixel centres are at whole numbers.
+    """Intrinsics with square pixels. Pixel centres have integer coordinates.
 
-    Its `kind` is part of them, so that whoever asks whether two cameras are the same asks for it.
+    Equality of two cameras includes `kind`.
 
     In the optical frame (right, down, forward) a pixel (u, v) looks along
 
@@ -29,20 +29,20 @@ class Intrinsics:
       from above. Depth is measured in the camera's horizontal plane, perpendicular to the axis of
       the cylinder. Upright edges are upright in the image, and the column of the optical axis is
       that of a pinhole of the same focal length.
-    - fisheye: (sin b cos c, sin b sin c, cos b), at the angle b [rad] from the optical axis that
-      `profiles.distortion` makes r / focal of, where r is the way from (cx, cy) to the pixel and c
-      its direction. Without coefficients b is r / focal, equidistant. Depth is measured along that
-      unit vector. Pixels more than 95 degrees from the axis see nothing, nor do those beyond the
-      angle to which the coefficients hold.
+    - fisheye: (sin b cos c, sin b sin c, cos b), at the angle b [rad] from the optical axis given
+      by r / focal and `profiles.distortion`, with r the distance from (cx, cy) to the pixel and c
+      its direction. Without coefficients b = r / focal (equidistant). Depth is measured along that
+      unit vector. Pixels more than 95 degrees from the axis are empty, as are pixels beyond the
+      valid angle of the coefficients.
 
-    In all of them depth is the factor of that vector which leads to the point that is seen.
+    In all models the visible point is this vector times depth.
     """
 
     width: int
     height: int
     focal: float
-    """Focal length [px] of a pinhole, pixels for an angle [px/rad] of a cylinder and in the middle
-    of a fisheye."""
+    """Focal length [px] of a pinhole; pixels per angle [px/rad] of a cylinder, and of a fisheye in
+    the middle of its image."""
     cx: float
     cy: float
     projection: Projection = "pinhole"
@@ -61,8 +61,8 @@ class Intrinsics:
     ) -> Intrinsics:
         """Return the intrinsics of a camera with a horizontal field of view [rad].
 
-        Up to pi for a pinhole, 2 pi for a cylinder, 190 degrees for a fisheye; half of it falls on
-        the edge of the image.
+        The maximum is pi for a pinhole, 2 pi for a cylinder and 190 degrees for a fisheye. The
+        field of view spans the image from edge to edge.
         """
         if projection != "pinhole":
             focal = width / (2.0 * distorted(0.5 * horizontal_fov, distortion))
@@ -95,7 +95,7 @@ class Intrinsics:
 
     @property
     def cylindrical(self) -> bool:
-        """Whether the image is a cylinder's."""
+        """True if the image is cylindrical."""
         return self.projection == "cylindrical"
 
     @property

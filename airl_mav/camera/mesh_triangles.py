@@ -1,9 +1,9 @@
-"""A triangle of a mesh, drawn into a part of an image or met by a single ray.
+"""Rasterization of a mesh's triangle into part of an image, and its intersection with a ray.
 
-A triangle with the corners a, b and c, seen from the camera, is hit by the ray d where the volumes
-d.(b x c), d.(c x a) and d.(a x b) have one sign, but for rounding, so that no ray passes between
-two that share an edge or a corner. Each is affine along a line of the image. The inverse depth is
-n.d / n.a with n = (b - a) x (c - a). Both sides are seen.
+A triangle with the corners a, b and c, relative to the camera, is hit by the ray d if the volumes
+d.(b x c), d.(c x a) and d.(a x b) have one sign. A rounding tolerance closes shared edges. Each
+volume is affine along a line of the image. The inverse depth is n.d / n.a, n = (b - a) x (c - a).
+Both sides are visible.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Vec
 
 _MARGIN_PX: Final = 1e-6
-"""Rounding of a place in the image is far below this."""
+"""Tolerance for the rounding of image positions."""
 
 NEAR: Final = 1e-4
-"""Corners nearer to the image plane than this are not projected, in units of the mesh."""
+"""Distance from the image plane below which corners are not projected, in units of the mesh."""
 
 NOWHERE: Final = (0, 0, 0, 0)
 
@@ -48,14 +48,14 @@ def part_of(
     node: int,
     outer: Rectangle,
 ) -> tuple[float, Rectangle]:
-    """Return the least depth of a node and the pixels, out of some, whose rays may hit it."""
+    """Return the minimum depth of a node and the pixels within `outer` whose rays may hit it."""
     c = pose.center
     middle = (c[0] + boxes[node, 0], c[1] + boxes[node, 1], c[2] + boxes[node, 2])
     half = (float(boxes[node, 3]), float(boxes[node, 4]), float(boxes[node, 5]))
     if view.cylindrical:
         at = Pose(pose.forward, pose.across, pose.along, middle)
         span = cylinder_span(out, view, at, half, False)
-        # As `cylinder_span` has it: the depth is that in the plane of the cylinder's ring.
+        # `cylinder_span` measures depth in the plane of the cylinder's ring.
         near = math.hypot(dot(pose.forward, middle), dot(pose.across, middle))
         near -= math.sqrt(dot(half, half))
         return near, _around(out, view, span, outer)
@@ -70,10 +70,10 @@ def part_of(
 
 @borrowing_kernel
 def _around(out: Image, view: View, span: Span, outer: Rectangle) -> Rectangle:
-    """Return the pixels of a part of a cylinder that lie in a span, after any turn of it."""
+    """Return the pixels of a part of a cylinder within a span, at any number of turns."""
     low, high = max(span[2], outer[2]), min(span[3], outer[3])
     if span[0] == 0.0 and span[1] == float(out.shape[0]):
-        # It stands across the cylinder's axis: what is in it may be seen all round.
+        # The box crosses the cylinder's axis and may be visible in all directions.
         return outer[0], outer[1], low, high
     first, last = outer[1], outer[0]
     for turn in range(-1, 2):
@@ -109,7 +109,7 @@ def between(
 
 @kernel
 def _reach(axis: Vec, half: Vec) -> float:
-    """Return how far a box reaches from its centre along an axis, either way."""
+    """Return the half extent of a box along an axis."""
     return abs(half[0] * axis[0]) + abs(half[1] * axis[1]) + abs(half[2] * axis[2])
 
 
@@ -128,13 +128,13 @@ def pixels(
 
 
 _SPARE: Final = 4e-14
-"""Of a volume in the square of the distance: above rounding, below a billionth of a metre."""
+"""Tolerance of a volume relative to the squared distance: above rounding, below 1e-9 m."""
 
 _EDGE_ON2: Final = 1e-18
-"""Square of the angle below which a triangle is not seen."""
+"""Squared angle below which a triangle is invisible."""
 
 Faces = NDArray[np.int32]
-"""The number of the triangle that each pixel sees."""
+"""Index of the visible triangle at each pixel."""
 
 
 @kernel
@@ -143,10 +143,10 @@ def _cross(a: Vec, b: Vec) -> Vec:
 
 
 class _Sides(NamedTuple):
-    """What a ray d is tested with against a triangle.
+    """Coefficients of the test of a ray d against a triangle.
 
-    The volumes that it spans with the edges are d.n0, d.n1 and d.n2, where it is hit not below 0
-    but by `spare`, for rounding. The inverse depth is gain d.normal; a gain of 0: seen edge on.
+    The volumes of ray and edges are d.n0, d.n1 and d.n2; a hit requires all of them >= -`spare`,
+    for rounding. The inverse depth is gain d.normal; gain 0 = edge on.
     """
 
     n0: Vec
@@ -159,7 +159,7 @@ class _Sides(NamedTuple):
 
 @kernel
 def _sides(p0: Vec, p1: Vec, p2: Vec) -> _Sides:
-    """Return what a ray is tested with against a triangle, by its corners from the camera."""
+    """Return the coefficients of the ray test for a triangle's corners relative to the camera."""
     n0, n1, n2 = _cross(p1, p2), _cross(p2, p0), _cross(p0, p1)
     volume = dot(p0, n0)
     sign = 1.0 if volume > 0.0 else -1.0
@@ -193,7 +193,7 @@ def draw_triangle(
     part: Rectangle,
     per: float,
 ) -> None:
-    """Draw a triangle into a part of the image; `per` is a metre in units of the mesh."""
+    """Draw a triangle into part of the image; `per` is one metre in units of the mesh."""
     c, f, r, d = pose.center, pose.forward, pose.along, pose.across
     p0 = (c[0] + corners[i, 0], c[1] + corners[i, 1], c[2] + corners[i, 2])
     p1 = (c[0] + corners[i, 3], c[1] + corners[i, 4], c[2] + corners[i, 5])
@@ -246,7 +246,7 @@ def draw_triangle(
             x = xs[u]
             e0, e1, e2 = start0 + x * slope0, start1 + x * slope1, start2 + x * slope2
             if min(min(e0, e1), e2) >= -sides.spare:
-                # Of a triangle seen edge on, rounding is kept within its corners.
+                # Limits rounding for a triangle that is almost edge on.
                 s = min(max(sides.gain * (start + x * slope), least), most)
                 s32 = np.float32(per * s)
                 if s >= view.s_min and s32 > out[v, u]:
@@ -263,7 +263,7 @@ def met(
 ) -> float:
     """Return a triangle's inverse depth along a ray, as `draw_triangle`; 0 = missed.
 
-    Only a pinhole's depth is kept within those of the corners.
+    Only a pinhole's depth is limited to the range of the corners.
     """
     c, f, r = pose.center, pose.forward, pose.along
     p0 = (c[0] + corners[i, 0], c[1] + corners[i, 1], c[2] + corners[i, 2])

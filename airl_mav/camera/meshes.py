@@ -1,13 +1,12 @@
-"""The inverse depth of a mesh along the lines of an image: its tree, walked by all rays together.
+"""Inverse depth of a mesh along the lines of an image; all rays traverse the tree together.
 
-All rays of an image begin in one place, so a node of the tree is tested against all of them at
-once. The rays that may hit it are those of the rectangle that its box projects to, cut to that of
-its parent. A node is passed over where no ray goes through its rectangle, as most are of a fine
-mesh seen from afar, or where all of its rays have been stopped nearer. Near nodes come before far
-ones. Where one ray is left, it alone goes on through the tree. Of a fisheye, whose rays are affine
-along no line, each goes through the tree alone from the beginning.
+All rays of an image share one origin, so a node of the tree is tested against all of them at once.
+Candidate rays form the rectangle of the node's projected box, cut to the parent's. A node is
+skipped if its rectangle is empty, as for most of a fine distant mesh, or if all of its rays hit
+something nearer. Near nodes come before far ones. A single remaining ray traverses the rest alone.
+A fisheye's rays are not affine along lines, so each traverses the whole tree alone.
 
-Which pixels a box projects to and what a ray does with a triangle are `mesh_triangles`.
+`mesh_triangles` projects boxes and intersects rays with triangles.
 """
 
 from __future__ import annotations
@@ -26,15 +25,15 @@ from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kern
 from airl_mav.vehicle.rotation import Vec
 
 _LEAST: Final = 1e-12
-"""Least component of a ray that is divided by."""
+"""Minimum magnitude of a ray component used as a divisor."""
 
 _MOST_LOOKED_AT: Final = 256
-"""In more pixels it is not looked whether all see something nearer."""
+"""Maximum number of pixels for the occlusion test of a node."""
 
 
 @borrowing_kernel
 def seen_from(optics: projection.Optics, pose: NDArray[np.float64], k: int) -> projection.Pose:
-    """Return the camera's axes along mesh k's, and its origin from the camera, in units of it."""
+    """Return the camera's axes in mesh k's frame, and the mesh's origin, in units of the mesh."""
     axes, camera = optics.axes, optics.camera
     per = 1.0 / pose[k, 4]
     offset = (pose[k, 0] - camera[0], pose[k, 1] - camera[1], pose[k, 5] - camera[2])
@@ -54,10 +53,10 @@ def draw_meshes(
     bent: projection.Bent | None,
     meshes: Meshes,
 ) -> None:
-    """Draw the meshes of an arena over what has been drawn; arguments as of `raycast.draw_bodies`.
+    """Draw the meshes of an arena over the present image; arguments as in `raycast.draw_bodies`.
 
-    `bent` is that of `optics`. `ids`, `faces` and `drawn_in` are None together; `drawn_in` is
-    written behind the obstacles, in the first place of each mesh.
+    `bent` is `optics.bent`. `ids`, `faces` and `drawn_in` are all None or all given; `drawn_in` is
+    written after the obstacles, in the first row of each mesh.
     """
     waiting = np.empty((STACK, 5), np.int32)
     nearest = np.empty(STACK)
@@ -131,7 +130,7 @@ def _draw_mesh(
         if near_l < near_r:
             left, right = right, left
             near_l, near_r, part_l, part_r = near_r, near_l, part_r, part_l
-        # The nearer one is on the right now: put down last, it is taken up first.
+        # The nearer child is on the right; pushed last, it is popped first.
         if part_l[0] < part_l[1] and part_l[2] < part_l[3]:
             _wait(waiting, nearest, tops, left, near_l, part_l)
             tops += 1
@@ -152,11 +151,11 @@ def _cast_mesh(
     k: int,
     waiting: NDArray[np.int32],
 ) -> None:
-    """Draw mesh k with the rays of a fisheye, one by one; the rest as of `_draw_mesh`."""
+    """Draw mesh k with the rays of a fisheye, one by one; other arguments as in `_draw_mesh`."""
     view, bvh, root = optics.lens, meshes.bvh, meshes.root[k]
     number, scale = OBSTACLE + meshes.first[k], meshes.pose[k, 4]
     pose = seen_from(optics, meshes.pose, k)
-    # Ranges, as a cylinder's depths, are no depths along the optical axis: `met` is told by this.
+    # The last argument (cylindrical) disables `met`'s limits, which hold for pinhole depth only.
     own = projection.View(view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, True)
     per = 1.0 / scale
     box, c = bvh.boxes[root], pose.center
@@ -172,7 +171,7 @@ def _cast_mesh(
         for u in range(part[2], part[3]):
             ray = projection.ray_of(pose, bent, v, u, nowhere, 0.0)
             if projection.dot(ray, ray) == 0.0:
-                # A pixel beyond the lens's circle.
+                # A pixel beyond the lens's image circle.
                 continue
             _cast(out, ids, faces, number, v, u, ray, 0.0, own, pose, bvh, root, per, waiting, 0)
 
@@ -186,7 +185,7 @@ def _wait(
     near: float,
     part: projection.Rectangle,
 ) -> None:
-    """Note a node, the least depth in it, and the rays that may hit it."""
+    """Push a node, its minimum depth, and its candidate rays."""
     waiting[at, 0] = node
     for side in range(4):
         waiting[at, 1 + side] = part[side]
@@ -195,7 +194,7 @@ def _wait(
 
 @borrowing_kernel
 def _hidden(out: projection.Image, part: projection.Rectangle, greatest: float) -> bool:
-    """Return whether all pixels of a small part see something nearer than an inverse depth."""
+    """Return True if all pixels of a small part see something nearer than an inverse depth."""
     if (part[1] - part[0]) * (part[3] - part[2]) > _MOST_LOOKED_AT:
         return False
     for v in range(part[0], part[1]):
@@ -223,14 +222,14 @@ def _cast(
     waiting: NDArray[np.int32],
     tops: int,
 ) -> None:
-    """Draw a ray's hits in a node; the stack lies before `waiting[tops]`."""
+    """Draw a ray's hits in a node; the stack starts at `waiting[tops]`."""
     c, r = pose.center, pose.along
     ray = (start[0] + x * r[0], start[1] + x * r[1], start[2] + x * r[2])
     i0, i1, i2 = inverse_of(ray[0]), inverse_of(ray[1]), inverse_of(ray[2])
     begin, inverse = (c[0] * i0, c[1] * i1, c[2] * i2), (i0, i1, i2)
     amounts = (abs(i0), abs(i1), abs(i2))
     boxes, links, corners = bvh.boxes, bvh.links, bvh.corners
-    # How far the ray goes: to what it has hit, or to the end of the range.
+    # Distance limit: the present hit, or the end of the range.
     most = 1.0 / max(out[v, u] / per, view.s_min)
     bottom, node = tops, root
     enter, leave = _through(boxes, node, begin, inverse, amounts)
@@ -276,7 +275,7 @@ def _cast(
 
 @kernel
 def inverse_of(x: float) -> float:
-    """Return one over a component of a ray, finite."""
+    """Return the reciprocal of a ray component, finite."""
     return 1.0 / (max(x, _LEAST) if x >= 0.0 else min(x, -_LEAST))
 
 
@@ -284,10 +283,10 @@ def inverse_of(x: float) -> float:
 def _through(
     boxes: NDArray[np.float32], node: int, begin: Vec, inverse: Vec, amounts: Vec
 ) -> tuple[float, float]:
-    """Return where a ray enters and leaves a node's box; it misses the box if it leaves first.
+    """Return the entry and exit distance of a ray through a node's box; exit < entry is a miss.
 
-    `begin` is the mesh's origin from the ray's start over the ray, `inverse` one over the ray and
-    `amounts` the amounts of these, along the three axes.
+    `begin` is the mesh's origin relative to the ray's start, divided by the ray; `inverse` is the
+    reciprocal of the ray, and `amounts` its absolute value, along the three axes.
     """
     a, b, c = (
         begin[0] + boxes[node, 0] * inverse[0],
@@ -302,12 +301,12 @@ def _through(
     return max(max(a - w0, b - w1), c - w2), min(min(a + w0, b + w1), c + w2)
 
 
-# --- single rays: what stops one, and where one meets the mesh first
+# --- single rays: occlusion, and the first hit of a mesh
 
 
 @borrowing_kernel
 def _span_of(boxes: NDArray[np.float32], node: int, at: Vec, inverse: Vec) -> tuple[float, float]:
-    """Return where a ray enters and leaves a node's box; it misses if it leaves first."""
+    """Return the entry and exit distance of a ray through a node's box; exit < entry is a miss."""
     i0, i1, i2 = inverse
     a, b, c = (
         (boxes[node, 0] - at[0]) * i0,
@@ -331,8 +330,8 @@ def stopped_by(
 ) -> int:
     """Return a triangle beyond `least` between a point and the sun; -1 = none.
 
-    Arguments as of `distance_to`; `inverse` (3,) is one over `sun`, and `last` the triangle that
-    hid the previous point, tested first.
+    Arguments as in `distance_to`; `inverse` (3,) is the reciprocal of `sun`, and `last` the
+    triangle that hid the previous point, tested first.
     """
     if last >= 0 and _stops(bvh.corners, last, at, sun, least):
         return last
@@ -369,7 +368,8 @@ def distance_to(
 ) -> tuple[float, int]:
     """Return distance and triangle of a ray's first hit in `least`..`most`; -1 = none.
 
-    Distances are in units of the mesh, `at` (3,) from its origin; `waiting` (STACK,) is a buffer.
+    Distances are in units of the mesh, `at` (3,) is relative to its origin; `waiting` (STACK,) is a
+    buffer.
     """
     inverse = (inverse_of(way[0]), inverse_of(way[1]), inverse_of(way[2]))
     boxes, links = bvh.boxes, bvh.links
@@ -396,7 +396,7 @@ def distance_to(
 
 @borrowing_kernel
 def _stops(corners: NDArray[np.float32], i: int, at: Vec, way: Vec, least: float) -> bool:
-    """Return whether a ray hits a triangle, from either side, no nearer than `least`."""
+    """Return True if a ray hits a triangle, from either side, at `least` or beyond."""
     return _distance(corners, i, at, way) >= least
 
 

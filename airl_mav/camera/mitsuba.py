@@ -1,7 +1,7 @@
 """Arenas and cameras as scenes of Mitsuba 3: path tracing, the reference of `colour`, without fog.
 
-It adds ambient occlusion and colour bleeding, of which the fast images only have means below a
-ceiling. Cylinders and fisheyes are resampled from pinholes (`cube_faces`) in linear light.
+Adds ambient occlusion and colour bleeding, which the fast renderer only averages below a ceiling.
+Cylinders and fisheyes are resampled from pinholes (`cube_faces`) in linear light.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from airl_mav.core.frames import quat_to_matrix
 Floats = NDArray[np.float64]
 
 VARIANT = "scalar_rgb"
-"""Needs no compiler and no GPU."""
+"""Mitsuba variant; requires neither compiler nor GPU."""
 
 MOST_BOUNCES = 8
 
 _SKY_ROWS = 256
 
 _SEEDS = 1 << 32
-"""Numbers of seeds that Mitsuba tells from each other."""
+"""Number of distinct seeds in Mitsuba."""
 
 
 class PathTracer:
-    """Draws images, and keeps the scene of the last one for as long as nothing in it moves."""
+    """Path-traced images; reuses the last scene while nothing in it moves."""
 
     def __init__(self, samples: int) -> None:
-        """Trace so many paths a pixel, about as many off the middle of a cylinder or fisheye."""
+        """Set the paths per pixel; approximate off the middle of a cylinder or fisheye."""
         self._samples = samples
         self._arena: Arena | None = None
         self._centers: Floats = np.zeros((0, 3))
@@ -57,7 +57,7 @@ class PathTracer:
         quaternion: Floats,
         seed: int,
     ) -> NDArray[np.uint8]:
-        """Return the sRGB image of an arena; arguments as of `render.render`.
+        """Return the sRGB image of an arena; arguments as in `render.render`.
 
         Raises UsageError for an arena with fog, ImportError without Mitsuba (the extra `render`).
         """
@@ -68,7 +68,7 @@ class PathTracer:
         mi.set_variant(VARIANT)
         if arena is not self._arena or not np.array_equal(centers, self._centers):
             self._arena, self._centers = arena, np.array(centers)
-            # Only this one lets the sun through glass.
+            # Only `volpath` lets sunlight through glass.
             glass = bool((arena.look.finish.surface == GLASS).any())
             integrator = {"type": "volpath" if glass else "path", "max_depth": MOST_BOUNCES}
             bodies = _lights(mi, arena.look.light) | _bodies(mi, arena, centers)
@@ -85,14 +85,14 @@ class PathTracer:
     def _rendered(
         self, mi: Any, axes: Floats, position: Floats, film: _Film, samples: int, seed: int
     ) -> Floats:
-        """Return the light (h, w, 3) that a pinhole sees; axes (3, 3) forward, right, down."""
+        """Return the light (h, w, 3) of a pinhole camera; axes (3, 3) forward, right, down."""
         sensor = mi.load_dict(_sensor(mi, axes, position, film, samples))
         return np.array(mi.render(self._scene, sensor=sensor, seed=seed))[..., :3]
 
     def _resampled(
         self, mi: Any, k: Intrinsics, axes: Floats, position: Floats, seed: int
     ) -> Floats:
-        """Return the light (h, w, 3) that a cylinder or a fisheye sees."""
+        """Return the light (h, w, 3) of a cylinder or fisheye camera."""
         side = side_for(k, self._samples)
         if self._cube is None or self._cube[0] != k:
             self._cube = k, cube_of(k, side)
@@ -102,14 +102,14 @@ class PathTracer:
         for number, face in enumerate(cube.faces):
             cut = (face.left, face.top, face.width, face.height)
             film = _Film(face.pixels, face.pixels, *cut, 0.5 * math.pi)
-            # Each face of each image has a seed of its own.
+            # Each face of each image has a different seed.
             own = (seed * len(FACES) + number) % _SEEDS
             images.append(self._rendered(mi, face.axes @ axes, position, film, samples, own))
         return resampled(cube, images)
 
 
 class _Film(NamedTuple):
-    """The image of a pinhole, and which part of it is drawn [px]."""
+    """Image size of a pinhole, and its rendered part [px]."""
 
     width: int
     height: int
@@ -123,7 +123,7 @@ class _Film(NamedTuple):
 
 def _sensor(mi: Any, axes: Floats, position: Floats, film: _Film, samples: int) -> dict[str, Any]:
     forward, right, down = axes
-    # Its camera looks along +z; x points to the left of the image, y up.
+    # Mitsuba's camera looks along +z; x points to the left of the image, y up.
     pose = np.eye(4)
     pose[:3, :4] = np.column_stack([-right, -down, forward, position])
     return {
@@ -149,7 +149,7 @@ def _sensor(mi: Any, axes: Floats, position: Floats, film: _Film, samples: int) 
 
 
 def _lights(mi: Any, light: Light) -> dict[str, Any]:
-    """Return sun and sky. A white surface reflects 1 / pi of its irradiance to each side."""
+    """Return sun and sky. A white surface reflects 1 / pi of its irradiance in each direction."""
     sine = np.sin((0.5 - (np.arange(_SKY_ROWS) + 0.5) / _SKY_ROWS) * math.pi).clip(0.0)
     rows = light.horizon + sine[:, None] * (light.zenith - light.horizon)
     sky = np.repeat(rows[:, None], 2 * _SKY_ROWS, axis=1).astype(np.float32)
@@ -177,7 +177,7 @@ def _bodies(mi: Any, arena: Arena, centers: Floats) -> dict[str, Any]:
     half_n, half_e, half_h = b.north_max - north, b.east_max - east, 0.5 * b.height
     x, y, z = np.eye(3)
     made = [
-        # Across is east, along (down in the image of the pattern) is south.
+        # Across is east, along (down in the pattern's image) is south.
         _face(mi, finish, FLOOR, np.array([north, east, 0.0]), half_e * y, -half_n * x),
         _ground(mi, finish),
     ]
@@ -216,7 +216,7 @@ def _face(
     along: Floats,
     origin: Floats | None = None,
 ) -> dict[str, Any]:
-    """Return a rectangle. Its pattern is measured in the world, or from an origin."""
+    """Return a rectangle. Its pattern starts at the world's origin, or at `origin`."""
     pose = np.eye(4)
     pose[:3, :4] = np.column_stack([across, along, np.cross(across, along), center])
     pose[:3, 2] /= np.linalg.norm(pose[:3, 2])
@@ -231,7 +231,7 @@ def _face(
 
 
 def _ceiling(mi: Any, light: Light, center: Floats, half_n: float, half_e: float) -> dict[str, Any]:
-    """Return a ceiling that glows downwards, and reflects nothing."""
+    """Return a ceiling that emits light downwards and reflects nothing."""
     pose = np.diag([half_n, half_e, 1.0, 1.0])
     pose[:3, 3] = center
     return {
@@ -243,7 +243,7 @@ def _ceiling(mi: Any, light: Light, center: Floats, half_n: float, half_e: float
 
 
 def _ground(mi: Any, finish: Finish) -> dict[str, Any]:
-    """Return the ground beyond the walls, of the floor's mean albedo, just below it."""
+    """Return the ground beyond the walls, slightly below the floor, with its mean albedo."""
     dark, bright = finish.albedo[FLOOR]
     mean = dark + mean_of(finish, FLOOR) * (bright - dark)
     pose = np.diag([RANGE_M, RANGE_M, 1.0, 1.0])
@@ -270,7 +270,7 @@ def _cylinder(
 ) -> list[dict[str, Any]]:
     radius, height, per_m = float(half[0]), float(half[2]), _per_m(finish, row)
     begin = finish.offset[row]
-    # Its second place goes from end to end, here from the top down.
+    # The second texture coordinate runs from end to end, here from the top down.
     bsdf = _material(
         mi,
         finish,
@@ -292,20 +292,20 @@ def _cylinder(
 
 def _sphere(mi: Any, finish: Finish, row: int, center: Floats, radius: float) -> dict[str, Any]:
     around, begin = _around(finish, row, radius), finish.offset[row]
-    # Its second place goes from the pole at +z, down, to the other one.
+    # The second texture coordinate runs from the pole at +z down to the opposite pole.
     bsdf = _material(mi, finish, row, (around, -0.5 * around), (begin[0], begin[1] + 0.25 * around))
     return {"type": "sphere", "center": center.tolist(), "radius": radius, "bsdf": bsdf}
 
 
 def _mesh(mi: Any, finish: Finish, row: int, placed: PlacedMesh) -> Any:
-    """Return a mesh of flat triangles. Its pattern is that of `surfaces.shade_meshes`."""
+    """Return a mesh of flat triangles. Its pattern matches `surfaces.shade_meshes`."""
     vertices, faces = standing(placed)
     corners = placed.scale * triangles_of(placed.file).corners.astype(np.float64)
     return _triangles(mi, finish, row, corners, vertices[faces])
 
 
 def _hills(mi: Any, finish: Finish, ground: Ground) -> Any:
-    """Return hills, whose pattern goes on from the floor's: across is east, along is south."""
+    """Return hills with the floor's pattern: across is east, along is south."""
     corners = ground.points[ground.faces]
     own = corners[..., [1, 0, 2]] * (1.0, -1.0, 1.0)
     return _triangles(mi, finish, FLOOR, own, corners)
@@ -322,7 +322,7 @@ def _triangles(mi: Any, finish: Finish, row: int, corners: Floats, placed: Float
     level = q2 >= np.maximum(q0, q1)
     across = np.where(level | (q1 > q0), corners[..., 0], corners[..., 1])
     along = np.where(level, corners[..., 1], corners[..., 2])
-    # Both in periods: nothing is left for the texture to do.
+    # Both are in periods, so the texture needs no transform.
     places = _per_m(finish, row) * np.stack([across, along], axis=-1) + finish.offset[row]
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict(_material(mi, finish, row, (1.0, 1.0), (0.0, 0.0)))
@@ -337,7 +337,7 @@ def _triangles(mi: Any, finish: Finish, row: int, corners: Floats, placed: Float
 
 
 def _per_m(finish: Finish, row: int) -> float:
-    """Return the periods of a pattern for a metre."""
+    """Return the periods of a pattern per metre."""
     return 1.0 / float((finish.size_m * periods(finish))[row])
 
 
@@ -359,10 +359,10 @@ def _two_sided(bsdf: dict[str, Any]) -> dict[str, Any]:
 
 
 def _reflecting(finish: Finish, row: int, albedo: dict[str, Any]) -> dict[str, Any]:
-    """Return a material of an albedo, which may be a texture, as `gloss` has it."""
+    """Return a material with an albedo, optionally a texture; optical model as in `gloss`."""
     surface, alpha = finish.surface[row], float(finish.roughness[row] ** 2)
     if surface == GLASS:
-        # Its panes have two sides of their own.
+        # The dielectric already has two sides.
         return {"type": "thindielectric", "int_ior": INDEX, "specular_transmittance": albedo}
     rough = {} if is_smooth(alpha) else {"distribution": "ggx", "alpha": alpha}
     if surface == METAL:
@@ -383,7 +383,7 @@ def _material(
     size: tuple[float, float],
     start: tuple[float, float],
 ) -> dict[str, Any]:
-    """Return a material whose pattern begins at `start` and goes on for `size`, in periods."""
+    """Return a material with a pattern from `start` over `size`, both in periods."""
     dark, bright = finish.albedo[row]
     if TEXTURES.index("plain") == finish.texture[row]:
         return _reflecting(finish, row, _rgb(dark))

@@ -1,9 +1,9 @@
-"""What makes a depth camera's images differ from the truth: how it measures, and conditions.
+"""Measurement errors of depth cameras: stereo matching, lidar ranging, and requested noise.
 
-The image is that of the left imager. Depth is focal length times baseline over disparity. An error
-of the disparity grows with the square of the depth, its steps are coarse far away, and the greatest
-disparity that is searched sets the least depth. What the right imager does not see has no match and
-no return. Something nearer hides it, or it lies outside of its image.
+The image belongs to the left imager. Depth is focal length times baseline over disparity. A
+disparity error grows with the square of the depth, disparity steps are coarse at long range, and
+the maximum search disparity sets the minimum depth. Points hidden in the right image, or outside of
+it, have no return.
 (Grunnet-Jepsen, Sweetser, Woodfill, "Tuning depth cameras for best performance", Intel RealSense;
 Luxonis, "Configuring Stereo Depth".)
 """
@@ -25,20 +25,20 @@ from airl_mav.profiles.conditions import SensorNoise
 
 
 class Matching(NamedTuple):
-    """A stereo camera's constants; a tuple, so that compiled loops take it."""
+    """Constants of a stereo camera; a tuple, because compiled loops require one."""
 
     disparity_px_m: float
-    """Focal length of the imagers times the baseline: over a depth it is the disparity [px m]."""
+    """Focal length of the imagers times the baseline [px m]; disparity = this / depth."""
     shift_px_m: float
-    """The same in columns of the depth image [px m]."""
+    """Product of baseline and focal length of the depth image, in its columns [px m]."""
     noise_px: float
     """Standard deviation of the disparity [px]."""
     step_px: float
-    """Step of the disparity [px]; 0: none."""
+    """Step of the disparity [px]; 0 = continuous."""
     most_px: float
-    """Greatest disparity that is searched [px]."""
+    """Maximum search disparity [px]."""
     range_m: float
-    """Greatest depth that gives a return [m]."""
+    """Maximum depth of a return [m]."""
 
 
 def matching_of(camera: Camera, share: float = 1.0) -> Matching | None:
@@ -59,7 +59,7 @@ def matching_of(camera: Camera, share: float = 1.0) -> Matching | None:
 def matched_depth(
     depth_mm: NDArray[np.uint16], matching: Matching, rng: np.random.Generator
 ) -> NDArray[np.uint16]:
-    """Return a true Z16 image (h, w) as a stereo camera measures it; 0 = no return."""
+    """Return the stereo measurement of a true Z16 image (h, w); 0 = no return."""
     draws = rng.standard_normal(depth_mm.shape)
     found = np.empty_like(depth_mm)
     _match(depth_mm, matching, draws, found)
@@ -73,11 +73,11 @@ def _match(
     draws: NDArray[np.float64],
     found: NDArray[np.uint16],
 ) -> None:
-    """Write what is measured; `draws` (h, w) are standard normal."""
+    """Write the measured depth; `draws` (h, w) are standard normal."""
     height, width = depth_mm.shape
     for row in range(height):
-        # The leftmost column of the right image that anything farther right in this row covers:
-        # what falls onto it or beyond it is hidden there.
+        # Leftmost column of the right image occupied by points farther right in this row. Points at
+        # or beyond this column are occluded.
         covered = math.inf
         for column in range(width - 1, -1, -1):
             found[row, column] = 0
@@ -99,21 +99,21 @@ def _match(
 
 
 NOISE_AT_M = 10.0
-"""Depth at which the noise is as declared; stereo noise grows with the square of the depth."""
+"""Depth of the declared noise; stereo noise grows with the square of the depth."""
 
 
 class DepthNoise(NamedTuple):
-    """What happens to images, in this order."""
+    """Noise stages of a depth image, in this order."""
 
     matching: Matching | None
-    """That of a stereo camera; None: none."""
+    """Stereo camera's constants; None for other cameras."""
     asked: SensorNoise
     ranging: Ranging | None = None
-    """That of a lidar; None: none."""
+    """Lidar's constants; None for other cameras."""
     range_m: float = 0.0
-    """Greatest depth of a lidar's return [m]."""
+    """Maximum depth of a lidar's return [m]."""
     own: tuple[int, ...] = ()
-    """`streams.words_of` the camera."""
+    """`streams.words_of` the camera's name."""
 
 
 def noise_of(camera: Camera, asked: SensorNoise, name: str = "") -> DepthNoise | None:
@@ -133,8 +133,8 @@ def noisy_frame(
 ) -> NDArray[np.uint16]:
     """Return a Z16 image (h, w) of an episode with noise.
 
-    `frame` is its number by the camera's rate, skipped frames included, so that the same moment has
-    the same noise at every level.
+    `frame` is its number by the camera's rate, skipped frames included. Images at the same time
+    therefore have the same noise at every level.
     """
     if noise.matching is not None:
         rng = stream(seed, Stream.STEREO, frame, *noise.own)
@@ -151,7 +151,7 @@ def noisy_frame(
 def ranged_depth(
     depth_mm: NDArray[np.uint16], ranging: Ranging, range_m: float, rng: np.random.Generator
 ) -> NDArray[np.uint16]:
-    """Return a true Z16 image (h, w) as a lidar measures it up to `range_m` [m]; 0 = no return."""
+    """Return a lidar's image (h, w) of true Z16 depth up to `range_m` [m]; 0 = no return."""
     depth = depth_mm / MM_PER_M
     sd = np.hypot(ranging.noise_m, ranging.noise_share * depth)
     measured = depth + sd * rng.standard_normal(depth.shape)

@@ -1,4 +1,4 @@
-"""What a colour camera sees of an arena: colour, depth and what is seen, from one pass."""
+"""Rendering of a colour camera's view: colour, depth and segmentation from one pass."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
 LUMA = (19595, 38470, 7471)
-"""Shares of red, green and blue in grey, times 65536: 0.299, 0.587 and 0.114, the luma of ITU-R
-BT.601, in the whole numbers that Pillow has for them."""
+"""Weights of red, green and blue in grey, times 65536: 0.299, 0.587 and 0.114, the luma of ITU-R
+BT.601. The integers equal Pillow's."""
 
 
 class Picture(NamedTuple):
-    """What a colour camera sees in one exposure."""
+    """Colour, depth and segmentation of one exposure."""
 
     rgb: NDArray[np.uint8]  # (height, width, 3) sRGB
     depth_m: NDArray[np.float32]  # (height, width), 0 = no surface
@@ -37,7 +37,7 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True)
 class ColourArrays:
-    """The look of an arena as `render_colour` takes it."""
+    """Appearance of an arena as arrays for `render_colour`."""
 
     texture: NDArray[np.int8]  # (m,)
     per_m: NDArray[np.float32]  # (m,) [1/m]
@@ -48,14 +48,14 @@ class ColourArrays:
 
     @classmethod
     def of(cls, look: Drawn) -> ColourArrays:
-        """Return the arrays of a drawn appearance."""
+        """Return the arrays of a rendered appearance."""
         finish, light = look.finish, look.light
         floor = finish.albedo[FLOOR_ROW]
         share = mean_of(finish, FLOOR_ROW)
         sky = light.sky
         radiosity = (floor[0] + share * (floor[1] - floor[0])) * (sky - light.to_sun[2] * light.sun)
         if (inside := light.inside) is not None:
-            # An upright surface gets half of either.
+            # An upright surface then receives (sky + radiosity) / 2 = `inside.walls`.
             sky, radiosity = inside.floor, np.maximum(2.0 * inside.walls - inside.floor, 0.0)
         lights = [light.to_sun, light.sun, sky, radiosity, light.zenith, light.horizon]
         lights.append(np.array([light.extinction, 0.0, 0.0]))
@@ -77,7 +77,7 @@ def render_picture(
     quaternion: Quat | NDArray[np.float64],
     gain: float = 1.0,
 ) -> Picture:
-    """Return the picture of an arena, light times `gain`; arguments as of `render`."""
+    """Return the picture of an arena, light times `gain`; arguments as in `render`."""
     k, obstacles, look = intrinsics, arena.obstacles, ColourArrays.of(arena.look)
     shape = (k.height, k.width)
     lights = look.lights if gain == 1.0 else _brightened(look.lights, gain)
@@ -111,14 +111,14 @@ def render_picture(
 
 
 def _brightened(lights: NDArray[np.float32], gain: float) -> NDArray[np.float32]:
-    """Return the lights (7, 3) of `ColourArrays` times a gain: neither direction nor fog."""
+    """Return the lights (7, 3) of `ColourArrays` times a gain; direction and fog are unchanged."""
     brighter = lights.copy()
     brighter[1:6] *= np.float32(gain)
     return brighter
 
 
 def grey(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return sRGB images (..., 3) as grey ones (...): luma of the encoded numbers, rounded."""
+    """Return sRGB images (..., 3) as grey images (...): luma of the encoded values, rounded."""
     luma = np.empty(rgb.shape[:-1], np.uint8)
     write_grey(luma.reshape(-1), np.ascontiguousarray(rgb).reshape(-1, 3))
     return luma
@@ -143,7 +143,7 @@ def antialiased(
     quaternion: Quat | NDArray[np.float64],
     side: int,
 ) -> NDArray[np.uint8]:
-    """Return the sRGB image of side x side rays per pixel, for people; the sensor has one."""
+    """Return an sRGB image with side x side rays per pixel, for display; sensors use one ray."""
     k, fine = intrinsics, finer(intrinsics, side)
     codes = render_picture(arena, centers, fine, position, quaternion).rgb
     light = linear_of(np.arange(256) / 255.0)[codes]

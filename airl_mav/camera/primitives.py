@@ -17,7 +17,7 @@ BOX: Final = int(Shape.BOX)
 CYLINDER: Final = int(Shape.CYLINDER)
 
 GROUND: Final = -2
-"""What sees hills while an image is drawn; where it is told of, they are the floor."""
+"""Number of hills during rendering; the output reports them as floor."""
 
 CEILING: Final = -1
 SKY: Final = 0
@@ -25,19 +25,19 @@ FLOOR: Final = 1
 WALL_NORTH_SOUTH: Final = 2
 WALL_EAST_WEST: Final = 3
 OBSTACLE: Final = 4
-"""What a pixel sees: the first obstacle has this number, the next ones those after it."""
+"""Number of the first obstacle in a segmentation; others follow in order."""
 
-_UNLIMITED: Final = 1e30  # inverse depth of an entry that lies behind the camera
-TINY: Final = 1e-9  # least distance to a plane [m], least range [1/m]; keeps inverses finite
+_UNLIMITED: Final = 1e30  # inverse depth of an entry behind the camera
+TINY: Final = 1e-9  # minimum distance to a plane [m] and minimum range [1/m]; keeps inverses finite
 
 Ids = NDArray[np.int32]
 Rectangles = NDArray[np.int32]
 
 
 class _Slab(NamedTuple):
-    """Inverse depths at two parallel planes, for a ray's component d across them.
+    """Inverse depths at two parallel planes, for the ray component d perpendicular to them.
 
-    Entry: enter_gain d + enter_base. Exit: the greater of exit_a d and exit_b d.
+    Entry: enter_gain d + enter_base. Exit: the maximum of exit_a d and exit_b d.
     """
 
     enter_gain: float
@@ -58,7 +58,7 @@ def _slab(low: float, high: float) -> _Slab:
 
 @kernel
 def turn_axes(v: Vec, cos: float, sin: float) -> Vec:
-    """Return a world vector along axes that are turned about the vertical."""
+    """Return a world vector in axes rotated about the vertical."""
     return (cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2])
 
 
@@ -73,11 +73,11 @@ def _line_start(pose: Pose, ahead: float, y: float) -> Vec:
 def draw_room(
     out: Image, ids: Ids | None, optics: Optics, pose: Pose, half: Vec, closed: bool
 ) -> None:
-    """Write inverse depth of floor, walls and ceiling, 0 = no return, and in `ids` what is seen.
+    """Write the inverse depth of floor, walls and ceiling, 0 = no return, and `ids`.
 
-    Without a ceiling the room is a box without a lid: a ray that leaves it by the lid sees nothing,
-    one that enters by the lid sees the inside, any other that enters sees a wall from outside.
-    Where it is closed, either sees the lid.
+    Without a ceiling the room is a box without a lid. A ray that leaves through the lid has no
+    return; a ray that enters through it sees the inside; any other entering ray sees a wall from
+    outside. In a closed room, rays in either direction see the lid.
     """
     c, lines, xs = pose.center, optics.lines, optics.xs
     north = _slab(c[0] - half[0], c[0] + half[0])
@@ -139,7 +139,7 @@ def _draw_room_around(
     lid: float,
     lid_seen: float,
 ) -> None:
-    """Draw the room that the camera is in, as `draw_room`: rays only leave it.
+    """Draw the room around the camera, as in `draw_room`; rays only leave the room.
 
     `north` and `east` are slabs between walls, `floor` and `lid` inverse depths below and,
     negative, above the camera [1/m]; `lid_seen` is 1 for a ceiling, 0 for an open room.
@@ -169,7 +169,7 @@ def _draw_room_around(
 
 @borrowing_kernel
 def draw_box(out: Image, ids: Ids | None, optics: Optics, body: Body, rectangle: Rectangle) -> bool:
-    """Draw a box; return whether the camera is inside."""
+    """Draw a box; return True if the camera is inside."""
     c, half, lines = body.pose.center, body.half, optics.lines
     i = _slab(c[0] - half[0], c[0] + half[0])
     j = _slab(c[1] - half[1], c[1] + half[1])
@@ -204,7 +204,7 @@ def draw_box(out: Image, ids: Ids | None, optics: Optics, body: Body, rectangle:
 def draw_cylinder(
     out: Image, ids: Ids | None, optics: Optics, body: Body, rectangle: Rectangle
 ) -> bool:
-    """Draw a vertical cylinder with caps; return whether the camera is inside."""
+    """Draw a vertical cylinder with caps; return True if the camera is inside."""
     c, half, lines = body.pose.center, body.half, optics.lines
     k = _slab(c[2] - half[2], c[2] + half[2])
     # Side: (c.c - radius²) s² - 2 (d.c) s + d.d = 0, horizontal components only.
@@ -242,7 +242,7 @@ def draw_cylinder(
 def draw_sphere(
     out: Image, ids: Ids | None, optics: Optics, body: Body, rectangle: Rectangle
 ) -> bool:
-    """Draw a sphere; return whether the camera is inside."""
+    """Draw a sphere; return True if the camera is inside."""
     c, radius, lines = body.pose.center, body.half[0], optics.lines
     cc = dot(c, c) - radius * radius
     if cc <= 0.0:
@@ -270,7 +270,7 @@ def draw_sphere(
 
 @kernel
 def turned(pose: Pose, cos: float, sin: float) -> Pose:
-    """Return a pose in the world along axes that are turned about the vertical."""
+    """Return a world pose in axes rotated about the vertical."""
     return Pose(
         turn_axes(pose.forward, cos, sin),
         turn_axes(pose.across, cos, sin),

@@ -1,7 +1,7 @@
-"""Where a body falls in the image: the pixels that bound its projection.
+"""Projection of bodies into the image: rectangles or spans of pixels that bound each body.
 
-An image is made of lines. A pinhole's are its rows, a cylinder's its columns. Along each of them a
-pixel's ray is start + x along, affine in x, so that both are drawn by the same loops.
+An image consists of lines: rows of a pinhole, columns of a cylinder. Along each line a pixel's ray
+is start + x along, affine in x, so both are drawn by the same loops.
 """
 
 from __future__ import annotations
@@ -20,70 +20,70 @@ from airl_mav.profiles.distortion import Distortion, distorted, sees_to
 from airl_mav.vehicle.rotation import Vec
 
 MIN_DEPTH_M: Final = 0.001
-"""Least depth of a return [m]: what is nearer reads as this, so that Z16 never rounds it to 0."""
+"""Minimum depth of a return [m]; nearer points read this value, so Z16 never rounds them to 0."""
 
 _WIDE: Final = 1e9  # slope of a ray (almost) in the image plane
 
 Image = NDArray[np.float32]
 Line = NDArray[np.float64]
 Lines = NDArray[np.float64]
-"""(n, 2) how much of the forward axis, and of the axis across, is in the first ray of a line."""
+"""(n, 2) components of a line's first ray on the forward axis and the axis across."""
 
 Rectangle = tuple[int, int, int, int]
 """Lines [first, last), pixels of each [begin, end)."""
 
 Span = tuple[float, float, int, int]
-"""Lines first..last, not yet cut to the image, and pixels of each [begin, end)."""
+"""Lines first..last, before clipping to the image, and pixels of each [begin, end)."""
 
 
 class View(NamedTuple):
-    """What a pixel looks along, and how far."""
+    """Projection constants and range of an image."""
 
     focal: float
     line_centre: float
     pixel_centre: float
-    """Pixel of the optical axis on that line."""
+    """Pixel of the optical axis on each line."""
     s_min: float  # inverse of the range
     cylindrical: bool
 
 
 class Pose(NamedTuple):
-    """Camera axes, and a body's centre from the camera, along the body's own axes."""
+    """Camera axes, and a body's centre relative to the camera, in the body's axes."""
 
     forward: Vec
     across: Vec
-    """From line to line: down of a pinhole, right of a cylinder."""
+    """Direction from line to line: down of a pinhole, right of a cylinder."""
     along: Vec
-    """Along a line: right of a pinhole, down of a cylinder."""
+    """Direction along a line: right of a pinhole, down of a cylinder."""
     center: Vec
 
 
 class Bent(NamedTuple):
-    """Unit rays of a fisheye as shares of `Pose`'s axes; zero in pixels that see nothing."""
+    """Unit rays of a fisheye in `Pose`'s axes; zero in pixels outside the field of view."""
 
     forward: NDArray[np.float64]  # (n, m)
     across: NDArray[np.float64]  # (n, m)
     along: NDArray[np.float64]  # (n, m)
     distortion: Distortion
     sees_to: float
-    """Greatest angle from the optical axis at which it sees anything [rad]."""
+    """Maximum visible angle from the optical axis [rad]."""
 
 
 class Optics(NamedTuple):
-    """The rays of an image, line by line, and the camera that they begin in."""
+    """Rays of an image, line by line, and the camera as their origin."""
 
     lines: Lines
-    xs: Line  # (m,) how much of the axis along is in each ray of a line
+    xs: Line  # (m,) component of each ray of a line on the axis along
     bent: Bent | None  # a fisheye's rays
     lens: View
     axes: Pose
-    """The camera's axes; no centre."""
+    """Camera axes; the centre is unused."""
     camera: Vec
     """Position NED, above the ground [m]."""
 
 
 class Scene(NamedTuple):
-    """The room and the n obstacles of an arena, as `render_depth` takes them."""
+    """Room and the n obstacles of an arena, as arguments of `render_depth`."""
 
     bounds: NDArray[np.float64]  # (6,)
     shape: NDArray[np.int8]  # (n,)
@@ -93,15 +93,15 @@ class Scene(NamedTuple):
 
 
 class Body(NamedTuple):
-    """An obstacle in the world, or along its own axes."""
+    """Obstacle in the world's axes or in its body axes."""
 
     number: int
     shape: int
     half: Vec
-    """Half extents [m]; a sphere's and a cylinder's radius first."""
+    """Half extents [m]; for spheres and cylinders the radius comes first."""
     yaw: float
     pose: Pose
-    """Camera axes, and the centre from the camera."""
+    """Camera axes, and the centre relative to the camera."""
 
 
 _distorted = kernel(distorted)
@@ -109,7 +109,7 @@ _distorted = kernel(distorted)
 
 @borrowing_kernel
 def ray_of(pose: Pose, bent: Bent | None, v: int, u: int, start: Vec, x: float) -> Vec:
-    """Return the ray of pixel u on line v, whose line starts so and whose place on it is x."""
+    """Return the ray of pixel u on line v, with the line's `start` and the pixel's offset x."""
     r = pose.along
     if bent is None:
         return start[0] + x * r[0], start[1] + x * r[1], start[2] + x * r[2]
@@ -130,11 +130,11 @@ def dot(a: Vec, b: Vec) -> float:
 
 @kernel
 def _span(forward: float, lateral: float, radius: float) -> tuple[float, float]:
-    """Return the slopes lateral / forward of tangents to a circle that reaches in front."""
+    """Return the slopes lateral / forward of tangents to a circle at least partly in front."""
     square = forward * forward + lateral * lateral - radius * radius
     if square <= 0.0:
         return -_WIDE, _WIDE
-    # The centre's direction, turned by -/+ the half angle under which the circle is seen.
+    # Direction of the centre, rotated by -/+ the circle's apparent half angle.
     k = math.sqrt(square)
     low, high = forward * k + lateral * radius, forward * k - lateral * radius
     return (
@@ -145,7 +145,7 @@ def _span(forward: float, lateral: float, radius: float) -> tuple[float, float]:
 
 @kernel
 def _pixels(low: float, high: float, n: int) -> tuple[int, int]:
-    """Return the pixels [first, last) of n that those between two places fall on."""
+    """Return the range [first, last) of n pixels between two coordinates."""
     first = min(max(math.floor(low), 0.0), float(n))
     last = min(max(math.ceil(high) + 1.0, 0.0), float(n))
     return int(first), int(last)
@@ -153,7 +153,7 @@ def _pixels(low: float, high: float, n: int) -> tuple[int, int]:
 
 @kernel
 def _reach(axis: Vec, half: Vec, sphere: bool) -> float:
-    """Return how far a body reaches from its centre along an axis, either way."""
+    """Return the half extent of a body along an axis."""
     if sphere:
         return half[0]
     return abs(half[0] * axis[0]) + abs(half[1] * axis[1]) + abs(half[2] * axis[2])
@@ -161,7 +161,7 @@ def _reach(axis: Vec, half: Vec, sphere: bool) -> float:
 
 @borrowing_kernel
 def is_pinhole(bent: Bent | None, view: View) -> bool:
-    """Return whether an image is a pinhole's."""
+    """Return True if an image is a pinhole's."""
     return not view.cylindrical if bent is None else False
 
 
@@ -177,10 +177,10 @@ def rectangle_of(
 
 @borrowing_kernel
 def pinhole_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Rectangle:
-    """Return the pixels of a pinhole that can see a body; empty when none can.
+    """Return the pixels of a pinhole that can see a body; empty if invisible.
 
-    `pose` has the camera's axes along the body's, and its centre, `half` the half extents of its
-    box [m]. A `sphere` has the radius half[0].
+    `pose` contains the camera's axes in the body's frame and the body's centre, `half` the half
+    extents of its box [m]. A `sphere` has the radius half[0].
     """
     f, r, d, c = pose.forward, pose.along, pose.across, pose.center
     z, x, y = dot(f, c), dot(r, c), dot(d, c)
@@ -210,9 +210,9 @@ def pinhole_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: boo
 
 @borrowing_kernel
 def cylinder_span(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Span:
-    """Return the pixels of a cylinder that can see a body; arguments as of `pinhole_rectangle`.
+    """Return the pixels of a cylinder that can see a body; arguments as in `pinhole_rectangle`.
 
-    Lines are columns around the body's bearing, to which `cut` adds a turn of the cylinder.
+    Lines are columns around the body's bearing, to which `cut` adds full turns.
     """
     f, r, d, c = pose.forward, pose.across, pose.along, pose.center
     z, x, y = dot(f, c), dot(r, c), dot(d, c)
@@ -226,7 +226,7 @@ def cylinder_span(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -
     if near * view.s_min > 1.0:
         return 0.0, 0.0, 0, 0
     if near < MIN_DEPTH_M:
-        # It may stand across the cylinder's axis: above, below or around the camera.
+        # The body may cross the cylinder's axis: above, below or around the camera.
         return 0.0, float(out.shape[0]), 0, out.shape[1]
     half_angle = math.asin(lateral / distance) if sphere else math.atan2(lateral, near)
     far = math.hypot(distance + reach, lateral)
@@ -242,7 +242,7 @@ def cylinder_span(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -
 
 @borrowing_kernel
 def cut(out: Image, view: View, span: Span, turns: int) -> Rectangle:
-    """Return the part of a span that falls into the image after so many turns of the cylinder."""
+    """Return the part of a span inside the image after a number of full turns."""
     around = turns * 2.0 * math.pi * view.focal
     first, last = _pixels(span[0] + around, span[1] + around, out.shape[0])
     return first, last, span[2], span[3]
@@ -252,7 +252,7 @@ def cut(out: Image, view: View, span: Span, turns: int) -> Rectangle:
 def fisheye_rectangle(
     out: Image, view: View, bent: Bent, pose: Pose, half: Vec, sphere: bool
 ) -> Rectangle:
-    """Return the pixels of a fisheye that can see a body; arguments as of `pinhole_rectangle`.
+    """Return the pixels of a fisheye that can see a body; arguments as in `pinhole_rectangle`.
 
     They bound the ring segment of the sphere around the body.
     """
@@ -268,7 +268,7 @@ def fisheye_rectangle(
     inner, outer = _way_out(view, bent, off - spread), _way_out(view, bent, off + spread)
     left, right, top, bottom = -outer, outer, -outer, outer
     if off > spread and off + spread < math.pi:
-        # Seen from the axis it covers so much to either side of its plane.
+        # Half of the angle about the optical axis that the body covers.
         turn = math.asin(min(math.sin(spread) / math.sin(off), 1.0))
         plane = math.atan2(y, x)
         left, right = _reached(plane - turn, plane + turn, inner, outer)
@@ -282,14 +282,14 @@ def fisheye_rectangle(
 
 @borrowing_kernel
 def _way_out(view: View, bent: Bent, angle: float) -> float:
-    """Return how far from the middle of a fisheye's image an angle falls [px], within its rim."""
+    """Return the distance of an angle from the middle of a fisheye's image [px], within its rim."""
     rim = bent.sees_to
     return view.focal * _distorted(min(max(angle, -rim), rim), bent.distortion)
 
 
 @kernel
 def _reached(first: float, last: float, inner: float, outer: float) -> tuple[float, float]:
-    """Return how far part of a ring, between two angles, reaches along the axis of angle 0."""
+    """Return the extent of a ring sector, between two angles, along the axis of angle 0."""
     turn = 2.0 * math.pi
     high = max(math.cos(first), math.cos(last))
     low = min(math.cos(first), math.cos(last))
@@ -304,13 +304,13 @@ def _reached(first: float, last: float, inner: float, outer: float) -> tuple[flo
 
 
 def bent_of(camera: Intrinsics) -> Bent | None:
-    """Return the rays of a camera; None: it is no fisheye."""
+    """Return the rays of a fisheye; None for other cameras."""
     return _bent_of(camera) if camera.projection == "fisheye" else None
 
 
 @lru_cache(maxsize=64)
 def _bent_of(camera: Intrinsics) -> Bent:
     forward, right, down = np.ascontiguousarray(fisheye_rays(camera))
-    # Numbers of one type, so that there is one compiled kernel.
+    # Plain floats, so that only one variant is compiled.
     k1, k2, k3, k4 = (float(each) for each in camera.distortion)
     return Bent(forward, down, right, (k1, k2, k3, k4), sees_to(camera.distortion))

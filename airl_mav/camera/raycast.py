@@ -1,19 +1,20 @@
-"""Depth image of an arena by analytic ray casting: the kernel that training and the plant share.
+"""Depth image of an arena by analytic ray casting: kernel of both training and plant.
 
 A pinhole's pixel has the ray d = forward + x right + y down with (x, y) = ((u - cx) / focal,
 (v - cy) / focal), so the distance t along it is the depth along the optical axis (planar z-depth,
-RealSense Z16). A cylinder's has d = cos(a) forward + sin(a) right + y down with a = (u - cx) /
-focal, and t is the depth in the plane of forward and right. Either is affine along a line of the
-image, and these lines are what is drawn: the rows of a pinhole, the columns of a cylinder. Each
-pixel of a fisheye has a ray of its own, a unit vector, and t is the range along it.
-Everything is done on inverse depth s = 1 / t. Of a plane it is n.d / n.(p - o): affine in the
-pixel, no division, finite for grazing rays. Of a sphere or cylinder it is a root of a quadratic.
-A convex body is hit where its last entry is no farther than its first exit. The image keeps the
-greatest s of all bodies. One division a pixel at the end turns it into metres.
+RealSense Z16). A cylinder's pixel has d = cos(a) forward + sin(a) right + y down with
+a = (u - cx) / focal, and t is the depth in the plane of forward and right. Both are affine along a
+line of the image: a row of a pinhole, a column of a cylinder. Each pixel of a fisheye has a
+separate unit ray, and t is the range along it.
 
-Obstacle-outer: an obstacle touches only the pixels of the rectangle that its bounding box or
-sphere projects to. The loops along a line have no branch, so that they vectorise. They are in
-float64: a float32 direction is off by millimetres on a floor seen at 20 m.
+All computations use inverse depth s = 1 / t. For a plane it is n.d / n.(p - o): affine in the
+pixel, no division, finite for grazing rays. For a sphere or cylinder it is a root of a quadratic. A
+convex body is hit if its last entry is no farther than its first exit. The image keeps the maximum
+s of all bodies. One final division per pixel converts it to metres.
+
+The outer loop runs over obstacles: each updates only the projected rectangle of its bounding box or
+sphere. The loops along a line are branch-free and vectorize. They use float64: a float32 direction
+is off by millimetres on a floor at a distance of 20 m.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ from airl_mav.vehicle.rotation import Quat, Vec, rotate
 
 @borrowing_kernel
 def body_of(scene: Scene, axes: Pose, camera: Vec, i: int) -> Body:
-    """Return an obstacle along the axes of the world."""
+    """Return an obstacle in the world's axes."""
     center, half_size = scene.center, scene.half_size
     offset = (center[i, 0] - camera[0], center[i, 1] - camera[1], center[i, 2] - camera[2])
     half = (half_size[i, 0], half_size[i, 1], half_size[i, 2])
@@ -72,13 +73,13 @@ def body_of(scene: Scene, axes: Pose, camera: Vec, i: int) -> Body:
 def _draw_obstacle(
     out: Image, ids: Ids | None, drawn_in: Rectangles | None, optics: Optics, body: Body
 ) -> bool:
-    """Draw one obstacle; return whether the camera is inside."""
+    """Draw one obstacle; return True if the camera is inside."""
     cos, sin = 1.0, 0.0
     shape, world, half, view = body.shape, body.pose, body.half, optics.lens
     if shape == BOX:
         cos, sin = math.cos(body.yaw), math.sin(body.yaw)
     elif shape == CYLINDER:
-        # Its bounding box turned towards the camera is the narrowest in the image.
+        # Its bounding box is narrowest in the image when turned towards the camera.
         distance = math.hypot(world.center[0], world.center[1])
         if distance > 0.0:
             cos, sin = world.center[0] / distance, world.center[1] / distance
@@ -88,7 +89,7 @@ def _draw_obstacle(
     span = (0.0, 0.0, 0, 0)
     rectangle = (0, 0, 0, 0)
     if view.cylindrical:
-        # What is behind the camera may be at both ends of the image.
+        # A body behind the camera may appear at both ends of the image.
         turns = 1
         span = cylinder_span(out, view, pose, half, sphere)
     else:
@@ -116,7 +117,7 @@ def _draw_obstacle(
 
 @borrowing_kernel
 def invert(out: Image) -> None:
-    """Turn inverse depth into depth [m], in place."""
+    """Convert inverse depth to depth [m], in place."""
     zero, one = np.float32(0.0), np.float32(1.0)
     least, most = np.float32(TINY), np.float32(1.0 / MIN_DEPTH_M)
     for v in range(out.shape[0]):
@@ -129,7 +130,7 @@ def invert(out: Image) -> None:
 
 @borrowing_kernel
 def blank(out: Image, bent: Bent) -> None:
-    """Write 0 where a fisheye's pixels see nothing at all."""
+    """Write 0 into fisheye pixels outside the field of view."""
     for v in range(out.shape[0]):
         for u in range(out.shape[1]):
             i, j, k = bent.forward[v, u], bent.across[v, u], bent.along[v, u]
@@ -148,10 +149,10 @@ def aim(
     cylindrical: bool,
     max_range: float,
 ) -> tuple[View, Pose]:
-    """Write the rays of an image's lines; return how it sees, and its axes about no centre.
+    """Write the rays of an image's lines; return the view, and camera axes without a centre.
 
-    `lines` (n, 2) gets the parts of the forward axis and of the axis across in each line's first
-    ray, `xs` (m,) the part of the axis along in each ray; the rest as of `render_depth`.
+    `lines` (n, 2) receives the components of each line's first ray on the forward axis and the axis
+    across, `xs` (m,) each ray's component on the axis along; other arguments as in `render_depth`.
     """
     q = (quaternion[0], quaternion[1], quaternion[2], quaternion[3])
     forward, right, down = (
@@ -213,9 +214,9 @@ def draw_bodies(
 
 @kernel
 def write_transposed(out: NDArray[Any], drawn: NDArray[Any]) -> None:
-    """Write an image (w, h) that was drawn by columns to `out` (h, w).
+    """Write an image (w, h) rendered by columns to `out` (h, w).
 
-    A slice assignment would also compile numba's error texts, for seconds at each place.
+    A slice assignment would also compile numba's error texts, for seconds at each use.
     """
     for u in range(drawn.shape[0]):
         for v in range(drawn.shape[1]):
@@ -243,26 +244,25 @@ def render_depth(
     """Render the depth image of an arena.
 
     The floor is the rectangle of the bounds at z = 0. The walls are thin, stand on its edges and
-    are seen from both sides. A ray that passes over them has no return, unless there is a ceiling
-    at their height. A camera less than `MIN_DEPTH_M` above the ground is lifted to that height (a
-    resting vehicle sinks in by the contact's penetration). From inside an obstacle every pixel
-    reads `MIN_DEPTH_M`. Meshes are seen in place of the obstacles that they own, from inside as
-    well.
+    are visible from both sides. A ray above the walls has no return, unless there is a ceiling at
+    their height. A camera less than `MIN_DEPTH_M` above the ground is raised to that height (a
+    resting vehicle sinks in by the contact's penetration). Inside an obstacle every pixel reads
+    `MIN_DEPTH_M`. Meshes are rendered in place of the obstacles that they own, also from inside.
 
     `out` (height, width) is depth [m], written; 0 = no return. It is measured along the optical
     axis of a pinhole, in the camera's horizontal plane of a cylinder, along the ray of a fisheye.
     The camera is at `position` NED [m]. Its x axis by `quaternion` (camera -> NED) is the optical
     axis; y points to the right of the image, z to its bottom. `focal`, `cx`, `cy` and `cylindrical`
-    are those of `Intrinsics`, `bent` the rays of a fisheye (`bent_of`), None for others. `bounds`
-    (6,) is `Bounds.as_array()`; the obstacles' arrays (n, ...) are those of `Obstacles`. `meshes`
-    are those that are seen, hills among them; None costs nothing.
+    are fields of `Intrinsics`, `bent` the rays of a fisheye (`bent_of`), None for others. `bounds`
+    (6,) is `Bounds.as_array()`; the obstacles' arrays (n, ...) are fields of `Obstacles`. `meshes`
+    contains the visible meshes, hills included; None has no cost.
     """
     camera = raised(meshes, position)
     height, width = out.shape
     xs = np.empty(height if cylindrical else width)
     lines = np.empty((width if cylindrical else height, 2))
     view, axes = aim(lines, xs, quaternion, focal, cx, cy, cylindrical, max_range)
-    # A cylinder's is drawn column by column, each in one piece; `out` gets them at the end.
+    # Columns of a cylinder are drawn into contiguous memory, then transposed into `out`.
     drawn = np.empty((width, height), np.float32) if cylindrical else out
     optics = Optics(lines, xs, bent, view, axes, camera)
     scene = Scene(bounds, shape, center, half_size, yaw)

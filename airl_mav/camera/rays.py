@@ -1,8 +1,8 @@
-"""Rays of a camera's pixels, of any projection; with numpy alone.
+"""Rays of a camera's pixels, of any projection; depends on numpy only.
 
-A fisheye has r = f theta_d, where theta_d is the angle from the optical axis as
-`profiles.distortion` distorts it. Its depth is measured along the ray: along the optical axis it
-would be 0 at 90 degrees, and negative beyond.
+A fisheye has r = f theta_d, with theta_d the angle from the optical axis as distorted by
+`profiles.distortion`. Its depth is measured along the ray: along the optical axis it would be 0 at
+90 degrees, and negative beyond.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def rays_of(camera: Intrinsics) -> NDArray[np.float64]:
 
 
 def finer(camera: Intrinsics, side: int) -> Intrinsics:
-    """Return a camera that sees the same with side x side pixels in the place of each."""
+    """Return a camera with the same field of view and side x side pixels in place of each."""
     k = camera
     return replace(
         k,

@@ -1,10 +1,10 @@
-"""What is seen in and through surfaces that are not matt, ray by ray.
+"""Ray tracing of reflection and transmission by surfaces that are not matt.
 
-Where an image sees varnish, metal or glass, its pixel is drawn once more: from the camera's ray a
-tree of rays grows, mirrored by varnish, metal and glass, straight on through glass, until all that
-they meet is matt, or counts for nothing. A rough surface that the camera itself sees mirrors
-`gloss.SAMPLES` directions. Those seen in others are as if smooth, but for the sun, whose highlight
-has a closed form. What is matt looks as in `shading.paint`, with a shadow ray to the sun.
+Pixels of varnish, metal or glass are rendered again. A tree of rays starts at the camera: varnish,
+metal and glass mirror them, glass also transmits them, until all hits are matt or contribute too
+little. A rough surface directly visible to the camera mirrors `gloss.SAMPLES` directions. Rough
+surfaces in reflections count as smooth, except for the sun's highlight, which has a closed form.
+Matt surfaces are shaded as in `shading.paint`, with a shadow ray to the sun.
 """
 
 from __future__ import annotations
@@ -48,39 +48,39 @@ from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kern
 from airl_mav.vehicle.rotation import Vec
 
 MOST_RAYS: Final = 64
-"""Rays of one pixel."""
+"""Maximum number of rays per pixel."""
 
 _COUNTS: Final = 1.0 / 256.0
-"""A ray of which less than this share is seen is not followed."""
+"""Minimum contribution of a ray; weaker rays are dropped."""
 
 _WAITING: Final = 48
-"""Rays of one pixel that wait, at most: `SAMPLES`, and one more for each that is followed."""
+"""Maximum number of pending rays per pixel: `SAMPLES`, plus one per traced ray."""
 
 _RAY: Final = 12
-"""Numbers of a ray that waits: origin, direction, share of red, green and blue, way so far, depth
-in the tree, `Seen.blur`."""
+"""Number of values per pending ray: origin, direction, share of red, green and blue, path length,
+depth in the tree, `Seen.blur`."""
 
 
 class Seen(NamedTuple):
-    """A point that a ray meets, and how much of the light from there is seen."""
+    """Hit of a ray, and its contribution to the pixel."""
 
     ray: Vec
     share: Vec
-    """Of red, green and blue."""
+    """Contribution of red, green and blue."""
     way: float
-    """From the camera [m]."""
+    """Path length from the camera [m]."""
     depth: int
-    """In the tree: the camera's ray has 0."""
+    """Depth in the tree; 0 for the camera's ray."""
     at: Vec
-    """NED [m]."""
+    """Position NED [m]."""
     normal: Vec
-    """Unit vector NED on the side that is seen."""
+    """Unit vector NED on the visible side."""
     albedo: Vec
     cosine: float
-    """Of the angle between ray and normal, 0 to 1."""
+    """Cosine of the angle between ray and normal, 0 to 1."""
     alpha: float
     blur: float
-    """`alpha` of the roughest surface that has mirrored the ray before; 0: of none."""
+    """`alpha` of the roughest surface that mirrored the ray; 0 = no rough surface."""
 
 
 @large_kernel
@@ -95,7 +95,7 @@ def draw_reflections(
 ) -> None:
     """Redraw the pixels of surfaces that are not matt.
 
-    `out` (n,) are packed colours, `ids` (n,) what is seen, `rays` those of the pixels, `camera`
+    `out` (n,) are packed colours, `ids` (n,) the segmentation, `rays` the pixels' rays, `camera`
     (3,) NED [m].
     """
     tree, nodes = np.empty((_WAITING, _RAY)), np.empty(STACK, np.int32)
@@ -106,7 +106,7 @@ def draw_reflections(
             continue
         n, e, d = float(rays.north[u]), float(rays.east[u]), float(rays.down[u])
         per = 1.0 / math.sqrt(n * n + e * e + d * d)
-        # By ways along oblique rays, where `Look.pixel2` is by depth.
+        # Per path length along oblique rays; `Look.pixel2` is per depth.
         pixel2 = shading.F32(look.pixel2 * per * per * per)
         _wait(tree, 0, camera, (per * n, per * e, per * d), (1.0, 1.0, 1.0), 0.0, 0, 0.0)
         _follow(colour, tree, nodes, bodies, meshes, look, pixel2)
@@ -126,7 +126,7 @@ def _wait(
     depth: int,
     blur: float,
 ) -> None:
-    """Note a ray that is to be followed."""
+    """Push a pending ray."""
     for k in range(3):
         tree[at, k], tree[at, 3 + k], tree[at, 6 + k] = origin[k], ray[k], share[k]
     tree[at, 9], tree[at, 10], tree[at, 11] = way, depth, blur
@@ -136,7 +136,7 @@ def _wait(
 def _grown(
     tree: NDArray[np.float64], tops: int, seen: Seen, ray: Vec, share: Vec, blur: float
 ) -> int:
-    """Note a ray from a point that counts for something; return how many wait."""
+    """Push a ray with a sufficient contribution; return the number of pending rays."""
     if max(max(share[0], share[1]), share[2]) < _COUNTS or tops == _WAITING:
         return tops
     _wait(tree, tops, seen.at, ray, share, seen.way, seen.depth + 1, max(seen.blur, blur))
@@ -170,7 +170,7 @@ def _follow(
     look: shading.Look,
     pixel2: np.float32,
 ) -> None:
-    """Write the linear RGB (3,) that the first ray of a tree brings; `nodes` (STACK,) is room."""
+    """Write the linear RGB (3,) of a tree's first ray; `nodes` (STACK,) is a buffer."""
     colour[:] = 0.0
     tops, followed, light = 1, 0, look.light
     while tops > 0 and followed < MOST_RAYS:
@@ -222,13 +222,13 @@ def _sun(light: shading.Lit) -> Vec:
 
 @kernel
 def _shines(light: shading.Lit) -> bool:
-    """Return whether the sun does."""
+    """Return True if the sun has any irradiance."""
     return bool(max(max(light.sun[0], light.sun[1]), light.sun[2]) > shading.ZERO)
 
 
 @large_borrowing_kernel
 def _pass(tree: NDArray[np.float64], tops: int, seen: Seen) -> int:
-    """Go on through a pane and back from it; return how many rays wait."""
+    """Push the transmitted and the reflected ray of a pane; return the number of pending rays."""
     back = gloss.pane_reflects(seen.cosine)
     away = gloss.mirrored(seen.ray, seen.normal)
     tops = _grown(tree, tops, seen, away, _scaled(seen.share, back), 0.0)
@@ -243,9 +243,9 @@ def _scatter(
     """Add the matt scattering of a bare or varnished surface; `arrives` = share of sunlight."""
     facing, enters, sun_enters = max(dot(seen.normal, _sun(light)), 0.0), 1.0, 1.0
     if kind == gloss.GLOSSY:
-        # Light from all sides that the varnish lets in, is scattered below it, thrown back by the
-        # varnish, scattered again, is in the end as bright as without any; so the sun's is set
-        # against the mean of all sides, and what comes out to the eye is what enters from there.
+        # Internal reflections return all scattered light, so diffuse light is as bright as without
+        # varnish. Sunlight is therefore relative to the mean over all directions, and the
+        # transmission towards the eye equals the transmission from there.
         enters = 1.0 - gloss.fresnel(seen.cosine)
         sun_enters = (1.0 - gloss.fresnel(min(facing, 1.0))) / gloss.VARNISH_ADMITS
     direct, rise = shading.F32(arrives * facing * sun_enters), shading.F32(-seen.normal[2])
@@ -258,9 +258,9 @@ def _scatter(
 def _shine(
     colour: NDArray[np.float64], seen: Seen, kind: int, light: shading.Lit, arrives: float
 ) -> None:
-    """Add the sun's highlight on a rough surface; mirrors show the sun itself.
+    """Add the sun's highlight on a rough surface; mirrors show the sun directly.
 
-    A mirrored highlight is widened by the mirror's roughness, since eight rays would show it eight
+    The mirror's roughness widens a reflected highlight, because eight rays would show it eight
     times (Kaplanyan and Dachsbacher, Path space regularization, 2013).
     """
     if arrives == 0.0 or gloss.is_smooth(seen.alpha):
@@ -276,7 +276,7 @@ def _shine(
 
 @large_borrowing_kernel
 def _mirror(tree: NDArray[np.float64], tops: int, seen: Seen, kind: int) -> int:
-    """Go on where metal or varnish mirrors; return how many rays wait."""
+    """Push the mirrored rays of metal or varnish; return the number of pending rays."""
     many = 1 if seen.depth > 0 or gloss.is_smooth(seen.alpha) else gloss.SAMPLES
     for number in range(many):
         u, v = gloss.spread(number)
@@ -292,12 +292,12 @@ def _mirror(tree: NDArray[np.float64], tops: int, seen: Seen, kind: int) -> int:
     return tops
 
 
-# --- where a ray ends
+# --- shading at the end of a ray
 
 
 @kernel
 def row_of(seen: int) -> int:
-    """Return the row of `Finish` of what is seen: neither ceiling nor sky."""
+    """Return the row of `Finish` for a segmentation number, neither ceiling nor sky."""
     if seen >= OBSTACLE:
         return OBSTACLE_ROW + seen - OBSTACLE
     return FLOOR_ROW if seen in (FLOOR, GROUND) else WALLS_ROW
@@ -315,7 +315,7 @@ def albedo_at(
     way: float,
     pixel2: np.float32,
 ) -> Vec:
-    """Return the linear RGB albedo of a surface where a ray meets it."""
+    """Return the linear RGB albedo of a surface at a ray's hit."""
     surface = shading.surface_of(look, row)
     a, b, c = shading.F32(place.at[0]), shading.F32(place.at[1]), shading.F32(place.at[2])
     per_m, per_turn = surface.per_m, shading.F32(0.0)

@@ -1,4 +1,4 @@
-"""A depth camera on a vehicle: where it sits, where it looks, and what it sees."""
+"""Depth camera on a vehicle: mounting, pose and rendering."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from airl_mav.vehicle.rotation import Quat, Vec, exponential, multiply, rotate
 
 
 class Mount(NamedTuple):
-    """How a camera is fixed to the vehicle; a tuple, so that compiled loops take it."""
+    """Mounting of a camera on the vehicle; a tuple, because compiled loops require one."""
 
     offset: Vec
     """Position of the camera in the body frame FRD [m]."""
@@ -30,13 +30,13 @@ class Mount(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera) -> Mount:
-        """Return how the camera of a vehicle profile is fixed."""
+        """Return the mounting of a vehicle profile's camera."""
         offset = (camera.forward_m, camera.right_m, -camera.up_m)
         return cls(offset, math.radians(camera.pitch_up_deg), math.radians(camera.yaw_deg))
 
 
 class Motion(NamedTuple):
-    """How a vehicle moves at a moment."""
+    """Pose and velocity of a vehicle."""
 
     position: NDArray[np.float64]
     """(3,) NED [m]."""
@@ -49,13 +49,13 @@ class Motion(NamedTuple):
 
     @classmethod
     def at_rest(cls, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> Motion:
-        """Return that of a vehicle that stands still."""
+        """Return the motion of a vehicle at rest."""
         return cls(position, quaternion, np.zeros(3), np.zeros(3))
 
 
 @kernel
 def carried_on(motion: Motion, seconds: float) -> tuple[Vec, Quat]:
-    """Return position and attitude after a time [s], of unchanged velocity and angular rates."""
+    """Return position and attitude after a time [s] at constant velocity and angular rates."""
     p, v, q, w = motion.position, motion.velocity, motion.quaternion, motion.rates
     turned = exponential((seconds * w[0], seconds * w[1], seconds * w[2]))
     at = (p[0] + seconds * v[0], p[1] + seconds * v[1], p[2] + seconds * v[2])
@@ -69,7 +69,7 @@ def camera_pose(
     """Return NED position [m] and quaternion of a camera mounted on a vehicle's pose."""
     q = (quaternion[0], quaternion[1], quaternion[2], quaternion[3])
     x, y, z = rotate(q, mount.offset)
-    # A positive turn about the body's right axis lifts the nose.
+    # A positive rotation about the body's right axis raises the nose.
     half = 0.5 * mount.pitch_up
     tilt = (math.cos(half), 0.0, math.sin(half), 0.0)
     if mount.yaw != 0.0:
@@ -81,7 +81,7 @@ def camera_pose(
 def pose_of(
     position: Vec | NDArray[np.float64], quaternion: Quat | NDArray[np.float64]
 ) -> tuple[Vec, Quat]:
-    """Return a camera's pose as the batch twin hands it over: one compiled renderer for both."""
+    """Return a camera's pose as tuples, as in the batch twin, so that one renderer is compiled."""
     north, east, down = (float(part) for part in position)
     w, x, y, z = (float(part) for part in quaternion)
     return (north, east, down), (w, x, y, z)
@@ -97,8 +97,8 @@ def render(
 ) -> NDArray[np.float32]:
     """Return the depth image (height, width) [m] of an arena; 0 = no return.
 
-    Depth passes through obstacles of glass, and sees what is behind them. `centers` (n, 3) are
-    those of `Arena.centers_at`. The pose is that of the camera, NED [m], camera -> NED. Raises
+    Depth rays pass through glass obstacles to the surfaces behind them. `centers` (n, 3) is the
+    result of `Arena.centers_at`. The pose is the camera's, NED [m], camera -> NED. Raises
     UsageError if a mesh's file is missing or has changed.
     """
     k, obstacles = intrinsics, arena.obstacles

@@ -1,8 +1,8 @@
-"""Single rays through an arena: what one meets first, and how much of the sun reaches a point.
+"""Single rays through an arena: the first hit, and the sunlight at a point.
 
-Images are drawn body by body (`raycast`, `shadows`), all rays of the camera at once. This is for
-rays that begin anywhere else, of which there are few: what surfaces mirror and what glass lets
-through. In float64; a ray is a unit vector.
+Images are drawn body by body (`raycast`, `shadows`), all rays of the camera at once. This module
+handles the few rays with other origins: reflections, and transmission through glass. Computes in
+float64; a ray is a unit vector.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kern
 from airl_mav.vehicle.rotation import Vec
 
 LEAST_M: Final = 1e-4
-"""What is nearer to where a ray begins is what it begins on [m]."""
+"""Minimum hit distance [m]; excludes the surface at the ray's origin."""
 
 
 class Bodies(NamedTuple):
-    """The obstacles of an arena, and its room, as `render_depth` takes them; see `bodies_of`."""
+    """Obstacles and room of an arena, as arguments of `render_depth`; see `bodies_of`."""
 
     bounds: NDArray[np.float64]  # (6,)
     shape: NDArray[np.int8]  # (n,)
@@ -38,32 +38,32 @@ class Bodies(NamedTuple):
 
 
 class Met(NamedTuple):
-    """What a ray meets first."""
+    """First hit of a ray."""
 
     distance: float
-    """Along the ray [m]; infinite: it meets nothing."""
+    """Distance along the ray [m]; infinite without a hit."""
     seen: int
-    """SKY, FLOOR, ... of `primitives`; of a mesh that of the first obstacle it owns, or GROUND."""
+    """SKY, FLOOR, ... of `primitives`; for a mesh the number of its first obstacle, or GROUND."""
     mesh: int
-    """Number of the mesh; -1: it is none."""
+    """Index of the mesh; -1 = not a mesh."""
     face: int
-    """Which of its triangles."""
+    """Index of the mesh's triangle."""
 
 
 class Place(NamedTuple):
-    """A point of a body along its own axes."""
+    """Point on a body in the body's axes."""
 
     at: Vec
-    """From the body's middle, or the mesh's origin [m]; of room and floor: NED."""
+    """Position from the body's centre or the mesh's origin [m]; on room and floor NED."""
     normal: Vec
-    """Unit vector NED on the side that the ray comes from."""
+    """Unit vector NED on the ray's side."""
     side: int
-    """0, 1 or 2: across the body's first, second or vertical axis; 3: all round it."""
+    """Face perpendicular to the body's first, second or vertical axis: 0, 1, 2; 3 = curved side."""
 
 
 @kernel
 def bodies_of(scene: Scene) -> Bodies:
-    """Return the bodies of an arena, with what all rays need of them."""
+    """Return the bodies of an arena, with values precomputed for all rays."""
     bounds, shape, center, half_size, yaw = scene
     n = len(shape)
     turn, reach = np.empty((n, 2)), np.empty(n)
@@ -80,7 +80,7 @@ def bodies_of(scene: Scene) -> Bodies:
 
 @kernel
 def advanced(origin: Vec, ray: Vec, distance: float) -> Vec:
-    """Return the point so far along a ray."""
+    """Return the point at a distance along a ray."""
     return (
         origin[0] + distance * ray[0],
         origin[1] + distance * ray[1],
@@ -90,10 +90,10 @@ def advanced(origin: Vec, ray: Vec, distance: float) -> Vec:
 
 @large_borrowing_kernel
 def _span(bodies: Bodies, i: int, origin: Vec, ray: Vec) -> tuple[float, float]:
-    """Return where a ray enters an obstacle and leaves it; it leaves before it enters: never."""
+    """Return a ray's entry and exit distance through an obstacle; exit < entry is a miss."""
     center, half = bodies.center[i], bodies.half_size[i]
     away = (origin[0] - center[0], origin[1] - center[1], origin[2] - center[2])
-    # Most rays pass by it.
+    # Early exit: most rays miss the bounding sphere.
     apart, ahead = dot(away, away) - bodies.reach[i], dot(away, ray)
     if apart > 0.0 and (ahead > 0.0 or ahead * ahead < apart):
         return math.inf, -math.inf
@@ -123,7 +123,7 @@ def _span(bodies: Bodies, i: int, origin: Vec, ray: Vec) -> tuple[float, float]:
 
 @borrowing_kernel
 def _room(bounds: NDArray[np.float64], origin: Vec, ray: Vec) -> tuple[float, int]:
-    """Return what a ray meets of floor, walls and ceiling: how far away, and which."""
+    """Return a ray's first hit of floor, walls and ceiling: distance and number."""
     best, seen = math.inf, primitives.SKY
     for side in range(4):
         axis = side // 2
@@ -147,7 +147,7 @@ def _room(bounds: NDArray[np.float64], origin: Vec, ray: Vec) -> tuple[float, in
 
 @borrowing_kernel
 def _from_mesh(meshes: Meshes, k: int, origin: Vec, ray: Vec) -> tuple[Vec, Vec]:
-    """Return a ray from mesh k's origin, along its axes and in units of it; the ray is a unit's."""
+    """Return a ray relative to mesh k's origin, in its axes and units; directions have length 1."""
     cos, sin, per = meshes.pose[k, 2], meshes.pose[k, 3], 1.0 / meshes.pose[k, 4]
     offset = (
         per * (origin[0] - meshes.pose[k, 0]),
@@ -187,7 +187,7 @@ def meet(
 
 @large_borrowing_kernel
 def place_of(bodies: Bodies, meshes: Meshes | None, met: Met, origin: Vec, ray: Vec) -> Place:
-    """Return where on a body a ray meets it: any body but ceiling and sky."""
+    """Return the point where a ray hits a body; any body except ceiling and sky."""
     p = advanced(origin, ray, met.distance)
     if meshes is not None and met.mesh >= 0:
         return _on_mesh(meshes, met, p, ray)
@@ -212,14 +212,14 @@ def _scaled_axis(axis: int, by: float) -> Vec:
 
 @kernel
 def _towards(normal: Vec, ray: Vec) -> Vec:
-    """Return a normal to the side that a ray comes from."""
+    """Return a normal, flipped to the ray's side."""
     sign = -1.0 if dot(normal, ray) > 0.0 else 1.0
     return (sign * normal[0], sign * normal[1], sign * normal[2])
 
 
 @borrowing_kernel
 def _on_mesh(meshes: Meshes, met: Met, p: Vec, ray: Vec) -> Place:
-    """Return where on a mesh the point p lies."""
+    """Return the point p on a mesh, with its normal."""
     k, n = met.mesh, meshes.bvh.normals[met.face]
     scale, cos, sin = meshes.pose[k, 4], meshes.pose[k, 2], meshes.pose[k, 3]
     at, _ = _from_mesh(meshes, k, p, ray)
@@ -229,7 +229,7 @@ def _on_mesh(meshes: Meshes, met: Met, p: Vec, ray: Vec) -> Place:
 
 @borrowing_kernel
 def _on_obstacle(bodies: Bodies, i: int, p: Vec, ray: Vec) -> Place:
-    """Return where on obstacle i the point p lies."""
+    """Return the point p on obstacle i, with its normal."""
     center, half = bodies.center[i], bodies.half_size[i]
     cos, sin = bodies.turn[i, 0], bodies.turn[i, 1]
     a, b, c = primitives.turn_axes((p[0] - center[0], p[1] - center[1], p[2] - center[2]), cos, sin)
@@ -246,7 +246,7 @@ def _on_obstacle(bodies: Bodies, i: int, p: Vec, ray: Vec) -> Place:
         height = 0.0 if bodies.shape[i] == primitives.CYLINDER else c
         per = 1.0 / max(math.sqrt(a * a + b * b + height * height), 1e-9)
         normal = (per * a, per * b, per * height)
-    # Inside glass the far side is seen from within.
+    # Inside glass the far side is visible from within.
     return Place((a, b, c), _towards(primitives.turn_axes(normal, cos, -sin), ray), side)
 
 

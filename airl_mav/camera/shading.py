@@ -1,4 +1,4 @@
-"""Light, texture, fog and sRGB of one point, in branch-free float32, to be vectorised inline."""
+"""Light, texture, fog and sRGB of one point, in branch-free float32 for vectorized loops."""
 
 from __future__ import annotations
 
@@ -23,47 +23,47 @@ ZERO: Final = F32(0.0)
 HALF: Final = F32(0.5)
 ONE: Final = F32(1.0)
 _IMAGES: Final = len(TEXTURES)
-"""The first number of a texture that is an image's."""
+"""First texture number of an image."""
 
 LEAST: Final = F32(1e-6)
-"""Least size of a divisor."""
+"""Minimum divisor."""
 
 
 class Surface(NamedTuple):
-    """The material of one surface."""
+    """Material of one surface."""
 
     base: np.int64
-    """Where its pattern begins in the atlas."""
+    """Start of the pattern in the atlas; for an image, its red channel."""
     step: np.int64
-    """From there to that of green, and from that to blue's; 0: they are one."""
+    """Atlas offset from red to green and from green to blue; 0 = one channel."""
     per_m: np.float32
-    """Periods of the pattern for a metre [1/m]."""
+    """Periods of the pattern per metre [1/m]."""
     offset: tuple[np.float32, np.float32]
-    """Where the pattern begins, in periods."""
+    """Offset of the pattern, in periods."""
     albedo: Vec32
-    """Where the pattern is 0."""
+    """Albedo at pattern value 0."""
     more: Vec32
-    """That where the pattern is 1, less `albedo`."""
+    """Difference between the albedo at pattern value 1 and `albedo`."""
 
 
 class Points(NamedTuple):
-    """Rows of the points of one line of an image, to work in."""
+    """Work buffers for the points of one line of an image."""
 
     place: Packed
-    """Of the nearest texel in its pattern."""
+    """Index of the nearest texel in the pattern."""
     facing: Plane
-    """Cosine of the angle between normal and sun; 0 for what faces away."""
+    """Cosine of the angle between normal and sun; 0 on sides away from the sun."""
     up: Plane
     """Cosine of the angle between normal and zenith."""
     pattern: Plane
-    """What the texture is there; of an image its red."""
+    """Pattern value; for an image, red."""
     green: Plane
-    """Of an image, with the next one."""
+    """Green of an image; `blue` accordingly."""
     blue: Plane
 
 
 class Rays(NamedTuple):
-    """The ray of every pixel, line after line, along north, east and down."""
+    """Rays of all pixels, line by line, in north, east and down."""
 
     north: Plane  # (n,)
     east: Plane  # (n,)
@@ -71,29 +71,29 @@ class Rays(NamedTuple):
 
 
 class Lit(NamedTuple):
-    """The light of an arena, linear RGB."""
+    """Light of an arena, linear RGB."""
 
     to_sun: Vec32
     """Unit vector NED."""
     sun: Vec32
-    """Irradiance of a surface that faces the sun."""
+    """Irradiance of a surface facing the sun."""
     sky: Vec32
     """Irradiance of a level surface by the whole sky."""
     ground: Vec32
-    """Radiosity of the sunlit floor: irradiance of a surface that sees nothing else."""
+    """Radiosity of the sunlit floor: irradiance of a surface that faces only the floor."""
     zenith: Vec32
     horizon: Vec32
     extinction: np.float32
 
 
 class Look(NamedTuple):
-    """How an arena looks, as `colour.render_colour` takes it; and how wide pixels are."""
+    """Appearance of an arena, as for `colour.render_colour`, and the pixel size."""
 
     texture: NDArray[np.int8]  # (2 + n,)
     per_m: NDArray[np.float32]  # (2 + n,)
     offset: NDArray[np.float32]  # (2 + n, 2)
     albedo: NDArray[np.float32]  # (2 + n, 2, 3)
-    gloss: Gloss  # None where all surfaces are matt
+    gloss: Gloss  # None if all surfaces are matt
     light: Lit
     atlas: Plane
     pixel2: np.float32
@@ -101,11 +101,11 @@ class Look(NamedTuple):
 
 
 class Canvas(NamedTuple):
-    """An image that is shaded: its n pixels line after line, and room to work in."""
+    """Image during shading: n pixels line by line, and work buffers."""
 
     out: Packed  # (n,) written
-    ids: Packed  # (n,) what each pixel sees
-    far: Plane  # (n,) depth [m], 0: no surface
+    ids: Packed  # (n,) segmentation
+    far: Plane  # (n,) depth [m], 0 = no surface
     lit: Plane  # (n,) 1 in the sun, 0 in shadow
     clear: Plane  # (n,) transmission of fog
     rays: Rays
@@ -114,7 +114,7 @@ class Canvas(NamedTuple):
 
 @borrowing_kernel
 def surface_of(look: Look, i: int) -> Surface:
-    """Return a row of the materials."""
+    """Return material i."""
     texture, per_m, offset, albedo = look.texture, look.per_m, look.offset, look.albedo
     dark = (albedo[i, 0, 0], albedo[i, 0, 1], albedo[i, 0, 2])
     more = (
@@ -129,22 +129,22 @@ def surface_of(look: Look, i: int) -> Surface:
 
 @kernel
 def _part(x: np.float32) -> np.float32:
-    """Return x less the greatest whole number that is not above it; `floor` does not vectorise."""
+    """Return x - floor(x); `floor` itself does not vectorize."""
     part = x - F32(I32(x))
     return part + ONE if part < ZERO else part
 
 
 @kernel
 def texel_at(u: np.float32, v: np.float32, texels2: np.float32) -> np.int32:
-    """Return the nearest texel at (u, v), in periods, of the level that fits a pixel.
+    """Return the nearest texel at (u, v), in periods, of the mip level for a pixel.
 
-    `texels2`: square of the texels of the finest level that a pixel covers, each way.
+    `texels2`: squared number of texels per pixel, each way, at the finest level.
     """
-    # Half the exponent of a float is the logarithm of its root; the side is 2 to its opposite.
+    # Half the exponent of a float is log2 of its root: the level. Its side is SIDE / 2^level.
     exponent = I32(F32(texels2 + texels2).view(I32) >> 23) - I32(127)
     level = I32(min(max(exponent, I32(0)), I32(2 * LEVELS))) >> 1
     side = I32(I32(127 + LEVELS - level) << 23).view(F32)
-    # A place just below a whole number may round up to it.
+    # A coordinate just below an integer may round up to it.
     column = min(F32(I32(_part(u) * side)), side - ONE)
     row = min(F32(I32(_part(v) * side)), side - ONE)
     return I32(side * (side + row) + column)
@@ -154,11 +154,11 @@ def texel_at(u: np.float32, v: np.float32, texels2: np.float32) -> np.int32:
 def irradiance(light: Lit, channel: int, direct: np.float32, rise: np.float32) -> np.float32:
     """Return the irradiance of a surface in one channel (0, 1 or 2) of linear RGB.
 
-    Sky and ground by the shares (1 + cos tilt) / 2 and (1 - cos tilt) / 2 (Liu and Jordan, The
+    Sky and ground are weighted by (1 + cos tilt) / 2 and (1 - cos tilt) / 2 (Liu and Jordan, The
     long-term average performance of flat-plate solar-energy collectors, 1963). `direct` is the
-    cosine of normal and sun times its share that arrives, `rise` that of normal and zenith.
+    cosine of normal and sun times the unshadowed share, `rise` the cosine of normal and zenith.
     """
-    # What an upright plane gets of both, and how much more a level one.
+    # Irradiance of an upright plane, and its increase for a level plane.
     upright = HALF * (light.sky[channel] + light.ground[channel])
     level = light.sky[channel] - upright
     return direct * light.sun[channel] + (upright + rise * level)
@@ -174,13 +174,13 @@ def paint(
     first: np.int32,
     last: np.int32,
 ) -> None:
-    """Write the packed sRGB of left..end where first..last are seen; Lambert's and Beer's laws."""
+    """Write the packed sRGB of left..end for surfaces first..last; Lambert's and Beer's laws."""
     place, facing, up, pattern, green_of, blue_of = canvas.points
     light, atlas = look.light, look.atlas
     row, marks = canvas.out[left:end], canvas.ids[left:end]
     lit_row, clear_row = canvas.lit[left:end], canvas.clear[left:end]
-    # By itself: a loop that reads from all over the atlas does not vectorise. Unsigned: of a number
-    # with a sign it would ask each time whether it counts from the end.
+    # A separate loop: gathers from the atlas do not vectorize. Unsigned: a signed index would add a
+    # check for negative values at each access.
     for u in range(end - left):
         pattern[u] = atlas[np.uint64(surface.base + place[u])]
     if surface.step == 0:
@@ -207,9 +207,9 @@ def paint(
 
 @kernel
 def encoded(x: np.float32) -> np.int32:
-    """Return linear light as an sRGB number, 0..255 (IEC 61966-2-1). Negative light is black.
+    """Return linear light as an sRGB code, 0..255 (IEC 61966-2-1). Negative light is black.
 
-    The power is a minimax polynomial of the root, accurate to 0.09 of a step.
+    The power is a minimax polynomial of the root, accurate to 0.09 of a code.
     """
     x = min(x, ONE)
     s = np.sqrt(x)
@@ -217,7 +217,7 @@ def encoded(x: np.float32) -> np.int32:
     curve = F32(517.7284762186123) + curve * s
     curve = F32(-357.54480524554555) + curve * s
     curve = F32(387.0472913646104) + curve * s
-    # Half a step more: the whole number below is the nearest one.
+    # Adds half a code, so that truncation rounds to the nearest code.
     curve = F32(-10.226101032503605 + 0.5) + curve * s
     straight = F32(12.92 * 255.0) * x + HALF
     return I32(curve if x > F32(0.0031308) else straight)
@@ -243,20 +243,20 @@ def turn_of(y: np.float32, x: np.float32) -> np.float32:
     return -angle if y < ZERO else angle
 
 
-# --- where a point lies in the pattern of its material
+# --- coordinates of a point in its material's pattern
 #
-# Places are along the body's own axes [m]. The pattern is in metres, or in periods where it goes
-# round a body in a whole number of them. Inlined into the loops of `surfaces`, which vectorise.
+# Coordinates are in body axes [m]. The pattern is in metres, or in periods where a whole number of
+# periods wraps around a body. Inlined into the vectorized loops of `surfaces`.
 
 _TURN: Final = 2.0 * math.pi
 
 STEEP: Final = F32(0.02)
-"""Least cosine between ray and normal for the size of a pixel."""
+"""Minimum cosine between ray and normal for the size of a pixel."""
 
 
 @kernel
 def texels2(surface: Surface, pixel2: np.float32) -> np.float32:
-    """Return the square of the texels of the finest level that a pixel covers 1 m away, head on."""
+    """Return the squared texels per pixel of the finest level, 1 m away, at normal incidence."""
     texels = F32(SIDE) * surface.per_m
     return texels * texels * pixel2
 
@@ -271,10 +271,10 @@ def periods_around(radius: float, per_m: np.float32) -> np.float32:
 def on_box(
     a: np.float32, b: np.float32, c: np.float32, on_c: bool, on_a: bool
 ) -> tuple[np.float32, np.float32]:
-    """Return the place [m] in the pattern of a box face, from its middle.
+    """Return the pattern coordinates [m] on a box face, from its middle.
 
     `a`, `b` and `c` (down) are box coordinates from the centre; `on_c` marks upper and lower faces,
-    otherwise `on_a` those across the first axis.
+    otherwise `on_a` marks faces across the first axis.
     """
     across = a if on_c else (b if on_a else a)
     along = b if on_c else c
@@ -290,7 +290,7 @@ def on_cylinder(
     per_m: np.float32,
     per_turn: np.float32,
 ) -> tuple[np.float32, np.float32]:
-    """Return a place in the pattern of a cylinder, in periods; `cap`: on one of its ends."""
+    """Return the pattern coordinates on a cylinder, in periods; `cap`: on an end face."""
     across = a * per_m if cap else turn_of(b, a) * per_turn
     along = (b if cap else c) * per_m
     return across, along
@@ -300,7 +300,7 @@ def on_cylinder(
 def on_sphere(
     a: np.float32, b: np.float32, c: np.float32, per_turn: np.float32
 ) -> tuple[np.float32, np.float32]:
-    """Return a place in the pattern of a sphere, in periods: by longitude and latitude."""
+    """Return the pattern coordinates on a sphere, in periods, from longitude and latitude."""
     return turn_of(b, a) * per_turn, turn_of(c, np.sqrt(a * a + b * b)) * per_turn
 
 
@@ -313,7 +313,7 @@ def on_triangle(
     n1: np.float32,
     n2: np.float32,
 ) -> tuple[np.float32, np.float32]:
-    """Return a place in the pattern of a triangle [m], as seen along the axis of its normal."""
+    """Return the pattern coordinates on a triangle [m], projected along the normal's main axis."""
     q0, q1, q2 = abs(n0), abs(n1), abs(n2)
     level = q2 >= max(q0, q1)
     across = a if level or q1 > q0 else b

@@ -1,9 +1,9 @@
-"""Which of an image's points the sun does not reach.
+"""Shadows of the sun in an image.
 
-Drawn as the bodies are: an obstacle's shadow touches only the pixels of the rectangle that its
-shadow volume (the body, drawn along the light down to the floor) projects to. A convex body's own
-dark side is where it faces away from the sun, so no body is tested against itself, and nothing
-needs an offset against false shadows. Meshes shade by parallel rays through their trees.
+Shadows are drawn body by body: an obstacle's shadow touches only the projected rectangle of its
+shadow volume, the body extruded along the light to the floor. A convex body's dark side faces away
+from the sun, so bodies are not tested against themselves and need no shadow bias. Meshes cast
+shadows by parallel rays through their trees.
 """
 
 from __future__ import annotations
@@ -35,38 +35,38 @@ from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kern
 from airl_mav.vehicle.rotation import Vec
 
 _NEAR_M: Final = 0.01
-"""What of a shadow volume is nearer than this to the image plane is cut off [m]."""
+"""Near clipping distance of a shadow volume from the image plane [m]."""
 
 _STEP_M: Final = F32(1e-3)
-"""A point less than this before a wall, towards the sun, lies on it [m]."""
+"""Distance below which a point in front of a wall, towards the sun, lies on it [m]."""
 
 VECTOR: Final = 16
-"""Pixels that are worked on together."""
+"""Pixels per vector operation."""
 
 CORNERS: Final = 16
-"""Of a shadow volume: those of the box around a body, then where their shadows fall."""
+"""Number of corners of a shadow volume: the body's box, then its projection onto the floor."""
 
 
 ABOVE_M: Final = 5e-4
-"""So far above the surface that is seen, and no nearer to its own, a ray begins [m]."""
+"""Offset of a ray's start above the surface, and minimum distance of hits [m]."""
 
 _WIDER_M: Final = 1e-4
-"""The box around a mesh is so much larger, where what is worked out is rounded to float32 [m]."""
+"""Margin of the box around a mesh against rounding to float32 [m]."""
 
 
 @kernel
 def sized(value: float) -> float:
-    """Return a component of a direction, kept off 0 so that it can be divided by."""
+    """Return a component of a direction, limited away from 0 for use as a divisor."""
     least = 1e-6
     return max(value, least) if value >= 0.0 else min(value, -least)
 
 
 @kernel
 def widened(left: int, end: int, low: int, high: int) -> tuple[int, int]:
-    """Return the pixels left..end widened within low..high to whole vectors.
+    """Return the pixels left..end, extended within low..high to whole vectors.
 
-    The rest of a vectorized loop runs one by one. Vectors begin where the pixels do, since few
-    pixels across a boundary would need two.
+    A vectorized loop runs its remainder one by one. Vectors begin at the first pixel: a few pixels
+    across an aligned boundary would need two.
     """
     whole = end - left + (left - end) % VECTOR
     first = max(min(left, high - whole), low)
@@ -82,13 +82,13 @@ def shade_by_walls(
     extinction: float,
     through: np.float32,
 ) -> None:
-    """Write the sunlight `lit` that passes the walls, and the fog's transmission `clear`.
+    """Write the sunlight `lit` past the walls, and the fog's transmission `clear`.
 
-    `extinction` is that of fog [1/m], `through` the transmission of the walls, 0 but for glass.
+    `extinction` is the fog's [1/m], `through` the transmission of the walls, 0 except for glass.
     """
     lit, clear, far, rays = canvas.lit, canvas.clear, canvas.far, canvas.rays
     north, east, up = sized(to_sun[0]), sized(to_sun[1]), F32(-to_sun[2])
-    # From the camera to the walls that the sunlight comes over.
+    # From the camera to the walls on the sun's side.
     edge_n = F32((bounds[1] if north > 0.0 else bounds[0]) - camera[0])
     edge_e = F32((bounds[3] if east > 0.0 else bounds[2]) - camera[1])
     per_n, per_e = F32(1.0 / north), F32(1.0 / east)
@@ -120,7 +120,7 @@ def start32(axes: Pose, ahead: float, y: float) -> Vec32:
 
 @kernel
 def along32(pose: Pose) -> Vec32:
-    """Return the axis along a line."""
+    """Return the axis along a line in float32."""
     r = pose.along
     return F32(r[0]), F32(r[1]), F32(r[2])
 
@@ -129,7 +129,7 @@ def along32(pose: Pose) -> Vec32:
 def ray32(
     pose: Pose, along: Vec32, bent: Bent | None, v: int, u: int, start: Vec32, x: np.float32
 ) -> Vec32:
-    """Return the ray of pixel u on line v as `projection.ray_of` does."""
+    """Return the ray of pixel u on line v in float32; see `projection.ray_of`."""
     if bent is None:
         return start[0] + x * along[0], start[1] + x * along[1], start[2] + x * along[2]
     n, e, d = ray_of(pose, bent, v, u, (0.0, 0.0, 0.0), 0.0)
@@ -137,11 +137,11 @@ def ray32(
 
 
 class Shaded(NamedTuple):
-    """An image whose shadows are drawn, line by line."""
+    """Image during shadow rendering, line by line."""
 
     lit: Plane  # (n, m) written
     far: Plane  # (n, m) depth [m]
-    ids: Ids  # (n, m) what each pixel sees
+    ids: Ids  # (n, m) segmentation
     corners: NDArray[np.float64]  # (CORNERS, 3) a buffer
 
 
@@ -196,7 +196,8 @@ def shade_by_obstacle(
             for u in range(end - left):
                 t = far_row[u]
                 n, e, s = ray32(f, along, bent, v, left + u, start, F32(x_row[u]))
-                # Its first axis lies under the sun: the light's way is along it, seen from above.
+                # The first axis points to the sun's azimuth, so seen from above the light is along
+                # it.
                 a = c0 - t * n
                 b = c1 - t * e
                 d = (c2 - t * s) * i2
@@ -231,11 +232,11 @@ def shadow_rectangle(
     sun: Vec,
     floor: float,
 ) -> Rectangle:
-    """Return the pixels of a pinhole that an obstacle's shadow volume projects to.
+    """Return the pixels of a pinhole covered by an obstacle's shadow volume.
 
-    `pose` has the camera's axes along the body's and the body's centre from the camera, `half` the
-    half extents of the box around it [m], `sun` the unit vector along the body's axes, `floor` the
-    depth of the floor below its centre [m]; `corners` (CORNERS, 3) is a buffer.
+    `pose` contains the camera's axes in the body's frame and the body's centre relative to the
+    camera, `half` the half extents of its box [m], `sun` the unit vector in the body's axes,
+    `floor` the depth of the floor below its centre [m]; `corners` (CORNERS, 3) is a buffer.
     """
     c = pose.center
     nearest, farthest = math.inf, -math.inf
@@ -266,8 +267,8 @@ def shadow_rectangle(
             low_x, high_x = min(low_x, x), max(high_x, x)
             low_y, high_y = min(low_y, y), max(high_y, y)
     if nearest < _NEAR_M:
-        # The volume crosses the image plane: its edges do, between corners on both sides. Corners
-        # differ in one bit along an edge; every shadow's edge has one of them.
+        # The volume crosses the image plane: clip its edges. The corners of an edge differ in one
+        # bit; bit 3 is the extrusion along the light.
         for k in range(CORNERS):
             for bit in range(4):
                 m = k ^ (1 << bit)
@@ -288,13 +289,13 @@ def shadow_rectangle(
 
 @kernel
 def _first(low: float, n: int) -> int:
-    """Return the first of n pixels that what begins at a place can fall on."""
+    """Return the first of n pixels of a range that starts at a coordinate."""
     return int(min(max(math.floor(low), 0.0), float(n)))
 
 
 @kernel
 def _last(high: float, n: int) -> int:
-    """Return the end of those that what ends at a place can fall on."""
+    """Return the end of the pixels of a range that ends at a coordinate."""
     return int(min(max(math.ceil(high) + 1.0, 0.0), float(n)))
 
 
@@ -305,8 +306,8 @@ def shade_by_meshes(
     """Put the points that meshes hide from the sun into shadow.
 
     Rays from meshes begin slightly above the visible side. Sides away from the sun need none.
-    `faces` (n, m) are the meshes' visible triangles; `gloss` has the surfaces' transmission,
-    None: opaque.
+    `faces` (n, m) are the meshes' visible triangles; `gloss` contains the surfaces' transmission,
+    None = opaque.
     """
     waiting, maybe = np.empty(STACK, np.int32), np.empty(len(optics.xs), np.bool_)
     for k in range(len(meshes.root)):
@@ -326,7 +327,7 @@ def _shade_by_mesh(
     waiting: NDArray[np.int32],
     maybe: NDArray[np.bool_],
 ) -> None:
-    """Put the points that mesh k hides into shadow but a share `through`; `maybe` is a buffer."""
+    """Multiply `lit` by `through` at points hidden by mesh k; `maybe` is a buffer."""
     lit, far, ids, corners = image
     lines, xs, bent, view = optics.lines, optics.xs, optics.bent, optics.lens
     bvh, root, scale = meshes.bvh, meshes.root[k], meshes.pose[k, 4]
@@ -340,7 +341,7 @@ def _shade_by_mesh(
     top, bottom, left, end = 0, len(lines), 0, len(xs)
     per = 1.0 / scale
     if is_pinhole(bent, view):
-        # In units of the mesh, as all that follows.
+        # In units of the mesh, as below.
         floor = -(middle[2] + per * optics.camera[2])
         around = Pose(pose.forward, pose.across, pose.along, middle)
         top, bottom, left, end = shadow_rectangle(
@@ -353,7 +354,7 @@ def _shade_by_mesh(
     own = np.int32(OBSTACLE + meshes.first[k])
     f, d, along = pose.forward, pose.across, along32(pose)
     above, last = per * ABOVE_M, -1
-    # First which points may be hidden, in float32 and so many at a time.
+    # First find candidates by a vectorized float32 test.
     c0, c1, c2 = F32(middle[0]), F32(middle[1]), F32(middle[2])
     per32 = F32(per)
     i0, i1, i2 = F32(inverse[0]), F32(inverse[1]), F32(inverse[2])
@@ -384,7 +385,7 @@ def _shade_by_mesh(
             ahead, y = lines[v, 0], lines[v, 1]
             begin = (ahead * f[0] + y * d[0], ahead * f[1] + y * d[1], ahead * f[2] + y * d[2])
             ray = ray_of(pose, bent, v, left + u, begin, x_row[u])
-            # From the mesh's origin.
+            # Relative to the mesh's origin.
             at = (t * ray[0] - c[0], t * ray[1] - c[1], t * ray[2] - c[2])
             if ids_row[u] == own:
                 i = faces[v, left + u]

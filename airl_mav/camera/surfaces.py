@@ -1,6 +1,6 @@
-"""Sky, floor, walls, obstacles and meshes in colour, as seen in an image.
+"""Shading of sky, floor, walls, obstacles and meshes in colour images.
 
-Images are shaded in blocks of consecutive lines: pattern places and light, then texels, then
+Images are shaded in blocks of consecutive lines: pattern coordinates and light, then texels, then
 colours.
 """
 
@@ -39,7 +39,7 @@ from airl_mav.core.kernels import borrowing_kernel, large_borrowing_kernel
 from airl_mav.vehicle.rotation import Vec
 
 BLOCK: Final = 512
-"""Pixels that are shaded together, so that what is noted of them stays near the processor."""
+"""Pixels per shading block; keeps intermediate results in the processor cache."""
 
 FOG_LAYER_M: Final = 100.0
 """Height of the fog above the floor, seen towards the sky [m]."""
@@ -119,12 +119,12 @@ def draw_sky(canvas: Canvas, camera: Vec, light: Lit) -> None:
 
 @borrowing_kernel
 def shade_floor(canvas: Canvas, look: Look, camera: Vec) -> None:
-    """Shade the floor. Its pattern begins in the start."""
+    """Shade the floor. Its pattern begins at the start position."""
     floor, rays, points = surface_of(look, FLOOR_ROW), canvas.rays, canvas.points
     ids, far, light, pixel2 = canvas.ids, canvas.far, look.light, look.pixel2
     at0, at1 = F32(camera[0]), F32(camera[1])
     sun_up = -light.to_sun[2]
-    # The camera's height is t times the ray's slope.
+    # t times the downward slope of the ray is the camera's height.
     texel = shading.texels2(floor, pixel2) / F32(max(-camera[2], MIN_DEPTH_M))
     own = I32(primitives.FLOOR)
     begin, stop = span_of(ids, 0, len(ids), 0, len(ids), own, own)
@@ -175,8 +175,8 @@ def shade_obstacle(
 ) -> None:
     """Shade an obstacle in a rectangle of the image.
 
-    A box's pattern begins in the middle of each face. A cylinder's goes round it in a whole number
-    of periods, a sphere's by longitude and latitude.
+    A box's pattern begins in the middle of each face. A cylinder's pattern wraps around it in a
+    whole number of periods, a sphere's follows longitude and latitude.
     """
     shape, half, light, points = body.shape, body.half, look.light, canvas.points
     ids, far, lines, xs = canvas.ids, canvas.far, optics.lines, optics.xs
@@ -275,7 +275,7 @@ def _shade_mesh(
     k: int,
     faces: Faces,
 ) -> None:
-    """Shade what is seen of mesh k in a rectangle (4,) of the image."""
+    """Shade the visible part of mesh k in a rectangle (4,) of the image."""
     ids, far, points, light = canvas.ids, canvas.far, canvas.points, look.light
     lines, xs, axes, camera = optics.lines, optics.xs, optics.axes, optics.camera
     surface = surface_of(look, material_row(meshes, k))
@@ -305,14 +305,14 @@ def _shade_mesh(
         for at in range(left, end):
             u = at - left
             if ids[at] != own:
-                # It is not painted; its place must only be one of the pattern.
+                # Not painted; any valid index will do.
                 points.place[u] = I32(1)
                 continue
             t, i = far[at], faces[at]
             n, e, d = ray32(pose, r, optics.bent, v, at - line, start, F32(xs[at - line]))
             n0, n1, n2 = normals[i, 0], normals[i, 1], normals[i, 2]
             normal = n0 * n + n1 * e + n2 * d
-            # The side that is seen faces the camera.
+            # The visible side faces the camera.
             side = -ONE if normal > ZERO else ONE
             a, b, c = t * n - c0, t * e - c1, t * d - c2
             across, along = shading.on_triangle(a, b, c, n0, n1, n2)

@@ -1,7 +1,8 @@
 """Textures: repeating patterns of numbers 0..1 with coarser levels (mip maps).
 
-A procedural pattern depends on its name alone. A picture from a file is three patterns. Surfaces
-differ in offset, size and albedos. Files are untrusted: two formats, of a size checked first.
+A procedural pattern depends on its name only. A picture from a file provides three patterns.
+Surfaces differ in offset, size and albedos. Files are untrusted: only two formats, with the size
+checked first.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ Floats = NDArray[np.float64]
 FORMATS: Final = ("PNG", "JPEG")
 
 MODES: Final = ("1", "L", "P", "RGB")
-"""Of Pillow: what has 8 bits a channel at most, and nothing that can be seen through."""
+"""Accepted Pillow modes: at most 8 bits per channel, without transparency."""
 
 LEAST_PX, MOST_PX = 2, 4096
 
@@ -30,7 +31,7 @@ LEAST_PX, MOST_PX = 2, 4096
 @lru_cache(maxsize=2 * MOST_IMAGES)
 def texels_of(file: ImageFile, side: int) -> Floats:
     """Return a picture (side, side, 3) in linear RGB 0..1, resized; cached. Raises UsageError."""
-    # Imported here: who flies without a simulation has no pictures to read.
+    # Imported here because flights without a simulation read no pictures.
     from PIL import Image
 
     data = read_checked(file)
@@ -40,7 +41,7 @@ def texels_of(file: ImageFile, side: int) -> Floats:
             pixels = np.asarray(picture.convert("RGB"))
     except UsageError:
         raise
-    except Exception as error:  # Whatever a decoder makes of a damaged file.
+    except Exception as error:  # Decoders raise many types for damaged files.
         words = " ".join(str(error).split()) or type(error).__name__
         raise UsageError(f"{file.file}: no PNG or JPEG that can be read: {words[:200]}") from None
     light = linear_of(np.arange(256) / 255.0).astype(np.float32)[pixels]
@@ -55,7 +56,7 @@ def texels_of(file: ImageFile, side: int) -> Floats:
 
 
 def _check(picture: Any, name: str) -> None:
-    """Raise UsageError for a picture that is no texture; none of its pixels has been read."""
+    """Raise UsageError for a picture unsuitable as a texture, before any pixel is read."""
     width, height = picture.size
     if width != height or not LEAST_PX <= width <= MOST_PX:
         raise UsageError(
@@ -68,19 +69,19 @@ def _check(picture: Any, name: str) -> None:
 
 
 LEVELS: Final = 7
-"""Coarser levels of a pattern: the last is one texel."""
+"""Number of coarser levels of a pattern; the last is one texel."""
 
 SIDE: Final = 1 << LEVELS
-"""Texels of a pattern's finest level, each way."""
+"""Texels along each side of a pattern's finest level."""
 
 STRIDE: Final = 2 * SIDE * SIDE
-"""Length of one pattern in the atlas: the level of n texels a side is at n² to 2 n², row by row."""
+"""Length of one pattern in the atlas; a level of n x n texels is at n² to 2 n², row by row."""
 
 PERIOD: Final = {"plain": 1.0, "checker": 2.0, "noise": 8.0, "brick": 4.0, "foliage": 16.0}
-"""Length of the period of a pattern, in `Material.size_m`."""
+"""Period of each pattern, in `Material.size_m`."""
 
 COURSES: Final = 8
-"""Courses of bricks in a period: a brick is twice as long as high."""
+"""Courses of bricks per period; a brick is twice as long as high."""
 
 _JOINT: Final = 2  # texels of mortar above a brick, and on its left
 _OCTAVES: Final = 3
@@ -150,12 +151,12 @@ def _value_noise(rng: np.random.Generator, cells: int, octaves: int) -> Floats:
         rows = values[low] + (values[high] - values[low]) * blend[:, None]
         total += 0.5**octave * (rows[:, low] + (rows[:, high] - rows[:, low]) * blend)
         weight += 0.5**octave
-    contrast = 1.7  # The mean of many octaves keeps near the middle.
+    contrast = 1.7  # The sum of octaves concentrates around the mean.
     return np.clip(0.5 + contrast * (total / weight - 0.5), 0.0, 1.0)
 
 
 def _leaves(rng: np.random.Generator) -> Floats:
-    """Return ellipses over each other, each brighter at its midrib, the later ones brighter."""
+    """Return overlapping ellipses, each brighter at its midrib, later ones brighter."""
     seen = np.zeros((SIDE, SIDE))
     row, column = np.mgrid[:SIDE, :SIDE]
     count = 500

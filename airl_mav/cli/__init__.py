@@ -1,1 +1,1 @@
-"""The commands, one file each."""
+"""Commands of the `airl` programs, one module per command."""

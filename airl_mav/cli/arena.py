@@ -1,4 +1,4 @@
-"""`airl arena`: show what the environment generator makes of a specification and a seed."""
+"""`airl arena`: show the arena that a profile and a seed generate."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED, ArenaName
 
 
 class ArenaOptions(ProfileModel):
-    """Generate an arena, list what is in it, draw it from above.
+    """Generate an arena, list its contents, draw a top view.
 
     Examples:
         airl arena dynamic-obstacles --seed 7 --png arena.png
@@ -82,7 +82,7 @@ def run(options: ArenaOptions, console: Console | None = None) -> int:
     )
     console.print(arena_table(arena, spec))
     if options.png is not None:
-        # Here, because only a picture needs matplotlib, which is slow to import.
+        # Imported here: only pictures need matplotlib, which is slow to import.
         from airl_mav.arena.draw import save_png
 
         try:

@@ -1,4 +1,4 @@
-"""`airl asset`: an arena with a thing of the user's, from its mesh."""
+"""`airl asset`: build an arena from your own mesh."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ EXTRAS = ("mesh",)
 
 
 class AssetOptions(ProfileModel):
-    """Make an arena profile whose obstacles are a mesh, and boxes that cover it.
+    """Make an arena profile whose obstacles are a mesh, and boxes that cover the mesh.
 
-    Cameras see the mesh; plants and planners know the boxes. The cells that the mesh is cut into
-    are as fine as the number of boxes allows; what the boxes cover beyond the mesh is told. The
-    mesh's triangles are written beside the profile, into a file of the same name that ends in .npz.
+    Cameras see the mesh; plants and planners use the boxes. The mesh is divided into cells as fine
+    as the number of boxes allows. The command prints how far the boxes extend beyond the mesh. The
+    triangles are written to an .npz file with the profile's name.
 
     Examples:
         airl asset pillar.stl --out pillars.toml
@@ -82,7 +82,7 @@ def run(options: AssetOptions, console: Console | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         for path, data in files.items():
             (Path(folder) / path.name).write_bytes(data)
-        # Before anything is written for good.
+        # Validate before writing the files.
         load_profile("arenas", str(Path(folder) / options.out.name), ArenaSpec)
     try:
         for path, data in files.items():
@@ -112,7 +112,7 @@ def _name(options: AssetOptions) -> str:
 
 
 def _told(made: MeshBoxes) -> str:
-    """Return what became of a mesh, for people."""
+    """Return a description of the boxes of a mesh."""
     forward, right, height = made.size_m
     inside = "closed, filled" if made.closed else "not closed: its surface alone"
     return (

@@ -1,4 +1,4 @@
-"""`airl-companion`, `airl companion`: what runs on the drone's onboard computer."""
+"""`airl-companion`, `airl companion`: companion program for the drone's onboard computer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from companion.systemd import service
 class CompanionOptions(StandAloneCompanion):
     """Fly a policy from take-off to a goal, through MAVSDK.
 
-    A first word that ends in .toml is a file of options, which those of the command line override.
+    A first word that ends in .toml is a file of options, overridden by the command line.
 
     Examples:
         airl-companion --goal 20 5
@@ -64,7 +64,7 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
     try:
         with service() as manager:
             if options.lockstep:
-                # Imported here: a companion on a drone needs nothing of it.
+                # Imported here: not needed on a drone.
                 from airl_mav.lockstep.token_companion import fly_in_lockstep
 
                 result, sha256 = fly_in_lockstep(options, mission, stop, abandon, waiting, progress)
@@ -89,7 +89,7 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
 def show_check(
     options: CompanionOptions, mission: Mission, stop: threading.Event, console: Console
 ) -> int:
-    """Say what is found on the ground, line by line; exit status 0 all is good, 1 it is not."""
+    """Print the findings of the ground check; return exit status 0 if all are good, else 1."""
     console.print(f"looking at {options.camera} and {options.connect}")
     good = True
     for finding in check_on_ground(options, mission, stop):

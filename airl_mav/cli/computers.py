@@ -1,4 +1,4 @@
-"""`airl computers`: what computer profiles know, and where they have it from."""
+"""`airl computers`: contents of computer profiles, with their sources."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SAYS = (
 
 
 class ComputersOptions(ProfileModel):
-    """List computer profiles with their workloads: measured or published, how late, from where.
+    """List computer profiles with the latency, origin and source of their workloads.
 
     Examples:
         airl computers
@@ -41,7 +41,7 @@ OPTIONS = ComputersOptions
 
 
 def run(options: ComputersOptions, console: Console | None = None) -> int:
-    """Print the table. Returns exit status 0; raises UsageError for a profile that is none."""
+    """Print the table. Returns exit status 0; raises UsageError for an invalid profile."""
     console = console or new_console()
     names = options.profiles or tuple(list_profiles("computers"))
     console.print(_table(names))

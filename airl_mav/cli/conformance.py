@@ -16,8 +16,8 @@ from airl_mav.rehearsal.signals import terminated_as_interrupted
 class ConformanceOptions(BaseModel):
     """Fly any flight controller through checks and step responses: airl-firmware, PX4, ArduPilot.
 
-    SITL or a board. It takes off. Once through it needs 60 m to the north, 20 m to the east and
-    15 m above the take-off altitude; Ctrl-C lands. Exit status 1: a check failed.
+    Works with SITL or a board. The vehicle takes off. A complete run needs 60 m to the north, 20 m
+    to the east and 15 m above the take-off altitude; Ctrl-C lands. Exit status 1: a check failed.
 
     Examples:
         airl-firmware --arena open-field
@@ -71,7 +71,7 @@ OPTIONS = ConformanceOptions
 
 
 def run(options: ConformanceOptions, console: Console | None = None) -> int:
-    """Check a vehicle and print the result; return 0, 1 unless it conforms, or 130."""
+    """Check a vehicle and print the result; return 0 if it conforms, else 1, or 130."""
     from airl_mav.conformance.report import check_table, line_text, step_table
     from airl_mav.conformance.run import check_conformance
     from airl_mav.conformance.steps import STEP_NAMES

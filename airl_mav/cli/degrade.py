@@ -1,4 +1,4 @@
-"""`airl degrade`: the same policies at growing latencies, and where they break down."""
+"""`airl degrade`: the same policies at increasing latencies."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from airl_mav.scenario.model import DEFAULT_ARENA, DEFAULT_POLICY, ArenaName
 
 
 class DegradeOptions(Gate, ExperimentOptions):
-    """Fly policies at growing latencies on the same seeds: what every step costs, as curves.
+    """Fly policies at increasing latencies on the same seeds, and draw performance curves.
 
-    The same --out goes on with what was interrupted.
+    The same --out resumes an interrupted run.
 
     Examples:
         airl degrade
@@ -53,7 +53,7 @@ OPTIONS = DegradeOptions
 
 
 def run(options: DegradeOptions, console: Console | None = None) -> int:
-    """Fly the latencies and show what they cost; exit status and errors as of `fly_and_show`."""
+    """Fly all latencies and show the results; exit status and errors as in `fly_and_show`."""
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)
     experiment = declare_degradation(
         scenario, options.latencies, options.policies, compensated=options.compensated

@@ -1,4 +1,4 @@
-"""Entry points of the console scripts. Light: `airl --help` loads no models of options."""
+"""Entry points of the console scripts. Light: `airl --help` loads no option models."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ import sys
 
 
 def sitl() -> None:
-    """`airl-sitl`."""
+    """Run `airl-sitl`."""
     from airl_mav.cli.options import run_command
 
     run_command("airl-sitl", "airl_mav.cli.sitl")
 
 
 def firmware() -> None:
-    """`airl-firmware`."""
+    """Run `airl-firmware`."""
     from airl_mav.cli.options import run_command
 
     run_command("airl-firmware", "airl_mav.cli.firmware")
 
 
 def companion() -> None:
-    """`airl-companion`: needs nothing beyond the light installation."""
+    """Run `airl-companion`, which needs only the light installation."""
     from airl_mav.cli.options import run_command
 
     run_command("airl-companion", "airl_mav.cli.companion")
 
 
 def airl() -> None:
-    """`airl`: the subcommands."""
+    """Run `airl` with its subcommands."""
     from airl_mav.cli.main import main
 
     main(sys.argv[1:])

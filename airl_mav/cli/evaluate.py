@@ -1,4 +1,4 @@
-"""`airl evaluate`: fly policies through seeded episodes and say how well, with intervals."""
+"""`airl evaluate`: fly policies through seeded episodes and print statistics with intervals."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 class EvaluateOptions(Gate, Viewing, ExperimentOptions):
     """Fly policies through seeded episodes: success, time, distance and energy with intervals.
 
-    Several policies or arenas give a table of policies x arenas. The same --out goes on with what
-    was interrupted; a finished evaluation shows its tables again. airl report RUN draws the page of
-    a run.
+    Several policies or arenas give a table of policies x arenas. The same --out resumes an
+    interrupted evaluation; a finished evaluation prints its tables again. airl report RUN draws the
+    page of a run.
 
     Examples:
         airl evaluate static-obstacles --episodes 1000
@@ -66,7 +66,7 @@ OPTIONS = EvaluateOptions
 
 def run(options: EvaluateOptions, console: Console | None = None) -> int:
     """Evaluate; return 0, 1 (workers lost), 3 to 5 (verdict) or 130 (Ctrl-C)."""
-    # Imported here and below: options need no simulator.
+    # Imported here and below: options do not need the simulator.
     from airl_mav.experiments.evaluate import (
         check_plain,
         evaluation_cells,
@@ -106,7 +106,7 @@ def run(options: EvaluateOptions, console: Console | None = None) -> int:
         if view is None:
             flown = fly_scenario(cell.scenario, options.out, progress)
         else:
-            # One flight after the other, in the order in which they are watched.
+            # Sequential flights, in the order of the viewer.
             name = run_name(cell.scenario)
             flown = fly_live(cell.scenario, options.out, progress, name=name, view=view)
         if options.on_card and flown.ended == "complete":
@@ -134,7 +134,7 @@ def _show(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voic
         code = verdict.exit_code
         if (sha256 := run_sha256(flown.episodes)) is not None:
             more = [f"sha256 of the flights  {sha256}"]
-    # A page that was drawn of fewer flights, or under another verdict, would be wrong.
+    # Redraw a page that shows fewer flights or another verdict.
     drawn = (flown.path / REPORT_FILE).exists()
     page = show_report(loaded, verdict, voice.console, voice.progress, draw=drawn)
     for line in more:

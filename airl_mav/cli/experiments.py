@@ -1,4 +1,4 @@
-"""What the commands that fly several runs share: options; fly, compare, print."""
+"""Shared parts of commands that fly several runs: options, flights, comparison, output."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ NOTHING_REQUIRED = Gate()
 FOR_PEOPLE = Telling()
 
 COMMANDS = {"matrix": "airl evaluate", "degradation": "airl degrade"}
-"""Kinds of comparisons whose commands are not called as they are."""
+"""Kinds of comparisons whose command has another name."""
 
 
 def episodes(description: str, default: int, least: int = 1) -> Any:
-    """Return a number of episodes as a field."""
+    """Return a field for a number of episodes."""
     return quantity(description, "1", ge=least, le=model.GREATEST_EPISODES, default=default)
 
 
 class ExperimentOptions(Telling, model.Flights, model.Lateness, model.Decisions, Aircraft):
-    """Options that all experiments share; the default level is the fastest."""
+    """Options of all experiments; the default level is the fastest."""
 
     level: model.LevelName = Field(
         default="gym", description=model.Flights.model_fields["level"].description
@@ -38,7 +38,7 @@ class ExperimentOptions(Telling, model.Flights, model.Lateness, model.Decisions,
 
 
 class OnboardOptions(Gate, ExperimentOptions):
-    """A policy on an onboard computer, compared with a reference."""
+    """Options for a policy on an onboard computer, compared with a reference."""
 
     computer: str = Field(
         default=model.ONBOARD_COMPUTER,
@@ -64,8 +64,8 @@ def fly_and_show(
     gate: Gate = NOTHING_REQUIRED,
     telling: Telling = FOR_PEOPLE,
 ) -> tuple[int, ExperimentRun]:
-    """Fly the rest of an experiment and show it; return 0, 1, 3 to 5 or 130, and what flew."""
-    # Imported here and below: options need no simulator, and no flight waits for figures.
+    """Fly the rest of an experiment and show it; return 0, 1, 3 to 5 or 130, and its runs."""
+    # Imported here and below: options need no simulator, and flights need no figures.
     from airl_mav.experiments.experiment import run_experiment
     from airl_mav.experiments.live import EXIT_CODES
 

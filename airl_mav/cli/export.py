@@ -1,4 +1,4 @@
-"""`airl export`: turn a trained model into a policy that flies."""
+"""`airl export`: convert a trained model to a policy."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from airl_mav.training.export_request import FLOWN, ExportRequest
 
 
 class ExportOptions(ExportRequest):
-    """Export a stable-baselines3 .zip, or a torch module of your own, to ONNX with a policy card.
+    """Export a stable-baselines3 .zip or a custom torch module to ONNX with a policy card.
 
     The model must take a Dict of the image (`depth`, `rgb` or `grey`, uint8), `velocity` and
-    `goal`, as `--layout`, `--image` and `--kind` say, and give the actions of `--actions`; a module
-    of your own may take the three as arguments. What a VecNormalize around the training environment
-    did to observations is not in a .zip: name its file with --vec-normalize, or the model does not
-    fly right. Both hold pickled Python objects, and a module is code: export only those of people
-    you trust.
+    `goal`, as set by `--layout`, `--image` and `--kind`, and return the actions of `--actions`. A
+    custom module may take the three as arguments. A .zip does not contain the statistics of a
+    VecNormalize wrapper. Pass its file with --vec-normalize, or the exported policy gets wrong
+    inputs. Both files contain pickled Python objects, and a module is code: export only files from
+    people that you trust.
 
     Examples:
         airl export model.zip --algorithm PPO --out policies/mine
@@ -47,7 +47,7 @@ OPTIONS = ExportOptions
 EXTRAS = ("train",)
 
 CHANGED = ("description", "decisions", *FLOWN)
-"""What of a policy that is there may be said anew."""
+"""Settings that may change when an existing policy is copied."""
 
 
 def run(options: ExportOptions, console: Console | None = None) -> int:
@@ -84,7 +84,7 @@ def run(options: ExportOptions, console: Console | None = None) -> int:
 def _export(options: ExportOptions) -> PolicyCard:
     command = shlex.join(["airl", *sys.argv[1:]])
     options.facts(command)
-    # Imported late: torch takes seconds, and a wrong option is found without it.
+    # Imported late: torch takes seconds, and option errors are found without it.
     from airl_mav.training.export import export
 
     return export(options, command)
@@ -102,7 +102,7 @@ def _copy(options: ExportOptions) -> PolicyCard:
 
 
 def _policy_folder(options: ExportOptions) -> Path:
-    """Return the folder of the learned policy that is named as the model. Raises UsageError."""
+    """Return the folder of the learned policy given as the model. Raises UsageError."""
     found = find_policy(options.model)
     if found.folder is None:
         raise FieldError("model", options.model, f"a learned policy; {found.name} has no network")
@@ -110,7 +110,7 @@ def _policy_folder(options: ExportOptions) -> Path:
 
 
 def _export_int8(options: ExportOptions) -> PolicyCard:
-    """Export a model, or take a policy that is there, and write it in 8-bit integers."""
+    """Export a model or use an existing policy, and write the policy in 8-bit integers."""
     if options.with_torch:
         raise FieldError("with_torch", problem="not with --int8: policy.pt2 would be in floats")
     name = options.policy_name

@@ -1,4 +1,4 @@
-"""`airl export-log`: flights of a run as logs for other programs, or live for Foxglove."""
+"""`airl export-log`: export flights of a run to log files, or stream them to Foxglove."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from airl_mav.report.replay.runs import ReplayedRun
 from airl_mav.scenario.aircraft import GREATEST_PORT
 
 FOXGLOVE_PORT = 8765
-"""Where Foxglove looks for a server."""
+"""Default port of Foxglove's connections."""
 
 
 class ExportLogOptions(ProfileModel):
     """Write flights of a run as MCAP (Foxglove, rerun) or ULog (PlotJuggler, Flight Review).
 
-    One file a flight, flight-NNN.mcap or flight-NNN.ulg. --stream publishes a flight at its own
-    pace instead, for Foxglove's "open connection"; Ctrl-C ends it.
+    Writes one file per flight, flight-NNN.mcap or flight-NNN.ulg. --stream publishes a flight in
+    real time instead, for Foxglove's "open connection"; Ctrl-C ends it.
 
     Examples:
         airl export-log runs/20261122T101530Z-sitl-static-obstacles
@@ -58,7 +58,7 @@ OPTIONS = ExportLogOptions
 
 
 def run(options: ExportLogOptions, console: Console | None = None) -> int:
-    """Write the files, or publish until Ctrl-C; return 0."""
+    """Write the files, or stream until Ctrl-C; return 0."""
     console = console or new_console()
     if options.stream or options.format == "mcap":
         check_installed("export")
@@ -96,7 +96,7 @@ def _check_recorded(run: ReplayedRun, number: int) -> None:
 def _stream(run: ReplayedRun, numbers: tuple[int, ...], port: int, console: Console) -> int:
     if len(numbers) != 1:
         raise FieldError("flights", len(numbers), "one flight, with --stream")
-    # Imported here: what publishes is an extra.
+    # Imported here: the streaming server is an extra.
     from airl_mav.report.export_log.live import LiveFlight
 
     live = LiveFlight(flight_of(run, numbers[0]), port)

@@ -1,4 +1,4 @@
-"""`airl faults`: the fault matrix of the flight controller."""
+"""`airl faults`: fault matrix of the flight controller."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ ELSEWHERE = (*LINKS, *PROCESSES, "camera")
 
 
 class FaultsOptions(ProfileModel):
-    """Fly every fault in every phase of a flight, in simulated time, and say how each flight ended.
+    """Fly every fault in every phase of a flight, in simulated time, and report how flights end.
 
-    The flight controller and its plant alone: a scripted pilot arms, climbs to 5 m, holds, flies in
-    offboard or by a mission, and lands. What ends otherwise than documented is marked, and is exit
-    status 3. With the same --out a run that was stopped goes on.
+    The command runs only the flight controller and its plant. A scripted pilot arms, climbs to 5 m,
+    holds, flies in offboard mode or a mission, and lands. Undocumented ends are marked and give
+    exit status 3. The same --out resumes an interrupted run.
 
     Examples:
         airl faults
@@ -108,7 +108,7 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
 def table_of(
     faults: Sequence[str], phases: Sequence[Phase], cells: Sequence[fault_matrix.Cell]
 ) -> TableView:
-    """Return the matrix as a table, a fault a row, for a terminal of any width."""
+    """Return the matrix as a table with a row per fault, for a terminal of any width."""
     rows = tuple(
         (fault, *(fault_matrix.cell_text(cell) for cell in cells if cell.fault == fault))
         for fault in faults

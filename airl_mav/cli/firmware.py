@@ -1,4 +1,4 @@
-"""`airl-firmware`, `airl firmware`: flight controller, vehicle and camera alone, for any client."""
+"""`airl-firmware`, `airl firmware`: flight controller, vehicle and camera, for any client."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ OPTIONS = FirmwareOptions
 
 
 def run(options: FirmwareOptions, console: Console | None = None) -> int:
-    """Fly for clients until Ctrl-C, or the companion's end in lockstep; return 1 if it was lost."""
+    """Fly until Ctrl-C or, in lockstep, the companion's end; return 1 for a lost connection."""
     console = console or new_console(soft_wrap=True)
     vehicle, _ = aircraft_of(options)
     compile_shown([flight_plan(vehicle, options.plant)])
@@ -70,7 +70,7 @@ def _listener(options: FirmwareOptions, console: Console) -> Listener:
         say(f"depth camera      {camera}")
         if options.firmware != "builtin":
             say(f"firmware          {FIRMWARE_TITLES[options.firmware]}")
-        # In lockstep the last digit counts.
+        # In lockstep all digits matter.
         metres = " ".join(repr(m) if options.lockstep else f"{m:.1f}" for m in goal)
         say(f"goal              {metres} (north east{' down' if len(goal) == 3 else ''}, m)")
         if options.lockstep:

@@ -1,4 +1,4 @@
-"""`airl gap`: what a policy loses on an onboard computer, without mitigation and with it."""
+"""`airl gap`: performance of a policy on an onboard computer, with and without mitigation."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from airl_mav.scenario.model import DEFAULT_ARENA
 
 
 class GapOptions(OnboardOptions):
-    """Measure the hardware gap: what a policy loses on an onboard computer, and with mitigation.
+    """Measure the hardware gap: a policy's loss on an onboard computer, also with mitigation.
 
-    The policy on a workstation and on the onboard computer; a policy that was trained as late as
-    that computer decides, there, in the conditions of its training, and on the workstation. Always
-    the same seeds: gaps of success, flight time, distance and energy with 95 % intervals, against
-    both references, beside those of the paper. The same --out goes on with what was interrupted.
+    The policy flies on a workstation and on the onboard computer. A policy trained with that
+    computer's latency flies there, in its training conditions, and on the workstation. All runs use
+    the same seeds. The tables show gaps of success, flight time, distance and energy with 95 %
+    intervals, against both references, and the paper's results. The same --out resumes an
+    interrupted run.
 
     Examples:
         airl gap
@@ -54,7 +55,7 @@ OPTIONS = GapOptions
 
 
 def run(options: GapOptions, console: Console | None = None) -> int:
-    """Measure the gap; exit status and errors as of `fly_and_show`."""
+    """Measure the gap; exit status and errors as in `fly_and_show`."""
     experiment = declare_gap(
         scenario_of(options),
         mitigated=options.mitigated,

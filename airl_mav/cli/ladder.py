@@ -18,11 +18,10 @@ from airl_mav.scenario.model import LevelName
 
 
 class LadderOptions(ExperimentOptions):
-    """Fly the same policy and seeds at several levels of fidelity, and say what differs.
+    """Fly the same policy and seeds at several levels of fidelity, and show the differences.
 
-    Success, flight time, distance and energy side by side, with the differences from the first
-    level on the same seeds and their 95 % intervals. The same --out goes on with what was
-    interrupted.
+    Prints success, flight time, distance and energy at each level, and the differences from the
+    first level on the same seeds with 95 % intervals. The same --out resumes an interrupted run.
 
     Examples:
         airl ladder static-obstacles
@@ -59,7 +58,7 @@ OPTIONS = LadderOptions
 
 
 def run(options: LadderOptions, console: Console | None = None) -> int:
-    """Fly the levels and show what differs; exit status and errors as of `fly_and_show`."""
+    """Fly all levels and show the differences; exit status and errors as in `fly_and_show`."""
     policy = find_policy(options.policy, trust=options.trust)
     arena = options.arena or training_arena(policy)
     experiment = declare_ladder(

@@ -1,4 +1,4 @@
-"""`airl list`: what is shipped, and the policies of installed packages."""
+"""`airl list`: built-in policies and profiles, and the policies of installed packages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PROFILES: tuple[Kind, ...] = ("vehicles", "arenas", "computers", "training", "sw
 KINDS: dict[str, Callable[[], list[tuple[str, str]]]] = {
     "policies": lambda: [
         *((name, find_policy(name).description) for name in policy_names()),
-        # Not loaded: that would run their code.
+        # Listed without loading, which would run their code.
         *((name, f"installed: {where}") for name, where in announced(POLICIES).items()),
     ],
     **{kind: partial(_profiles, kind) for kind in PROFILES},
@@ -33,7 +33,7 @@ KINDS: dict[str, Callable[[], list[tuple[str, str]]]] = {
 
 
 class ListOptions(BaseModel):
-    """List what is shipped: vehicles, arenas, policies, computers, training configurations, sweeps.
+    """List built-in vehicles, arenas, policies, computers, training configurations and sweeps.
 
     Examples:
         airl list

@@ -1,4 +1,4 @@
-"""`airl`: everything around a rehearsal, one subcommand a file."""
+"""`airl`: all subcommands, one module per subcommand."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ SUBCOMMANDS: dict[str, str] = {
     "computers": "computer profiles: what each was timed with, by whom, and how late it decides",
     "list": "shipped vehicles, arenas, policies, computers, sweeps",
 }
-"""Subcommands, and what each is for; module `airl_mav.cli.<name>`."""
+"""Subcommands with their purposes; module `airl_mav.cli.<name>`."""
 
 MODULES = {"export-log": "airl_mav.cli.export_log", "list": "airl_mav.cli.listing"}
-"""Where a subcommand's module is not called as the subcommand is."""
+"""Modules of subcommands with another name."""
 
 
 def main(words: Sequence[str] | None = None) -> NoReturn:
@@ -69,7 +69,7 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
             f"error: airl {name}: no such command; {hint}", style="red"
         )
         sys.exit(EXIT_USAGE)
-    # Imported here: the list of commands needs no models of their options.
+    # Imported here: the list of commands does not need the option models.
     from airl_mav.cli.options import run_command
 
     run_command(f"airl {name}", MODULES.get(name, f"airl_mav.cli.{name}"), rest)

@@ -1,7 +1,7 @@
-"""Command lines made from models: a field's meaning, unit, range and default stand on the model.
+"""Command lines generated from models, which contain meaning, unit, range and default of fields.
 
-A command's options are a pydantic model, mostly the scenario's own groups of fields. tyro reads the
-words; the model checks the values, so that what is wrong gets one line which names the option.
+A command's options are a pydantic model, mostly composed of the scenario's groups of fields. tyro
+parses the words and the model validates the values. Each error is one line that names the option.
 """
 
 from __future__ import annotations
@@ -43,22 +43,22 @@ from airl_mav.scenario.model import Scenario
 Options = TypeVar("Options", bound=BaseModel)
 
 POSITIONAL = "positional"
-"""Marks a field whose values come without an option's name."""
+"""Marker of a field with values without an option name."""
 
 REPEATED = "repeated"
-"""Marks a field whose option may be given several times, a value each."""
+"""Marker of a field whose option may be repeated, with one value each."""
 
 PREFIXED = ("limits", "payload", "sensors", "spread", "wind")
-"""Tables whose options carry the table's name; those of the others are unique by themselves."""
+"""Tables whose options have the table's name as a prefix; option names of others are unique."""
 
 CALLED = {"json_lines": "json"}
-"""Fields whose option has another name: pydantic's models have their own `json`."""
+"""Fields with another option name: pydantic's models have a `json` method."""
 
 SINGULAR = {"faults": "fault"}
-"""Lists whose option, given once for each item, is called by one of them."""
+"""Lists whose option is repeated for each item, with a singular name."""
 
 _FIELD = re.compile(r"\b[a-z0-9]+(?:_[a-z0-9]+)+\b")
-"""A word in a message that may be a field's name: one with an underscore, so no word of English."""
+"""Words in a message that may be field names: with an underscore, so not English words."""
 
 
 def read_options(model: type[Options], prog: str, words: Sequence[str]) -> Options:
@@ -70,7 +70,7 @@ def read_options(model: type[Options], prog: str, words: Sequence[str]) -> Optio
         words = words[1:]
         held = read_scenario_file(file)
         validated(model, held, file)
-    # There are no comments: it would read this file's source for each table.
+    # Without comments, as tyro would read this file's source for each table.
     kind: Any = Annotated[(_arguments(model, held), tyro.conf.HelptextFromCommentsOff)]
     parsed = tyro.cli(kind, prog=prog, description=inspect.getdoc(model), args=words)
     try:
@@ -80,12 +80,12 @@ def read_options(model: type[Options], prog: str, words: Sequence[str]) -> Optio
 
 
 def scenario_of(options: BaseModel, **changes: Any) -> Scenario:
-    """Return the scenario that a command's options hold; changes that are None are passed over."""
+    """Return the scenario of a command's options, with changes except for None."""
     given = {
         name: getattr(options, name)
         for name, field in Scenario.model_fields.items()
         if name in type(options).model_fields
-        # An experiment may have several where the scenario has one: they are its own to fly.
+        # Options with several values instead of one belong to the experiment.
         and (IN_WORDS in field.metadata or not isinstance(getattr(options, name), tuple))
     }
     given |= {name: value for name, value in changes.items() if value is not None}
@@ -98,7 +98,7 @@ def told(
     file: Path | None = None,
     positionals: Sequence[str] = (),
 ) -> str:
-    """Return an error about a field in one line that names the option, or the line of the file."""
+    """Return a field's error as one line with the name of the option, or the file."""
     if error.field in positionals:
         return error.line(error.field.upper())
     error = _with_options(error)
@@ -110,7 +110,7 @@ def told(
 
 
 def _names(model: type[BaseModel]) -> Iterator[str]:
-    """Give the names of a model's fields, with those of tables that are no part of an option."""
+    """Yield the option field names of a model; some tables are not part of the option name."""
     for name, field in model.model_fields.items():
         kind = field.annotation
         if isinstance(kind, type) and issubclass(kind, BaseModel) and name not in PREFIXED:
@@ -131,8 +131,8 @@ def _with_options(error: FieldError) -> FieldError:
 
 
 def option_of(field: str) -> str:
-    """Return the option of a field: --hold-s of hold_s, --leave-after-s of watchdog's."""
-    # An element of a list is named by its option: goal.0 is the first word of --goal.
+    """Return the option of a field: --hold-s for hold_s, --leave-after-s for a watchdog field."""
+    # Elements of a list use the list's option: goal.0 is the first value of --goal.
     table, _, name = re.sub(r"(\.\d+)+$", "", field).rpartition(".")
     listed, _, _ = field.partition(".")
     if listed in SINGULAR:
@@ -156,7 +156,7 @@ def _with_values(model: type[BaseModel], words: Sequence[str]) -> list[str]:
 
 
 def _scenario_file(model: type[BaseModel], words: Sequence[str]) -> Path | None:
-    """Return the scenario file that a command line begins with; None: it has none."""
+    """Return the scenario file at the start of a command line, or None."""
     if "policy" not in model.model_fields or _positionals(model):
         return None
     return Path(words[0]) if words and words[0].endswith(".toml") else None
@@ -167,9 +167,9 @@ def _positionals(model: type[BaseModel]) -> list[str]:
 
 
 def _arguments(model: type[BaseModel], held: Mapping[str, Any]) -> type[Any]:
-    """Return the dataclass that tyro reads into: types and defaults of the model, no ranges."""
+    """Return the dataclass for tyro: the model's types and defaults, without ranges."""
     fields: list[tuple[str, Any, Any]] = []
-    # Positional words first: what has no default must come before what has one.
+    # Positional fields first: fields without a default must come first.
     names = sorted(
         model.model_fields, key=lambda name: POSITIONAL not in model.model_fields[name].metadata
     )
@@ -204,7 +204,7 @@ def _arguments(model: type[BaseModel], held: Mapping[str, Any]) -> type[Any]:
 
 
 def _default(field: FieldInfo, held: Any) -> Any:
-    """Return what an option is when it is not given: as the file says, else as the model says."""
+    """Return an option's default: from the file, else from the model."""
     if held is not None:
         if isinstance(held, str) and Path in (field.annotation, *get_args(field.annotation)):
             return Path(held)
@@ -231,8 +231,7 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
     """Run the command of a module and exit with its status.
 
     The module has `OPTIONS`, the model of its options, `run(options) -> exit status`, and
-    optionally `EXTRAS`, what it needs beside the simulator. Errors become one line and exit status
-    2 or 1.
+    optionally `EXTRAS`, its additional requirements. Errors become one line and exit status 2 or 1.
     """
     words = sys.argv[1:] if words is None else words
     threading.excepthook = _thread_failed
@@ -240,10 +239,10 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
         try:
             code = carry_out(prog, module, words)
         finally:
-            # Or what is left in the buffer fails where nobody can handle it, at the very end.
+            # Flush here: errors at interpreter exit cannot be handled.
             sys.stdout.flush()
     except BrokenPipeError:
-        # Its reader has had enough: `| head`. Nothing more is to be written there.
+        # The reader has closed the pipe (`| head`): discard further output.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = EXIT_BROKEN
     except UsageError as error:
@@ -260,15 +259,15 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
 
 
 def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
-    """Read a command line and run its command, which gets `more`; return the exit status."""
+    """Parse a command line and run its command with `more`; return the exit status."""
     if module.rpartition(".")[2] not in LIGHT:
-        # Before the import: it would fail for want of them.
+        # Before the import, which fails without the packages.
         check_installed("sim")
     command = importlib.import_module(module)
     options = read_options(command.OPTIONS, prog, words)
     check_installed(*getattr(command, "EXTRAS", ()))
     try:
-        # On standard error: programs read standard output.
+        # On standard error, as programs read standard output.
         with shown_by(lambda: RichProgress(new_console(stderr=True))):
             return int(command.run(options, **more))
     except FieldError as error:
@@ -278,7 +277,7 @@ def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
 
 
 def _thread_failed(failed: threading.ExceptHookArgs) -> None:
-    """Print what ended a thread, unless a full disk did: the next writer raises it again."""
+    """Print a thread's error, except for a full disk, which is raised by the next write."""
     error = failed.exc_value
     if not isinstance(error, OSError) or machine_failure(error) is None:
         threading.__excepthook__(failed)
@@ -301,16 +300,16 @@ EXTRAS = {
     "train": ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch"),
     "view": ("viser",),
 }
-"""What the extras install, by their names in pyproject.toml."""
+"""Packages of the extras, by their names in pyproject.toml."""
 
 LIGHT = (
     *("companion", "computers", "conformance", "export", "listing", "profile", "train", "video"),
 )
-"""Commands whose modules need no simulator; those of the others cannot be imported without."""
+"""Commands that can be imported without the simulator."""
 
 
 def check_installed(*extras: str) -> None:
-    """Raise UsageError, with what to install, unless all that these extras install is there."""
+    """Raise UsageError, with installation instructions, for missing packages of the extras."""
     lacking = {
         extra: missing
         for extra in extras

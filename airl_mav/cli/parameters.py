@@ -1,4 +1,4 @@
-"""`airl parameters`: a vehicle's parameters as a file for real firmware."""
+"""`airl parameters`: export a vehicle's parameters to a file for real firmware."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ KINDS: dict[str, Kind] = {
     "px4-hitl": (lambda vehicle: px4_airframe(vehicle, HITL_OUTPUT), qgroundcontrol_file),
     "ardupilot": (ardupilot_airframe, ardupilot_file),
 }
-"""How the parameters are found, and written, by kind of firmware."""
+"""Functions that compute and format the parameters, by kind of firmware."""
 
 
 class ParametersOptions(ProfileModel):
-    """Write what real firmware must be set to, to fly a vehicle: for firmware that you start.
+    """Write the parameters that real firmware needs to fly a vehicle, for firmware that you start.
 
-    For PX4 a file that QGroundControl loads, for ArduPilot one for its --defaults. Firmware that
-    airl-sitl starts is set by itself.
+    For PX4, the file is for QGroundControl; for ArduPilot, for the option --defaults. airl-sitl
+    sets these parameters on firmware that it starts.
 
     Examples:
         airl parameters px4-hitl --out quad.params

@@ -1,4 +1,4 @@
-"""`airl profile`: how long this computer takes for a policy's decisions."""
+"""`airl profile`: measure the decision latency of this computer."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from airl_mav.profiling.request import ProfileRequest
 
 
 class ProfileOptions(ProfileRequest):
-    """Measure how long this computer takes for a policy's decisions: a computer profile.
+    """Measure this computer's latency for a policy's decisions, and write a computer profile.
 
-    The samples that it writes are what --computer and --workload replay at every level of fidelity.
+    The options --computer and --workload replay the written samples at every level of fidelity.
 
     Examples:
         airl profile --on my-pi --watts 6.4
@@ -56,7 +56,7 @@ OPTIONS = ProfileOptions
 
 
 def run(options: ProfileOptions, console: Console | None = None) -> int:
-    """Measure, print the report, and write the profile unless it broke off; return 0, 1 or 130."""
+    """Measure, print the report, and write the profile unless it failed; return 0, 1 or 130."""
     console = console or new_console()
     if options.level == "sitl":
         check_installed("sim")

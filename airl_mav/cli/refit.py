@@ -1,4 +1,4 @@
-"""`airl refit`: a vehicle and a computer profile from a recorded flight."""
+"""`airl refit`: estimate vehicle and computer profiles from a recorded flight."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 
 class RefitOptions(ProfileModel):
-    """Fit a vehicle, a computer and the wind to a flight that --black-box has recorded.
+    """Fit a vehicle, a computer and the wind to a flight recorded with --black-box.
 
-    With the flight controller's log (.ulg) also mass or thrust, and the time on the link. A PX4 log
-    alone, of whatever flew the vehicle, tells all of that but the computer; several of them tell of
-    the vehicle more closely. Writes profiles that load as they are, and says what the flights do
-    not tell.
+    The flight controller's log (.ulg) adds mass or thrust, and the link latency. A PX4 log alone,
+    of any flight, gives everything except the computer. Several logs give more precise vehicle
+    parameters. Writes profiles that load without changes, and lists quantities that the flights do
+    not determine.
 
     Examples:
         airl refit log_12.ulg --vehicle quad --out refit
@@ -70,7 +70,7 @@ SHORT = {
     "wind_east_m_s": "wind east",
     "dead_time_s": "dead time",
 }
-"""What a table of several flights shows of each, and what it calls that."""
+"""Quantities in the table of several flights, with their column titles."""
 
 
 def run(options: RefitOptions, console: Console | None = None) -> int:
@@ -104,7 +104,7 @@ def run(options: RefitOptions, console: Console | None = None) -> int:
 
 
 def table_of(found: Refit) -> TableView:
-    """Return the table of what was fitted."""
+    """Return the table of fitted quantities."""
     columns = columns_of("<quantity | <unit | fitted | 95 % interval | profile")
     rows = tuple(
         (
@@ -120,7 +120,7 @@ def table_of(found: Refit) -> TableView:
 
 
 def table_of_flights(flights: Sequence[Refit]) -> TableView:
-    """Return what each of several flights tells of the vehicle and its own wind."""
+    """Return the table of vehicle and wind estimates from each flight."""
     told = [key for key in SHORT if any(each.estimate(key).observed for each in flights)]
     columns = (
         Column("flight", number=False),
@@ -137,7 +137,7 @@ def table_of_flights(flights: Sequence[Refit]) -> TableView:
 
 
 def unobserved_lines(found: Refit) -> list[str]:
-    """Return a line for each quantity that the flight does not tell."""
+    """Return a line for each quantity that the flight does not determine."""
     return [
         f"not observable{' in this flight' if not found.flights else ''}: {each.meaning}:"
         f" {each.unobservable}"

@@ -1,4 +1,4 @@
-"""`airl refly`: a recorded flight, rehearsed, and the two beside each other."""
+"""`airl refly`: rehearse a recorded flight and compare the two."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 
 class ReflyOptions(ProfileModel):
-    """Rehearse a flight that `airl-companion --black-box` has recorded, and compare the two.
+    """Rehearse a flight recorded by `airl-companion --black-box`, and compare the two.
 
     The same policy flies to the same goal in lockstep, with the decision latencies of the flight.
-    Where the flight is none like its rehearsals, the aircraft is not the vehicle profile, or the
-    world not the arena.
+    If the flight differs from all rehearsals, the aircraft differs from the vehicle profile, or the
+    world from the arena.
 
     Examples:
         airl refly flights/20261123T172437.230467Z.mcap
@@ -132,7 +132,7 @@ def run(options: ReflyOptions, console: Console | None = None) -> int:
 
 
 def parts_table(parts: Sequence[PartFlown], flown_s: float) -> TableView:
-    """Return what the flight and its rehearsals differ by, with each part of a refit."""
+    """Return the differences between flight and rehearsals, with each part of a refit."""
     columns = columns_of("<with | reached | time [s] | off [%] | path apart [m]")
     rows = tuple(
         (
@@ -162,7 +162,7 @@ def _check(options: ReflyOptions) -> None:
 
 
 def _changes(options: ReflyOptions) -> Changes:
-    """Return what the rehearsals have otherwise than the flight's settings say."""
+    """Return the changes to the flight's settings in the rehearsals."""
     from airl_mav.experiments.refly import AS_FLOWN
 
     changes = AS_FLOWN

@@ -1,4 +1,4 @@
-"""`airl render`: an arena as a camera sees it, as a picture, or a recorded flight as a film."""
+"""`airl render`: render an arena as a picture, or a recorded flight as a film."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ OF_AN_ARENA = (
     *("seed", "north_m", "east_m", "height_m", "yaw_deg", "pitch_up_deg"),
     *("time_s", "vehicle_width_m", "speed_m_s", "yaw_rate_deg_s"),
 )
-"""Options that a flight has no use for: it has its own."""
+"""Options that are not supported for a flight, which defines them."""
 
 OF_A_FLIGHT = ("flight", "rate_hz", "trust")
 
@@ -55,16 +55,16 @@ OF_NO_VEHICLE = (
     *("show", "renderer", "samples", "projection", "width_px", "height_px", "fov_deg", "range_m"),
     "distortion",
 )
-"""Options that the camera of a vehicle profile has no use for: it has its own."""
+"""Options that are not supported with a vehicle profile's camera, which defines them."""
 
 OF_A_VEHICLE = ("speed_m_s", "yaw_rate_deg_s", "camera_name")
-"""Options of what moves with its camera."""
+"""Options of a moving camera."""
 
 
 class RenderOptions(ProfileModel):
-    """Render an arena as a picture, or what the camera of a recorded flight saw as a film.
+    """Render an arena as a picture, or the camera of a recorded flight as a film.
 
-    Without a pose the camera is where the vehicle begins to fly, and looks north.
+    Without a pose the camera is at the vehicle's start and looks north.
 
     Examples:
         airl render static-obstacles --seed 7
@@ -229,7 +229,7 @@ def _check(options: RenderOptions, filmed: bool) -> None:
 
 
 def _not_asked_for(options: RenderOptions) -> tuple[str, ...]:
-    """Return the options that the camera that is asked for has no use for."""
+    """Return the options that the selected camera does not support."""
     if options.camera is not None:
         return OF_NO_VEHICLE
     return OF_A_VEHICLE[-1:] if options.show == "flow" else OF_A_VEHICLE
@@ -247,7 +247,7 @@ def _taking(vehicle: str, name: str | None) -> ground_truth.TakingCamera:
 
 
 def _is_truth(options: RenderOptions, out: Path) -> bool:
-    """Return whether what is asked for are numbers of the ground truth, or drawn of them."""
+    """Return True for ground truth as numbers, or as a drawing of optical flow."""
     return options.show == "flow" or out.suffix.lower() == ground_truth.ARRAY
 
 
@@ -263,9 +263,9 @@ def _camera(options: RenderOptions, size: tuple[int, int]) -> Intrinsics:
 
 
 def _drawn(options: RenderOptions, samples: int) -> camera_pictures.Drawn:
-    """Return what draws, with so many rays or paths a pixel."""
+    """Return the renderer, with a number of rays or paths per pixel."""
     if options.renderer == "mitsuba":
-        # Imported here: what it draws with is an extra.
+        # Imported here: Mitsuba is an extra.
         from airl_mav.camera.mitsuba import PathTracer
 
         return partial(PathTracer(samples), seed=0)

@@ -1,4 +1,4 @@
-"""`airl report`: build a run's report again, or compare runs."""
+"""`airl report`: rebuild a run's report, or compare runs."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from airl_mav.report.comparison.model import comparison_file, kind_of
 
 
 class ReportOptions(ProfileModel):
-    """Print the tables of a run, a gap or a ladder and write its page again; or compare runs.
+    """Print the tables of a run, a gap or a ladder and rewrite its page; or compare runs.
 
-    Two or more runs are compared: what differs in what was flown, quality of flight with intervals,
-    paired differences on shared seeds, latencies, paths, energy. The first is the reference.
+    Two or more runs are compared: settings, quality of flight with intervals, paired differences on
+    shared seeds, latencies, paths, energy. The first run is the reference.
 
     Examples:
         airl report runs/20261122T101530Z-sitl-static-obstacles
@@ -80,7 +80,7 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
         if value:
             raise FieldError(field, f"{value}", "with two runs or more")
     if kind_of(first) is None:
-        # Imported here and below: options need no figures.
+        # Imported here and below: options do not need the figures.
         from airl_mav.report.run_report import show_report, verdict_of
 
         loaded = load(first)

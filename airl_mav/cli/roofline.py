@@ -1,4 +1,4 @@
-"""`airl roofline`: how fast a vehicle may fly on which computer, and what binds it."""
+"""`airl roofline`: safe velocity of a vehicle with different computers, and its limiting factor."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from airl_mav.report.document import print_document, print_place
 class RooflineOptions(RooflineRequest):
     """The F-1 roofline: safe velocity against reaction time, for a vehicle and its computers.
 
-    Each computer is carried and fed by the vehicle. The closed form stands beside the braking that
-    was measured on the vehicle, and beside the speed that was flown.
+    The vehicle carries and powers each computer. The results show the closed-form limit, the limit
+    from the vehicle's measured braking, and the flown speed.
 
     Examples:
         airl roofline
@@ -35,7 +35,7 @@ OPTIONS = RooflineOptions
 
 
 def run(options: RooflineOptions, console: Console | None = None) -> int:
-    """Work out and fly the roofline, and show it; 0. Raises UsageError as `roofline`."""
+    """Compute, fly and show the roofline; return 0. Raises UsageError as `roofline` does."""
     asked = {name: getattr(options, name) for name in RooflineRequest.model_fields}
     result = roofline(RooflineRequest(**asked), out=options.out)
     console = console or new_console()

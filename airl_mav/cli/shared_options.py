@@ -1,4 +1,4 @@
-"""Options that commands share: requirements, the live view, a recording in place of a run."""
+"""Options shared by commands: requirements, live view, recordings as runs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TrustArenas = Annotated[
 
 
 class Gate(ProfileModel):
-    """Requirements, and files that say whether they are met."""
+    """Requirements, and files for the verdict."""
 
     require: Annotated[tuple[str, ...], REPEATED] = Field(
         default=(),
@@ -47,7 +47,7 @@ def requirements_of(gate: Gate, *, reference: bool = True) -> tuple[Requirement,
     """Return the requirements; FieldError for a gap without a `reference`."""
     if not gate.require:
         return ()
-    # Imported here and below: no flight waits for statistics and figures to be loaded.
+    # Imported here and below: flights do not need statistics and figures.
     from airl_mav.flight.requirements import ACCEPTED, parse_requirement
 
     requirements = tuple(parse_requirement(text) for text in gate.require)
@@ -62,7 +62,7 @@ def requirements_of(gate: Gate, *, reference: bool = True) -> tuple[Requirement,
 
 
 def leave(gate: Gate, verdict: OverallVerdict, suite: str) -> None:
-    """Write the files that were asked for; `suite` is the command."""
+    """Write the requested files of the verdict; `suite` is the command."""
     from airl_mav.report.verdict import write_badge, write_junit
 
     if gate.junit is not None:
@@ -72,7 +72,7 @@ def leave(gate: Gate, verdict: OverallVerdict, suite: str) -> None:
 
 
 class Viewing(ProfileModel):
-    """Whether flights are watched."""
+    """Live view of flights."""
 
     view: bool = Field(
         default=False,
@@ -101,7 +101,7 @@ def view_of(options: Viewing) -> ViewRequest | None:
 
 
 def folder_of(path: Path, ulg: Path | None = None) -> Path:
-    """Return a run's folder, made of a black box and its log if need be, or raise UsageError."""
+    """Return a run's folder, created from a black box and log if necessary, or UsageError."""
     if path.suffix != SUFFIX or path.is_dir():
         return path
     check_installed("black-box" if ulg is None else "refit")

@@ -1,4 +1,4 @@
-"""`airl-sitl`, `airl sitl`: the front door."""
+"""`airl-sitl`, `airl sitl`: rehearse a policy."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 class SitlOptions(Gate, Viewing, Telling, Scenario):
     """Rehearse a policy: firmware and companion as two processes, seeded episodes, a report.
 
-    A first word that ends in .toml is a scenario file, whose values the options override; a run
-    folder has one, scenario.toml, which flies that run again.
+    If the first word ends in .toml, it is a scenario file; options override its values. A run
+    folder contains scenario.toml, which repeats the run.
 
     Examples:
         airl-sitl --vehicle quad
@@ -88,12 +88,12 @@ def video_of(
 
 
 def conclude(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voice: Voice) -> int:
-    """Print the tables and write the report of what was flown; return the verdict's exit status."""
+    """Print the tables and write the report of the flights; return the verdict's exit status."""
     if not flown.episodes:
         _say(voice.console, f"no episode was finished; logs in {flown.path}")
         voice.finish(EXIT_CODES[flown.ended], flown.ended, flown.path)
         return 0
-    # Imported here: the figures take seconds to load, which no flight has to wait for.
+    # Imported here: the figures take seconds to load, which flights do not need.
     from airl_mav.rehearsal.run_folder import load
     from airl_mav.report.run_report import show_report, verdict_of
 

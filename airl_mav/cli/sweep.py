@@ -1,4 +1,4 @@
-"""`airl sweep`: the architecture search, here or on a cluster, taken up again after anything."""
+"""`airl sweep`: resumable architecture search, on this machine or on a cluster."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from airl_mav.sweep.tables import print_plan
 
 
 class SweepOptions(SweepRequest):
-    """Search for the network that flies best: train many, judge all, draw heat maps.
+    """Search for the best network: train many networks, evaluate all, draw heat maps.
 
-    Air Learning's search over its template: layers x filters, several training seeds a cell. The
-    same --out goes on with what was interrupted, whoever was killed.
+    The search space is Air Learning's template: layers x filters, with several training seeds per
+    cell. The same --out resumes after any interruption.
 
     Examples:
         airl sweep quick
@@ -78,7 +78,7 @@ def run(options: SweepOptions, console: Console | None = None) -> int:
 
 
 def _check_device(options: SweepOptions) -> None:
-    """Raise UsageError for a GPU that is asked for and is not there."""
+    """Raise UsageError if the requested GPU is not available."""
     if options.device == "cuda" and options.executor == "process":
         check_installed("train")
         import torch

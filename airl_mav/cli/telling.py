@@ -1,4 +1,4 @@
-"""What a command prints: for a person, nothing but the result, or lines of JSON for programs."""
+"""Output of a command: text, only the result, or JSON lines for programs."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from airl_mav.report.verdict import OverallVerdict
 
 SCHEMA = 1
-"""Version of the lines; docs/reference/json-lines.md describes them."""
+"""Version of the JSON lines; docs/reference/json-lines.md describes them."""
 
 
 class Telling(ProfileModel):
-    """For whom a command prints."""
+    """Output mode of a command."""
 
     quiet: bool = Field(
         default=False,
@@ -43,59 +43,59 @@ class Telling(ProfileModel):
 
 @dataclass(frozen=True)
 class Started(Event):
-    """The command has read its input and begins."""
+    """Start of the command, after reading its input."""
 
     event: ClassVar[str] = "started"
     schema: int
     """Version of these lines: 1."""
     command: str
     version: str
-    """Of airl-mav."""
+    """Version of airl-mav."""
     time_utc: str
-    """ISO 8601."""
+    """Time in ISO 8601."""
 
 
 @dataclass(frozen=True)
 class ToldRun:
-    """A run in figures."""
+    """Statistics of a run."""
 
     name: str
-    """What the comparison calls it; that of its folder for a single run."""
+    """Name in the comparison; for a single run, the name of the folder."""
     path: str
-    """Its folder."""
+    """Run folder."""
     planned: int
-    """Number of flights in all."""
+    """Planned number of flights."""
     flights: int
-    """Number of those that are there."""
+    """Number of finished flights."""
     quality: dict[str, Any]
-    """Each figure of `airl_mav.flight.statistics.Aggregate`: `value`, `low` and `high` of its 95 %
-    interval, `n`; `outcomes` counts the flights by outcome."""
+    """Each statistic of `airl_mav.flight.statistics.Aggregate`: `value`, `low` and `high` of its 95
+    % interval, `n`; `outcomes` counts the flights by outcome."""
     sha256: str | None
-    """Fingerprint of all its flights in lockstep; None elsewhere."""
+    """Digest of all flights in lockstep; None at other levels and for incomplete runs."""
 
 
 @dataclass(frozen=True)
 class Finished(Event):
-    """The command ends: always the last line, unless the input could not be used."""
+    """End of the command: always the last line, unless the input is invalid."""
 
     event: ClassVar[str] = "finished"
     exit_status: int
     ended: str
-    """`complete`, `interrupted` or `broken off`."""
+    """State: `complete`, `interrupted` or `broken off`."""
     path: str
-    """The folder of what was made."""
+    """Folder of the results."""
     page: str | None = None
-    """Its report; None: there is none."""
+    """Report page; None = no report."""
     status: str | None = None
-    """`met`, `not met`, `undecided`, `invalid` or `nothing required`; None: there is no verdict."""
+    """`met`, `not met`, `undecided`, `invalid` or `nothing required`; None = no verdict."""
     sentences: tuple[str, ...] = ()
-    """The verdict as it is printed."""
+    """Text of the verdict, as printed."""
     runs: tuple[ToldRun, ...] = ()
-    """The runs that have flights, in figures."""
+    """Statistics of the runs with flights."""
 
 
 class Voice:
-    """How a command speaks. Use as a context manager: bars are drawn in it."""
+    """Output of a command. Use as a context manager to draw progress bars."""
 
     def __init__(self, options: Telling, command: str, console: Console | None = None) -> None:
         """Prepare the output of a command; raise FieldError if both kinds are requested."""
@@ -107,13 +107,13 @@ class Voice:
         self._command = command
         silent = options.quiet or options.json_lines
         self.console = new_console(quiet=True) if silent else self._out
-        """Takes what only a person reads: remarks and tables."""
+        """Console for text that only people read: remarks and tables."""
         self._drawn = None if silent else RichProgress(self._out)
         self.progress: Progress = self._drawn or self._json or _Errors()
-        """Is told how far the work is."""
+        """Receiver of progress reports."""
 
     def __enter__(self) -> Voice:
-        """Begin: draw bars, or tell that the command has started."""
+        """Start drawing bars, or write the `started` event."""
         if self._drawn is not None:
             self._drawn.__enter__()
         if self._json is not None:
@@ -137,7 +137,7 @@ class Voice:
         runs: Mapping[str, LoadedRun] | None = None,
         more: Sequence[str] = (),
     ) -> None:
-        """Write the result of a command, which has "complete", is "interrupted" or "broken off"."""
+        """Write the result of a command; `ended` is "complete", "interrupted" or "broken off"."""
         lines = () if verdict is None else verdict.lines
         if self._json is not None:
             told = tuple(_told(name, run) for name, run in (runs or {}).items())
@@ -155,7 +155,7 @@ class Voice:
 
 
 def _told(name: str, run: LoadedRun) -> ToldRun:
-    # Imported here: no flight waits for statistics.
+    # Imported here: flights do not need statistics.
     from airl_mav.flight.record import run_sha256
     from airl_mav.flight.statistics import aggregate
 
@@ -172,7 +172,7 @@ def _told(name: str, run: LoadedRun) -> ToldRun:
 
 
 class _Errors(Progress):
-    """Passes everything over but what went wrong."""
+    """Progress that prints only errors."""
 
     def note(self, text: str, style: str | None = None) -> None:
         """Print an error on standard error."""

@@ -1,4 +1,4 @@
-"""`airl train`: train a policy from a TOML file, to a folder that flies."""
+"""`airl train`: train a policy from a TOML file and export it."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ def run(
     config = options.configured()
     vehicle = load_vehicle(config.environment.vehicle)
     kind = config.environment.camera.of(vehicle.camera).kind
-    # Imported late: it needs an arena, which a light installation has not, and `--help` not.
+    # Imported late: needs an arena, which `--help` and a light installation do not have.
     from airl_mav.scenario.compile_plans import vectorized_plan
 
     compile_shown([vectorized_plan(kind)])
     bound, injections = speed_bound(config.environment), injections_of(config.environment.delay)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    # Imported late: the learner takes two seconds to load, and a typo must not wait for it.
+    # Imported late: the learner takes two seconds to load; typos are reported before.
     from airl_mav.training.run import train
 
     stem, out = options.stem, options.folder
@@ -92,7 +92,7 @@ def run(
                     command=command_line or shlex.join(["airl", *sys.argv[1:]]),
                     view=None if viewer is None else viewer.ends,
                 )
-        except FieldError as error:  # It is the file's, not an option's.
+        except FieldError as error:  # An error of the file, not of an option.
             raise UsageError(f"{options.config}: {error.line(sign=' = ')}") from None
         except KeyboardInterrupt:
             show(f"interrupted: airl train {options.config} --out {out} --resume continues")
@@ -113,8 +113,8 @@ def run(
 
 @contextmanager
 def _viewer(name: str, asked: ViewRequest) -> Iterator[Viewer]:
-    """Show a training for a while. Raises UsageError where it cannot be shown."""
-    # Imported here: a training that nobody watches does without.
+    """Show a training in a viewer. Raises UsageError if the viewer cannot start."""
+    # Imported here: only trainings with a viewer need it.
     from airl_mav.training.watched import request_of
     from airl_mav.view.viewer import Viewer, ViewError
 

@@ -1,4 +1,4 @@
-"""`airl verdict`: does a policy hold on an onboard computer? As few flights as that takes."""
+"""`airl verdict`: sequential test of a policy's success rate on an onboard computer."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ DEFAULT_REQUIREMENT = "success >= 95 %"
 
 
 class VerdictOptions(OnboardOptions):
-    """Fly a policy as late as an onboard computer decides, until its success rate is decided.
+    """Fly a policy with an onboard computer's latency, until its success rate is decided.
 
-    Flights are added until they show that the rate is reached, or that it is not; a verdict is
-    wrong at most once in twenty, however often it is looked. The same seeds are then flown on the
-    reference, for one page that compares both. The same --out goes on.
+    Flights are added until the rate is shown to be met or not met. The probability of a wrong
+    verdict is at most 5 %, regardless of the number of interim analyses. The same seeds are then
+    flown on the reference, for a comparison page. The same --out resumes an interrupted run.
 
     Examples:
         airl verdict static-obstacles --computer ras-pi-4 --workload template-5x32
@@ -64,7 +64,7 @@ OPTIONS = VerdictOptions
 def run(options: VerdictOptions, console: Console | None = None) -> int:
     """Seek the verdict; return 0, 1 (workers lost), 3 to 5 (verdict) or 130 (Ctrl-C)."""
     voice = Voice(options, "airl verdict", console)
-    # Not the field's default: what is given would be added to it.
+    # Not the field's default: given requirements would be appended to the default.
     asked = options.model_copy(update={"require": options.require or (DEFAULT_REQUIREMENT,)})
     requirements = requirements_of(asked)
     with voice:
@@ -81,7 +81,7 @@ def run(options: VerdictOptions, console: Console | None = None) -> int:
         if verdict is None or comparison is None:
             voice.finish(code, sought.ended, sought.path)
             return code
-        # Imported here: no flight waits for figures to be loaded.
+        # Imported here: flights do not need the figures.
         from airl_mav.report.comparison.show import show_comparison
 
         leave(options, verdict, "airl verdict")

@@ -1,4 +1,4 @@
-"""`airl video`: what the camera sees, for QGroundControl and every player of RTP."""
+"""`airl video`: camera video for QGroundControl and all RTP players."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from companion.video import GIMBAL_PORT, Watcher
 
 
 class VideoOptions(ProfileModel):
-    """Show what a camera sees in QGroundControl, or any player of RTP; Ctrl-C ends it.
+    """Show a camera's images in QGroundControl, or any player of RTP; Ctrl-C ends it.
 
-    Ground stations are told of the camera by MAVLink's camera protocol and need no settings.
+    Ground stations discover the camera by MAVLink's camera protocol and need no settings.
 
     Examples:
         airl video
@@ -60,15 +60,15 @@ class VideoOptions(ProfileModel):
 
 
 NICENESS = 10
-"""Whatever decides or flies on this computer runs first."""
+"""Niceness of the video process: policy and flight controller have priority."""
 
 OPTIONS = VideoOptions
 EXTRAS = ("film",)
 
 
 def run(options: VideoOptions, console: Console | None = None) -> int:
-    """Send the video until Ctrl-C. Exit status: 0."""
-    # Imported here: help needs no MAVSDK.
+    """Send the video until Ctrl-C; return exit status 0."""
+    # Imported here: `--help` does not need MAVSDK.
     from companion.video_program import OnNetwork, ShownCamera, show_video
 
     console = console or new_console(soft_wrap=True)
@@ -92,9 +92,9 @@ def run(options: VideoOptions, console: Console | None = None) -> int:
 
 
 def watcher_of(address: str, field: str = "to") -> Watcher:
-    """Return the address of HOST:PORT. Raises FieldError, naming the field, for a wrong one."""
+    """Return the address of HOST:PORT. Raises FieldError, naming the field, if it is invalid."""
     host, _, port = address.rpartition(":")
-    # RTCP goes to the port after it.
+    # RTCP uses the next port.
     if not host or not port.isdecimal() or not 1 <= int(port) < GREATEST_PORT:
         raise FieldError(field, address, f"HOST:PORT, port 1..{GREATEST_PORT - 1}")
     try:
@@ -112,7 +112,7 @@ MODULE = "airl_mav.cli.video"
 
 
 def video_words(asked: Scenario, to: str) -> list[str]:
-    """Return the options of `airl video` for a camera and a watcher; FieldError: no address."""
+    """Return the options of `airl video` for a camera and a viewer; FieldError if unsupported."""
     if asked.level != "sitl":
         raise FieldError(
             "video", to, problem="accepted: with level sitl, whose camera has a socket"
@@ -126,7 +126,7 @@ def video_words(asked: Scenario, to: str) -> list[str]:
 
 
 def _network(asked: Scenario) -> str | None:
-    """Return where the camera joins the vehicle's network; None: unsigned, or other firmware."""
+    """Return the camera's connection to the vehicle; None for a signed link or other firmware."""
     if asked.firmware == "px4":
         return f"udpin://{LOOPBACK}:{GIMBAL_PORT + asked.real.instance}"
     if asked.firmware == "builtin" and asked.signing_key is None:
@@ -136,9 +136,9 @@ def _network(asked: Scenario) -> str | None:
 
 @contextmanager
 def video_shown(words: list[str], say: Callable[[str], None]) -> Iterator[None]:
-    """Show the video while the context lasts; the flights go on if it fails, which is said then."""
+    """Show the video within the context; flights continue if the video fails, with a message."""
     with tempfile.TemporaryDirectory(prefix="airl-video-") as folder:
-        # Behind a guard: it must not outlive whoever started it.
+        # The guard ends the video with its parent.
         command = [sys.executable, "-m", MODULE, *words]
         child = ChildProcess(command, Path(folder) / "video.log", guarded=True)
         try:

@@ -25,8 +25,8 @@ from airl_mav.scenario.aircraft import GREATEST_PORT
 class ViewOptions(ProfileModel):
     """Replay the flights of a run in a browser, the worst first; Ctrl-C ends it.
 
-    Of a campaign (airl evaluate of several policies, gap, degrade, ...) any two runs can be chosen
-    on the page; it begins with the first.
+    For a campaign (airl evaluate of several policies, gap, degrade, ...) any two runs can be
+    selected on the page, which starts with the first run.
 
     Examples:
         airl view runs/20261122T101530Z-sitl-static-obstacles
@@ -75,10 +75,10 @@ def run(options: ViewOptions, console: Console | None = None) -> int:
     for each in shown:
         if (same := each.same(first)) is not None:
             each.check(same)
-    # Imported here: what draws is an extra.
+    # Imported here: the viewer is an extra.
     from airl_mav.view.local_server import LocalServer
 
-    # What it prints says the same in more lines.
+    # Its output repeats the address.
     with redirect_stdout(io.StringIO()):
         server = LocalServer(options.port or 0)
     try:
@@ -87,8 +87,8 @@ def run(options: ViewOptions, console: Console | None = None) -> int:
             raise FieldError("port", options.port, problem="it is taken; accepted: a free one")
         console.print(f"view  http://{LOOPBACK}:{port}", soft_wrap=True, highlight=False)
         console.file.flush()
-        # A browser loads the page while the flight is prepared: what compiles and draws takes
-        # longer to import than all above.
+        # The browser loads the page while the flight is prepared. These imports, with compiled
+        # and drawing code, take longer than all of the above.
         from airl_mav.report.replay.page import ReplayPage
 
         ReplayPage(server, replayed, others[0] if others else None, first, runs).run()

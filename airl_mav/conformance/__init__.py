@@ -1,7 +1,7 @@
-"""Conformance test of a flight controller: does it behave as the rehearsal assumes?
+"""Conformance test: checks a flight controller against the rehearsal's assumptions.
 
 `check_conformance` makes the checks of `ground_checks` and `flight_checks` on a `Vehicle` in their
-order, flies the step responses of `steps`, and lands whatever happens.
+order, flies the step responses of `steps`, and always lands.
 """
 
 from airl_mav.conformance.result import ConformanceResult

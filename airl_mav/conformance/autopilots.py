@@ -10,13 +10,13 @@ from airl_mav.conformance.mavlink_names import MavFrame, MavResult
 
 
 class Reaction(Enum):
-    """What an autopilot does with a setpoint."""
+    """Reaction of an autopilot to a setpoint."""
 
     FLOWN = "flown"
     REFUSED = "refused"
-    """With a STATUSTEXT for every message; it does not count as a setpoint."""
+    """Rejected with a STATUSTEXT for every message; it does not count as a setpoint."""
     IGNORED = "ignored"
-    """Without a STATUSTEXT."""
+    """Ignored without a STATUSTEXT."""
 
 
 class ExpectedAnswer(NamedTuple):
@@ -24,24 +24,24 @@ class ExpectedAnswer(NamedTuple):
 
     result: MavResult
     text: str = ""
-    """Part of a STATUSTEXT that comes with it; "": none in particular."""
+    """Part of the STATUSTEXT sent with it; "": any or none."""
 
 
 class ExpectedLoss(NamedTuple):
-    """Expected reaction when setpoints stop and heartbeats go on."""
+    """Expected reaction when setpoints stop and heartbeats continue."""
 
     starts_s: tuple[float, float]
     """Earliest and latest time of the reaction, from the last setpoint [s]."""
     text: str
-    """Part of the STATUSTEXT that tells it; "": none, the speed tells it."""
+    """Part of the STATUSTEXT that reports it; "": none, the reaction is detected by speed."""
     mode: int
     """HEARTBEAT.custom_mode during it."""
     descends: bool
-    """Whether it descends, level, slowed by drag alone; otherwise it brakes and hovers."""
+    """True if it descends level, slowed by drag alone; False if it brakes and hovers."""
 
 
 class Autopilot(NamedTuple):
-    """The expected behaviour of one autopilot."""
+    """Expected behaviour of one autopilot."""
 
     title: str
     offboard: tuple[int, int]
@@ -55,15 +55,15 @@ class Autopilot(NamedTuple):
     after_takeoff_mode: int
     mode_names: Mapping[int, str]
     offboard_on_ground: ExpectedAnswer
-    """To offboard on the ground, without a setpoint."""
+    """Answer to an offboard request on the ground, without a setpoint."""
     arms_without_setpoint: bool
-    """Whether it can be armed then."""
+    """True if it can be armed in that state."""
     offboard_in_air: ExpectedAnswer
     disarm_in_air: ExpectedAnswer
     unknown_mode: ExpectedAnswer
     frames: Mapping[MavFrame, Reaction]
     ignore_all: Reaction
-    """To a type mask that ignores everything."""
+    """Reaction to a type mask that ignores everything."""
     loss: ExpectedLoss
 
     def mode_name(self, mode: int) -> str:

@@ -1,4 +1,4 @@
-"""The transcript of a run, and its checks with their outcomes."""
+"""Transcript of a run, and its checks with their outcomes."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ class Line(NamedTuple):
     """One line of the transcript."""
 
     time_s: float
-    """Since the start, in the vehicle's seconds [s]."""
+    """Time since the start, in the vehicle's seconds [s]."""
     kind: LineKind
     text: str
 
 
 class Transcript:
-    """Everything sent and received, in its order; written by any thread."""
+    """Ordered log of all messages sent and received; written by any thread."""
 
     def __init__(self, clock: Clock, progress: Callable[[Line], None]) -> None:
         """Start empty. `progress` is called with each line, by the thread that adds it."""
@@ -36,11 +36,11 @@ class Transcript:
 
     @property
     def time_s(self) -> float:
-        """The present time on the lines' scale [s]."""
+        """Current time on the lines' scale [s]."""
         return self._clock.time_us() / US_PER_S
 
     def add(self, kind: LineKind, text: str) -> None:
-        """Add a line; one that repeats the last is only counted."""
+        """Add a line; a repetition of the last line is only counted."""
         with self._lock:
             if self.lines and self.lines[-1][1:] == (kind, text):
                 self._repeated += 1
@@ -57,7 +57,7 @@ class Transcript:
 
 
 class Outcome(Enum):
-    """The outcome of a check."""
+    """Outcome of a check."""
 
     PASSED = "pass"
     FAILED = "fail"
@@ -65,21 +65,21 @@ class Outcome(Enum):
 
 
 class Check(NamedTuple):
-    """A check that was made."""
+    """Completed check."""
 
     name: str
     outcome: Outcome
     finding: str
     time_s: float
-    """How long it took, by the transcript's clock [s]."""
+    """Duration by the transcript's clock [s]."""
 
 
 class CheckFailedError(Exception):
-    """The finding of a check that fails."""
+    """Failure of a check; the message is its finding."""
 
 
 class NotApplicableError(Exception):
-    """Why a check says nothing about this vehicle."""
+    """The check does not apply to this vehicle; the message is the reason."""
 
 
 def require(condition: object, finding: str) -> None:
@@ -89,28 +89,28 @@ def require(condition: object, finding: str) -> None:
 
 
 class CheckDefinition(NamedTuple):
-    """A check that can be made."""
+    """Definition of a check."""
 
     name: str
     function: Callable[[Any], str]
-    """Makes it on a Vehicle and returns its finding. Raises as `Checklist.perform` says."""
+    """Runs the check on a Vehicle and returns its finding. Raises as in `Checklist.perform`."""
     essential: bool = False
-    """Whether the rest of its table is left out when it fails."""
+    """True if its failure skips the rest of the table."""
     for_steps: bool = False
-    """Whether it is also made when step responses alone are asked for."""
+    """True if it also runs for step responses alone."""
 
 
 class Checklist:
-    """Checks in the order in which they are made."""
+    """Checks in the order of execution."""
 
     def __init__(self, transcript: Transcript) -> None:
         self._transcript = transcript
         self.checks: list[Check] = []
 
     def perform(self, name: str, check: Callable[[], str]) -> bool:
-        """Run a check and return whether it did not fail.
+        """Run a check and return True if it did not fail.
 
-        It returns its finding, or raises CheckFailedError or NotApplicableError. LinkError and
+        `check` returns its finding, or raises CheckFailedError or NotApplicableError. LinkError and
         KeyboardInterrupt are recorded as failures and raised again.
         """
         start_s = self._transcript.time_s
@@ -129,7 +129,7 @@ class Checklist:
     def perform_all(
         self, table: Iterable[CheckDefinition], vehicle: Any, *, steps_only: bool = False
     ) -> bool:
-        """Make the checks of a table on a Vehicle, and return whether no essential one failed."""
+        """Make the checks of a table on a Vehicle; return True if no essential one failed."""
         return all(
             self.perform(entry.name, partial(entry.function, vehicle)) or not entry.essential
             for entry in table
@@ -137,7 +137,7 @@ class Checklist:
         )
 
     def skip(self, name: str, reason: str) -> None:
-        """Note a check that could not be made as failed."""
+        """Record a check that could not be made as failed."""
         self._note(name, Outcome.FAILED, reason, self._transcript.time_s)
 
     def _note(self, name: str, outcome: Outcome, finding: str, start_s: float) -> None:

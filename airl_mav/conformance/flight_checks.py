@@ -22,28 +22,28 @@ from airl_mav.conformance.vehicle import (
     Vehicle,
 )
 
-CLIMB_S = 60.0  # Longest take-off [s]
-CLIMB_SHARE = 0.9  # Share of the altitude asked for that a take-off must reach
-FLY_S = 3.0  # A velocity is held for so long; its last second is measured [s]
-CRUISE_M_S = 1.0  # The velocity that is asked for [m/s]
-# A velocity is reached when no axis is farther off; a change of it by more is flown [m/s].
+CLIMB_S = 60.0  # Take-off timeout [s]
+CLIMB_SHARE = 0.9  # Share of the requested altitude that a take-off must reach
+FLY_S = 3.0  # Duration of a velocity setpoint; the last second is measured [s]
+CRUISE_M_S = 1.0  # Requested velocity [m/s]
+# Velocity tolerance per axis, and minimum change of a flown setpoint [m/s].
 VELOCITY_M_S = 0.25
-STANDING_M_S = 0.3  # A vehicle stands when it is slower [m/s]
-STOP_S = 6.0  # Longest time to stop [s]
-DRIFT_M = 1.0  # Greatest drift in `FLY_S` of hold [m]
-# Longest landing: the height at this speed, and so much more [m/s, s].
+STANDING_M_S = 0.3  # Maximum speed of a stopped vehicle [m/s]
+STOP_S = 6.0  # Stop timeout [s]
+DRIFT_M = 1.0  # Maximum drift in `FLY_S` of hold [m]
+# Landing timeout: height divided by this speed [m/s], plus a constant [s].
 LANDING_M_S, LANDING_S = 0.3, 30.0
-DISARM_S = 15.0  # Longest time from the ground to disarmed [s]
-# A setpoint that may be refused is sent for so long: less than PX4's offboard-loss time [s].
+DISARM_S = 15.0  # Timeout from landing to disarmed [s]
+# Duration of a setpoint that may be rejected: less than PX4's offboard-loss time [s].
 PROBE_S = 0.8
-OBSERVE_S = 1.8  # From its beginning its effect is looked for so long [s]
-RECOVER_S = 2.0  # After it the vehicle stands for so long [s]
-BRAKING = 0.9  # Share of the speed below which a vehicle has begun to brake
-# Slowest and fastest descent after a loss; PX4: MPC_LAND_SPEED, 0.7 m/s [m/s].
+OBSERVE_S = 1.8  # Observation time of its effect, from its first message [s]
+RECOVER_S = 2.0  # Stop time after it [s]
+BRAKING = 0.9  # Share of the speed below which a vehicle is braking
+# Minimum and maximum descent after a loss; PX4: MPC_LAND_SPEED, 0.7 m/s [m/s].
 DESCENT_M_S = (0.3, 1.2)
-# A STATUSTEXT carries no time: that of the telemetry before it is off by so much [s].
+# Time error of a STATUSTEXT, stamped by the previous telemetry [s].
 TEXT_TIME_S = 0.02
-LOSS_MARGIN_S = 2.0  # The reaction to a loss is waited for so much longer than it may take [s]
+LOSS_MARGIN_S = 2.0  # Additional wait for the reaction to a loss [s]
 EAST_DEG = 90.0
 NORTH_NED = Setpoint("ned", CRUISE_M_S)
 FACING_EAST = RawSetpoint(yaw_rad=math.radians(EAST_DEG))
@@ -51,7 +51,7 @@ NORTH = RawSetpoint(vx=CRUISE_M_S)
 
 
 def takeoff(vehicle: Vehicle, altitude_m: float) -> str:
-    """Take off; expect landed_state ON_GROUND, TAKEOFF, IN_AIR, and the mode after it."""
+    """Take off; expect landed_state ON_GROUND, TAKEOFF, IN_AIR, and the mode after take-off."""
     start_m, start_s = vehicle.height_m, vehicle.telemetry.boot_s
     vehicle.call(
         f"action.set_takeoff_altitude({altitude_m:g})",
@@ -78,7 +78,7 @@ def takeoff(vehicle: Vehicle, altitude_m: float) -> str:
 
 
 def start_offboard(vehicle: Vehicle, setpoint: Setpoint) -> None:
-    """Enter offboard by MAVSDK. Raises CheckFailedError when the mode does not come."""
+    """Enter offboard by MAVSDK. Raises CheckFailedError without the mode change."""
     vehicle.fly(setpoint)
     vehicle.call("offboard.start()", vehicle.offboard.start, must_succeed=True)
     expected = vehicle.autopilot.mode_name(vehicle.autopilot.offboard_mode)
@@ -155,7 +155,7 @@ def _request_offboard(vehicle: Vehicle) -> None:
 
 
 def _react(stream: SetpointStream, setpoint: RawSetpoint, vehicle: Vehicle) -> str:
-    """Send a setpoint of 1 m/s and find out whether it is flown, refused or ignored."""
+    """Send a setpoint of 1 m/s and determine the reaction: flown, refused or ignored."""
     frame, mask = setpoint.frame, setpoint.mask
     expected = vehicle.autopilot.frames[frame]
     if mask != VELOCITY:
@@ -195,8 +195,8 @@ def _react(stream: SetpointStream, setpoint: RawSetpoint, vehicle: Vehicle) -> s
 def _nan_velocity(stream: SetpointStream, vehicle: Vehicle) -> str:
     """Send a NaN velocity: it is ignored and does not count as a loss of setpoints.
 
-    Judged by the last second's mean velocity: ArduCopter restarts its mode with each such setpoint
-    and swings by up to 0.6 m/s.
+    The check uses the last second's mean velocity: ArduCopter restarts its mode with each such
+    setpoint and swings by up to 0.6 m/s.
     """
     stream.send(RawSetpoint(MavFrame.LOCAL_NED, VELOCITY, vx=None))
     vehicle.transcript.add("sent", "SET_POSITION_TARGET_LOCAL_NED vx NaN for 2 s")
@@ -259,7 +259,7 @@ def _lose_setpoints(vehicle: Vehicle) -> str:
 
 
 def _motion_after_loss(vehicle: Vehicle, cruise: float) -> str:
-    """Return how it moves after the loss. Raises CheckFailedError if not as expected."""
+    """Return the motion after the loss. Raises CheckFailedError if not as expected."""
 
     def level_m_s() -> float:
         return math.hypot(*vehicle.velocity_m_s[:2])

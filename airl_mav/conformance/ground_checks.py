@@ -1,4 +1,4 @@
-"""Checks on the ground: identity, messages sent unasked and asked for, refusals, arming."""
+"""Checks on the ground: identity, message streams, rejected commands, arming."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from airl_mav.conformance.vehicle_clock import Method
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 
-FIRST_MESSAGE_S = 5.0  # Longest wait for a message that every vehicle sends [wall s]
-COUNT_S = 5.0  # Messages are counted for so long [s]
-# A rate may be off by this share of the expected one, or by so many messages.
+FIRST_MESSAGE_S = 5.0  # Timeout of a message that every vehicle sends [wall s]
+COUNT_S = 5.0  # Duration of message counting [s]
+# Rate tolerance: a share of the expected rate, or a number of messages.
 RATE_SHARE, RATE_MESSAGES = 0.10, 1.5
-READY_S = 120.0  # Longest wait until it may be armed [s]; ArduPilot takes some 40 s from its start
-# It must have been ready for so long: one report may still be from before a reboot [s].
+READY_S = 120.0  # Timeout until ready to arm [s]; ArduPilot takes some 40 s from its start
+# Minimum time ready, because one report may precede a reboot [s].
 READY_SETTLE_S = 1.0
-TEXT_S = 1.0  # A STATUSTEXT belongs to an answer when it comes within [s]
-ARM_S = 20.0  # Arming is repeated for so long [s]
+TEXT_S = 1.0  # Maximum delay of a STATUSTEXT that belongs to an answer [s]
+ARM_S = 20.0  # Timeout of arming retries [s]
 AUTOPILOT_VERSION_ID = 148
 NEEDED_CAPABILITIES = {128: "SET_POSITION_TARGET_LOCAL_NED", 8192: "MAVLINK2"}
 
@@ -46,13 +46,13 @@ ASKED_HZ: Mapping[str, tuple[int, float]] = {
     "EXTENDED_SYS_STATE": (245, 10.0),
     "SYS_STATUS": (1, 5.0),
 }
-"""Messages that are asked for: message id, rate [Hz]."""
+"""Requested messages: message id, rate [Hz]."""
 
 UNKNOWN_MAIN_MODE = 99
 
 
 def heartbeat(vehicle: Vehicle) -> str:
-    """Wait for a heartbeat, and expect the behaviour of its autopilot from now on."""
+    """Wait for a heartbeat, and expect its autopilot's behaviour in later checks."""
     beat = _first(vehicle, "HEARTBEAT")
     vehicle.expect_autopilot(beat["autopilot"])
     kind = VEHICLE_TYPES.get(beat["type"], "vehicle")
@@ -63,7 +63,7 @@ def heartbeat(vehicle: Vehicle) -> str:
 
 
 def require_answer(vehicle: Vehicle, result: int, expected: ExpectedAnswer, since: int) -> str:
-    """Return the finding of the expected MAV_RESULT; otherwise raise CheckFailedError."""
+    """Return the finding of the expected MAV_RESULT. Raises CheckFailedError for others."""
     name = name_of(MavResult, result)
     require(result == expected.result, f"{name}, not {expected.result.name}")
     if not expected.text:
@@ -74,7 +74,7 @@ def require_answer(vehicle: Vehicle, result: int, expected: ExpectedAnswer, sinc
 
 
 def _version(vehicle: Vehicle) -> str:
-    # MAVSDK asks for it when it connects.
+    # MAVSDK requests it when it connects.
     if vehicle.telemetry.latest("AUTOPILOT_VERSION") is None:
         vehicle.command(MavCommand.REQUEST_MESSAGE, AUTOPILOT_VERSION_ID, note="AUTOPILOT_VERSION")
     fields = _first(vehicle, "AUTOPILOT_VERSION")
@@ -182,7 +182,7 @@ def _arm(vehicle: Vehicle) -> str:
 
 
 def _first(vehicle: Vehicle, name: str) -> Fields:
-    """Return the newest message of a name. Raises CheckFailedError when none comes."""
+    """Return the newest message of a name. Raises CheckFailedError on timeout."""
     stopwatch = WallClock()
     while (fields := vehicle.telemetry.latest(name)) is None:
         require(stopwatch.time_us() < FIRST_MESSAGE_S * US_PER_S, f"no {name}")
@@ -193,7 +193,7 @@ def _first(vehicle: Vehicle, name: str) -> Fields:
 def _require_rates(
     counts: Counter[str], elapsed_s: float, expected_hz: Mapping[str, float], finding: str = ""
 ) -> None:
-    """Raise CheckFailedError unless messages come as often as expected."""
+    """Raise CheckFailedError unless messages arrive at the expected rates."""
     wrong = [
         f"{name} {counts[name] / elapsed_s:.3g} Hz, not {rate_hz:g}"
         for name, rate_hz in expected_hz.items()
@@ -215,4 +215,4 @@ GROUND_CHECKS = (
     CheckDefinition("offboard without setpoint, on the ground", _offboard_without_setpoint),
     CheckDefinition("arm", _arm, essential=True, for_steps=True),
 )
-"""In this order, after the heartbeat."""
+"""Ground checks, executed in this order after the heartbeat."""

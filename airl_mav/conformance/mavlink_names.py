@@ -28,7 +28,7 @@ LandedState = IntEnum("LandedState", "UNDEFINED ON_GROUND IN_AIR TAKEOFF LANDING
 
 
 class MavFrame(IntEnum):
-    """MAV_FRAME, those of SET_POSITION_TARGET_LOCAL_NED."""
+    """MAV_FRAME values valid in SET_POSITION_TARGET_LOCAL_NED."""
 
     LOCAL_NED = 1
     LOCAL_OFFSET_NED = 7
@@ -37,7 +37,7 @@ class MavFrame(IntEnum):
     BODY_FRD = 12
 
 
-UNKNOWN_COMMAND = 29_999  # a number that no dialect gives a meaning
+UNKNOWN_COMMAND = 29_999  # Undefined in all dialects
 VEHICLE_TYPES = {
     2: "quadrotor", 3: "coaxial", 4: "helicopter", 13: "hexarotor", 14: "octorotor", 15: "tricopter"
 }  # fmt: skip
@@ -48,14 +48,14 @@ PREARM_CHECK = 0x1000_0000  # MAV_SYS_STATUS_PREARM_CHECK: the vehicle may be ar
 
 
 def command_long(number: int, *params: float) -> dict[str, float]:
-    """Return the fields of a COMMAND_LONG; parameters that are left out are 0."""
+    """Return the fields of a COMMAND_LONG; missing parameters are 0."""
     padded = (*params, *[0.0] * 7)[:7]
     numbered = {f"param{index}": value for index, value in enumerate(padded, 1)}
     return {"command": int(number), "confirmation": 0, **numbered}
 
 
 def name_of(kind: type[IntEnum], number: int) -> str:
-    """Return the name of a number, or the number itself where it has none."""
+    """Return the name of a number, or the number itself without a name."""
     try:
         return kind(number).name
     except ValueError:

@@ -15,14 +15,14 @@ from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import list_profiles, load_profile
 
 AUTO = "auto"
-"""The stored column of the vehicle's autopilot; of several the first by name."""
+"""Selects the stored column of the vehicle's autopilot, the first by name of several."""
 
 JUDGED = ("latency_s", "rise_s", "overshoot_percent")
 """Figures with a tolerance; the others follow from these, or are noise."""
 
 
 class Tolerance(ProfileModel):
-    """How far a figure may lie from the stored one."""
+    """Maximum deviation of a figure from the stored one."""
 
     latency_share: float = quantity("latency, of the stored one", "1", gt=0, le=1, default=0.10)
     rise_share: float = quantity("rise time, of the stored one", "1", gt=0, le=1, default=0.10)
@@ -33,7 +33,7 @@ class Tolerance(ProfileModel):
 
 
 class StoredStep(ProfileModel):
-    """One step as it was measured; what was not measured is left out."""
+    """Measured step; figures without a measurement are omitted."""
 
     latency_s: float | None = quantity("until the first movement", "s", gt=0, default=None)
     t10_s: float | None = quantity("until 10 %", "s", gt=0, default=None)
@@ -45,7 +45,7 @@ class StoredStep(ProfileModel):
 
 
 class Reference(ProfileModel):
-    """One firmware's column."""
+    """Stored column of one firmware."""
 
     title: str = Field(description="name of the firmware")
     source: str = Field(description="where the figures come from")
@@ -58,13 +58,13 @@ class Reference(ProfileModel):
 
 
 class Deviation(NamedTuple):
-    """A figure outside its tolerance."""
+    """Figure outside its tolerance."""
 
     figure: str
     measured: float
     stored: float
     allowed: float
-    """Greatest difference allowed, in the figure's unit."""
+    """Maximum allowed difference, in the figure's unit."""
 
     def __str__(self) -> str:
         name, _, unit = self.figure.rpartition("_")
@@ -78,7 +78,7 @@ class Deviation(NamedTuple):
 
 
 def deviations(measured: StepResponse, stored: StoredStep, tolerance: Tolerance) -> list[Deviation]:
-    """Return which of latency, rise time and overshoot lie outside; NaN always does."""
+    """Return the deviations of latency, rise time and overshoot; NaN always deviates."""
     floor_s = tolerance.floor_s
     found = []
     for figure, share, floor in (
@@ -91,7 +91,7 @@ def deviations(measured: StepResponse, stored: StoredStep, tolerance: Tolerance)
             continue
         allowed = max(share * expected, floor)
         value: float = getattr(measured, figure)
-        # Staying short of the new value is no overshoot: the error at the end tells that.
+        # Undershoot counts as zero overshoot: the final error shows it.
         compared = max(value, 0.0) if figure == "overshoot_percent" else value
         if math.isnan(value) or abs(compared - expected) > allowed:
             found.append(Deviation(figure, value, expected, allowed))
@@ -107,7 +107,7 @@ def summary(response: StepResponse) -> str:
 
 
 def judge(measured: MeasuredStep | None, reference: Reference) -> str:
-    """Return the finding of a step. Raises CheckFailedError if it was not flown or deviates."""
+    """Return the finding of a step. Raises CheckFailedError if missing or deviating."""
     if measured is None:
         raise CheckFailedError("not flown")
     stored = reference.steps.get(measured.step.name)
@@ -119,7 +119,7 @@ def judge(measured: MeasuredStep | None, reference: Reference) -> str:
 
 
 def load_reference(name: str, autopilot: int) -> Reference:
-    """Return stored steps: `auto` (by HEARTBEAT.autopilot), a name or path; UsageError if none."""
+    """Return stored steps: `auto` (by HEARTBEAT.autopilot), a name or path. Raises UsageError."""
     if name != AUTO:
         return load_profile("conformance", name, Reference)
     for shipped in list_profiles("conformance"):

@@ -1,4 +1,4 @@
-"""The terminal's view of a conformance run."""
+"""Terminal output of a conformance run."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ COLOURS = {Outcome.PASSED: "green", Outcome.FAILED: "red", Outcome.NOT_APPLICABL
 
 
 def line_text(line: Line) -> Text:
-    """Return a line of the transcript."""
+    """Return a formatted line of the transcript."""
     mark, style = LINE_MARKS.get(line.kind, ("--", "dim"))
     return Text(f"{line.time_s:9.3f} {mark} {line.text}", style=style)
 
 
 def step_table(result: ConformanceResult, reference: Reference) -> Table:
-    """Return the step responses beside the stored ones; deviations are marked."""
+    """Return the step responses beside the stored ones, with marked deviations."""
     flights = max(len(each.flights) for each in result.steps.values())
     what = "one flight" if flights == 1 else f"median of {flights} flights"
     table = Table(
@@ -61,7 +61,7 @@ def step_table(result: ConformanceResult, reference: Reference) -> Table:
 
 
 def check_table(result: ConformanceResult) -> Table:
-    """Return the list of checks."""
+    """Return the table of checks."""
     table = Table(title="Checks", title_justify="left")
     table.add_column("check")
     table.add_column("outcome")
@@ -74,13 +74,13 @@ def check_table(result: ConformanceResult) -> Table:
 
 
 def _cell(figure: str, median: StepResponse, stored: StoredStep, outside: bool) -> Text:
-    """Return measured over stored over their difference."""
+    """Return measured value, stored value and difference, one below the other."""
     _, scale, digits = FIGURES[figure]
     measured, expected = getattr(median, figure), getattr(stored, figure)
     shown = "never" if math.isnan(measured) else f"{scale * measured:.{digits}f}"
     if expected is None:
         return Text(f"{shown}\n\n")
-    # What is stored of the error is its size.
+    # The stored error is an absolute value.
     difference = (abs(measured) if figure == "error" else measured) - expected
     if math.isnan(difference):
         apart = ""

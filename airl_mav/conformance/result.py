@@ -1,4 +1,4 @@
-"""What a conformance run found."""
+"""Result of a conformance run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Settings:
-    """What is asked for; `check_conformance` says what each means."""
+    """Settings of a run; see `check_conformance`."""
 
     connect: str
     reference: str
@@ -49,30 +49,30 @@ class Settings:
 
 @dataclass
 class ConformanceResult:
-    """Results of a run, complete or not."""
+    """Results of a complete or interrupted run."""
 
     settings: Settings
     checks: list[Check] = field(default_factory=list)
     transcript: list[Line] = field(default_factory=list)
     steps: dict[StepName, MeasuredStep] = field(default_factory=dict)
-    """Step responses, by the name of the step."""
+    """Step responses, by step name."""
     reference: Reference | None = None
-    """The stored column; None before the autopilot is known."""
+    """Stored column; None before the autopilot is known."""
     heartbeat: Fields | None = None
     autopilot_version: Fields | None = None
     interrupted: bool = False
     known_to_be_down: bool = True
-    """Whether the vehicle is known to be disarmed at the end."""
+    """True if the vehicle is known to be disarmed at the end."""
 
     @property
     def passed(self) -> bool:
-        """Whether every check was made and none failed."""
+        """True if checks were made and all passed."""
         failed = any(check.outcome is Outcome.FAILED for check in self.checks)
         return bool(self.checks) and not failed and not self.interrupted
 
     @property
     def verdict(self) -> str:
-        """The outcome in one line."""
+        """Outcome in one line."""
         failed = [check.name for check in self.checks if check.outcome is Outcome.FAILED]
         passed = sum(check.outcome is Outcome.PASSED for check in self.checks)
         rest = len(self.checks) - passed - len(failed)
@@ -85,7 +85,7 @@ class ConformanceResult:
         return f"CONFORMS to {self.reference.title if self.reference else ''}: {counted}"
 
     def as_data(self) -> dict[str, Any]:
-        """Return everything, as docs/conformance.md describes the file."""
+        """Return all results in the file format of docs/conformance.md."""
         settings = self.settings
         return {
             "schema": SCHEMA,
@@ -120,7 +120,7 @@ class ConformanceResult:
         }
 
     def write(self, path: Path) -> None:
-        """Write everything to a .json. Raises UsageError if it cannot be written."""
+        """Write all results to a .json. Raises UsageError if it cannot be written."""
         try:
             write_json(path, self.as_data())
         except OSError as error:
@@ -128,7 +128,7 @@ class ConformanceResult:
 
 
 def _without_nan(response: StepResponse) -> dict[str, float | None]:
-    """Return the figures, None for NaN, which JSON has not."""
+    """Return the figures with None for NaN, which JSON does not support."""
     return {
         name: None if math.isnan(value) else value for name, value in response._asdict().items()
     }

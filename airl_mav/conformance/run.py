@@ -1,4 +1,4 @@
-"""The whole run: the checks in their order. Whatever fails, the vehicle is brought down."""
+"""Complete run: all checks in order, and a landing after any failure."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from companion.interfaces import LinkError
 
-FACE_NORTH_S = 5.0  # Before the first step, to turn north and stand [s]
-RESCUE_S = 300.0  # Longest landing after a failure [s]
-RESCUE_RETRY_S = 2.0  # A request to land is repeated so often while it is not answered [s]
-HEARTBEAT_S = 1.5  # A heartbeat comes within [s]
+FACE_NORTH_S = 5.0  # Time before the first step, to turn north and stop [s]
+RESCUE_S = 300.0  # Landing timeout after a failure [s]
+RESCUE_RETRY_S = 2.0  # Retry interval of an unanswered land request [s]
+HEARTBEAT_S = 1.5  # Maximum heartbeat interval [s]
 
 
 def check_conformance(
@@ -58,7 +58,7 @@ def check_conformance(
         altitude_m: Take-off altitude, 8 to 100, with `steps_only` from 2 [m].
         steps: Names of the steps to fly.
         repeat: Repetitions of the steps, 1 to 20; every second one mirrored.
-        steps_only: Skip refusals, frames, offboard loss and hold.
+        steps_only: Skip rejections, frames, offboard loss and hold.
         connect_timeout_s: Timeout for finding a flight controller, 1 to 3600 [wall s].
         progress: Called with each line of the transcript, by any thread.
 
@@ -80,7 +80,7 @@ def check_conformance(
             vehicle.connect(connect_timeout_s)
             _check(vehicle, checklist, result)
         except LinkError:
-            pass  # Noted with the check that met it.
+            pass  # Recorded with the failed check.
         except KeyboardInterrupt:
             result.interrupted = True
         result.heartbeat = vehicle.telemetry.latest("HEARTBEAT")
@@ -94,7 +94,7 @@ def check_conformance(
 
 
 def _check(vehicle: Vehicle, checklist: Checklist, result: ConformanceResult) -> None:
-    """Make all checks, as far as one leads to the next. Raises UsageError and LinkError."""
+    """Make all checks until one blocks the next. Raises UsageError and LinkError."""
     settings = result.settings
     if not checklist.perform("heartbeat", lambda: heartbeat(vehicle)):
         return
@@ -130,7 +130,7 @@ def _check_in_air(vehicle: Vehicle, checklist: Checklist, result: ConformanceRes
 
 
 def _fly_steps(vehicle: Vehicle, settings: Settings, measured: dict[StepName, MeasuredStep]) -> str:
-    """Fly the steps; responses are added as they come. Raises CheckFailedError, LinkError."""
+    """Fly the steps and add their responses. Raises CheckFailedError, LinkError."""
     steps = {leg.step.name: leg.step for legs in MANOEUVRES for leg in legs if leg.step}
     flight_checks.start_offboard(vehicle, STOP_NED)
     vehicle.wait(FACE_NORTH_S)
@@ -149,7 +149,7 @@ def _fly_steps(vehicle: Vehicle, settings: Settings, measured: dict[StepName, Me
 
 
 def _fly_leg(vehicle: Vehicle, leg: Leg) -> StepResponse | None:
-    """Hold a setpoint for its time; return the response to its step."""
+    """Hold a setpoint for its duration; return the response to its step."""
     sent_s = vehicle.fly(leg.setpoint)
     vehicle.wait(leg.seconds - (vehicle.telemetry.boot_s - sent_s))
     offboard = vehicle.mode == vehicle.autopilot.offboard_mode
@@ -165,12 +165,12 @@ def _fly_leg(vehicle: Vehicle, leg: Leg) -> StepResponse | None:
 
 
 def _bring_down(vehicle: Vehicle, result: ConformanceResult) -> None:
-    """Land if it is still armed; repeat the request until it answers. Ctrl-C gives it up."""
+    """Land if still armed; repeat the request until answered. Ctrl-C aborts the landing."""
     if not vehicle.may_be_armed:
         return
     note = vehicle.transcript.add
     with suppress(LinkError):
-        # The heartbeat, once a second, may not have told it yet.
+        # The heartbeat, once a second, may not report it yet.
         vehicle.wait_for(lambda: vehicle.armed, HEARTBEAT_S)
     if not vehicle.armed and vehicle.telemetry.silence_s < HEARTBEAT_S:
         return
@@ -186,7 +186,7 @@ def _bring_down(vehicle: Vehicle, result: ConformanceResult) -> None:
                     note("note", "landed and disarmed")
                     return
             except LinkError as error:
-                # It may be heard again.
+                # The link may recover.
                 note("note", f"{error}: trying to land")
                 answered = False
                 retry_us = stopwatch.time_us() + int(RESCUE_RETRY_S * US_PER_S)

@@ -1,7 +1,6 @@
 """Step responses, their telemetry and figures.
 
-A value counts as reached in the first sample that shows it, up to one sample late, as in the stored
-columns.
+A value is reached at its first sample, up to one sample late, as in the stored columns.
 """
 
 from __future__ import annotations
@@ -30,19 +29,19 @@ StepName = Literal[
 STEP_NAMES: tuple[StepName, ...] = get_args(StepName)
 
 BEFORE_S = 0.2
-"""Latency counts from the mean of this long before a step [s]: noise of the estimate is slow."""
+"""Duration before a step whose mean is the start value [s]: estimate noise is slow."""
 
 VELOCITY_CHANGE = 0.05
 ANGLE_CHANGE = 0.5
-"""Movement that ends the latency, of a velocity [m/s], and of a heading or its rate [deg, deg/s].
-"""
+"""Movement that ends the latency, of a velocity [m/s], and of a heading or its rate [deg,
+deg/s]."""
 
 
 SETTLED = 0.05
-"""A response has settled once it stays so close to the new value, as a share of the step."""
+"""Settling tolerance around the new value, as a share of the step."""
 
 END_S = 1.0
-"""The error at the end is a mean over so long [s]."""
+"""Averaging time of the final error [s]."""
 
 
 class Setpoint(NamedTuple):
@@ -59,7 +58,7 @@ Quantity = Literal["north", "east", "down", "forward", "heading", "heading rate"
 
 
 class Step(NamedTuple):
-    """A step of one quantity from one setpoint to another."""
+    """Step of one quantity from one setpoint to another."""
 
     name: StepName
     quantity: Quantity
@@ -69,17 +68,17 @@ class Step(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """The quantity's unit."""
+        """Unit of the quantity."""
         return {"heading": "deg", "heading rate": "deg/s"}.get(self.quantity, "m/s")
 
     @property
     def title(self) -> str:
-        """For example "north 0 -> 2 m/s"."""
+        """Title, for example "north 0 -> 2 m/s"."""
         return f"{self.quantity} {self.before:g} -> {self.after:g} {self.unit}"
 
     @property
     def setpoint(self) -> Setpoint:
-        """The new setpoint."""
+        """New setpoint."""
         return {
             "north": Setpoint("ned", self.after),
             "east": Setpoint("ned", 0.0, self.after),
@@ -90,38 +89,38 @@ class Step(NamedTuple):
         }[self.quantity]
 
     def mirrored(self) -> Step:
-        """Return the opposite step; up stays up."""
+        """Return the opposite step; vertical steps stay the same."""
         if self.quantity == "down":
             return self
         return self._replace(before=0.0 - self.before, after=0.0 - self.after)
 
 
 class Leg(NamedTuple):
-    """One setpoint, held for a while."""
+    """Setpoint held for a fixed time."""
 
     setpoint: Setpoint
     seconds: float
     step: Step | None = None
-    """The step that is measured; None: it only leads to the next leg."""
+    """Measured step; None: a transition to the next leg."""
 
 
 class StepResponse(NamedTuple):
-    """One step; times from the moment of sending. NaN: not reached."""
+    """Response to one step; times start at sending. NaN: not reached."""
 
     latency_s: float
-    """Until the value has moved by a given amount [s]."""
+    """Time until the value has moved by a given amount [s]."""
     t10_s: float
-    """Until a tenth of the step is done [s]."""
+    """Time until 10 % of the step [s]."""
     t50_s: float
-    """Until half of it is done [s]."""
+    """Time until 50 % of the step [s]."""
     rise_s: float
-    """From the first tenth to nine tenths [s]."""
+    """Time from 10 % to 90 % [s]."""
     overshoot_percent: float
-    """How far it goes beyond the new value, of the step [%]; negative: it stays short of it."""
+    """Overshoot beyond the new value, relative to the step [%]; negative: undershoot."""
     error: float
-    """New value minus the mean at the end, positive when it stays short of it [unit]."""
+    """New value minus the mean at the end, positive for undershoot [unit]."""
     settle_s: float
-    """From when on it stays within 5 % of the step around the new value [s]."""
+    """Time after which it stays within 5 % of the step around the new value [s]."""
 
 
 def step_response(
@@ -161,14 +160,14 @@ def step_response(
 
 
 class MeasuredStep(NamedTuple):
-    """A step and its responses, one per repetition."""
+    """Step and its responses, one per repetition."""
 
     step: Step
     flights: list[StepResponse]
 
     @property
     def median(self) -> StepResponse:
-        """Median of each figure over the repetitions; NaN where one is. Noise moves it little."""
+        """Median of each figure over the repetitions, robust to noise; NaN if any is NaN."""
         return StepResponse(*np.median(np.array(self.flights), axis=0).tolist())
 
 
@@ -183,7 +182,7 @@ def _leg(seconds: float, name: StepName, quantity: Quantity, before: float, afte
     return Leg(step.setpoint, seconds, step)
 
 
-# Long enough to settle by PX4's and ArduPilot's measured settling times, with a second to spare.
+# Settling time by PX4's and ArduPilot's measurements, plus one second.
 MANOEUVRES: tuple[tuple[Leg, ...], ...] = (
     (
         Leg(STOP_NED, 2.0),
@@ -207,18 +206,18 @@ MANOEUVRES: tuple[tuple[Leg, ...], ...] = (
         *(Leg(STOP_BODY, 2.0), Leg(STOP_NED, 4.0)),
     ),
 )
-"""In this order, each from a hover facing north. Once through: 40 m north, 10 m east, 10 m up, and
-with a second, mirrored time back."""
+"""Manoeuvres in flight order, each from a hover facing north. One pass: 40 m north, 10 m east, 10 m
+up; a second, mirrored pass returns."""
 
 
 def plan(names: tuple[StepName, ...], *, mirrored: bool) -> list[Leg]:
-    """Return the legs of the manoeuvres that hold the named steps; others are not measured."""
+    """Return the legs of the manoeuvres that contain the named steps; others are not measured."""
     legs = []
     for manoeuvre in MANOEUVRES:
         if not any(leg.step is not None and leg.step.name in names for leg in manoeuvre):
             continue
         for setpoint, seconds, step in manoeuvre:
-            # The legs between steps are stops: there is nothing to mirror.
+            # The legs between steps are stops and need no mirroring.
             flown = step.mirrored() if step is not None and mirrored else step
             measured = flown if flown is not None and flown.name in names else None
             legs.append(Leg(setpoint if flown is None else flown.setpoint, seconds, measured))
@@ -230,7 +229,7 @@ def measure(step: Step, motion: Motion, sent_s: float) -> StepResponse:
     position, heading = motion
     velocity, times_s = motion.velocity, position[:, 0]
     if step.quantity == "heading":
-        # Around the start: a turn may cross south.
+        # Unwrapped from the start: a turn may cross south.
         times_s, values = heading[:, 0], np.degrees(np.unwrap(heading[:, 1]))
     elif step.quantity == "heading rate":
         times_s, values = heading[:, 0], np.degrees(heading[:, 2])

@@ -1,4 +1,4 @@
-"""What the vehicle sends: newest messages, motion, texts, and changes of its state."""
+"""Telemetry of the vehicle: newest messages, motion, texts and state changes."""
 
 from __future__ import annotations
 
@@ -32,19 +32,18 @@ MESSAGES = (
     "STATUSTEXT",
     "SYS_STATUS",
 )
-"""Messages that `Telemetry.receive` takes."""
+"""Messages that `Telemetry.receive` accepts."""
 
 AUTOPILOT_COMPONENT = 1
-"""MAV_COMP_ID_AUTOPILOT1: other components of the vehicle have heartbeats and clocks of their own.
-"""
+"""MAV_COMP_ID_AUTOPILOT1: other components of the vehicle send separate heartbeats and clocks."""
 
-FULL_TEXT = 50  # Characters of a STATUSTEXT that another part may follow
-MOTION_HZ = 250.0  # More samples a second than are asked for
+FULL_TEXT = 50  # Length of a STATUSTEXT that may continue in another part
+MOTION_HZ = 250.0  # Above the requested sample rates
 Fields = Mapping[str, Any]
 
 
 class Motion(NamedTuple):
-    """The vehicle's motion by its own estimate and clock, over a stretch of the flight."""
+    """The vehicle's estimated motion by the vehicle's clock, over a part of the flight."""
 
     position: NDArray[np.float64]
     """(n, 7) LOCAL_POSITION_NED: time since boot [s], north, east, down [m], their rates [m/s]."""
@@ -62,7 +61,7 @@ class Motion(NamedTuple):
 
 
 class StatusText(NamedTuple):
-    """A STATUSTEXT."""
+    """STATUSTEXT of the vehicle."""
 
     boot_s: float
     """Time since boot of the newest telemetry before it [s]."""
@@ -83,13 +82,13 @@ class Telemetry:
         self._last_received_us = 0
         self.texts: list[StatusText] = []
         self.landed_states: list[int] = []
-        """landed_state, each change of it."""
+        """Each new value of landed_state."""
         self.unlogged_acks: Counter[int] = Counter()
-        """COMMAND_ACKs still to come that are left out of the transcript, by command."""
+        """Number of pending COMMAND_ACKs to omit from the transcript, by command."""
         self.boot_s = 0.0
         """Newest time since boot in telemetry [s]."""
         self.mode_name: Callable[[int], str] = str
-        """Returns the name of a custom_mode."""
+        """Function that returns the name of a custom_mode."""
 
     @property
     def silence_s(self) -> float:
@@ -97,11 +96,11 @@ class Telemetry:
         return (self._wall.time_us() - self._last_received_us) / US_PER_S
 
     def latest(self, name: str) -> Fields | None:
-        """Return the fields of the newest message of a name; None when there was none."""
+        """Return the fields of the newest message of a name; None before the first."""
         return self._latest.get(name)
 
     def receive(self, message: Any, _: object) -> None:
-        """Take a message of MAVSDK's mavlink_direct."""
+        """Process a message of MAVSDK's mavlink_direct."""
         if message.component_id != AUTOPILOT_COMPONENT:
             return
         fields: Fields = json.loads(message.fields_json)
@@ -125,14 +124,14 @@ class Telemetry:
 
     def recent(self, seconds: float) -> Motion:
         """Return the motion of the last seconds, by the vehicle's clock [s]."""
-        rows = int(seconds * MOTION_HZ) + 10  # not the whole flight every time
+        rows = int(seconds * MOTION_HZ) + 10  # Avoids copying the whole flight
         with self._lock:
             position, heading = self._position[-rows:], self._heading[-rows:]
         motion = Motion(np.array(position).reshape(-1, 7), np.array(heading).reshape(-1, 3))
         return motion.between(self.boot_s - seconds, self.boot_s)
 
     def find_text(self, part: str, since: int = 0) -> StatusText | None:
-        """Return the first text that contains a part, from the n-th text on."""
+        """Return the first text that contains a part, from index `since` on."""
         return next((each for each in self.texts[since:] if part in each.text), None)
 
     def _row(self, fields: Fields, names: tuple[str, ...]) -> tuple[float, ...]:

@@ -1,6 +1,6 @@
-"""The vehicle under test: MAVSDK's calls, and raw messages through MAVSDK.
+"""Vehicle under test: MAVSDK's calls, and raw messages through MAVSDK.
 
-Timeouts follow the vehicle's clock, at any simulation speed. Silence is measured by the wall clock.
+Timeouts follow the vehicle's clock, at any simulation speed. Silence uses the wall clock.
 """
 
 from __future__ import annotations
@@ -28,21 +28,19 @@ from airl_mav.core.errors import FieldError
 from companion.interfaces import LinkError
 from companion.mavsdk_connection import first_autopilot, open_connection
 
-POLL_S = 0.02  # How often a condition is looked at [wall s]
+POLL_S = 0.02  # Polling interval of a condition [wall s]
 SILENT_S = 5.0
-"""A vehicle counts as lost when nothing is received for so long; heartbeats come each second
-[wall s]."""
+"""Silence after which a vehicle counts as lost; heartbeats come each second [wall s]."""
 
 SLOWEST, SLACK_S = 20.0, 10.0
-"""A wait is given up when it takes so many times as long by the wall clock, and so many seconds
-more [1, wall s]."""
+"""Wall-clock limit of a wait: this factor of its duration, plus this margin [1, wall s]."""
 
 # MAVSDK repeats a command within 2 s of wall time; simulators have been seen to stall longer.
 COMMAND_ATTEMPTS = 5
-MODE_S = 3.0  # Longest wait until the heartbeat, which comes each second, shows a new mode [s]
-STREAM_PERIOD_S = 0.05  # Raw setpoints are repeated at 20 Hz, as MAVSDK repeats its own [s]
+MODE_S = 3.0  # Timeout of a mode change; heartbeats come each second [s]
+STREAM_PERIOD_S = 0.05  # Period of raw setpoints: 20 Hz, as in MAVSDK [s]
 
-# SET_POSITION_TARGET_LOCAL_NED.type_mask: a bit says what to ignore.
+# SET_POSITION_TARGET_LOCAL_NED.type_mask: each bit ignores a field.
 VELOCITY_AND_YAW = 0x9C7
 VELOCITY = 0xDC7
 VELOCITY_FORCE_BIT = 0xFC7
@@ -50,28 +48,28 @@ IGNORE_ALL = 0xDFF
 
 
 class Vehicle:
-    """One vehicle, observed and commanded."""
+    """Vehicle connection with telemetry and commands."""
 
     def __init__(self, url: str, speed: float, transcript: Transcript) -> None:
-        """Open a MAVSDK connection to a vehicle of some speed, or raise UsageError."""
+        """Open a MAVSDK connection to a vehicle of some speed. Raises UsageError."""
         self.url, self.speed = url, speed
         self.transcript = transcript
         self.telemetry = telemetry.Telemetry(transcript)
         self.clock = vehicle_clock.VehicleClock(self.telemetry, self.send, speed)
         self.autopilot: Autopilot = PX4
         self.unasked_hz: Mapping[str, float] = {}
-        """Messages that are expected without asking [Hz]."""
-        # PX4 sends STATUSTEXT only where it hears a ground station.
+        """Expected default messages [Hz]."""
+        # PX4 sends STATUSTEXT only to ground stations.
         self._mavsdk = open_connection(url, ComponentType.GROUND_STATION)
         self._direct: Any = None
         self.action: Any = None
         self.offboard: Any = None
         self._target = 0
         self.may_be_armed = False
-        """Whether it was asked to arm, and has not disarmed after it as far as is known."""
+        """True from an arming request until the vehicle is known to be disarmed."""
 
     def connect(self, timeout_s: float) -> None:
-        """Wait for a flight controller. Raises UsageError if none is heard in time [wall s]."""
+        """Wait for a flight controller. Raises UsageError on timeout [wall s]."""
         system = first_autopilot(self._mavsdk, timeout_s)
         if system is None:
             heard = f"no flight controller heard in {timeout_s:g} s (connect_timeout_s)"
@@ -85,7 +83,7 @@ class Vehicle:
         self.action, self.offboard = Action(system), Offboard(system)
 
     def expect_autopilot(self, number: int) -> None:
-        """Expect the behaviour of a HEARTBEAT.autopilot. Raises UsageError if it is not known."""
+        """Expect the behaviour of a HEARTBEAT.autopilot. Raises UsageError if unknown."""
         if number not in AUTOPILOTS:
             known = ", ".join(f"{key} {each.title}" for key, each in AUTOPILOTS.items())
             problem = f"HEARTBEAT.autopilot = {number}; accepted: {known}"
@@ -117,7 +115,7 @@ class Vehicle:
         return ""
 
     def command(self, number: int, *params: float, note: str = "") -> int:
-        """Send a COMMAND_LONG until answered and return its MAV_RESULT, or raise LinkError."""
+        """Send a COMMAND_LONG until answered and return its MAV_RESULT. Raises LinkError."""
         values = " ".join(f"{value:g}" for value in params)
         what = f"{mavlink_names.name_of(mavlink_names.MavCommand, number)} {values}".strip()
         self.transcript.add("sent", f"COMMAND_LONG {what}{note and f': {note}'}")
@@ -150,7 +148,7 @@ class Vehicle:
         values = ", ".join(f"{value:g}" for value in setpoint[1:])
         self.call(f"set_velocity_{setpoint.frame}({values})", send, must_succeed=True)
         latest = self.clock.exchange()
-        # A simulation may have stalled in between: it was not later than this second exchange.
+        # A simulation may have stalled: the arrival precedes this second exchange.
         return reached[0] if latest is None else min(reached[0], latest.boot_s)
 
     def send(self, name: str, fields: dict[str, Any]) -> None:
@@ -167,7 +165,7 @@ class Vehicle:
     # --- waiting
 
     def poll(self) -> None:
-        """Wait until the next look. Raises LinkError when the vehicle is silent."""
+        """Wait for one polling interval. Raises LinkError when the vehicle is silent."""
         threading.Event().wait(POLL_S)
         if self.telemetry.silence_s > SILENT_S:
             raise LinkError(f"nothing heard for {SILENT_S:g} s")
@@ -189,11 +187,11 @@ class Vehicle:
         self.wait_for(lambda: False, seconds)
 
     def reaches_mode(self, *modes: int) -> bool:
-        """Wait for one of these custom_modes; return whether it came within `MODE_S`."""
+        """Wait for any of these custom_modes; return False on timeout (`MODE_S`)."""
         return bool(self.wait_for(lambda: self.mode in modes, MODE_S))
 
     def count_messages(self, seconds: float) -> tuple[Counter[str], float]:
-        """Count all messages for a while; return their numbers and the vehicle's time [s]."""
+        """Count all messages for a while; return the counts and the vehicle's time [s]."""
         counts: Counter[str] = Counter()
 
         def count(message: Any, _: object) -> None:
@@ -201,7 +199,7 @@ class Vehicle:
                 counts[message.message_name] += 1
 
         stopwatch, start_s = WallClock(self.speed), self.clock.now()
-        every = self._direct.subscribe_message("", count)  # too costly to keep
+        every = self._direct.subscribe_message("", count)  # Too costly to keep
         try:
             stopwatch.sleep_until(int(seconds * US_PER_S))
             elapsed_s = self.clock.now() - start_s or stopwatch.time_us() / US_PER_S
@@ -213,7 +211,7 @@ class Vehicle:
 
     @property
     def armed(self) -> bool:
-        """Whether the newest heartbeat says armed."""
+        """True if the newest heartbeat reports armed."""
         return bool(self._newest("HEARTBEAT", "base_mode") & mavlink_names.ARMED_FLAG)
 
     @property
@@ -223,12 +221,12 @@ class Vehicle:
 
     @property
     def mode_name(self) -> str:
-        """Name of the present mode."""
+        """Name of the current mode."""
         return self.autopilot.mode_name(self.mode)
 
     @property
     def landed_state(self) -> int:
-        """Newest landed_state, 0 when it is not known."""
+        """Newest landed_state, 0 if unknown."""
         return int(self._newest("EXTENDED_SYS_STATE", "landed_state"))
 
     @property
@@ -265,7 +263,7 @@ class RawSetpoint(NamedTuple):
 
 
 class SetpointStream:
-    """Repeats the newest raw setpoint until stopped, heartbeats or not, unlike MAVSDK."""
+    """Repeats the newest raw setpoint until stopped, independent of heartbeats, unlike MAVSDK."""
 
     def __init__(self, vehicle: Vehicle, setpoint: RawSetpoint) -> None:
         self._vehicle, self._setpoint = vehicle, setpoint
@@ -273,7 +271,7 @@ class SetpointStream:
         self._thread = threading.Thread(target=self._run, name="setpoints", daemon=True)
 
     def __enter__(self) -> SetpointStream:
-        """Begin to send."""
+        """Start sending."""
         self._thread.start()
         return self
 
@@ -282,12 +280,12 @@ class SetpointStream:
         self.stop()
 
     def send(self, setpoint: RawSetpoint) -> None:
-        """Send another setpoint, now and from now on."""
+        """Send another setpoint now, and repeat it."""
         self._setpoint = setpoint
         self._send()
 
     def stop(self) -> None:
-        """Stop; nothing is repeated after it returns."""
+        """Stop; no setpoint is sent after it returns."""
         self._stop.set()
         self._thread.join()
 
@@ -304,7 +302,7 @@ class SetpointStream:
             try:
                 self._send()
             except LinkError:
-                return  # The main thread notices the silence.
-            # Missed setpoints are not made up for.
+                return  # The main thread detects the silence.
+            # Missed setpoints are skipped.
             due_us = max(due_us + int(STREAM_PERIOD_S * US_PER_S), clock.time_us())
             clock.sleep_until(due_us, self._stop)

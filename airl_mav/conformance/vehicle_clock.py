@@ -1,8 +1,8 @@
-"""The vehicle's time at the moment when something is sent to it.
+"""Vehicle time at the moment of sending.
 
-The vehicle is asked for its time right before. Between that exchange of a few milliseconds and the
-setpoint that follows, neither the clocks' drift nor the pace of a simulation matters (F. Cristian,
-"Probabilistic clock synchronization", Distributed Computing 3, 1989).
+The vehicle's time is requested right before. Between that exchange of a few milliseconds and the
+next setpoint, neither clock drift nor simulation speed matters (F. Cristian, "Probabilistic clock
+synchronization", Distributed Computing 3, 1989).
 """
 
 from __future__ import annotations
@@ -19,36 +19,36 @@ from airl_mav.core.clock import NS_PER_US, WallClock
 from airl_mav.core.constants import MS_PER_S, US_PER_S
 
 MESSAGES = ("SYSTEM_TIME", "TIMESYNC")  # Messages that `VehicleClock.receive` takes
-ANSWER_S = 2.0  # Longest wait for an answer [wall s]
-SAME_CLOCK_S = 1.0  # An answer and telemetry come from the same clock if they differ by less [s]
+ANSWER_S = 2.0  # Answer timeout [wall s]
+SAME_CLOCK_S = 1.0  # Maximum difference between an answer and telemetry of the same clock [s]
 ATTEMPTS = 8  # Maximum exchanges in a row
-SHORT_US = 2000  # An exchange is good enough if its middle is no longer ago than this [wall µs]
+SHORT_US = 2000  # Maximum age of an exchange's middle [wall µs]
 SYSTEM_TIME_ID = 2
 
 
 class Method(Enum):
-    """How the vehicle is asked for its time."""
+    """Method to request the vehicle's time."""
 
     TIMESYNC = "TIMESYNC"
     SYSTEM_TIME = "REQUEST_MESSAGE(SYSTEM_TIME)"
-    """PX4 1.16 leaves the target of its TIMESYNC answer unset, and MAVSDK drops it."""
+    """Needed for PX4 1.16, whose TIMESYNC answer lacks a target, so that MAVSDK drops it."""
     TELEMETRY = "the newest telemetry"
-    """Not at all: up to one message too early."""
+    """No request: up to one message early."""
 
 
 class Exchange(NamedTuple):
-    """A question and its answer."""
+    """Request and answer."""
 
     boot_s: float
-    """The vehicle's time since boot when it answered [s]."""
+    """Vehicle time since boot at the answer [s]."""
     middle_us: float
-    """Middle between question and answer [wall µs]."""
+    """Midpoint between request and answer [wall µs]."""
     round_trip_us: int
-    """From question to answer [wall µs]."""
+    """Time from request to answer [wall µs]."""
 
 
 class VehicleClock:
-    """Asks the vehicle for its time, by the first method that it answers."""
+    """Requests the vehicle's time, by the first supported method."""
 
     def __init__(
         self, telemetry: Telemetry, send: Callable[[str, dict[str, Any]], None], speed: float
@@ -58,14 +58,14 @@ class VehicleClock:
         self._question = 0
         """ts1 of the newest TIMESYNC [ns]."""
         self._answer: tuple[float, int] | None = None
-        """Time since boot [s], and when it was received [wall µs]."""
+        """Time since boot [s], and its reception time [wall µs]."""
         self._answered = threading.Event()
         self.method = Method.TIMESYNC
         self.inexact = 0
-        """How many sending times came from telemetry, for want of an answer."""
+        """Number of sending times taken from telemetry because an answer was missing."""
 
     def receive(self, message: Any, _: object) -> None:
-        """Take a SYSTEM_TIME or TIMESYNC of MAVSDK's mavlink_direct."""
+        """Process a SYSTEM_TIME or TIMESYNC of MAVSDK's mavlink_direct."""
         if message.component_id != AUTOPILOT_COMPONENT or self._answered.is_set():
             return
         received_us, fields = self.wall.time_us(), json.loads(message.fields_json)
@@ -81,14 +81,14 @@ class VehicleClock:
         self._answered.set()
 
     def choose_method(self) -> Method:
-        """Find the first method that the vehicle answers, and use it from now on."""
+        """Select the first method that the vehicle answers."""
         for self.method in Method:
             if self._ask() is not None:
                 break
         return self.method
 
     def exchange(self) -> Exchange | None:
-        """Return the first of a few exchanges that is short enough, else the shortest."""
+        """Return the first exchange that is short enough, or the shortest of several."""
         best: Exchange | None = None
         for _ in range(ATTEMPTS):
             found = self._ask()
@@ -101,7 +101,7 @@ class VehicleClock:
         return best
 
     def now(self) -> float:
-        """Return the vehicle's time since boot, or that of its newest telemetry [s]."""
+        """Return the vehicle's time since boot [s], from the newest telemetry without an answer."""
         found = self.exchange()
         return self._telemetry.boot_s if found is None else found.boot_s
 
@@ -115,7 +115,7 @@ class VehicleClock:
         return found.boot_s + since_us * self._speed / US_PER_S
 
     def _ask(self) -> Exchange | None:
-        """Exchange once; None when there is no answer, or one by another clock."""
+        """Exchange once; None without an answer, or for an answer by another clock."""
         if self.method is Method.TELEMETRY:
             return None
         newest_s = self._telemetry.boot_s

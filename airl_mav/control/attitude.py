@@ -1,8 +1,8 @@
 """Thrust vector and heading -> attitude setpoint -> body rate setpoint -> normalized torque.
 
-The structure of PX4's AttitudeControl (Brescianini, Hehn, D'Andrea, Nonlinear Quadrocopter
-Attitude Control, ETH 2013). The thrust axis is turned first, the heading with a reduced weight.
-The body rate PID is PX4's RateControl.
+The structure follows PX4's AttitudeControl (Brescianini, Hehn, D'Andrea, Nonlinear Quadrocopter
+Attitude Control, ETH 2013). The thrust axis is turned first, the heading with a reduced weight. The
+body rate PID is PX4's RateControl.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def attitude_setpoint(thrust: Vec, cy: float, sy: float) -> Quat:
     """
     norm = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
     if norm < 1e-9:
-        # Half the heading, without a call that vehicles side by side cannot be compiled with.
+        # Half the heading, without a call that prevents SIMD compilation across vehicles.
         half_sin = math.sqrt(max(0.0, 0.5 - 0.5 * cy))
         return (
             math.sqrt(max(0.0, 0.5 + 0.5 * cy)),
@@ -96,11 +96,11 @@ def rate_setpoint(q: Quat, q_sp: Quat, yaw_rate_ff: float, gains: Gains) -> Vec:
 
 @kernel
 def reduced_attitude(q: Quat, q_sp: Quat) -> tuple[Quat, float]:
-    """Return q with its thrust axis turned into that of q_sp, on the shortest way.
+    """Return q with its thrust axis turned into the thrust axis of q_sp, by the shortest rotation.
 
     Returns:
-        The attitude, body -> NED, and the sine of half the turn about the thrust axis that then
-        remains to q_sp, -1..1.
+        The attitude, body -> NED, and the sine of half the remaining turn about the thrust axis
+        to q_sp, -1..1.
     """
     down = (0.0, 0.0, 1.0)
     reduced = multiply(_shortest(rotate(q, down), rotate(q_sp, down)), q)
@@ -111,7 +111,7 @@ def reduced_attitude(q: Quat, q_sp: Quat) -> tuple[Quat, float]:
 
 @kernel
 def weighted_turn(half_turn: float, gains: Gains) -> float:
-    """Return the sine of half the heading's turn with its weight, from that without."""
+    """Return the sine of half the heading's weighted turn, from the unweighted one."""
     return math.sin(gains.yaw_weight * math.asin(half_turn))
 
 
@@ -121,7 +121,7 @@ def rates_towards(
 ) -> Vec:
     """Return the body rates FRD [rad/s] that turn q into an attitude.
 
-    `reduced` is that attitude but for a turn about its thrust axis, `half_turn` the sine of half
+    `reduced` is that attitude without a turn about its thrust axis, `half_turn` the sine of half
     that turn, `yaw_rate_ff` the heading rate about the world's down axis [rad/s].
     """
     wanted = multiply(reduced, (math.sqrt(1.0 - half_turn * half_turn), 0.0, 0.0, half_turn))
@@ -162,7 +162,7 @@ def rate_control(
     """Return the torque setpoint (-1..1 per axis) and the new integral, in torque units.
 
     Rates [rad/s] and their derivative [rad/s²] are filtered, FRD; `saturation` is the torque per
-    axis that the mixer could not deliver last time (its sign matters).
+    axis that the mixer could not deliver in the last tick (its sign matters).
     """
     er, ep, ey = rates_sp[0] - rates[0], rates_sp[1] - rates[1], rates_sp[2] - rates[2]
     torque = (

@@ -1,11 +1,11 @@
-"""The whole cascade, one tick: state and setpoint -> motor commands.
+"""One tick of the cascade: state and setpoint -> motor commands.
 
-The loops hand over to each other as PX4's do in lockstep. The position loop runs whenever its
-estimator publishes a position, at every second sample of the IMU. Each loop flies the setpoint
-that the loop above it published at an earlier sample, as the inner ones are scheduled first. From
-a new position to the motors that takes two ticks.
+The loops pass setpoints as PX4's do in lockstep. The position loop runs whenever its estimator
+publishes a position, at every second IMU sample. Each loop uses the setpoint that the loop above
+published at an earlier sample, because inner loops are scheduled first. A new position reaches the
+motors after two ticks.
 
-`demand` says what can be asked for, `memory` what is kept between two ticks.
+`demand` defines the inputs, `memory` the state between two ticks.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
 POSITION_TICKS = 2
-"""PX4's EKF (EKF2_PREDICT_US = 10 ms) publishes positions at every second 4 ms sample, measured."""
+"""Ticks between positions of PX4's EKF (EKF2_PREDICT_US = 10 ms): every second 4 ms sample,
+measured."""
 
 
 class Output(NamedTuple):
@@ -67,14 +68,14 @@ class Output(NamedTuple):
 
 
 Published = tuple[Quat, float, float]
-"""What the position loop hands on: attitude setpoint, yaw rate [rad/s], collective 0..1."""
+"""Output of the position loop: attitude setpoint, yaw rate [rad/s], collective 0..1."""
 
 
 class Filters(NamedTuple):
-    """The low-passes of the cascade, for a fixed tick."""
+    """Low-pass filters of the cascade, for a fixed tick."""
 
     velocity: float
-    """Weight of a new sample, as of the others below."""
+    """Weight of a new sample, as for the others below."""
     gyro: Biquad
     angular_acceleration: float
     yaw_torque: float
@@ -109,7 +110,7 @@ def cascade_tick(
     `weights` are `filters(gains, dt)`.
     """
     first = start(velocity, omega, memory, weights)
-    # Setpoints published by an outer loop take effect at the next tick, except at the very first.
+    # Setpoints of an outer loop take effect at the next tick, except at the first.
     published = attitude_sp(memory)
     if memory[WAIT] == 0.0:
         position_loop(position, velocity, q, demand, memory, gains, weights, dt)
@@ -155,7 +156,7 @@ def attitude_tick(
     weights: Filters,
     dt: float,
 ) -> Output:
-    """Run the attitude and the rate loop alone. The position loop is due when it is wanted again.
+    """Run only the attitude and the rate loop. The position loop is due at its next use.
 
     The velocity setpoint of the output is NaN.
     """
@@ -178,9 +179,9 @@ def rate_tick(
     weights: Filters,
     dt: float,
 ) -> Output:
-    """Run the rate loop alone; the others are due when they are wanted again.
+    """Run only the rate loop; the others are due at their next use.
 
-    The attitude setpoint of the output is the present attitude, its velocity setpoint NaN.
+    The attitude setpoint of the output is the current attitude, its velocity setpoint NaN.
     """
     start(velocity, omega, memory, weights)
     _skip_position_loop(velocity, memory, weights, dt)
@@ -196,7 +197,7 @@ def rate_tick(
 
 @kernel
 def start(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> bool:
-    """Settle the filters if this is the first tick; return whether it is."""
+    """Initialise the filters at the first tick; return True for the first tick."""
     first: bool = memory[PRIMED] == 0.0
     if first:
         _prime(velocity, omega, memory, weights)
@@ -214,7 +215,7 @@ def _inner_loops(
     weights: Filters,
     dt: float,
 ) -> Output:
-    """Fly what the position loop has published: attitude setpoint, yaw rate, collective."""
+    """Fly the position loop's output: attitude setpoint, yaw rate, collective."""
     q_sp, yaw_rate, thrust_sp = published
     wanted = rate_setpoint(q, q_sp, yaw_rate, gains)
     rates_sp, collective = hand_over(wanted, thrust_sp, first, memory)
@@ -225,7 +226,7 @@ def _inner_loops(
 
 @kernel
 def hand_over(wanted: Vec, thrust_sp: float, first: bool, memory: Memory) -> tuple[Vec, float]:
-    """Publish rates and collective; return those that the rate loop flies in this tick."""
+    """Publish rates and collective; return the rates and collective to fly in this tick."""
     rates_sp, collective = wanted, thrust_sp
     if not first:
         rates_sp = three(memory, RATES_SP)
@@ -238,7 +239,7 @@ def hand_over(wanted: Vec, thrust_sp: float, first: bool, memory: Memory) -> tup
 
 @kernel
 def _skip_position_loop(velocity: Vec, memory: Memory, weights: Filters, dt: float) -> None:
-    """Keep the velocity's filter going while no position is flown."""
+    """Update the velocity's filter while no position is flown."""
     if memory[WAIT] == 0.0:
         differentiate(velocity, memory, weights, POSITION_TICKS * dt)
         memory[WAIT] = POSITION_TICKS
@@ -260,7 +261,7 @@ def _prime(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> None:
 
 @kernel
 def attitude_sp(memory: Memory) -> Published:
-    """Return attitude setpoint, yaw rate and collective as the position loop published them."""
+    """Return attitude setpoint, yaw rate and collective as published by the position loop."""
     a = ATTITUDE_SP
     q_sp = (memory[a], memory[a + 1], memory[a + 2], memory[a + 3])
     return q_sp, memory[YAW_RATE_SP], memory[THRUST_SP]
@@ -303,7 +304,7 @@ def _trajectory_loop(
     weights: Filters,
     dt: float,
 ) -> None:
-    """As `position_loop`, with an acceleration."""
+    """Run the position loop, as `position_loop`, with an acceleration."""
     period = POSITION_TICKS * dt
     differentiate(velocity, memory, weights, period)
     north, east, down = velocity_setpoint(position, demand.position, demand.velocity, gains)
@@ -342,7 +343,7 @@ def _publish(
     q: Quat,
     memory: Memory,
 ) -> None:
-    """Store what the position loop hands on: attitude, yaw rate and collective."""
+    """Store the position loop's output: attitude, yaw rate and collective."""
     if math.isnan(yaw):
         cos_yaw, sin_yaw = heading_of(q)
     else:
@@ -367,7 +368,7 @@ def _rate_loop(
     weights: Filters,
     dt: float,
 ) -> Motors:
-    """Return the motor commands that turn as wanted, with a collective 0..1."""
+    """Return the motor commands for the body rates, with a collective 0..1."""
     torque = torque_setpoint(omega, rates_sp, memory, gains, weights, dt)
     motors, missing = mix(collective, torque, gains)
     for i in range(3):
@@ -379,9 +380,9 @@ def _rate_loop(
 def torque_setpoint(
     omega: Vec, rates_sp: Vec, memory: Memory, gains: Gains, weights: Filters, dt: float
 ) -> Vec:
-    """Return the torque -1..1 per axis that turns as wanted, and advance the loop's filters.
+    """Return the torque -1..1 per axis for the body rates, and advance the loop's filters.
 
-    Rates are FRD [rad/s]; the `SAT` of `memory` is that of the mixer's last tick.
+    Rates are FRD [rad/s]; the `SAT` of `memory` comes from the mixer's last tick.
     """
     rates_now = (omega[0], omega[1], omega[2])
     for i in range(3):

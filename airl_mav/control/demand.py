@@ -1,4 +1,4 @@
-"""What the cascade can be asked for: one kind of demand for each loop where it can be entered.
+"""Inputs of the cascade: one kind of demand for each entry point.
 
 NaN = not commanded.
 """
@@ -11,20 +11,20 @@ from airl_mav.vehicle.rotation import Quat, Vec
 
 
 class Demand(NamedTuple):
-    """The setpoint of the cascade; NaN = not commanded."""
+    """Setpoint of the cascade; NaN = not commanded."""
 
     position: Vec
     """NED [m]."""
     velocity: Vec
     """NED [m/s]."""
     yaw: float
-    """Heading [rad]; NaN with a yaw rate = the heading of the moment."""
+    """Heading [rad]; NaN with a yaw rate = the current heading."""
     yaw_rate: float
     """[rad/s] about the world's down axis."""
 
 
 class TrajectoryDemand(NamedTuple):
-    """As `Demand`, with an acceleration: PX4's trajectory setpoint, any mixture of axes."""
+    """Demand with an acceleration: PX4's trajectory setpoint, any mixture of axes."""
 
     position: Vec
     """NED [m]."""
@@ -33,13 +33,13 @@ class TrajectoryDemand(NamedTuple):
     acceleration: Vec
     """NED [m/s²]: alone, or fed forward to the velocity's correction."""
     yaw: float
-    """Heading [rad]; NaN with a yaw rate = the heading of the moment."""
+    """Heading [rad]; NaN with a yaw rate = the current heading."""
     yaw_rate: float
     """[rad/s] about the world's down axis."""
 
 
 class AttitudeDemand(NamedTuple):
-    """What the attitude loop is given; nothing controls the velocity."""
+    """Input of the attitude loop, without velocity control."""
 
     attitude: Quat
     """Body -> NED."""
@@ -50,7 +50,7 @@ class AttitudeDemand(NamedTuple):
 
 
 class RateDemand(NamedTuple):
-    """What the rate loop is given; nothing controls the attitude."""
+    """Input of the rate loop, without attitude control."""
 
     rates: Vec
     """Body rates FRD [rad/s]."""
@@ -59,10 +59,10 @@ class RateDemand(NamedTuple):
 
 
 KIND_US = 500_000
-"""PX4 follows another kind of offboard setpoint at the next publication of its control mode: twice
-a second, counted from the last change of its status, as the switch to Offboard is one [µs]. Until
-then it flies the last of the kind before. Source: PX4 1.16, Commander::run (vehicle_control_mode);
-measured: from velocities to body rates it took 0.5 s."""
+"""Interval of changes between kinds of offboard setpoint [µs]: PX4 accepts another kind when it
+publishes its control mode, twice a second, counted from its last status change, such as the switch
+to Offboard. Until then it flies the last setpoint of the previous kind. Source: PX4 1.16,
+Commander::run (vehicle_control_mode); measured: from velocities to body rates it took 0.5 s."""
 
 AnyDemand = Demand | TrajectoryDemand | AttitudeDemand | RateDemand
-"""What `Controller.fly` takes."""
+"""Inputs of `Controller.fly`."""

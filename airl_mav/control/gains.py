@@ -10,9 +10,9 @@ from airl_mav.core.constants import DEG
 
 
 class Gains(NamedTuple):
-    """Everything the cascade needs, SI units and radians.
+    """Gains of the cascade, in SI units and radians.
 
-    Each is the product of what its annotation names: PX4's parameters, and a unit.
+    Each is the product of the factors in its annotation: PX4's parameters, and a unit.
     """
 
     pos_p_xy: Annotated[float, "MPC_XY_P"]
@@ -57,7 +57,7 @@ class Gains(NamedTuple):
     mix_roll: float
     """Share of a roll torque in each motor's command, by CA_ROTORn_PX, CA_ROTORn_PY."""
     mix_pitch: float
-    """Of a pitch torque."""
+    """Share of a pitch torque."""
 
     @classmethod
     def from_parameters(cls, value: Callable[[str], float]) -> Gains:
@@ -78,11 +78,11 @@ _FACTORS = [
     for hint in get_type_hints(Gains, include_extras=True).values()
     if get_origin(hint) is Annotated
 ]
-"""Of the gains that are parameters, in their order."""
+"""Factors of the gains that are parameters, in their order."""
 
 LEAST_ARM = 1e-6
-"""Arms along one axis that are shorter than this share of those along the other one are taken for
-missing: no motor command would turn such a vehicle about that axis."""
+"""Minimum ratio of the arms along one axis to the other axis. Shorter arms count as missing: no
+motor command could turn such a vehicle about that axis."""
 
 
 def _allocation(forward: float, right: float) -> tuple[float, float]:

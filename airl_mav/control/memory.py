@@ -1,7 +1,7 @@
-"""What the cascade remembers of a vehicle between two ticks: a row of `MEMORY_SIZE` floats.
+"""State of the cascade between two ticks: a row of `MEMORY_SIZE` floats per vehicle.
 
-N vehicles are an (N, MEMORY_SIZE) array, and the flight controller holds a single row. The low-pass
-filters are those of PX4's control loops: AlphaFilter and LowPassFilter2p.
+N vehicles are an (N, MEMORY_SIZE) array, and the flight controller uses a single row. The low-pass
+filters are PX4's AlphaFilter and LowPassFilter2p of its control loops.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Biquad(NamedTuple):
 
 
 LEAST_CUTOFF = 0.001
-"""A lower cut-off of a second-order filter is raised to this share of the sample rate, as in PX4's
+"""Minimum cut-off of a second-order filter, as a share of the sample rate, as in PX4's
 LowPassFilter2p: below it, the filter's coefficients cancel to rounding noise."""
 
 
@@ -56,7 +56,7 @@ def butterworth(cutoff_hz: float, dt: float) -> Biquad:
 
 @kernel
 def settled(f: Biquad, sample: float) -> float:
-    """Return what both delay elements hold in the steady state of a constant `sample`."""
+    """Return the value of both delay elements in the steady state of a constant `sample`."""
     return sample / (1.0 + f.a1 + f.a2)
 
 
@@ -70,21 +70,21 @@ def filtered(f: Biquad, sample: float, newer: float, older: float) -> tuple[floa
 Memory = NDArray[np.float64]
 
 HANDOVER_TICKS = 2
-"""From the tick of the position loop to that whose motor commands reflect it: attitude, rates."""
+"""Ticks from the position loop to the motor commands that reflect it: attitude, rates."""
 
 # Layout of a memory row.
 VEL_INT, VEL_LP, VEL_DOT, RATE_INT, SAT = 0, 3, 6, 9, 12
 GYRO, GYRO_NEWER, GYRO_OLDER, DGYRO = 15, 18, 21, 24
 YAW_TORQUE, PRIMED, WAIT = 27, 28, 29
-# What the position loop published: velocity and attitude setpoint, yaw rate, collective.
+# Output of the position loop: velocity and attitude setpoint, yaw rate, collective.
 VELOCITY_SP, ATTITUDE_SP, YAW_RATE_SP, THRUST_SP = 30, 33, 37, 38
-# What the attitude loop published: rates and, passed on, collective.
+# Output of the attitude loop: rates and, passed on, collective.
 RATES_SP, THRUST_ON = 39, 42
 MEMORY_SIZE = 43
 
 
 def ticks_to_motors(memory: Memory) -> int:
-    """Return after how many more ticks the motors reflect what is demanded in the next one."""
+    """Return the ticks until the motors reflect the demand of the next tick."""
     return int(memory[WAIT]) + HANDOVER_TICKS if memory[PRIMED] else 0
 
 
@@ -98,7 +98,7 @@ def trim_for_hover(
 ) -> None:
     """Set the integrals of the velocity to their steady values in a hover at a collective 0..1.
 
-    `north` and `east` are the acceleration that the vehicle leans for, against the wind [m/s²].
+    `north` and `east` are the acceleration of the lean against the wind [m/s²].
     """
     # thrust_from_acceleration, solved for the acceleration that gives the command.
     upright = GRAVITY_M_S2 / math.hypot(GRAVITY_M_S2, north, east)

@@ -34,7 +34,7 @@ def _add(m: Motors, direction: Motors, amount: float) -> Motors:
 
 @kernel
 def _excess(m: Motors, direction: Motors, high: float) -> float:
-    """Return how much of `direction` to add so that the worst motors come back into [0, high]."""
+    """Return the multiple of `direction` that brings the worst motors back into [0, high]."""
     k_min = 0.0
     k_max = 0.0
     for i in range(4):
@@ -69,13 +69,13 @@ def mix(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, Vec]:
     """Return motor commands 0..1 for thrust 0..1 and torque -1..1, and the missing torque."""
     motors, fits = allocate(thrust, torque, gains)
     if fits:
-        return motors, (0.0, 0.0, 0.0)  # the usual case
+        return motors, (0.0, 0.0, 0.0)  # The usual case
     return desaturate(thrust, torque, gains)
 
 
 @kernel
 def allocate(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, bool]:
-    """Return motor commands without limits, and whether none is reached, with and without yaw."""
+    """Return motor commands without limits, and True if all are in range, with and without yaw."""
     m = _roll_and_pitch(thrust, torque, gains)
     turning = _add(m, YAW, torque[2])
     return turning, _in_range(m) and _in_range(turning)
@@ -100,7 +100,7 @@ def _scaled(direction: Motors, share: float) -> Motors:
 
 @kernel
 def desaturate(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, Vec]:
-    """As `mix`, for commands of which some would be out of range."""
+    """Return the result of `mix` for commands that are partly out of range."""
     r, p = gains.mix_roll, gains.mix_pitch
     rolling, pitching = _scaled(ROLL, r), _scaled(PITCH, p)
     m = _roll_and_pitch(thrust, torque, gains)
@@ -125,5 +125,5 @@ def desaturate(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, Vec]:
 
 @kernel
 def _dead(value: float) -> float:
-    """Return 0 for rounding noise: the deficit of a saturated axis is greater."""
+    """Return 0 for rounding noise: the deficit of a saturated axis is larger."""
     return value if abs(value) > 1e-6 else 0.0

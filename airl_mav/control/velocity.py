@@ -24,9 +24,9 @@ def clamp(value: float, low: float, high: float) -> float:
 def velocity_setpoint(position: Vec, position_sp: Vec, velocity_ff: Vec, gains: Gains) -> Vec:
     """Return the velocity to fly NED [m/s]: position error x gain + feed-forward, limited.
 
-    A NaN axis of `position_sp` has no position loop; a NaN axis of `velocity_ff` adds nothing.
-    Where neither commands a horizontal axis, the horizontal result is NaN: not controlled.
-    The horizontal limit gives the position correction priority over the feed-forward.
+    A NaN axis of `position_sp` has no position loop; a NaN axis of `velocity_ff` adds nothing. If
+    neither commands a horizontal axis, the horizontal result is NaN: not controlled. The horizontal
+    limit gives the position correction priority over the feed-forward.
     """
     px = 0.0 if math.isnan(position_sp[0]) else gains.pos_p_xy * (position_sp[0] - position[0])
     py = 0.0 if math.isnan(position_sp[1]) else gains.pos_p_xy * (position_sp[1] - position[1])
@@ -67,7 +67,7 @@ def thrust_from_acceleration(acc: Vec, gains: Gains) -> Vec:
     square = acc[0] * acc[0] + acc[1] * acc[1]
     lean = 1.0 / math.sqrt(square + GRAVITY_M_S2 * GRAVITY_M_S2)
     c = GRAVITY_M_S2 * lean
-    # A tilt's tangent is greater than the tilt: mostly there is no need for the limit's cosine.
+    # tan(tilt) > tilt: usually the limit's cosine need not be computed.
     if square > (GRAVITY_M_S2 * gains.tilt_max) ** 2 and c < math.cos(gains.tilt_max):
         lean = math.sin(gains.tilt_max) / math.sqrt(square)
         c = math.cos(gains.tilt_max)
@@ -88,8 +88,9 @@ def velocity_control(
     """Return the thrust vector (3,) NED and the new integral (3,) [m/s²].
 
     A NaN horizontal setpoint is not controlled: the vehicle stays level.
-    PID on velocity with anti-windup: vertical integration stops at the thrust limits. Horizontal
-    integration is pulled back by what saturation takes away (tracking anti-windup, gain 2/P).
+
+    PID on velocity with anti-windup: vertical integration stops at the thrust limits. Saturation
+    pulls back the horizontal integration (tracking anti-windup, gain 2/P).
     """
     ex = velocity_sp[0] - velocity[0]
     ey = velocity_sp[1] - velocity[1]
@@ -97,7 +98,7 @@ def velocity_control(
     ax = gains.vel_p_xy * ex + integral[0] - gains.vel_d_xy * velocity_dot[0]
     ay = gains.vel_p_xy * ey + integral[1] - gains.vel_d_xy * velocity_dot[1]
     if math.isnan(velocity_sp[0]):
-        # Not controlled: level. The integral against drag would accelerate it for ever.
+        # Not controlled: level. The integral against drag would keep accelerating it.
         ax, ay, ex, ey = 0.0, 0.0, 0.0, 0.0
         integral = (0.0, 0.0, integral[2])
     az = gains.vel_p_z * ez + integral[2] - gains.vel_d_z * velocity_dot[2]
@@ -114,7 +115,7 @@ def acceleration_control(
     gains: Gains,
     dt: float,
 ) -> tuple[Vec, Vec]:
-    """As `velocity_control`, with an acceleration NED [m/s²] that is added on each axis.
+    """Return thrust and integral as `velocity_control`, with an acceleration NED [m/s²] per axis.
 
     An axis without a velocity (NaN) is flown by the acceleration alone, without feedback, and its
     integral stays. Source: PX4 1.16, PositionControl::_velocityControl.

@@ -1,4 +1,4 @@
-"""Code of ours that runs once another package is imported, without importing that package."""
+"""Import hook: runs a module once another package is imported, without importing that package."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 def after_import(package: str, ours: str) -> None:
-    """Import our module `ours` once `package`, which need not be installed, is imported whole."""
+    """Import module `ours` after `package` is fully imported; `package` may be missing."""
     if package in sys.modules:
         importlib.import_module(ours)
     else:
@@ -18,14 +18,14 @@ def after_import(package: str, ours: str) -> None:
 
 
 class _Watcher:
-    """A finder that finds nothing by itself, and sees that a package is being imported."""
+    """Import finder that detects the import of a package and delegates it to other finders."""
 
     def __init__(self, package: str, ours: str) -> None:
         self._package = package
         self._ours = ours
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        """Return what the finders behind this one find, with our module's import put after it."""
+        """Return the spec of the next finders, extended by the import of our module."""
         if name != self._package:
             return None
         for finder in sys.meta_path:
@@ -37,7 +37,7 @@ class _Watcher:
         return None
 
     def _watch(self, spec: ModuleSpec) -> None:
-        """Let the package's loader import our module when it is done."""
+        """Let the package's loader import our module at its end."""
         loader: Any = spec.loader
         execute = getattr(loader, "exec_module", None)
         if execute is None:
@@ -49,5 +49,5 @@ class _Watcher:
                 sys.meta_path.remove(self)
             importlib.import_module(self._ours)
 
-        # On this one object: the package's spec and all that its loader is asked for stay its own.
+        # Patch only this loader object: the package's spec and loader interface are unchanged.
         loader.exec_module = then

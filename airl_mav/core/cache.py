@@ -1,4 +1,4 @@
-"""Folders for what is made on this machine and may be made again: compiled code above all."""
+"""Folders for generated files that can be rebuilt, mainly compiled code."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 
 
 def writable_folder(name: str) -> Path | None:
-    """Return a folder with that name for generated files, made if need be.
+    """Return a folder with a given name for generated files, created if necessary.
 
-    Beside the package's own byte code, or in the user's cache where the package cannot be written.
-    None where neither can.
+    The folder is beside the package's byte code, or in the user's cache if the package is
+    read-only. Returns None if both are read-only.
     """
     package = Path(__file__).resolve().parents[1]
     for parent in (package / "__pycache__", Path.home() / ".cache" / "airl-mav"):

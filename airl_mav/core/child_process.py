@@ -1,9 +1,9 @@
-"""Child processes: started with a log, watched, and surely ended, also when their parent is killed.
+"""Child processes with a log, supervision, and termination, even if the parent is killed.
 
-A child's standard input is a pipe that its parent holds. When it closes, because the parent ended
-the child or died itself, the child has to end. Our own programs read that pipe. Any other program
-runs behind a parent-death guard, which reads it for them:
-`python -m airl_mav.core.child_process PROGRAM ARGUMENT...`.
+A child's standard input is a pipe held by its parent. The child must exit when the pipe closes,
+because the parent stopped the child or ended unexpectedly. Programs of this package read the pipe.
+All other programs run behind a parent-death guard, which reads the pipe for them: `python -m
+airl_mav.core.child_process PROGRAM ARGUMENT...`.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from pathlib import Path
 from airl_mav.core.suspension import Suspension
 
 GRACE_S = 5.0
-"""How long a child may take to end once its pipe is closed, and again once terminated [wall s]."""
+"""Timeout for a child to exit after its pipe is closed, and again after SIGTERM [wall s]."""
 
 GUARDED_GRACE_S = 2.0
-"""How long a guarded program may take to end when terminated, less than its guard [wall s]."""
+"""Timeout for a guarded program to exit after SIGTERM, shorter than its guard's [wall s]."""
 
 SIGNALLED = 128
-"""A guard's exit status is this and the signal's number when a signal killed its program."""
+"""Offset of a guard's exit status: added to the signal's number if a signal killed its program."""
 
 TAIL_LINES = 12
-"""Lines of a dead child's log that are shown."""
+"""Number of log lines shown after a child has ended."""
 
 
 @dataclass(frozen=True)
 class Exited:
-    """A child has ended."""
+    """Exit of a child."""
 
     code: int
-    """Exit status; negative = the signal that killed it."""
+    """Exit status; negative = the signal that killed the child."""
 
     @property
     def by_signal(self) -> bool:
-        """Whether a signal killed it, or the program behind its guard."""
+        """True if a signal killed the child, or the program behind its guard."""
         return self.code < 0 or SIGNALLED < self.code < SIGNALLED + signal.NSIG
 
     def __str__(self) -> str:
-        """Return the name of the signal, as SIGKILL, or the exit status, as exit status 1."""
+        """Return the name of the signal, such as SIGKILL, or the text "exit status 1"."""
         if self.code < 0:
             with suppress(ValueError):
                 return signal.Signals(-self.code).name
@@ -54,9 +54,9 @@ class Exited:
 
 
 class ChildProcess:
-    """One child process in a session of its own.
+    """One child process in a new session.
 
-    Ctrl-C at the terminal reaches the parent alone, which then ends its children in order.
+    Ctrl-C at the terminal reaches only the parent, which then ends its children in order.
     """
 
     def __init__(
@@ -72,10 +72,10 @@ class ChildProcess:
     ) -> None:
         """Start a program.
 
-        What it prints is appended to `log`. With `capture_stdout` only its standard error is, and
-        the parent reads its standard output (`stdout`). It needs the parent-death guard (`guarded`)
-        unless it reads its pipe itself. `environment` is added to our own. File descriptors in
-        `inherited` are locks that it never uses.
+        Its output is appended to `log`. With `capture_stdout`, only standard error is logged and
+        the parent reads standard output (`stdout`). Programs that do not read their pipe need the
+        parent-death guard (`guarded`). `environment` extends the parent's environment. The program
+        inherits the file descriptors in `inherited` as locks.
         """
         guard = [sys.executable, "-m", "airl_mav.core.child_process"] if guarded else []
         path = {"PYTHONPATH": os.pathsep.join(sys.path)} if guarded else {}
@@ -94,9 +94,9 @@ class ChildProcess:
             )
         self._suspension: Suspension | None = None
         self.stdin = self._process.stdin
-        """The pipe that it reads; None never."""
+        """Pipe to the child's standard input; never None."""
         self.stdout = self._process.stdout
-        """The pipe that it writes to; None where that is not captured."""
+        """Pipe from the child's standard output; None = not captured."""
 
     @property
     def pid(self) -> int:
@@ -104,16 +104,16 @@ class ChildProcess:
         return self._process.pid
 
     def poll(self) -> Exited | None:
-        """Return how it ended; None while it runs."""
+        """Return the exit; None while the child runs."""
         code = self._process.poll()
         return None if code is None else Exited(code)
 
     def wait(self) -> Exited:
-        """Return how it ended, once it has."""
+        """Wait for the exit and return it."""
         return Exited(self._process.wait())
 
     def log_tail(self) -> str:
-        """Return the last lines that it wrote to its log."""
+        """Return the last lines of the child's log."""
         try:
             written = self.log.read_bytes()[self._log_start :]
         except OSError:
@@ -121,18 +121,18 @@ class ChildProcess:
         return "\n".join(written.decode(errors="replace").splitlines()[-TAIL_LINES:])
 
     def suspend(self) -> None:
-        """Suspend it (SIGSTOP) until `resume`; it is also resumed when we are killed."""
+        """Suspend the child (SIGSTOP) until `resume`; it also resumes if the parent is killed."""
         if self._suspension is None and self._process.poll() is None:
             self._suspension = Suspension(self._process.pid)
 
     def resume(self) -> None:
-        """Resume it, if it is suspended (SIGCONT)."""
+        """Resume the child if it is suspended (SIGCONT)."""
         suspension, self._suspension = self._suspension, None
         if suspension is not None:
             suspension.end()
 
     def stop(self) -> None:
-        """Close its pipe, wait, terminate, kill; return when it is gone. Harmless if repeated."""
+        """Close the pipe, wait, terminate, kill; return after the exit. May be repeated."""
         self.resume()
         if self.stdin is not None:
             with suppress(BrokenPipeError):
@@ -145,7 +145,7 @@ class ChildProcess:
                 return
 
     def kill(self) -> None:
-        """End it at once; does not wait."""
+        """Kill the child without waiting."""
         self._process.kill()
         self.resume()
 
@@ -155,8 +155,8 @@ class ChildProcess:
 
 def main() -> None:
     """Run the command line's program until it or standard input ends; exit with its status."""
-    # A session of its own: signals meant for the parent pass it by, and it can be ended with all
-    # that it has started.
+    # A new session: signals to the parent do not reach the program, and it can be ended together
+    # with all of its children.
     program = subprocess.Popen(  # noqa: S603 - a list of arguments, no shell
         sys.argv[1:], stdin=subprocess.DEVNULL, start_new_session=True
     )

@@ -1,4 +1,4 @@
-"""Time. Everything else takes a Clock; nothing else reads the time.
+"""Clocks. All other modules use a Clock and never read the time directly.
 
 All times are integer microseconds of simulated time. `SimClock` is advanced by its owner;
 `WallClock` follows the host's monotonic clock, multiplied by a speed factor.
@@ -17,38 +17,38 @@ NS_PER_US = 1_000
 
 
 def processor_time_us() -> int:
-    """Return the processor time that this process has used, all its threads together [µs]."""
+    """Return the processor time used by all threads of this process [µs]."""
     return time.process_time_ns() // NS_PER_US
 
 
 class Clock(Protocol):
-    """A source of simulated time."""
+    """Interface of a source of simulated time."""
 
     def time_us(self) -> int:
-        """Return the present simulated time [µs]."""
+        """Return the current simulated time [µs]."""
 
     def sleep_until(self, time_us: int, interrupt: threading.Event | None = None) -> None:
-        """Return once `time_us()` has reached a time [µs], or early when `interrupt` is set."""
+        """Wait until `time_us()` reaches a time [µs], or until `interrupt` is set."""
 
 
 class SimClock:
-    """Simulated time that its owner advances: unpaced, deterministic."""
+    """Simulated time advanced by its owner: unpaced, deterministic."""
 
     def __init__(self, start_us: int = 0) -> None:
         self._now_us = start_us
 
     def time_us(self) -> int:
-        """Return the present simulated time [µs]."""
+        """Return the current simulated time [µs]."""
         return self._now_us
 
     def advance(self, step_us: int) -> None:
-        """Move time forward by `step_us` [µs]. Raises ValueError when asked to go back."""
+        """Advance time by `step_us` [µs]. Raises ValueError for a negative step."""
         if step_us < 0:
             raise ValueError(f"time cannot go back: step_us={step_us}")
         self._now_us += step_us
 
     def sleep_until(self, time_us: int, interrupt: threading.Event | None = None) -> None:
-        """Jump to `time_us` [µs], or stay when it has passed or `interrupt` is set."""
+        """Jump to `time_us` [µs]; no effect if it has passed or `interrupt` is set."""
         if interrupt is None or not interrupt.is_set():
             self._now_us = max(self._now_us, time_us)
 
@@ -71,11 +71,11 @@ class WallClock:
         self.epoch_ns = time.monotonic_ns() if epoch_ns is None else epoch_ns
 
     def time_us(self) -> int:
-        """Return the present simulated time [µs]."""
+        """Return the current simulated time [µs]."""
         return int((time.monotonic_ns() - self.epoch_ns) * self.speed) // NS_PER_US
 
     def wall_seconds_until(self, time_us: int) -> float:
-        """Return wall seconds left until simulated `time_us`; negative when it has passed."""
+        """Return the wall seconds left until simulated `time_us`; negative if it has passed."""
         target_ns = self.epoch_ns + time_us * NS_PER_US / self.speed
         return (target_ns - time.monotonic_ns()) / (US_PER_S * NS_PER_US)
 
@@ -88,16 +88,16 @@ class WallClock:
                 return
 
     def slip(self, step_us: int) -> None:
-        """Give up `step_us` [µs] of simulated time: the host could not keep up."""
+        """Skip `step_us` [µs] of simulated time: the host could not keep up."""
         self.epoch_ns += int(step_us * NS_PER_US / self.speed)
 
 
 GREATEST_GAP_US = 2 * US_PER_S
-"""A longer time between two looks was no waiting: the process was stopped [µs of wall time]."""
+"""Maximum interval counted as waiting: after a longer one the process was stopped [wall µs]."""
 
 
 class Patience:
-    """Adds up wall time in which somebody waited; a process that is stopped does not wait."""
+    """Stopwatch of waiting time that excludes time in which the process is stopped."""
 
     def __init__(self) -> None:
         self._clock = WallClock()
@@ -105,7 +105,7 @@ class Patience:
         self._waited_us = 0
 
     def so_far_s(self) -> float:
-        """Return what has been waited [s]. To be asked more often than `GREATEST_GAP_US`."""
+        """Return the total waiting time [s]. Call more often than `GREATEST_GAP_US`."""
         now_us = self._clock.time_us()
         self._waited_us += min(now_us - self._seen_us, GREATEST_GAP_US)
         self._seen_us = now_us
@@ -118,13 +118,13 @@ def utc_now() -> datetime:
 
 
 def since_1970_us(timestamp: str) -> int:
-    """Return a calendar time, written as ISO 8601 with its offset from UTC, since 1970 [µs].
+    """Return a calendar time, given in ISO 8601 with its offset from UTC, since 1970 [µs].
 
-    Raises ValueError if the text is no such time.
+    Raises ValueError for an invalid text.
     """
     return round(datetime.fromisoformat(timestamp).timestamp() * US_PER_S)
 
 
 def utc_us() -> int:
-    """Return the calendar time since 1970 [µs], for stamps. It may jump: nothing waits by it."""
+    """Return the calendar time since 1970 [µs], for time stamps only: it may jump."""
     return time.time_ns() // NS_PER_US

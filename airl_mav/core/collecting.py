@@ -1,4 +1,4 @@
-"""Python's search for unreachable cycles of objects, made rarer for a while."""
+"""Context with less frequent garbage collection of reference cycles."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 YOUNG_OBJECTS = 50_000
-"""So many new containers lead to a search, in place of Python's 700."""
+"""Number of new containers that trigger a collection, instead of Python's 700."""
 
 
 @contextmanager
 def seldom_collected() -> Iterator[None]:
-    """Search for unreachable cycles seldom, for work that makes very many objects which live on.
+    """Reduce garbage collection during work that creates many long-lived objects.
 
-    matplotlib builds figures from hundreds of thousands of objects: with Python's own thresholds, a
-    fifth of the time that a report takes goes into searching through them; with these, next to
-    nothing, for a few MB more of memory. The thresholds of before stand again afterwards.
+    matplotlib builds figures from hundreds of thousands of objects. With Python's thresholds,
+    garbage collection takes a fifth of a report's time; with these, almost no time, for a few MB
+    more of memory. The previous thresholds are restored afterwards.
     """
     before = gc.get_threshold()
     gc.set_threshold(max(YOUNG_OBJECTS, before[0]) if before[0] else 0, *before[1:])

@@ -1,7 +1,7 @@
-"""The process of a `first_start.CompileJob`: reads it from standard input and carries it out.
+"""Process of a `first_start.CompileJob`: reads the job from standard input and runs it.
 
-Writes a line of JSON for each kernel that it compiles, and at the end the source files that all its
-kernels depend on. Ends with the pipe of its standard input.
+Writes a line of JSON for each compiled kernel, and at the end the source files of all its kernels,
+including dependencies. Exits when its standard input is closed.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from airl_mav.core import kernels
 
 
 class _Compiler(event.Listener):  # type: ignore[misc]
-    """Reports the kernels that numba compiles, and none of numba's own functions."""
+    """Listener that reports compiled kernels, without numba's own functions."""
 
     def on_start(self, event: event.Event) -> None:  # noqa: ARG002
         """Report that a kernel is missing in the cache."""
         _write({"compiling": True})
 
     def on_end(self, event: event.Event) -> None:
-        """Report a kernel."""
+        """Report a compiled kernel."""
         function = event.data["dispatcher"].py_func
         if function.__code__.co_filename in kernels.kernel_files:
             _write({"compiled": function.__qualname__})
@@ -46,8 +46,8 @@ def _end_with_stdin() -> None:
 
 
 def main() -> None:
-    """Carry out one job."""
-    # Not by `sys.stdin`, whose lock the thread would hold at the end.
+    """Run one job."""
+    # Not `sys.stdin`, whose lock the thread would hold at exit.
     request = b""
     while not request.endswith(b"\n"):
         if not (part := os.read(0, 65536)):

@@ -1,7 +1,7 @@
-"""That kernels are compiled: after an install the first start takes a minute for it.
+"""Notifications about kernel compilation, which takes a minute at the first start.
 
-Who waits is told by who compiles, in this process or another. Nothing of numba is loaded here;
-`kernels` reports what numba begins and ends.
+Listeners are called by the compiling process, or on behalf of another one. numba is not imported
+here; `kernels` reports when numba starts and ends compiling.
 """
 
 from __future__ import annotations
@@ -10,19 +10,19 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 COMPILING = "compiling kernels (first start, up to a minute)"
-"""What is shown meanwhile; `benchmarks/bench_compiling.py` measures the time."""
+"""Status text during compilation; `benchmarks/bench_compiling.py` measures the time."""
 
 Heard = Callable[[bool], None]
-"""Is told True when kernels begin to be compiled, False when that is over; often in turn."""
+"""Listener, called with True at the start of compilation and False at the end, repeatedly."""
 
 _listeners: list[Heard] = []
 _depth = 0
-"""Of kernels that are compiled: one that calls others compiles them first."""
+"""Number of nested compilations: a kernel compiles the kernels that it calls first."""
 
 
 @contextmanager
 def heard_compiling(tell: Heard) -> Iterator[None]:
-    """Be told when this process compiles kernels; code from the cache on disk is not compiled."""
+    """Notify a listener of compilation in this process, except for loads from the disk cache."""
     _listeners.append(tell)
     try:
         yield
@@ -31,7 +31,7 @@ def heard_compiling(tell: Heard) -> Iterator[None]:
 
 
 def report_compiling(*, begins: bool) -> None:
-    """Report that a kernel is about to be compiled, or was. Called under numba's lock."""
+    """Report the start or the end of a kernel's compilation. Called under numba's lock."""
     global _depth
     _depth += 1 if begins else -1
     if _depth == (1 if begins else 0):

@@ -1,7 +1,7 @@
-"""Where commands print: rich's console, without its markup.
+"""Console output by rich, without its markup.
 
-What is printed are paths, names and messages of others. Brackets in them are brackets, not styles,
-and `:name:` is no emoji. Who wants a style gives it by name.
+The output contains paths, names and external messages. Square brackets in them are not styles, and
+`:name:` is not an emoji. Pass styles by name.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def new_console(
     file: IO[str] | None = None,
     width: int | None = None,
 ) -> Console:
-    """Return a console; with `soft_wrap`, lines longer than the terminal stay whole."""
+    """Return a console; `soft_wrap` keeps lines longer than the terminal whole."""
     return Console(
         stderr=stderr,
         quiet=quiet,

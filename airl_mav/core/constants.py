@@ -1,4 +1,4 @@
-"""Physical constants with their sources, unit conversions, and what holds for all processes."""
+"""Physical constants with their sources, unit conversions, and definitions for all processes."""
 
 from __future__ import annotations
 
@@ -45,24 +45,24 @@ TICK_S: Final = TICK_US / US_PER_S
 """Base tick [s]."""
 
 TICK_HZ: Final = US_PER_S // TICK_US
-"""Base ticks a second."""
+"""Base ticks per second."""
 
 DEG: Final = math.pi / 180.0
 """One degree [rad]."""
 
 TAKEOFF_REACHED_M: Final = 0.2
-"""The climb is over this close to the take-off altitude [m]: PX4's last decimetres take seconds, as
-its approach halves the rest in 1.4 s."""
+"""Distance from the take-off altitude at which the climb ends [m]. PX4 needs seconds for the last
+decimetres, as its approach halves the rest in 1.4 s."""
 
 TAKEOFF_REACHED_M_S: Final = 0.3
 """Maximum vertical speed at the end of the climb [m/s]."""
 
 MAX_ATTEMPTS: Final = 3
-"""A job or a flight whose processes are lost is begun so many times, the first included."""
+"""Maximum number of attempts for a job or a flight that loses its processes."""
 Level = Literal["gym", "lockstep", "sitl", "hil", "firmware", "flight"]
-"""What flew, as a report calls it: a rung of the fidelity ladder."""
+"""Rung of the fidelity ladder, as named in reports."""
 CommandKind = Literal["velocity", "attitude", "body_rates"]
-"""What a policy commands: all actions of one are of one kind."""
+"""Type of a policy's commands, equal for all of its actions."""
 UNMEASURED_A: Final = -1.0
-"""What PX4 tells as the battery's current where its monitor measures none [A]. Its simulated one
-does not. Source: PX4 1.16, msg/versioned/BatteryStatus.msg, current_a."""
+"""PX4's battery current if the monitor does not measure it [A], as in its simulated battery.
+Source: PX4 1.16, msg/versioned/BatteryStatus.msg, current_a."""

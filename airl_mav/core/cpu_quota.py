@@ -1,4 +1,4 @@
-"""Limit the processor time of this process by a control group of its own (Linux).
+"""Processor time limit of this process by a separate control group (Linux).
 
 The kernel lets the group run for its quota in every period and stops all its threads for the rest
 (Documentation/scheduler/sched-bwc.rst). Version 2 has `cpu.max`, version 1 `cpu.cfs_quota_us`.
@@ -15,9 +15,9 @@ from pathlib import Path
 from airl_mav.core.errors import UsageError
 
 LEAST_QUOTA_US = 1_000
-"""The kernel's least quota [µs]. Shares of less than a core get it in the shortest period that is
-possible, so that a decision is slowed evenly instead of stopped once for long. One that takes
-less than this is not slowed at all."""
+"""Minimum quota of the kernel [µs]. It gives the shortest period for shares of less than a core, so
+a decision is slowed evenly instead of stopped once for long. A decision that takes less than the
+quota is not slowed."""
 
 PERIOD_US = 10_000
 """Period for a core or more [µs]."""
@@ -28,11 +28,11 @@ OPTION = "--cpu-quota"
 
 @dataclass(frozen=True)
 class CpuGroup:
-    """A control group that limits its processes to a share of a core."""
+    """Control group that limits its processes to a share of a core."""
 
     path: Path
     version: int
-    """1 or 2."""
+    """Version of the control groups: 1 or 2."""
 
     def set_quota(self, percent: float) -> None:
         """Set the quota [% of one core]. Raises OSError."""
@@ -54,7 +54,7 @@ class CpuGroup:
 
 @dataclass(frozen=True)
 class _Home:
-    """The group of this process, and the groups in which it can make one of its own."""
+    """Control group of this process, and possible parents of a new group."""
 
     version: int
     own: Path
@@ -65,8 +65,7 @@ class _Home:
 def held_to(percent: float | None, root: Path = Path("/")) -> Iterator[CpuGroup | None]:
     """Limit this process, with its threads and future children, to a share of a core [%].
 
-    None is no limit; `root` is where /proc and /sys are found. Raises UsageError if the system does
-    not permit it.
+    None = no limit; `root` contains /proc and /sys. Raises UsageError if the system forbids it.
     """
     if percent is None:
         yield None
@@ -94,14 +93,14 @@ def check_permitted(percent: float | None, root: Path = Path("/")) -> None:
 
 
 def remove_left(root: Path = Path("/")) -> None:
-    """Remove the groups of processes that ended without a chance to remove their own."""
+    """Remove the groups of killed processes."""
     with suppress(UsageError):
         for parent in _home(root).parents:
             _sweep(parent)
 
 
 def _made(home: _Home, percent: float) -> CpuGroup:
-    """Make a group with a quota. Raises UsageError."""
+    """Create a group with a quota. Raises UsageError."""
     reason = ""
     for parent in home.parents:
         _sweep(parent)
@@ -143,8 +142,8 @@ def _home(root: Path) -> _Home:
             for _, point, kind, *_ in mounts:
                 place = _inside(root, point, own)
                 if kind == "cgroup2" and "cpu" in _words(place / "cgroup.controllers"):
-                    # A group with processes cannot have groups with controllers below it (but for
-                    # the root): then one beside it.
+                    # Except for the root, a group with processes cannot have child groups with
+                    # controllers: use a sibling group.
                     beside = (place.parent,) if own != "/" else ()
                     return _Home(2, place, (*beside, place))
     raise _refused("the CPU controller of control groups is not there")
@@ -154,14 +153,15 @@ def _inside(root: Path, point: str, own: str) -> Path:
     """Return a process's group in a mounted hierarchy."""
     place = root / point.lstrip("/")
     inner = place / own.lstrip("/")
-    # Inside a container the path may be that of the host.
+    # Inside a container the path may be the host's.
     return inner if inner.is_dir() else place
 
 
 def _sweep(parent: Path) -> None:
-    """Remove the groups of processes that are gone."""
+    """Remove the groups of processes that have ended."""
     for old in parent.glob(f"{PREFIX}*"):
-        # Its process may live and be about to move in; the kernel keeps a group with processes.
+        # A living process may be about to move into its group. The kernel keeps groups with
+        # processes.
         if not Path(f"/proc/{old.name.removeprefix(PREFIX)}").exists():
             with suppress(OSError):
                 old.rmdir()

@@ -1,6 +1,6 @@
-"""Errors meant for the person at the keyboard: one line, no traceback.
+"""Errors for the user: one line, no traceback.
 
-Input that cannot be used ends a command with exit code 2, a failure of the machine with 1.
+Invalid input ends a command with exit code 2, a failure of the machine with 1.
 """
 
 from __future__ import annotations
@@ -10,50 +10,50 @@ import reprlib
 from pathlib import PurePath
 
 EXIT_BROKEN = 1
-"""The run could not be finished: a flight lost its processes, or its worker, too often."""
+"""Exit code: a run ended early, as a flight or a worker lost its processes too often."""
 
 EXIT_USAGE = 2
-"""The input cannot be used."""
+"""Exit code: invalid input."""
 
 EXIT_NOT_MET = 3
-"""All was flown, and a requirement is not met."""
+"""Exit code: all flights are complete, and a requirement is not met."""
 
 EXIT_INVALID = 4
-"""All was flown, but flights stayed invalid: the host could not keep up. There is no verdict."""
+"""Exit code: flights remain invalid as the host could not keep up. There is no verdict."""
 
 EXIT_UNDECIDED = 5
-"""All was flown, and it was too little to tell whether a requirement is met."""
+"""Exit code: all flights are complete, and too few to decide a requirement."""
 
 EXIT_INTERRUPTED = 130
-"""Ctrl-C (128 + SIGINT)."""
+"""Exit code: Ctrl-C (128 + SIGINT)."""
 
 MISSING = object()
-"""Value of a field that was not given."""
+"""Marker for a field without a value."""
 
 LONGEST_VALUE = 80
-"""Characters of a value that a message shows."""
+"""Maximum length of a value in a message [characters]."""
 
 
 class UsageError(Exception):
-    """Input that cannot be used. The message names the file, field, value and accepted range."""
+    """Invalid input. The message names the file, field, value and accepted range."""
 
 
 class FieldError(UsageError):
-    """A field of a scenario or a file that cannot be used.
+    """Invalid field of a scenario or a file.
 
-    The field is kept apart from the rest, so that each front end can name it in its own way: as an
-    option of a command, as a key of a file.
+    The field is stored separately, so each front end can name it differently: as an option of a
+    command, or as a key of a file.
     """
 
     def __init__(
         self, field: str, value: object = MISSING, accepted: str = "", problem: str = ""
     ) -> None:
-        """Describe a field by its dotted path, "" for the whole, and the value that was given.
+        """Describe a field by its dotted path, "" for the whole, and its value.
 
-        The value is `MISSING` when there was none or when it would not help. `accepted` is a range
-        such as "0 < value <= 10 s"; `problem` replaces it where it says more.
+        The value is `MISSING` if it does not exist or does not help. `accepted` is a range such as
+        "0 < value <= 10 s"; `problem` replaces it with a better explanation.
         """
-        # All arguments, so that the error can be pickled between processes.
+        # All arguments, to support pickling between processes.
         super().__init__(field, value, accepted, problem)
         self.field = field
         self.value = value
@@ -63,8 +63,8 @@ class FieldError(UsageError):
     def line(self, name: str | None = None, sign: str = " ") -> str:
         """Return the message in one line: "NAME VALUE: accepted: RANGE".
 
-        `name` is that of an option, whose value is shown as typed; None: the dotted path. `sign`
-        stands between name and value, " = " in messages about files.
+        `name` is an option, whose value is shown as typed; None = the dotted path. `sign` separates
+        name and value, " = " in messages about files.
         """
         where = self.field if name is None else name
         if self.value is not MISSING:
@@ -80,17 +80,17 @@ class FieldError(UsageError):
 
 
 class UnexpectedArgumentError(UsageError, TypeError):
-    """A keyword argument that a function does not have.
+    """Unsupported keyword argument of a function.
 
-    Python's own error for it as well: callers who offer what not every environment takes (TorchRL
-    its `frameskip`) look for that and try without.
+    Also a TypeError, Python's error for this case: callers with optional arguments (TorchRL with
+    `frameskip`) catch it and retry without them.
     """
 
 
 MACHINE_ERRORS = frozenset(
     {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EMFILE, errno.ENFILE}
 )
-"""System errors that the machine is to blame for: a full or broken disk, no more open files."""
+"""System errors caused by the machine: a full or broken disk, too many open files."""
 
 
 def machine_failure(error: OSError) -> str | None:
@@ -101,21 +101,21 @@ def machine_failure(error: OSError) -> str | None:
 
 
 def shown(value: object) -> str:
-    """Return a value as a message shows it: numbers as a person writes them, never too long."""
+    """Return a value as text for messages: numbers in short notation, limited in length."""
     if isinstance(value, float) and float(f"{value:g}") == value:
         return min(f"{value:g}", repr(value), key=len)
     if isinstance(value, PurePath):
         return shortened(str(value))
     try:
-        # reprlib stops early in containers; a plain repr of a long list or number takes ages.
+        # reprlib stops early in containers; repr of a long list or number is slow.
         text = _REPR.repr(value)
-    except ValueError:  # A whole number with more digits than Python turns into text.
+    except ValueError:  # An integer with more digits than Python converts.
         return "a number of too many digits"
     return shortened(text)
 
 
 def shortened(text: str) -> str:
-    """Return a text as a message shows it: never too long."""
+    """Return a text for messages, limited in length."""
     return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 3]}..."
 
 

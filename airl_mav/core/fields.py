@@ -1,7 +1,7 @@
-"""Fields of profiles, cards and scenarios: a value with a meaning, a unit and a range.
+"""Fields of profiles, cards and scenarios with a meaning, a unit and a range.
 
-Declared once with `quantity`; `validated` reads input as a model, `field_error` turns what pydantic
-says of wrong input into one line.
+Fields are declared once with `quantity`. `validated` reads input as a model; `field_error` converts
+pydantic's errors to one line.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Model = TypeVar("Model", bound=BaseModel)
 Numbers = TypeVar("Numbers", bound="tuple[float, ...]")
 
 MOST_NAMES = 40
-"""Names of fields that a message lists."""
+"""Maximum number of field names in a message."""
 
 TYPES = {
     "bool_parsing": "true or false",
@@ -46,20 +46,20 @@ TYPES = {
     "string_type": "a text",
     "tuple_type": "a list",
 }
-"""What is accepted, by pydantic's names of errors of type."""
+"""Accepted input by pydantic's error type."""
 
 
 class ProfileModel(BaseModel):
-    """Base of all profile models: immutable, unknown fields refused."""
+    """Base of all profile models: immutable, unknown fields rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class ArrayField:
-    """Annotation of an array in a dataclass that pydantic reads and writes as lists."""
+    """Annotation of a dataclass array that pydantic reads and writes as lists."""
 
     def __init__(self, dtype: type[Any], columns: int = 0) -> None:
-        """Define an array (n, columns); 0: of any shape."""
+        """Define an array (n, columns); 0 = any shape."""
         self._dtype, self._columns = dtype, columns
 
     def __get_pydantic_core_schema__(
@@ -88,14 +88,14 @@ def quantity(
 ) -> Any:
     """Declare a number, an optional number or a list of numbers, with its unit and range.
 
-    The unit is "1" for plain numbers. A field without a default is required. A field that came
-    `later` is dumped as `later_field` says.
+    The unit is "1" for plain numbers. A field without a default is required. `later` marks a field
+    that is dumped as described in `later_field`.
     """
     scalar = any(bound is not None for bound in (ge, gt, le, lt))
     return Field(
         default=default,
         description=description,
-        # Strict, or true and "1.5" would pass for numbers; a tuple in strict mode refuses lists.
+        # Strict, to reject true and "1.5" as numbers; strict tuples would reject lists.
         strict=True if scalar else None,
         ge=ge,
         gt=gt,
@@ -107,20 +107,20 @@ def quantity(
 
 
 def optional(description: str) -> Any:
-    """Declare a field that is None unless it is given."""
+    """Declare an optional field with default None."""
     return Field(default=None, description=description)
 
 
 def switch(description: str) -> Any:
-    """Declare a switch that is off unless it is given."""
+    """Declare a switch with default False."""
     return Field(default=False, description=description)
 
 
 def later_field(default: Any, description: str | None = None) -> Any:
-    """Declare a field that came later than digests and cards of such models.
+    """Declare a field that was added after digests and cards of its model existed.
 
-    A value equal to the default is left out of the dump, so that digests and cards stay as they
-    were. The default may be the type that makes one.
+    A value equal to the default is left out of the dump, so that digests and cards do not change.
+    The default may be a type, which is then called.
     """
     made = default() if isinstance(default, type) else default
     given: dict[str, Any] = (
@@ -132,7 +132,7 @@ def later_field(default: Any, description: str | None = None) -> Any:
 
 
 def _equals(default: Any) -> Callable[[Any], bool]:
-    """Return what tells whether a value is a default."""
+    """Return a function that compares a value with a default."""
 
     def is_default(value: Any) -> bool:
         return bool(value == default)
@@ -142,7 +142,7 @@ def _equals(default: Any) -> Callable[[Any], bool]:
 
 @dataclass(frozen=True)
 class Each:
-    """Range of every number of a tuple field. The bounds carry pydantic's names for `range_of`."""
+    """Range of every number in a tuple field. Bounds have pydantic's names, for `range_of`."""
 
     ge: float
     le: float
@@ -151,7 +151,7 @@ class Each:
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        """Put the checks before and behind the field's own type."""
+        """Add checks before and after the field's type."""
         args = get_args(source)
         length = None if Ellipsis in args else len(args)
         inner = core_schema.no_info_after_validator_function(self.check, handler(source))
@@ -166,7 +166,7 @@ class Each:
         return core_schema.no_info_before_validator_function(listed, inner)
 
     def check(self, values: Numbers) -> Numbers:
-        """Return `values`, or raise when one is out of range or they do not ascend."""
+        """Return `values`; raise if a value is out of range or the order is not ascending."""
         if not all(self.ge <= value <= self.le for value in values):
             raise PydanticCustomError("out_of_range", "out of range")
         if self.ascending and list(values) != sorted(values):
@@ -175,7 +175,7 @@ class Each:
 
 
 def unit_of(field: FieldInfo) -> str | None:
-    """Return the unit a field was declared with."""
+    """Return the unit of a field's declaration; None = no unit."""
     for declared in (field, *_branch_marks(field.annotation)):
         extra = getattr(declared, "json_schema_extra", None)
         if isinstance(extra, dict) and "unit" in extra:
@@ -184,7 +184,7 @@ def unit_of(field: FieldInfo) -> str | None:
 
 
 def range_of(field: FieldInfo) -> str:
-    """Return the accepted range of a field as text: "0 < value <= 10 kg", or "" when unbounded."""
+    """Return the accepted range of a field as text: "0 < value <= 10 kg", or "" if unbounded."""
     low = high = ""
     marks = _branch_marks(field.annotation)
     inner = (
@@ -204,19 +204,19 @@ def range_of(field: FieldInfo) -> str:
 
 
 def _branch_marks(annotation: Any) -> list[Any]:
-    """Return what the branches of a union are annotated with: Annotated[float, Field(gt=0)]."""
+    """Return the annotations of a union's branches: Annotated[float, Field(gt=0)]."""
     if get_origin(annotation) not in (Union, UnionType):
         return []
     return [mark for each in get_args(annotation) for mark in getattr(each, "__metadata__", ())]
 
 
 def validated(model: type[Model], data: object, source: object = None) -> Model:
-    """Return data as a model. Raises UsageError naming `source`; without it the `FieldError`."""
+    """Return data as a model. Raises UsageError with `source`, or `FieldError` without it."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
         found = field_error(error, model)
-    except FieldError as error:  # Of a validator of several fields: it knows which is to blame.
+    except FieldError as error:  # A validator of several fields names the field.
         found = error
     if source is None:
         raise found
@@ -224,17 +224,17 @@ def validated(model: type[Model], data: object, source: object = None) -> Model:
 
 
 def field_error(error: ValidationError, model: type[BaseModel] | None = None) -> FieldError:
-    """Return the first finding of a failed validation as an error of one line.
+    """Return the first error of a failed validation as one line.
 
-    The fields of `model` give ranges and names; None for anything else that pydantic validates, a
-    dataclass above all.
+    The fields of `model` give ranges and names; None for other types that pydantic validates,
+    mainly dataclasses.
     """
     findings = error.errors(include_url=False)
-    # A misspelt field also goes missing: its misspelling says more.
+    # A misspelt field also causes a missing one: the misspelling is more helpful.
     first = min(findings, key=lambda finding: finding["type"] != "extra_forbidden")
     path, kind = first["loc"], first["type"]
     field = _dotted(model, path)
-    # What each branch of a union has to say about one value is one finding.
+    # Errors of a union's branches for the same value count as one.
     same = [finding for finding in findings if _dotted(model, finding["loc"]) == field]
     others = len(findings) - len(same)
     tail = f" (and {others} more)" if others else ""
@@ -259,15 +259,15 @@ def field_error(error: ValidationError, model: type[BaseModel] | None = None) ->
 
 
 _BRANCH = ""
-"""In place of the part of a location that names no field."""
+"""Placeholder for a location's part that does not name a field."""
 
 
 def _steps(
     model: type[BaseModel] | None, path: tuple[int | str, ...]
 ) -> Iterator[tuple[int | str, FieldInfo | None, type[BaseModel] | None]]:
-    """Yield each part of a location, the field that it names, and the model that this leads to.
+    """Yield each part of a location, the field with that name, and the model of the field.
 
-    The part that says which model of a union it is (`_choices`) is yielded as `_BRANCH`.
+    The part that selects a model of a union (`_choices`) is yielded as `_BRANCH`.
     """
     here = model
     choices: dict[str, type[BaseModel]] = {}
@@ -296,7 +296,7 @@ def _dotted(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> str:
 
 
 def _choices(field: FieldInfo) -> dict[str, type[BaseModel]]:
-    """Return the models, of which a field holds one or several, that a value selects."""
+    """Return the models of a field's tagged union by tag, for fields of one or several models."""
     name, union = field.discriminator, field.annotation
     for part in _annotated_parts(field.annotation):
         for mark in part.__metadata__:
@@ -312,7 +312,7 @@ def _choices(field: FieldInfo) -> dict[str, type[BaseModel]]:
 
 
 def _annotated_parts(annotation: Any) -> Iterator[Any]:
-    """Yield what an annotation holds that has marks of its own: Annotated[...]."""
+    """Yield the parts of an annotation that are annotated: Annotated[...]."""
     if hasattr(annotation, "__metadata__"):
         yield annotation
     for inner in get_args(annotation):
@@ -320,7 +320,7 @@ def _annotated_parts(annotation: Any) -> Iterator[Any]:
 
 
 def _accepted(finding: ErrorDetails, model: type[BaseModel] | None) -> str:
-    """Return what would have been accepted in place of a wrong value."""
+    """Return the accepted input in place of a wrong value."""
     path, kind = finding["loc"], finding["type"]
     if kind in ("model_type", "dataclass_type", "model_attributes_type"):
         names = _field_names(model, path)
@@ -333,19 +333,19 @@ def _accepted(finding: ErrorDetails, model: type[BaseModel] | None) -> str:
 
 
 def _declared_range(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> str:
-    """Return the declared range of the innermost field on the way to a location, "" for none."""
+    """Return the declared range of the innermost field in a location, or ""."""
     fields = [field for _, field, _ in _steps(model, path) if field is not None]
     return range_of(fields[-1]) if fields else ""
 
 
 def _field_names(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> list[str]:
-    """Return the names of the fields of the model at a location."""
+    """Return the field names of the model at a location."""
     *_, owner = model, *(here for _, _, here in _steps(model, path))
     return list(owner.model_fields) if owner else []
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the model an annotation holds, looking into unions and containers."""
+    """Return the model in an annotation, including unions and containers; None = no model."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for inner in get_args(annotation):

@@ -1,9 +1,9 @@
-"""Files that survive kills, full disks and flipped bits: written whole, checked when read.
+"""Files that survive kills, full disks and bit errors: atomic writes, checked reads.
 
-A file is written under a temporary name, brought to the disk and renamed, so that a reader sees the
-old one or the whole new one. JSON objects carry a CRC-32 of themselves, as the field `crc32`;
-members of archives carry their own. Reading compares them: what is damaged is refused in one line.
-Files without the field, of earlier versions of this package or edited by hand, are read unchecked.
+A file is written under a temporary name, synced to the disk and renamed. A reader sees the old file
+or the complete new file. JSON objects contain their CRC-32 in the field `crc32`; archive members
+have a CRC by format. Damaged data is rejected on reading with one line. Files without the field, by
+earlier versions of this package or edited by hand, are read unchecked.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ T = TypeVar("T")
 Arrays = dict[str, NDArray[Any]]
 
 CRC = "crc32"
-"""Field of a JSON object: CRC-32 (zlib) of the rest of it as compact ASCII JSON, hexadecimal."""
+"""Field of a JSON object: CRC-32 (zlib) of the other fields as compact ASCII JSON, hexadecimal."""
 
 DEEPEST = 100
-"""Levels of lists and tables in a JSON file."""
+"""Maximum nesting of lists and tables in a JSON file."""
 
 
 # --- whole files
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Write a file so that a reader sees the old one or the whole new one, never a part.
+    """Write a file atomically: a reader sees the old file or the complete new file.
 
-    Raises OSError if it cannot be written, a full disk above all. Its `filename` is the path. The
-    old file is untouched, and nothing is left beside it.
+    Raises OSError if writing fails, for example on a full disk, with the path as `filename`. The
+    old file is then unchanged, and no temporary file remains.
     """
     with replacing(path) as partial:
         partial.write_bytes(data)
@@ -53,7 +53,7 @@ def replace_file(path: Path, data: bytes) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield the temporary name of a file, which then replaces `path`. Raises as `replace_file`."""
+    """Yield a temporary name for a file, which then replaces `path`. Raises as `replace_file`."""
     partial = path.with_name(path.name + ".partial")
     try:
         with naming(path):
@@ -69,7 +69,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Name a file in the errors of the system that lack a name: those of a write do."""
+    """Add a file name to system errors without one, such as errors of writes."""
     try:
         yield
     except OSError as error:
@@ -79,7 +79,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def sync(path: Path) -> None:
-    """Bring a file to the disk. Raises OSError."""
+    """Sync a file to the disk. Raises OSError."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -88,7 +88,7 @@ def sync(path: Path) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Bring the names in a folder to the disk, where the file system knows how."""
+    """Sync a folder's entries to the disk, if the file system supports it."""
     with suppress(OSError):
         sync(path)
 
@@ -106,17 +106,17 @@ def sha256_of(path: Path) -> str:
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write a file for people and programs, with its CRC. Raises ValueError for a NaN."""
+    """Write a readable JSON file with its CRC. Raises ValueError for a NaN."""
     text = json.dumps(_sealed(data), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     replace_file(path, text.encode())
 
 
 def read_json(path: Path, schema: int | None, what: str) -> dict[str, Any]:
-    """Return the object that a file holds, without its CRC.
+    """Return the object in a JSON file, without its CRC.
 
-    `schema` is the accepted value of its field `schema`, None where it has none; `what` is the
-    folder's content, for messages. Raises UsageError if the file is missing, no JSON, damaged, or
-    of another version.
+    `schema` is the accepted value of its field `schema`, None = no such field; `what` describes the
+    folder's content in messages. Raises UsageError if the file is missing, not JSON, damaged, or of
+    another version.
     """
     try:
         data = path.read_bytes()
@@ -129,12 +129,12 @@ def read_json(path: Path, schema: int | None, what: str) -> dict[str, Any]:
 
 
 def read_typed(path: Path, adapter: TypeAdapter[T], schema: int | None, what: str) -> T:
-    """Return what a file holds, as its type. Raises UsageError as `read_json`, and for a field."""
+    """Return a file's content as a typed object. Raises UsageError, also for a wrong field."""
     return typed(adapter, read_json(path, schema, what), path)
 
 
 def typed(adapter: TypeAdapter[T], data: Mapping[str, Any], source: object) -> T:
-    """Return data as its type. Raises UsageError, with the source, for a wrong field."""
+    """Return data as a typed object. Raises UsageError, with the source, for a wrong field."""
     try:
         return adapter.validate_python(data)
     except ValidationError as error:
@@ -142,11 +142,11 @@ def typed(adapter: TypeAdapter[T], data: Mapping[str, Any], source: object) -> T
 
 
 def append_lines(path: Path, objects: Iterable[Mapping[str, Any]]) -> None:
-    """Append objects to a file of JSON lines. On return they are on the disk.
+    """Append objects to a file of JSON lines, and sync it to the disk.
 
     Raises:
         ValueError: A NaN or an infinity.
-        OSError: They cannot be written; the file is what it was before.
+        OSError: Writing failed; the file is unchanged.
     """
     data = b"".join(json_line(each) for each in objects)
     with naming(path), path.open("ab") as file:
@@ -162,15 +162,15 @@ def append_lines(path: Path, objects: Iterable[Mapping[str, Any]]) -> None:
 
 
 def json_line(data: Mapping[str, Any]) -> bytes:
-    """Return an object as one line with its CRC and its newline. Raises ValueError for a NaN."""
+    """Return an object as one line with its CRC and newline. Raises ValueError for a NaN."""
     return _compact(_sealed(data)) + b"\n"
 
 
 def read_lines(path: Path, schema: int | None) -> list[tuple[str, dict[str, Any]]]:
-    """Return the objects of a file of JSON lines, each with its place: "path:number".
+    """Return the objects of a file of JSON lines, each with its location: "path:number".
 
-    A last line without its newline was cut short by a kill and is passed over. No file, no objects.
-    `schema` and errors as of `read_json`.
+    A last line without a newline was cut short by a kill and is ignored. A missing file gives an
+    empty list. For `schema` and errors see `read_json`.
     """
     *whole, rest = _read_if_there(path).split(b"\n")
     found = []
@@ -179,8 +179,8 @@ def read_lines(path: Path, schema: int | None) -> list[tuple[str, dict[str, Any]
             found.append((f"{path}:{number}", _opened(line, schema)))
         except ValueError as error:
             raise UsageError(f"{path}:{number}: {error}") from None
-    # What a kill cuts short is the beginning of a line. A whole one with another byte than its
-    # newline behind it was damaged later.
+    # A kill leaves only the beginning of a line. A complete line with another byte in place of its
+    # newline was damaged later.
     with suppress(ValueError, RecursionError):
         if isinstance(json.loads(rest[:-1]), dict):
             raise UsageError(f"{path}:{len(whole) + 1}: damaged: no newline at its end")
@@ -188,7 +188,7 @@ def read_lines(path: Path, schema: int | None) -> list[tuple[str, dict[str, Any]
 
 
 def cut_torn_line(path: Path) -> None:
-    """Cut off a last line without its newline, so that the next one can be appended."""
+    """Remove a last line without a newline, so that the file can be appended to."""
     data = _read_if_there(path)
     if (whole := data.rfind(b"\n") + 1) != len(data):
         os.truncate(path, whole)
@@ -213,7 +213,7 @@ def _sealed(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _opened(data: bytes, schema: int | None) -> dict[str, Any]:
-    """Return the object that bytes hold, without its CRC. Raises ValueError, its text one line."""
+    """Return the object in JSON bytes, without its CRC. Raises ValueError with one line."""
     try:
         found = json.loads(data, parse_constant=_refuse_constant)
         too_deep = deeper_than(found, DEEPEST)
@@ -240,7 +240,7 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def deeper_than(value: object, most: int) -> bool:
-    """Return whether lists and tables are nested in more than `most` levels."""
+    """Return True if lists and tables are nested in more than `most` levels."""
     level = [value]
     for _ in range(most + 1):
         level = [
@@ -260,30 +260,30 @@ def deeper_than(value: object, most: int) -> bool:
 
 @dataclass(frozen=True)
 class ArrayGroup:
-    """Arrays of an archive under one name."""
+    """Group of arrays in an archive."""
 
     arrays: Arrays
     crc32: str
-    """Of the names and contents of all of them, hexadecimal."""
+    """CRC-32 of the names and contents of all arrays, hexadecimal."""
 
 
 NO_ARRAYS = ArrayGroup({}, "00000000")
-"""A group that an archive does not have."""
+"""Placeholder for a group that is missing in an archive."""
 
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays by name to a new .npz, in place of any old one."""
+    """Write arrays by name to a new .npz, replacing an old file."""
     keywords: dict[str, Any] = dict(arrays)
     with replacing(path) as partial, partial.open("wb") as file:
         np.savez(file, **keywords)
 
 
 def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> dict[str, str]:
-    """Add groups of arrays to an .npz, made when there is none; return the CRC of each group.
+    """Add groups of arrays to an .npz, created if missing; return the CRC of each group.
 
-    Keys become `<group>/<name>`. All that the archive has of these groups is replaced. The file is
-    the old one or the whole new one. The old archive is copied as bytes and appended to. So adding
-    costs a copy, not a second compression of the whole run.
+    Keys become `<group>/<name>`. Existing arrays of these groups are replaced. The update is
+    atomic. The old archive is copied as bytes and appended to, which avoids a second compression of
+    the whole run.
     """
     with replacing(path) as partial:
         old = path.exists()
@@ -295,7 +295,7 @@ def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> 
                 _write_groups(new, groups)
                 members = new.infolist()
         if stale:
-            # Arrays of an episode that a kill cut off and that is flown again.
+            # Arrays of an episode that was killed and flown again.
             with _archive(partial, "w") as new:
                 _copy_others(path, new, groups)
                 _write_groups(new, groups)
@@ -307,7 +307,7 @@ def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> 
 
 
 def read_groups(path: Path) -> dict[str, ArrayGroup]:
-    """Return all groups of arrays of an archive, none without a file. Raises UsageError."""
+    """Return all groups of arrays in an archive, empty without a file. Raises UsageError."""
     if not path.exists():
         return {}
     try:
@@ -322,7 +322,7 @@ def read_groups(path: Path) -> dict[str, ArrayGroup]:
                 )
                 for group, held in members.items()
             }
-    except Exception as error:  # Anything: a flipped bit asks for passwords or unknown methods.
+    except Exception as error:  # Bit errors may request passwords or unknown methods.
         raise UsageError(f"{path}: damaged: {' '.join(str(error).split())[:200]}") from None
 
 
@@ -333,7 +333,7 @@ def _archive(path: Path, mode: Literal["a", "w"]) -> zipfile.ZipFile:
 def _copy_others(
     path: Path, new: zipfile.ZipFile, groups: Mapping[str, Mapping[str, NDArray[Any]]]
 ) -> None:
-    """Copy what an archive has of all other groups."""
+    """Copy the members of all other groups."""
     with zipfile.ZipFile(path) as old:
         for member in old.infolist():
             if _group_of(member) not in groups:
@@ -348,7 +348,7 @@ def _write_groups(new: zipfile.ZipFile, groups: Mapping[str, Mapping[str, NDArra
 
 
 def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """Return an array. Read to its end first: only then the CRC of the member is compared."""
+    """Return an array. The member is read completely first, which checks its CRC."""
     data = io.BytesIO(archive.read(member))
     array: NDArray[Any] = np.lib.format.read_array(data, allow_pickle=False)
     return array

@@ -1,8 +1,8 @@
-"""Compilation of kernels before the first start: a step of its own, in processes side by side.
+"""Compilation of kernels before the first start, as a separate step in parallel processes.
 
-A plan names functions that use the kernels of a command. Each runs in a process of its own, as many
-at a time as there are cores; what they compile stays in numba's cache, function by function, so
-that an interrupted step resumes where it ended. A record of the source files marks a plan as done.
+A plan names functions that use the kernels of a command. Each function runs in a separate process,
+with one process per core. numba's cache stores the result of each kernel, so an interrupted step
+resumes where it ended. A record of the source files marks a plan as done.
 """
 
 from __future__ import annotations
@@ -34,33 +34,33 @@ POLL_S = 0.1
 """Interval between two checks for Ctrl-C [wall s]."""
 
 LINE_EVERY_S = 10.0
-"""Interval between two lines where no bar can be drawn [wall s]."""
+"""Interval between two progress lines if bars cannot be drawn [wall s]."""
 
 
 @dataclass(frozen=True)
 class CompileJob:
-    """A function that uses kernels, for a process of its own."""
+    """Function that uses kernels, run in a separate process."""
 
     function: str
     """Module and name, as `package.module:function`."""
     arguments: Mapping[str, Any]
-    """Keyword arguments, as JSON has them."""
+    """Keyword arguments, JSON compatible."""
     kernels: int
-    """Number of kernels compiled with an empty cache; progress alone depends on it."""
+    """Number of kernels compiled with an empty cache; used only for progress."""
 
 
 @dataclass(frozen=True)
 class CompilePlan:
-    """What a command compiles before its first flight."""
+    """Kernels to compile before a command's first flight."""
 
     family: str
-    """Plans of a family share most kernels: what others of it need is compiled by `whole` alone."""
+    """Family of plans with many common kernels: after one of them, others run only `whole`."""
     variant: str
-    """Names it within the family; plans that need different kernels have different variants."""
+    """Name within the family; plans that need different kernels have different variants."""
     parts: tuple[CompileJob, ...]
-    """Jobs that run side by side; they share few kernels."""
+    """Parallel jobs, with few shared kernels."""
     whole: CompileJob
-    """Runs after the parts and compiles what they left; uses every kernel of the plan."""
+    """Final job, which compiles all remaining kernels; uses every kernel of the plan."""
 
     def record(self, folder: Path) -> Path:
         """Return the file that marks the plan as done."""
@@ -75,8 +75,8 @@ def compile_first(
 ) -> None:
     """Compile the kernels of plans, unless all are cached; one process per core by default.
 
-    `stop` is polled several times a second; True ends the step. Ctrl-C (KeyboardInterrupt) keeps
-    what is compiled.
+    `stop` is polled several times per second; True ends the step. Ctrl-C (KeyboardInterrupt) keeps
+    compiled kernels.
     """
     folder, missing = _missing(plans)
     if folder is None or not missing:
@@ -100,12 +100,12 @@ def compile_first(
 
 
 _show: Callable[[], AbstractContextManager[Progress]] | None = None
-"""Makes what shows the step of the command that runs."""
+"""Factory of the running command's progress display; None = no display."""
 
 
 @contextmanager
 def shown_by(show: Callable[[], AbstractContextManager[Progress]]) -> Iterator[None]:
-    """Show with `show` what `compile_shown` compiles meanwhile."""
+    """Use `show` to display progress of `compile_shown` within the context."""
     global _show
     before, _show = _show, show
     try:
@@ -115,7 +115,7 @@ def shown_by(show: Callable[[], AbstractContextManager[Progress]]) -> Iterator[N
 
 
 def compile_shown(plans: Sequence[CompilePlan]) -> None:
-    """Compile as `compile_first` within `shown_by`; elsewhere do nothing."""
+    """Compile as `compile_first` within `shown_by`; otherwise do nothing."""
     if _show is not None and _missing(plans)[1]:
         with _show() as progress:
             compile_first(plans, progress)
@@ -125,7 +125,7 @@ def compile_shown(plans: Sequence[CompilePlan]) -> None:
 
 
 def _missing(plans: Sequence[CompilePlan]) -> tuple[Path | None, list[CompilePlan]]:
-    """Return the folder of the records and the plans without one; None: nothing can be kept."""
+    """Return the folder of the records and the plans without one; None = no writable folder."""
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     folder = Path(chosen) if chosen else writable_folder("first-start")
     if folder is None:
@@ -134,7 +134,7 @@ def _missing(plans: Sequence[CompilePlan]) -> tuple[Path | None, list[CompilePla
 
 
 def _is_done(path: Path) -> bool:
-    """Return whether a record is of the present sources and of such a machine."""
+    """Return True if a record matches the current sources and machine."""
     try:
         record = json.loads(path.read_bytes())
         return bool(
@@ -152,13 +152,13 @@ def _record(path: Path, files: Sequence[str]) -> None:
 
 
 def _stamp(name: str) -> list[int]:
-    """Return size and time of a file: numba compiles again when either changes."""
+    """Return size and time of a file: numba recompiles after a change of either."""
     stat = os.stat(name)  # noqa: PTH116 - three hundred of them at every start
     return [stat.st_size, stat.st_mtime_ns]
 
 
 def _machine() -> str:
-    """Return what else numba's cache depends on: interpreter, and the processor as Linux has it."""
+    """Return other inputs of numba's cache: the interpreter, and the processor name on Linux."""
     with suppress(OSError), open("/proc/cpuinfo", "rb", buffering=0) as file:  # noqa: PTH123
         for line in file.read(2048).decode(errors="replace").splitlines():
             if line.startswith("model name"):
@@ -168,7 +168,7 @@ def _machine() -> str:
 
 @contextmanager
 def _locked(folder: Path, progress: Progress, stop: Callable[[], bool]) -> Iterator[None]:
-    """Let one program at a time compile; the others wait, and then find the code in the cache."""
+    """Let one program at a time compile; the others wait, and then use the cache."""
     clock, said = WallClock(), False
     descriptor = os.open(folder, os.O_RDONLY)
     try:
@@ -196,17 +196,17 @@ def _locked(folder: Path, progress: Progress, stop: Callable[[], bool]) -> Itera
 
 @dataclass
 class _Running:
-    """A job in its process."""
+    """Job in its process."""
 
     job: CompileJob
     process: ChildProcess
     reader: threading.Thread | None = None
-    """Reads what it prints."""
+    """Reader of the process's output."""
     count: int = 0
 
 
 class _Step:
-    """Runs the jobs of one plan."""
+    """Runner of one plan's jobs."""
 
     def __init__(
         self, progress: Progress, stop: Callable[[], bool], workers: int, scratch: Path
@@ -217,23 +217,23 @@ class _Step:
         self._running: list[_Running] = []
         self._total = 0
         self._ended = 0
-        """Kernels of the jobs that have ended, compiled or found in the cache."""
+        """Kernels of finished jobs, compiled or found in the cache."""
         self._files: list[str] = []
-        """Those of the job that ended last."""
+        """Source files of the last finished job."""
         self._failed = False
         self._clock = WallClock()
         self._line_us: int | None = None
-        """When the next line is due; None: nothing is compiled yet."""
+        """Time of the next progress line; None = no compilation so far."""
         self._bar: Bar | None = None
 
     def run(self, parts: Sequence[CompileJob], whole: CompileJob) -> list[str] | None:
-        """Run all jobs; return the source files that the kernels depend on, None if one failed."""
+        """Run all jobs; return the source files of the kernels, or None if a job failed."""
         self._total = sum(job.kernels for job in (*parts, whole))
         try:
             done = self._run_all(parts) and self._run_all([whole])
         finally:
             for each in self._running:
-                each.process.kill()  # numba replaces files as a whole: none is left in part.
+                each.process.kill()  # numba replaces files atomically.
                 _clear(each)
             if self._bar is not None:
                 self._bar.close()
@@ -266,7 +266,7 @@ class _Step:
         self._running.append(running)
         if process.stdin is not None:
             request = {"function": job.function, "arguments": dict(job.arguments)}
-            with suppress(BrokenPipeError):  # Its end is reported.
+            with suppress(BrokenPipeError):  # Its exit is reported.
                 process.stdin.write(json.dumps(request).encode() + b"\n")
                 process.stdin.flush()
         running.reader.start()
@@ -275,7 +275,7 @@ class _Step:
         if running.process.stdout is not None:
             with running.process.stdout as lines:
                 for line in lines:
-                    with suppress(ValueError):  # Printed by a library.
+                    with suppress(ValueError):  # Output of a library.
                         self._events.put((running, json.loads(line)))
         self._events.put((running, running.process.wait()))
 
@@ -292,7 +292,7 @@ class _Step:
                 )
         elif "files" in event:
             self._files = event["files"]
-        elif self._line_us is None:  # The first kernel that is not in the cache.
+        elif self._line_us is None:  # The first kernel missing in the cache.
             self._bar = self._progress.bar(LABEL, self._total, unit="kernels")
             self._line_us = self._clock.time_us()
         elif "compiled" in event:
@@ -313,7 +313,7 @@ class _Step:
 
 
 def _clear(running: _Running) -> None:
-    """Close the pipes of a job that has ended or is about to."""
+    """Close the pipes of a job that has ended or has been killed."""
     running.process.stop()
     if running.reader is not None and running.reader.ident is not None:
         running.reader.join()

@@ -1,10 +1,10 @@
-"""Coordinate frames: the only place that converts.
+"""Coordinate frames; all conversions are in this module.
 
-The project speaks PX4's frames: world NED (north, east, down), body FRD (forward, right, down).
-pybullet, ROS and Foxglove speak ENU / FLU, and cameras look along +z of an optical frame (right,
-down, forward). Quaternions are Hamilton, unit, scalar first [w, x, y, z], and rotate
-body vectors into the world: v_ned = R(q) v_frd. Euler angles are the aerospace sequence yaw,
-pitch, roll (Z-Y-X, intrinsic).
+The project uses PX4's frames: world NED (north, east, down), body FRD (forward, right, down).
+pybullet, ROS and Foxglove use ENU / FLU, and cameras look along +z of an optical frame (right,
+down, forward). Quaternions are Hamilton, unit, scalar first [w, x, y, z], and rotate body vectors
+into the world: v_ned = R(q) v_frd. Euler angles are the aerospace sequence yaw, pitch, roll (Z-Y-X,
+intrinsic).
 """
 
 from __future__ import annotations
@@ -131,24 +131,24 @@ _FRD_FROM_FLU = np.array([0.0, 1.0, 0.0, 0.0])
 
 
 def quat_ned_frd_to_enu_flu(q: Vector) -> Vector:
-    """Turn an attitude NED <- FRD (4,) into the same as ENU <- FLU (4,). Its own inverse."""
+    """Convert an attitude NED <- FRD (4,) to ENU <- FLU (4,). Its own inverse."""
     return quat_normalize(quat_multiply(quat_multiply(_ENU_FROM_NED, q), _FRD_FROM_FLU))
 
 
 FRD_FROM_OPTICAL = np.array([0.5, 0.5, 0.5, 0.5])
-"""The optical frame of a camera that looks along the body's forward axis, as FRD <- optical."""
+"""Optical frame of a camera that looks along the body's forward axis, as FRD <- optical."""
 
 
 def quat_flu_from_optical(pitch_up: float, yaw: float = 0.0) -> Vector:
-    """Return FLU <- optical (4,) of a camera that looks so far up and right of forward [rad]."""
+    """Return FLU <- optical (4,) of a camera, by its angles up and right of forward [rad]."""
     tilt = quat_from_euler(0.0, pitch_up, yaw)
     return quat_normalize(quat_multiply(quat_multiply(_FRD_FROM_FLU, tilt), FRD_FROM_OPTICAL))
 
 
 def quat_from_direction(direction: Vector) -> Vector:
-    """Return an attitude (4,) whose x axis has a direction (3,) in the parent frame, level in y.
+    """Return an attitude (4,) with its x axis along a direction (3,), level in y.
 
-    Any right-handed frame; the direction need not have length 1, and z is the vertical.
+    Works in any right-handed parent frame with z as the vertical; the direction is normalized.
     """
     x, y, z = (float(part) for part in direction)
     return quat_from_euler(0.0, -math.atan2(z, math.hypot(x, y)), math.atan2(y, x))
@@ -177,19 +177,19 @@ def heading_to_ned(v: Vector, yaw: float | Vector) -> Vector:
 
 
 class Geodetic(NamedTuple):
-    """A point on the globe."""
+    """Geodetic position."""
 
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
-    """Above mean sea level, positive up [m]."""
+    """Altitude above mean sea level, positive up [m]."""
 
 
 def local_to_geodetic(ned: Vector, origin: Geodetic) -> Geodetic:
-    """Map a local NED position (3,) [m] to the globe.
+    """Convert a local NED position (3,) [m] to a geodetic position.
 
-    Azimuthal equidistant projection on a sphere, as PX4's MapProjection::reproject
-    (Snyder, Map Projections, USGS 1395, eqs. 20-14, 20-15).
+    Azimuthal equidistant projection on a sphere, as PX4's MapProjection::reproject (Snyder, Map
+    Projections, USGS 1395, eqs. 20-14, 20-15).
     """
     x, y = float(ned[0]) / EARTH_RADIUS_M, float(ned[1]) / EARTH_RADIUS_M
     c = math.hypot(x, y)
@@ -206,7 +206,7 @@ def local_to_geodetic(ned: Vector, origin: Geodetic) -> Geodetic:
 
 
 def geodetic_to_local(point: Geodetic, origin: Geodetic) -> Vector:
-    """Map a point on the globe to local NED (3,) [m]; inverse of `local_to_geodetic`."""
+    """Convert a geodetic position to local NED (3,) [m]; inverse of `local_to_geodetic`."""
     lat0, lat = math.radians(origin.latitude_deg), math.radians(point.latitude_deg)
     dlon = math.radians(point.longitude_deg - origin.longitude_deg)
     cos_c = math.sin(lat0) * math.sin(lat) + math.cos(lat0) * math.cos(lat) * math.cos(dlon)

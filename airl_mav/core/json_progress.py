@@ -1,4 +1,4 @@
-"""Progress for programs: one JSON object a line."""
+"""Progress reports for programs: one JSON object per line."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.progress import Bar, Event, Progress
 
 EVERY_S = 1.0
-"""Of each work, programs hear no more often how far it is [wall s]."""
+"""Minimum interval between progress events of one task [wall s]."""
 
 
 @dataclass(frozen=True)
 class Status(Event):
-    """What is being done or waited for."""
+    """Current activity or wait."""
 
     event: ClassVar[str] = "status"
     text: str
@@ -25,7 +25,7 @@ class Status(Event):
 
 @dataclass(frozen=True)
 class Note(Event):
-    """A remark for a person: a warning, or what a flight controller said."""
+    """Remark for people: a warning, or a flight controller's text."""
 
     event: ClassVar[str] = "note"
     text: str
@@ -33,28 +33,28 @@ class Note(Event):
 
 @dataclass(frozen=True)
 class Advanced(Event):
-    """How far a work is: at most once a second, and when it is done."""
+    """Progress of a task: at most once per second, and at its end."""
 
     event: ClassVar[str] = "progress"
     work: str
-    """What is being done, as its bar is called."""
+    """Name of the task, as its bar's label."""
     done: float
     planned: float
     unit: str | None
-    """What is counted, in the plural."""
+    """Unit of the count, in the plural."""
     elapsed_s: float
-    """Since this command began with it [wall s]."""
+    """Time since this command began the task [wall s]."""
     per_s: float | None
-    """Pace of this command since the first one [1/s]; None before there is one."""
+    """Pace of this command since the first completed unit [1/s]; None before the first one."""
     left_s: float | None
-    """Time left at that pace [wall s]."""
+    """Remaining time at this pace [wall s]."""
 
 
 class JsonProgress(Progress):
-    """Writes a line of JSON for everything that happens."""
+    """Progress that writes a line of JSON for every event."""
 
     def __init__(self, out: IO[str], clock: Clock | None = None) -> None:
-        """Write to a stream; the clock, by default the wall's, is that of paces."""
+        """Write to a stream; `clock` measures the pace, by default in wall time."""
         self._out = out
         self._clock = clock or WallClock()
         self._status: str | None = None
@@ -62,28 +62,28 @@ class JsonProgress(Progress):
     def bar(
         self, label: str, total: float, *, completed: float = 0.0, unit: str | None = None
     ) -> Bar:
-        """Begin a work; see `Progress`."""
+        """Begin a task; see `Progress`."""
         return _JsonBar(self, self._clock, label, total, completed, unit)
 
     def status(self, text: str | None) -> None:
-        """Tell what is being done, once."""
+        """Write the status if it has changed."""
         if text is not None and text != self._status:
             self.tell(Status(text))
             self._status = text
 
-    def note(self, text: str, style: str | None = None) -> None:  # noqa: ARG002 (for those who draw)
-        """Tell a remark."""
+    def note(self, text: str, style: str | None = None) -> None:  # noqa: ARG002 (for drawing)
+        """Write a remark."""
         self.tell(Note(text.strip()))
 
     def tell(self, event: Event, **more: Any) -> None:
-        """Write an event, with more figures of it; no line waits for the next one."""
+        """Write an event with additional values, and flush the stream."""
         line = {"event": event.event, **asdict(event), **more}
         self._out.write(json.dumps(line, ensure_ascii=False, allow_nan=False) + "\n")
         self._out.flush()
 
 
 class _JsonBar(Bar):
-    """A work as programs hear of it."""
+    """Task that is reported to programs."""
 
     def __init__(
         self,
@@ -99,13 +99,13 @@ class _JsonBar(Bar):
         self._before = self._completed = completed
         self._began_us = clock.time_us()
         self._first: tuple[int, float] | None = None
-        """When the first ones were completed, and how many there were then."""
+        """Time and number of the first completed units; None = no unit completed."""
         self._told_us: int | None = None
         self._told = completed
         self._figures: dict[str, Any] = {}
 
     def advance(self, amount: float = 1.0) -> None:
-        """Add to what is completed."""
+        """Increase the completed amount."""
         self.update(completed=self._completed + amount)
 
     def update(
@@ -113,10 +113,10 @@ class _JsonBar(Bar):
         *,
         completed: float | None = None,
         total: float | None = None,
-        postfix: str | None = None,  # noqa: ARG002 (the figures say it)
+        postfix: str | None = None,  # noqa: ARG002 (the figures contain it)
         figures: Mapping[str, Any] | None = None,
     ) -> None:
-        """Set what is completed of how much, or the figures that are told with it."""
+        """Set the completed and total amount, or additional values of the event."""
         self._figures.update(figures or {})
         self._total = self._total if total is None else total
         if completed is None:
@@ -130,7 +130,7 @@ class _JsonBar(Bar):
             self._tell(now_us)
 
     def close(self) -> None:
-        """Tell how far it came, if that was not told."""
+        """Write the last progress if it has not been reported."""
         if self._told != self._completed:
             self._tell(self._clock.time_us())
 
@@ -144,7 +144,7 @@ class _JsonBar(Bar):
         self._progress.tell(event, **self._figures)
 
     def _pace(self, now_us: int) -> float | None:
-        """Return how many are completed a second; what came before the first is no part of it."""
+        """Return the completed units per second, measured from the first completed unit."""
         if self._first is None:
             return None
         began_us, before = self._first
@@ -156,5 +156,5 @@ class _JsonBar(Bar):
 
 
 def _plain(count: float) -> float:
-    """Return a whole number as one: 3, not 3.0."""
+    """Return a whole number as int: 3, not 3.0."""
     return int(count) if float(count).is_integer() else count

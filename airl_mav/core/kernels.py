@@ -1,4 +1,4 @@
-"""How hot functions are compiled: one decorator, one set of options, one cache."""
+"""Compilation of hot functions: one decorator, one set of options, one cache."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from airl_mav.core.compiling import report_compiling
 F = TypeVar("F", bound=Callable[..., Any])
 
 _PACKAGES = ("airl_mav", "firmware_sim")
-"""Those of the distribution that hold kernels."""
+"""Packages of the distribution that contain kernels."""
 
 _ROOT = Path(__file__).resolve().parents[2]
 """Folder of the packages."""
 
 _CACHE_NAME = "numba-"
-"""How the name of a folder of compiled code begins; the digest of its sources follows."""
+"""Prefix of folder names for compiled code, followed by the digest of its sources."""
 
 _PACKAGE = rf"(?:{'|'.join(_PACKAGES)})[\w.]*"
 _IMPORT = re.compile(
@@ -40,7 +40,7 @@ _IMPORT = re.compile(
 
 @cache
 def _file_of(module: str) -> Path | None:
-    """Return the file of a module of this distribution; None: there is none, or it is a name."""
+    """Return the file of a module of this distribution; None if there is no such module."""
     path = _ROOT.joinpath(*module.split("."))
     for file in (path.with_suffix(".py"), path / "__init__.py"):
         if file.is_file():
@@ -50,7 +50,7 @@ def _file_of(module: str) -> Path | None:
 
 @cache
 def _read(file: Path) -> tuple[str, tuple[Path, ...]]:
-    """Return the digest of a source file, and the files that it imports."""
+    """Return the digest of a source file, and its imported files."""
     text = file.read_text(encoding="utf-8")
     names: list[str] = []
     for package, imported, module in _IMPORT.findall(text):
@@ -61,7 +61,7 @@ def _read(file: Path) -> tuple[str, tuple[Path, ...]]:
 
 
 def _closure(files: Iterable[Path]) -> dict[Path, str]:
-    """Return the digests of source files and all that they import, directly or not."""
+    """Return the digests of source files and of all direct and indirect imports."""
     pending, found = list(files), dict[Path, str]()
     while pending:
         each = pending.pop()
@@ -73,7 +73,7 @@ def _closure(files: Iterable[Path]) -> dict[Path, str]:
 
 @cache
 def _closure_digest(file: Path) -> str:
-    """Return a digest of a source file and all that it imports, directly or not."""
+    """Return a digest of a source file and of all its direct and indirect imports."""
     found = _closure([file])
     listed = "".join(sorted(f"{each.name} {digest}\n" for each, digest in found.items()))
     return hashlib.sha256(listed.encode()).hexdigest()[:16]
@@ -81,15 +81,15 @@ def _closure_digest(file: Path) -> str:
 
 @cache
 def _folder(digest: str) -> Path | None:
-    """Return the folder of what was made of sources; None: nothing can be written."""
+    """Return the cache folder for a digest of sources; None if no folder is writable."""
     return writable_folder(f"{_CACHE_NAME}{digest}")
 
 
 def cache_folder(source: str) -> Path | None:
-    """Return the folder for what is made of a source file and of all that it imports.
+    """Return the cache folder for a source file and all its imports.
 
-    Another state of any of them has another folder. None where none can be written, or where the
-    user has chosen one for all compiled code (`NUMBA_CACHE_DIR`), or the source is in no file.
+    A change of any of these files gives another folder. None if no folder is writable, if the user
+    has set a folder for all compiled code (`NUMBA_CACHE_DIR`), or if the source is not a file.
     """
     file = Path(source).resolve()
     if numba.config.CACHE_DIR or not file.is_file():
@@ -99,7 +99,7 @@ def cache_folder(source: str) -> Path | None:
 
 @contextmanager
 def _caching_in(folder: Path | None) -> Iterator[None]:
-    """Let numba keep what is decorated meanwhile in a folder; None: where it would."""
+    """Set numba's cache folder within the context; None = numba's default."""
     chosen = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = chosen if folder is None else str(folder)
     try:
@@ -112,39 +112,39 @@ def kernel(function: F) -> F:
     """Compile a function with numba.
 
     Compiled code is cached on disk and releases the GIL. Only the first start after an install
-    compiles. Kernels are always inlined: numba would pass the forty gains by value at each call,
-    which costs a third of the batch twin's speed. They are never `parallel`: one thread a process,
-    processes for parallelism.
+    compiles. Kernels are always inlined: numba would pass the forty gains by value at each call, at
+    the cost of a third of the vectorized simulator's speed. They are never `parallel`: each process
+    has one thread, and processes provide parallelism.
 
-    A division by zero gives infinity or NaN, as numpy's. Checks for a ZeroDivisionError take a
-    tenth of the twin's speed, and prevent vector instructions.
+    A division by zero gives infinity or NaN, as in numpy. Checks for a ZeroDivisionError take a
+    tenth of the vectorized simulator's speed, and prevent vector instructions.
 
-    numba stamps a cached function with its own file only. A kernel that inlines another one, or a
-    constant, from a changed file would keep running the old code, also after an upgrade of the
-    package. So each is kept in a folder of its file and of all that this imports.
+    numba invalidates a cached function only if its own file changes. A kernel that inlines another
+    kernel, or a constant, from a changed file would keep running the old code, even after an
+    upgrade of the package. The cache folder therefore depends on the file and all its imports.
     """
     return _compiled(function, forceinline=True)
 
 
 def large_kernel(function: F) -> F:
-    """Compile a function with numba, not inlined: it is long, and rarely needed."""
+    """Compile a function with numba, not inlined: for long functions that are rarely called."""
     return _compiled(function, forceinline=False)
 
 
 def borrowing_kernel(function: F) -> F:
-    """Compile a function as `kernel` does, without counting who holds its arrays.
+    """Compile a function as `kernel` does, without reference counts of arrays.
 
-    numba counts the holders of every array: one more for each view, `row[left:end]`, one less when
-    it is done with, both atomically. Where an image is drawn in short rows, that is half the time.
+    numba counts the references to every array: one more for each view, `row[left:end]`, and one
+    less at its end, both atomically. For images drawn in short rows this takes half the time.
 
-    For what only borrows arrays: all are the caller's, who holds them until it returns. It can make
-    none (numba refuses to compile it), and must return none, not even within a tuple.
+    The caller must own all arrays and hold them until the function returns. The function cannot
+    create arrays (numba refuses to compile it), and must not return any, not even within a tuple.
     """
     return _compiled(function, forceinline=True, counts=False)
 
 
 def large_borrowing_kernel(function: F) -> F:
-    """Compile a function as `borrowing_kernel`, called and not inlined, as `large_kernel`."""
+    """Compile a function as `borrowing_kernel`, but not inlined, as `large_kernel`."""
     return _compiled(function, forceinline=False, counts=False)
 
 
@@ -153,7 +153,7 @@ kernel_files: set[str] = set()
 
 
 def sources() -> list[Path]:
-    """Return the source files that the kernels loaded so far depend on."""
+    """Return the source files of the kernels loaded so far, with their imports."""
     return sorted(_closure(Path(each).resolve() for each in kernel_files))
 
 
@@ -168,7 +168,7 @@ def _compiled(function: F, *, forceinline: bool, counts: bool = True) -> F:
 
 
 def _call_template(compiled: Dispatcher, args: Iterable[Any], kws: dict[str, Any]) -> Any:
-    """Return how a kernel is called from others: compiled once for all values of a constant."""
+    """Return a kernel's call template for other kernels, compiled once for all constants."""
     types = map(numba.types.unliteral, args)
     return Dispatcher.get_call_template(compiled, tuple(types), kws)
 
@@ -193,7 +193,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
 
 class _Compiler(event.Listener):  # type: ignore[misc]
-    """Hears of every function that numba compiles; of none that it finds in its cache."""
+    """Listener for every function that numba compiles; excludes functions found in the cache."""
 
     def on_start(self, event: event.Event) -> None:  # noqa: ARG002 (any is one)
         report_compiling(begins=True)

@@ -1,4 +1,4 @@
-"""A file that grows during a flight: under a temporary name until it is whole."""
+"""Log file written during a flight, under a temporary name until it is complete."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from pathlib import Path
 from airl_mav.core.constants import US_PER_S
 
 PARTIAL_SUFFIX = ".part"
-"""Added to the file's name until the log is complete."""
+"""Suffix of the file's name until the log is complete."""
 
 _FLUSH_BYTES = 65_536
 _FLUSH_US = US_PER_S
 
 
 class LogFile:
-    """Writer of whole records, at the latest after one second of simulated time.
+    """Writer of complete records, at the latest after one second of simulated time.
 
-    A killed process leaves a valid log under the temporary name. It lacks its last second at most.
-    A log that cannot be written any more, on a full disk, ends with its last whole record. The
-    program continues without it.
+    A killed process leaves a valid log under the temporary name, which lacks at most its last
+    second. If writing fails, for example on a full disk, the log ends with its last complete
+    record. The program continues without it.
     """
 
     def __init__(self, path: Path, on_lost: Callable[[str], None] = lambda _: None) -> None:
@@ -28,7 +28,7 @@ class LogFile:
         self.path = path
         self.on_lost = on_lost
         self.lost = False
-        """Whether it ended early."""
+        """True if the log has ended early."""
         self.failure: OSError | None = None
         self.partial_path = path.with_name(path.name + PARTIAL_SUFFIX)
         self._buffer = bytearray()
@@ -38,17 +38,17 @@ class LogFile:
 
     @property
     def size_bytes(self) -> int:
-        """Size by now, with what is not yet written."""
+        """Current size, including buffered data [bytes]."""
         return self._written + len(self._buffer)
 
     @property
     def written_bytes(self) -> int:
-        """Size of what stands in the file by now."""
+        """Current size of the file [bytes]."""
         return self._written
 
     @property
     def closed(self) -> bool:
-        """Whether the log is complete."""
+        """True if the log is complete."""
         return self._file.closed
 
     def add(self, time_us: int, *parts: bytes) -> None:
@@ -64,7 +64,7 @@ class LogFile:
             self._flushed_us = time_us
 
     def flush(self) -> None:
-        """Write out what is buffered."""
+        """Write buffered data to the file."""
         whole = self._written
         view = memoryview(bytes(self._buffer))
         self._buffer.clear()
@@ -77,9 +77,9 @@ class LogFile:
             self._end(error, whole)
 
     def close(self) -> None:
-        """Complete the log and give it its final name; harmless when called again.
+        """Complete the log and rename it to its final name; may be called repeatedly.
 
-        Of one that never had a record nothing is left.
+        A lost log without records is deleted.
         """
         if self._file.closed:
             return
@@ -94,15 +94,15 @@ class LogFile:
             self._end(error, self._written)
 
     def discard(self) -> None:
-        """Close the file, and leave nothing of it."""
+        """Close and delete the file."""
         with suppress(OSError):
             self._file.close()
         with suppress(OSError):
             self.partial_path.unlink(missing_ok=True)
 
     def _end(self, error: OSError, whole: int) -> None:
-        """Write nothing any more, and leave the whole records, of so many bytes."""
-        with suppress(OSError, ValueError):  # not a file that could be cut, or closed by now
+        """Stop writing, and truncate the file to its complete records of `whole` bytes."""
+        with suppress(OSError, ValueError):  # not a regular file, or closed
             self._file.truncate(whole)
         self._written = whole
         if not self.lost:

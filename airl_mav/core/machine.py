@@ -1,8 +1,8 @@
-"""What a machine's speed depends on at a moment: governor, frequency, temperature, throttling.
+"""State of a machine that affects its speed: governor, frequency, temperature, throttling.
 
-psutil reads what it knows; governor and throttling are read from where Linux and the Raspberry Pi's
-firmware offer them. None stands for what a system does not offer. psutil is imported where it is
-asked. The records of flights need this module, and whoever reads them asks nothing.
+Most values come from psutil; governor and throttling come from Linux and the Raspberry Pi's
+firmware. None means not available. psutil is imported only in functions that use it: flight records
+need this module, and reading them does not need psutil.
 """
 
 from __future__ import annotations
@@ -30,31 +30,31 @@ PI_FLAGS = {
 """Bits of the Raspberry Pi's `get_throttled` (raspberrypi.com, documentation of vcgencmd)."""
 
 PI_PAST = 16
-"""From this bit on the flags are of what has been since the start of the system."""
+"""First bit of the flags for past events since the start of the system."""
 
 CPU_SENSORS = ("cpu", "soc", "x86_pkg", "coretemp", "k10temp", "package")
-"""Parts of the names of sensors that belong to a processor."""
+"""Parts of the names of processor temperature sensors."""
 
 
 @dataclass(frozen=True)
 class MachineState:
-    """A machine at one moment."""
+    """State of a machine at one time."""
 
     governor: str | None
-    """Frequency governors of the cores, one when all have the same."""
+    """Frequency governors of the cores; a single name if all are the same."""
     frequency_mhz: tuple[float, float] | None
-    """Least and greatest frequency of the cores."""
+    """Minimum and maximum frequency of the cores [MHz]."""
     frequency_limit_mhz: float | None
-    """Greatest frequency that is allowed."""
+    """Maximum permitted frequency [MHz]."""
     temperature_c: float | None
-    """Of the processor; the hottest sensor of it."""
+    """Temperature of the hottest processor sensor [°C]."""
     throttling: str | None
-    """`none`, or what the system reports."""
+    """Text `none`, or the system's report."""
     load: tuple[float, float, float] | None
     """Load average over 1, 5 and 15 minutes."""
 
     def rows(self) -> tuple[tuple[str, str], ...]:
-        """Return what is known, as names and texts."""
+        """Return all values as names and texts."""
         mhz, limit, load = self.frequency_mhz, self.frequency_limit_mhz, self.load
         frequency = None
         if mhz is not None:
@@ -77,8 +77,8 @@ def machine_state(
 ) -> MachineState:
     """Return the state of this machine; psutil does not read governor and throttling.
 
-    `root` is where /sys is found. `ask_pi` returns the output of `vcgencmd get_throttled`, None
-    where there is no such program; by default it is run.
+    `root` contains /sys. `ask_pi` returns the output of `vcgencmd get_throttled`, or None if the
+    program is missing; by default it is run.
     """
     import psutil
 
@@ -89,7 +89,7 @@ def machine_state(
         governor=", ".join(sorted({text for path in governors if (text := sysfs_text(path))}))
         or None,
         frequency_mhz=(min(now), max(now)) if now else None,
-        # 0: not known.
+        # 0 = unknown.
         frequency_limit_mhz=max((core.max for core in cores), default=0.0) or None,
         temperature_c=temperature_c(),
         throttling=_throttling(root, ask_pi or _vcgencmd),
@@ -98,20 +98,20 @@ def machine_state(
 
 
 def _core_frequencies() -> Sequence[Any]:
-    """Return what psutil says of each core's frequency; empty where it says nothing."""
+    """Return psutil's frequency of each core; empty if not available."""
     import psutil
 
     return (psutil.cpu_freq(percpu=True) if hasattr(psutil, "cpu_freq") else None) or ()
 
 
 def mean_frequency_mhz() -> float | None:
-    """Return the mean of the cores' frequencies; None where the system does not tell."""
+    """Return the mean frequency of the cores; None if not available."""
     now = [core.current for core in _core_frequencies()]
     return sum(now) / len(now) if now else None
 
 
 def temperature_c() -> float | None:
-    """Return the hottest sensor of the processor [°C]."""
+    """Return the temperature of the hottest processor sensor [°C]; None if not available."""
     import psutil
 
     if not hasattr(psutil, "sensors_temperatures"):  # Linux and FreeBSD have it.
@@ -128,10 +128,10 @@ def temperature_c() -> float | None:
 
 
 def throttled_since(before: str | None, after: str | None) -> bool | None:
-    """Return whether a processor was slowed down between two states of `throttling`.
+    """Return True if a processor was throttled between two states of `throttling`.
 
-    None where the system does not tell. The Raspberry Pi's flags of the past stay set until it is
-    started again: one that was set before says nothing, one of the present does.
+    None if not available. The Raspberry Pi's flags of past events stay set until a restart: only
+    newly set flags count, while flags of the present always count.
     """
     if before is None or after is None:
         return None
@@ -140,7 +140,7 @@ def throttled_since(before: str | None, after: str | None) -> bool | None:
 
 
 def _throttling(root: Path, ask_pi: Callable[[], str | None]) -> str | None:
-    """Return what slows the processor down, as text; None where the system does not tell."""
+    """Return the reasons for throttling as text; None if not available."""
     bits = sysfs_text(root / "sys/devices/platform/soc/soc:firmware/get_throttled")
     if bits is None and (answer := ask_pi()) is not None:
         bits = answer.partition("=")[2]
@@ -185,7 +185,7 @@ def _vcgencmd() -> str | None:
 
 
 def sysfs_text(path: Path) -> str | None:
-    """Return what a small file says, None where it cannot be read."""
+    """Return the text of a small file; None if it is unreadable or empty."""
     try:
         return path.read_text(encoding="utf-8", errors="replace").strip() or None
     except OSError:
@@ -193,7 +193,7 @@ def sysfs_text(path: Path) -> str | None:
 
 
 def sysfs_number(path: Path) -> float | None:
-    """Return the number that a small file says, None where it says none."""
+    """Return the number in a small file; None if there is no number."""
     text = sysfs_text(path)
     try:
         return None if text is None else float(text)

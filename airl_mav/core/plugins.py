@@ -1,8 +1,8 @@
-"""Parts that users write: put in by name, where a shipped part would stand.
+"""Plug-ins: custom components, selected by name in place of built-in ones.
 
-A part is named as `FILE.py:NAME`, as `MODULE:NAME`, or by the name under which an installed package
-announces it (an entry point of the part's group). Naming a part runs its module, as an import does,
-so a name may come from a command line or from a file of the user's, never from what was downloaded.
+A component is named as `FILE.py:NAME`, as `MODULE:NAME`, or by an entry point of an installed
+package, in the group of its kind. Loading a component runs its module, like an import. Names may
+therefore come from a command line or from the user's files, but not from downloaded data.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ _MODULE = re.compile(r"(?P<module>[^\W\d]\w*(\.[^\W\d]\w*)*):(?P<name>[^\W\d]\w*
 
 @dataclass(frozen=True)
 class Door:
-    """A kind of part that can be put in."""
+    """Kind of component that plug-ins can provide."""
 
     field: str
-    """What names it, as messages call it."""
+    """Field that selects the component, as named in messages."""
     group: str
-    """Entry points under which installed packages announce theirs."""
+    """Entry point group of installed packages."""
     wanted: str
-    """What it must be: "a class with a method act"."""
+    """Required type: "a class with a method act"."""
 
 
 POLICIES = Door("policy", "airl_mav.policies", "a class with a method act")
@@ -54,35 +54,35 @@ DOORS = (POLICIES, REWARDS, NETWORKS, LAYOUTS, ACTION_SETS, GENERATORS, CAMERAS,
 
 
 def names_code(name: str) -> bool:
-    """Return whether a name is FILE.py:NAME or MODULE:NAME."""
+    """Return True if a name is FILE.py:NAME or MODULE:NAME."""
     return names_file(name) or _MODULE.fullmatch(name) is not None
 
 
 def names_file(name: str) -> bool:
-    """Return whether a name is FILE.py:NAME."""
+    """Return True if a name is FILE.py:NAME."""
     return _FILE.fullmatch(name) is not None
 
 
 def announced(door: Door) -> dict[str, str]:
-    """Return what installed packages announce: name to MODULE:NAME. Nothing is imported."""
+    """Return the components of installed packages, name to MODULE:NAME, without importing them."""
     return {each.name: f"{each.module}:{each.attr}" for each in entry_points(group=door.group)}
 
 
 def reference(door: Door, name: str) -> str | None:
-    """Return a part's FILE.py:NAME or MODULE:NAME by any of its names; None: there is no such."""
+    """Return a component's FILE.py:NAME or MODULE:NAME by any of its names; None = unknown."""
     return name if names_code(name) else announced(door).get(name)
 
 
 def accepted(door: Door, shipped: Sequence[str]) -> str:
-    """Return which names are accepted, as a message says it."""
+    """Return the accepted names as text for messages."""
     known = [repr(name) for name in (*shipped, *announced(door))]
     return f"{', '.join(known)}, FILE.py:NAME or MODULE:NAME"
 
 
 def part_name(door: Door, shipped: Sequence[str]) -> AfterValidator:
-    """Return the check of a text field that names a shipped part or one that is put in.
+    """Return the validator of a field with the name of a built-in component or a plug-in.
 
-    The part itself is not looked for: reading a file runs no code.
+    The component is not loaded: reading a file runs no code.
     """
 
     def check(name: str) -> str:
@@ -95,20 +95,20 @@ def part_name(door: Door, shipped: Sequence[str]) -> AfterValidator:
 
 
 _loaded: set[tuple[str, str]] = set()
-"""Kind and name of the parts that this process has loaded."""
+"""Kind and name of the components loaded by this process."""
 
 
 def is_loaded(door: Door, name: str) -> bool:
-    """Return whether this process has loaded a part by this name, as the user asked for it."""
+    """Return True if this process has loaded a component by this name, as given by the user."""
     return (door.group, name) in _loaded
 
 
 def load_part(door: Door, name: str, fits: Callable[[Any], bool] = callable) -> Any:
-    """Return a part by any of its names. Its file or module is run once in a process.
+    """Return a component by any of its names. Its file or module runs once per process.
 
-    The name is FILE.py:NAME, MODULE:NAME, or a name of an installed package's; `fits` accepts or
-    rejects the part. Raises FieldError if there is no such file, module or part, its module raises,
-    or it does not fit.
+    The name is FILE.py:NAME, MODULE:NAME, or an installed package's entry point; `fits` accepts or
+    rejects the component. Raises FieldError if the file, module or component is missing, its module
+    raises, or it is rejected.
     """
     found = reference(door, name)
     if found is None:
@@ -129,7 +129,7 @@ def load_part(door: Door, name: str, fits: Callable[[Any], bool] = callable) -> 
 
 
 def digest_of(found: str) -> str | None:
-    """Return the SHA-256 of the file of a part; None: it is in no file. Raises OSError."""
+    """Return the SHA-256 of a component's file; None without a file. Raises OSError."""
     where = found.rpartition(":")[0]
     file: str | None = where
     if not names_file(found):
@@ -138,22 +138,22 @@ def digest_of(found: str) -> str | None:
 
 
 def _module(name: str) -> ModuleType:
-    """Import a module, from the present folder too, behind all that is installed."""
+    """Import a module; the current folder is searched last."""
     here = str(Path.cwd())
     if here not in sys.path and "" not in sys.path:
-        # A console script's path has its own folder in this place.
+        # The path of a console script starts with the script's folder instead.
         sys.path.append(here)
     return importlib.import_module(name)
 
 
 @cache
 def _file_module(file: Path) -> ModuleType:
-    """Return the module of a file, run once in a process."""
-    # With the folder in its name: dataclasses and pickles look their module up, and two files of
-    # one name are two modules.
+    """Return the module of a file, run once per process."""
+    # The name includes the folder: dataclasses and pickles look up their module, and files of the
+    # same name must be different modules.
     folder = hashlib.sha256(str(file.parent).encode()).hexdigest()[:8]
     spec = importlib.util.spec_from_file_location(f"airl_mav_plugin_{file.stem}_{folder}", file)
-    assert spec is not None and spec.loader is not None  # noqa: S101 (a file that ends in .py)
+    assert spec is not None and spec.loader is not None  # noqa: S101 (the file ends in .py)
     module = importlib.util.module_from_spec(spec)
     sys.modules[module.__name__] = module
     try:

@@ -1,3 +1,3 @@
-"""The address that everything binds unless the user asks otherwise."""
+"""Default address for all sockets."""
 
 LOOPBACK = "127.0.0.1"

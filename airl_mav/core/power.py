@@ -1,14 +1,14 @@
-"""The electrical power that a machine says it draws, from Linux's sysfs.
+"""Electrical power of a machine, as reported by Linux's sysfs.
 
-Looked for in this order, the first that answers counts:
+Sources, in order of priority:
 
 - INA2xx and INA3221 shunt monitors of hwmon (Jetson and other boards): `power*_input` [µW], or
-  `in*_input` [mV] times `curr*_input` [mA]. A rail that feeds the whole board (`TOTAL_RAILS`)
-  counts alone. Without one the rails are added up.
-- A battery that is being discharged: `power_now` [µW], or `current_now` [µA] times `voltage_now`
-  [µV]. It feeds the whole machine.
+  `in*_input` [mV] times `curr*_input` [mA]. A rail that feeds the whole board (`TOTAL_RAILS`) is
+  used alone. Without such a rail, the rails are added up.
+- A discharging battery: `power_now` [µW], or `current_now` [µA] times `voltage_now` [µV]. It feeds
+  the whole machine.
 - RAPL (Intel, AMD): energy counters [µJ] of the processor packages and of the memory, or of the
-  whole platform where there is a domain `psys`. All but that one leave the rest of the machine out.
+  whole platform if there is a domain `psys`. Other domains exclude the rest of the machine.
 
 Formats: the kernel's Documentation/hwmon/sysfs-interface.rst, hwmon/ina3221.rst,
 power/powercap/powercap.rst and ABI/testing/sysfs-class-power.
@@ -31,39 +31,39 @@ TOTAL_RAILS = ("VDD_IN", "POM_5V_IN")
 """Labels of rails that feed the whole board: Jetson Orin and Xavier NX, Jetson Nano."""
 
 UNCONNECTED = "NC"
-"""Label of a channel that measures nothing."""
+"""Label of an unconnected channel."""
 
 INA3221_RAILS = 3
-"""Channels that are rails; the others are shunt voltages, and the sum of the currents."""
+"""Number of rail channels; other channels are shunt voltages and the sum of the currents."""
 
 NO_SENSOR = "no power sensor that can be read: no INA monitor, no discharging battery, no RAPL"
 
 SAMPLE_EVERY_S = 1.0
-"""Far less than the fastest overflow of a RAPL counter (about a minute), and cheap."""
+"""Sampling interval, far below the fastest overflow of a RAPL counter (about a minute)."""
 
 
 class PowerSource(Protocol):
-    """Something that knows what is drawn."""
+    """Interface of a power source."""
 
     @property
     def name(self) -> str:
-        """What is measured, in words."""
+        """Description of the measured power."""
 
     def take_j(self, elapsed_s: float) -> float | None:
-        """Return the energy of the last `elapsed_s`, since the call before [J]."""
+        """Return the energy of the last `elapsed_s` seconds, since the previous call [J]."""
 
 
 class EnergyCounters:
-    """Counters that run up and begin again at 0. Implements `PowerSource`."""
+    """Energy counters that overflow to 0. Implements `PowerSource`."""
 
     def __init__(self, name: str, zones: tuple[Path, ...]) -> None:
-        """Take folders of the power capping framework, whose counters can be read."""
+        """Set the folders of readable counters in the power capping framework."""
         self.name = name
         self._zones = zones
         self._last_uj = self._read()
 
-    def take_j(self, elapsed_s: float) -> float | None:  # noqa: ARG002 (it counts by itself)
-        """Return the energy since the call before; see `PowerSource`."""
+    def take_j(self, elapsed_s: float) -> float | None:  # noqa: ARG002 (not needed by a counter)
+        """Return the energy since the previous call; see `PowerSource`."""
         before, self._last_uj = self._last_uj, self._read()
         total_uj = 0.0
         for zone, last, now in zip(self._zones, before, self._last_uj, strict=True):
@@ -79,21 +79,21 @@ class EnergyCounters:
 
 @dataclass(frozen=True)
 class Rail:
-    """A power that can be read at a moment: the product of what its files say."""
+    """Instantaneous power: the product of the values in its files."""
 
     name: str
     files: tuple[Path, ...]
     watts_per_unit: float
 
     def read_w(self) -> float | None:
-        """Return the power [W], whichever way the current is counted; None: unreadable."""
+        """Return the absolute power [W]; None if it is unreadable."""
         values = [sysfs_number(path) for path in self.files]
         known = [value for value in values if value is not None]
         return abs(math.prod(known)) * self.watts_per_unit if len(known) == len(values) else None
 
 
 class Rails:
-    """The sum of powers at moments; between two the power changes evenly. A `PowerSource`."""
+    """Sum of instantaneous powers, interpolated linearly over time. Implements `PowerSource`."""
 
     def __init__(self, name: str, rails: tuple[Rail, ...]) -> None:
         self.name = name
@@ -101,7 +101,7 @@ class Rails:
         self._last_w = self._read_w()
 
     def take_j(self, elapsed_s: float) -> float | None:
-        """Return the energy since the call before; see `PowerSource`."""
+        """Return the energy since the previous call; see `PowerSource`."""
         before, self._last_w = self._last_w, self._read_w()
         if before is None or self._last_w is None:
             return None
@@ -114,7 +114,7 @@ class Rails:
 
 
 def find_power_source(root: Path = Path("/")) -> tuple[PowerSource | None, str]:
-    """Return this machine's power source, found below `root`/sys, and its name; None, and why."""
+    """Return this machine's power source below `root`/sys and its name; or None and a reason."""
     found = _shunt_monitors(root) or _battery(root)
     if found is not None:
         return found, found.name
@@ -134,7 +134,7 @@ def _shunt_monitors(root: Path) -> Rails | None:
 
 
 def _rails_of(monitor: Path) -> Iterator[Rail]:
-    """Yield the rails that an INA monitor of hwmon measures."""
+    """Yield the rails of an INA monitor of hwmon."""
     chip = sysfs_text(monitor / "name") or ""
     if not chip.startswith("ina"):
         return
@@ -147,10 +147,10 @@ def _rails_of(monitor: Path) -> Iterator[Rail]:
 
 
 def _battery(root: Path) -> Rails | None:
-    """Return the batteries that feed the machine at the moment."""
+    """Return the batteries that currently feed the machine; None = no such battery."""
     rails = []
     for supply in sorted((root / "sys/class/power_supply").glob("*")):
-        # Those of scope Device are a mouse's.
+        # Batteries of scope Device belong to peripherals such as a mouse.
         mine = sysfs_text(supply / "type") == "Battery" and (
             sysfs_text(supply / "scope") != "Device"
         )
@@ -187,13 +187,13 @@ class PowerMeter:
     """Averages the power of a source over time."""
 
     def __init__(self, source: PowerSource, clock: Clock) -> None:
-        """Begin now."""
+        """Start the measurement."""
         self._source, self._clock = source, clock
         self._begun_us = self._last_us = clock.time_us()
         self._energy_j: float | None = 0.0
 
     def sample(self) -> float | None:
-        """Return the mean power since the last sample [W]; None: unreadable, or no time passed.
+        """Return the mean power since the last sample [W]; None if unreadable or no time passed.
 
         Must be called more often than the counters of the source overflow.
         """
@@ -211,28 +211,28 @@ class PowerMeter:
 
     @property
     def mean_w(self) -> float | None:
-        """Mean power up to the last sample [W]; None: none, or one could not be read."""
+        """Mean power up to the last sample [W]; None without samples or after a failed one."""
         elapsed_s = (self._last_us - self._begun_us) / US_PER_S
         return None if self._energy_j is None or not elapsed_s else self._energy_j / elapsed_s
 
 
 class PowerSampling:
-    """Samples a meter from a thread of its own for as long as the context lasts."""
+    """Context that samples a meter in a separate thread."""
 
     def __init__(self, source: PowerSource, clock: Clock) -> None:
-        """Take the source, and the wall clock."""
+        """Set the source and the wall clock."""
         self._clock = clock
         self.meter = PowerMeter(source, clock)
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="power", daemon=True)
 
     def __enter__(self) -> PowerMeter:
-        """Start."""
+        """Start the thread."""
         self._thread.start()
         return self.meter
 
     def __exit__(self, *_: object) -> None:
-        """End, with a last sample."""
+        """Stop the thread and take a last sample."""
         self._ending.set()
         self._thread.join()
         self.meter.sample()

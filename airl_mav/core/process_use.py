@@ -1,9 +1,8 @@
-"""What this process takes of its machine over a time: processor time, memory, and the power drawn.
+"""Resource usage of this process in an interval: processor time, memory, and power.
 
-`VmHWM` of /proc/self/status is the greatest resident set since the process began. Writing 5 to
-/proc/self/clear_refs sets it back to the present one (Linux 4.0, proc(5)). Where that is not
-permitted, the peak stays that of the whole life of the process, and `ProcessUse.peak_since` says
-so.
+`VmHWM` of /proc/self/status is the peak resident set since the start of the process. Writing 5 to
+/proc/self/clear_refs resets it to the current value (Linux 4.0, proc(5)). If that is not permitted,
+the peak covers the lifetime of the process, as reported by `ProcessUse.peak_since`.
 """
 
 from __future__ import annotations
@@ -23,38 +22,38 @@ BYTES_PER_KIB = 1024
 
 @dataclass(frozen=True)
 class ProcessUse:
-    """What a process took of its machine while it did something."""
+    """Resource usage of a process in an interval."""
 
     wall_s: float
-    """How long that lasted [wall s]."""
+    """Duration of the interval [wall s]."""
     cpu_s: float
-    """Processor time of all its threads [s]."""
+    """Processor time of all threads [s]."""
     peak_memory_bytes: int | None
-    """Greatest resident set: all its memory that lay in RAM, shared libraries included."""
+    """Peak resident set: all memory in RAM, including shared libraries."""
     peak_since: Literal["begin", "process start"]
-    """Since when that is the greatest."""
+    """Start of the interval for the peak."""
     power_w: float | None
-    """Mean power of the whole machine, as far as its source sees it [W]."""
+    """Mean power of the machine, or of the part that the source measures [W]."""
     power_source: str
-    """What told the power, or why nothing did."""
+    """Source of the power, or the reason for a missing value."""
 
     @property
     def cores(self) -> float:
-        """Processor time by wall time: 1 is one core, all the time."""
+        """Processor time by wall time: 1 is one fully used core."""
         return self.cpu_s / self.wall_s if self.wall_s > 0.0 else 0.0
 
 
 class UseMeter:
-    """Measures from its `begin` to its `end`."""
+    """Meter of the resource usage from `begin` to `end`."""
 
     def __init__(self, clock: Clock, root: Path = Path("/")) -> None:
-        """Take the wall clock, and where /proc and /sys are found."""
+        """Set the wall clock; `root` contains /proc and /sys."""
         self._clock, self._root = clock, root
         self._sampling = ExitStack()
         self._power: PowerMeter | None = None
 
     def begin(self) -> None:
-        """Begin."""
+        """Start the measurement."""
         self._reset = _reset_peak(self._root)
         source, self._source = find_power_source(self._root)
         if source is not None:
@@ -62,7 +61,7 @@ class UseMeter:
         self._begun_us, self._used_us = self._clock.time_us(), processor_time_us()
 
     def end(self) -> ProcessUse:
-        """Return what was used since the beginning."""
+        """Return the usage since `begin`."""
         used_us = processor_time_us() - self._used_us
         wall_us = self._clock.time_us() - self._begun_us
         self._sampling.close()
@@ -77,7 +76,7 @@ class UseMeter:
 
 
 def _reset_peak(root: Path) -> bool:
-    """Set the peak of the resident set back to the present one; return whether that worked."""
+    """Reset the peak of the resident set to the current value; return False on failure."""
     try:
         (root / "proc/self/clear_refs").write_text("5")
     except OSError:
@@ -86,7 +85,7 @@ def _reset_peak(root: Path) -> bool:
 
 
 def _peak_bytes(root: Path) -> int | None:
-    """Return the peak of the resident set; None where the system does not tell."""
+    """Return the peak of the resident set; None if not available."""
     for line in (sysfs_text(root / "proc/self/status") or "").splitlines():
         name, _, value = line.partition(":")
         if name == "VmHWM":

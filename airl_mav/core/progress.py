@@ -1,8 +1,7 @@
-"""Progress of long work: bars and lines on a terminal, or nothing for callers of the Python API.
+"""Progress of long tasks: bars and lines on a terminal, or nothing for callers of the Python API.
 
-Whoever does the work is given a `Progress`. It opens a `Bar` for what can be counted, says what is
-done meanwhile, notes what a person should read and tells what a program should know. `RichProgress`
-draws; `json_progress` writes for programs.
+Tasks report to a `Progress`: a `Bar` for countable work, the current status, notes for people, and
+events for programs. `RichProgress` draws; `json_progress` writes for programs.
 """
 
 from __future__ import annotations
@@ -30,10 +29,10 @@ from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 
 DRAWING = "drawing the report"
-"""What is said while pages and pictures are made."""
+"""Status text while pages and figures are created."""
 
 WIDE = 110
-"""A terminal of so many columns has room for bars and the time taken."""
+"""Minimum width of a terminal for bars and the elapsed time [columns]."""
 
 PACE_S = 600.0
 """The remaining time is estimated from the pace over this interval [wall s]."""
@@ -41,17 +40,17 @@ PACE_S = 600.0
 
 @dataclass(frozen=True)
 class Event:
-    """What a program is told: one JSON object. Fields and their meaning are those of the class."""
+    """Event for programs: one JSON object with the fields of the class."""
 
     event: ClassVar[str]
-    """What happened, in a word."""
+    """Type of the event."""
 
 
 class Bar:
-    """One countable piece of work; by itself it shows nothing."""
+    """Countable task; this base class shows nothing."""
 
     def advance(self, amount: float = 1.0) -> None:
-        """Add to what is completed."""
+        """Increase the completed amount."""
 
     def update(
         self,
@@ -61,9 +60,9 @@ class Bar:
         postfix: str | None = None,
         figures: Mapping[str, Any] | None = None,
     ) -> None:
-        """Set what is completed of how much, the text after it, or what that says as figures.
+        """Set the completed and total amount, the text after the bar, or its values for programs.
 
-        The figures are for programs. None leaves each as it is.
+        None leaves a value unchanged.
         """
 
     def close(self) -> None:
@@ -71,11 +70,11 @@ class Bar:
 
 
 class Progress:
-    """Where long work says how far it is; by itself it passes everything over."""
+    """Receiver of progress reports; this base class ignores them."""
 
     def bar(
         self,
-        label: str,  # noqa: ARG002 (for those who draw)
+        label: str,  # noqa: ARG002 (for subclasses)
         total: float,  # noqa: ARG002
         *,
         completed: float = 0.0,  # noqa: ARG002
@@ -83,32 +82,32 @@ class Progress:
     ) -> Bar:
         """Open a bar.
 
-        `completed` was done before and does not count for the pace. `unit`, in the plural, shows
-        count and pace; None: neither.
+        `completed` is the initial amount, which does not count for the pace. `unit`, in the plural,
+        enables count and pace; None = neither.
         """
         return Bar()
 
     def status(self, text: str | None) -> None:
-        """Say what is being done or waited for, until something else is; None: nothing."""
+        """Show the current activity or wait, until the next call; None clears it."""
 
     def watch(self, text: str) -> None:
-        """Say what somebody who looks on may want to see just now, instead of the status."""
+        """Show live information for spectators in place of the status."""
 
     def tell(self, event: Event) -> None:
-        """Tell programs what has happened."""
+        """Send an event to programs."""
 
     def line(self, text: str) -> None:
-        """Print how far long work is, where no bar can be drawn."""
+        """Print progress on consoles that cannot draw bars."""
 
     def note(self, text: str, style: str | None = None) -> None:
-        """Print a line, taken literally, that outlasts the bars; `style` is one of rich's."""
+        """Print a permanent line without markup; `style` is a style of rich."""
 
 
 class RichProgress(Progress):
-    """Draws bars on an interactive console; notes are printed to any. Use as a context manager."""
+    """Progress with bars on interactive consoles; prints notes on any. Use as a context manager."""
 
     def __init__(self, console: Console, clock: Clock | None = None) -> None:
-        """Draw on a console; without a terminal only notes are printed."""
+        """Set the console; without a terminal only notes are printed."""
         self._console = console
         source = clock or WallClock()
         wide = console.width >= WIDE
@@ -138,7 +137,7 @@ class RichProgress(Progress):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Stop drawing and remove the bars."""
+        """Remove the bars."""
         if self._console.is_interactive:
             self._bars.stop()
 
@@ -149,27 +148,27 @@ class RichProgress(Progress):
         return _RichBar(self._bars, label, total, completed, unit)
 
     def status(self, text: str | None) -> None:
-        """Draw what is being done below the bars; see `Progress`."""
+        """Draw the status below the bars; see `Progress`."""
         self._bars.say(text)
 
     def watch(self, text: str) -> None:
-        """Draw what is seen now below the bars; see `Progress`."""
+        """Draw live information below the bars; see `Progress`."""
         self._bars.say(text)
 
     def line(self, text: str) -> None:
-        """Print a line without a terminal; see `Progress`."""
+        """Print a line if there is no terminal; see `Progress`."""
         if not self._console.is_interactive:
             self.note(text)
 
     def note(self, text: str, style: str | None = None) -> None:
         """Print a line; see `Progress`."""
         self._console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
-        # In a file or a pipe a line must not wait for the end of the work.
+        # Flush: in a file or a pipe a line must appear immediately.
         self._console.file.flush()
 
 
 class _Bars(RichBars):
-    """Bars, and a line below them that says what is being done."""
+    """Bars, with a status line below them."""
 
     _doing: Spinner | None = None
 
@@ -184,13 +183,13 @@ class _Bars(RichBars):
 
 
 class _RichBar(Bar):
-    """A task of rich's."""
+    """Bar drawn as a task of rich."""
 
     def __init__(
         self, bars: RichBars, label: str, total: float, completed: float, unit: str | None
     ) -> None:
         self._bars = bars
-        # Not by an update, which would count for the pace.
+        # Set here: an update would count for the pace.
         self._task = bars.add_task(
             label,
             total=total,
@@ -201,7 +200,7 @@ class _RichBar(Bar):
         )
 
     def advance(self, amount: float = 1.0) -> None:
-        """Add to what is completed."""
+        """Increase the completed amount."""
         self._bars.advance(self._task, amount)
 
     def update(
@@ -212,7 +211,7 @@ class _RichBar(Bar):
         postfix: str | None = None,
         figures: Mapping[str, Any] | None = None,  # noqa: ARG002 (the text says them)
     ) -> None:
-        """Set what is completed of how much, or the text after the bar."""
+        """Set the completed and total amount, or the text after the bar."""
         self._bars.update(self._task, completed=completed, total=total)
         if postfix is not None:
             self._bars.update(self._task, postfix=postfix)
@@ -223,7 +222,7 @@ class _RichBar(Bar):
 
 
 class _Count(ProgressColumn):
-    """The count and the pace, for bars that have a unit."""
+    """Column with count and pace, for bars with a unit."""
 
     def render(self, task: Task) -> Text:
         """Return, for example, "120/1,000 3.4 flights/s", or "2/10 6.5 flights/min"."""
@@ -234,7 +233,7 @@ class _Count(ProgressColumn):
         new = task.completed - task.fields["before"]
         if not new or not task.elapsed:
             return Text(count)
-        # What came before the first one, as loading and compiling, is no part of the pace.
+        # Time before the first completed unit, such as loading and compiling, is excluded.
         pace, time = task.speed or new / task.elapsed, "s"
         if pace < 1.0:
             pace, time = 60.0 * pace, "min"
@@ -242,7 +241,7 @@ class _Count(ProgressColumn):
 
 
 class _Left(TimeRemainingColumn):
-    """The time left, called so; the time taken at the end."""
+    """Column with the remaining time; shows the elapsed time at the end."""
 
     def __init__(self) -> None:
         super().__init__(elapsed_when_finished=True, table_column=Column(no_wrap=True))

@@ -1,4 +1,4 @@
-"""What a run was made with: package versions, machine, commit."""
+"""Provenance of a run: package versions, machine, commit."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ GIT_TIMEOUT_S = 10.0
 
 
 def package_versions() -> dict[str, str]:
-    """Return the versions of the packages that can change a result; those installed."""
+    """Return the installed versions of all packages that can change a result."""
     found = {"airl-mav": __version__}
     for name in PACKAGES:
         try:
@@ -44,7 +44,7 @@ def package_versions() -> dict[str, str]:
 
 
 def provenance(command: str) -> dict[str, Any]:
-    """Return versions, machine and commit of what a command makes now, as plain values."""
+    """Return versions, machine and commit for the results of a command, as plain values."""
     return {
         "created_utc": utc_now().isoformat(timespec="seconds"),
         "command": command,
@@ -56,7 +56,7 @@ def provenance(command: str) -> dict[str, Any]:
 
 def describe_machine() -> dict[str, Any]:
     """Return processor, cores, memory, operating system and Python. No names, no addresses."""
-    # Imported here: whoever reads a run does not ask about the machine.
+    # Imported here: reading a run does not need it.
     import psutil
 
     return {
@@ -71,7 +71,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def usable_cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""How the host schedules this process."""
+"""Host scheduling of this process."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from contextlib import suppress
 from pathlib import Path
 
 SLICE_NS = 100_000
-"""Linux' shortest time slice [ns]."""
+"""Minimum time slice of Linux [ns]."""
 
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 """Number of the system call sched_setattr (Linux, unistd.h)."""
 
 
 class _Attributes(ctypes.Structure):
-    """struct sched_attr, as of sched_setattr(2)."""
+    """Structure sched_attr, as in sched_setattr(2)."""
 
     _fields_ = (
         ("size", ctypes.c_uint32),
@@ -32,38 +32,38 @@ class _Attributes(ctypes.Structure):
 
 
 def ask_for_short_slices() -> None:
-    """Ask that this thread, and what it starts from now on, run soon when they are woken.
+    """Request short time slices for this thread and its later children, for faster wake-up.
 
-    Threads that hand work to and fro all the time wait for their turn each time. With short slices
-    they have it sooner, and no more of the processor than before. Linux knows this from 6.12 on
-    (EEVDF: the slice of a thread is its request); elsewhere nothing happens.
+    Threads that continuously hand work to each other wait for the processor each time. Short slices
+    shorten these waits at the same processor share. Supported by Linux 6.12 and later (EEVDF: the
+    slice of a thread is its request); otherwise without effect.
     """
     _ask_for_slices(SLICE_NS)
 
 
 def _ask_for_slices(length_ns: int) -> None:
-    """Ask for slices of a length [ns], 0: as Linux has them for all."""
+    """Request slices of a length [ns]; 0 = Linux's default."""
     number = _SCHED_SETATTR.get(platform.machine())
     if sys.platform != "linux" or number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
         return
     nice = os.getpriority(os.PRIO_PROCESS, 0)
     asked = _Attributes(ctypes.sizeof(_Attributes), 0, 0, nice, 0, length_ns, 0, 0)
-    # Refused or not known: nothing depends on it.
+    # Optional: failures are ignored.
     ctypes.CDLL(None).syscall(number, 0, ctypes.byref(asked), 0)
 
 
 def give_way(niceness: int) -> None:
-    """Let all others run before this process and what it starts from now on; niceness 1 to 19.
+    """Lower the priority of this process and its later children; niceness 1 to 19.
 
-    Linux' autogroups share the processor out among sessions. Niceness counts only within one: a
-    nice process of one session takes half of what an urgent one of another could have. So this
-    process becomes a session of its own, and is nice as such, too (sched(7)). Short slices of its
-    parent are no longer its own.
+    Linux's autogroups divide the processor among sessions, and niceness counts only within a
+    session. A nice process would take half of the time that an urgent process of another session
+    needs. Therefore this process starts a new session with its own autogroup niceness (sched(7)).
+    The parent's short slices are reset.
     """
     os.nice(niceness)
     _ask_for_slices(0)
-    with suppress(OSError):  # It leads its process group already, and perhaps its session.
+    with suppress(OSError):  # Already a process group leader, or a session leader.
         os.setsid()
     if os.getsid(0) == os.getpid():
-        with suppress(OSError):  # There are no autogroups here.
+        with suppress(OSError):  # Autogroups are not available.
             Path("/proc/self/autogroup").write_text(str(niceness), "ascii")

@@ -1,4 +1,4 @@
-"""MAVLink 2 message signing: who has the key may speak, and nothing is taken twice.
+"""MAVLink 2 message signing: authentication by a key, and replay protection.
 
 Source: https://mavlink.io/en/guide/message_signing.html. A signed frame has an incompatibility flag
 and ends with 13 bytes: a link id, a time stamp of 48 bits (units of 10 µs since 2015), and the
@@ -23,21 +23,21 @@ from airl_mav.core.files import replace_file
 
 KEY_BYTES = 32
 SIGNATURE_BYTES = 13
-"""What a signed frame has more than an unsigned one."""
+"""Length of the signature at the end of a signed frame."""
 
 EPOCH_UNIX_US = 1_420_070_400_000_000
-"""2015-01-01T00:00Z, when time stamps begin [µs since 1970]."""
+"""Epoch of time stamps, 2015-01-01T00:00Z [µs since 1970]."""
 UNIT_US = 10
-"""What a time stamp counts [µs]."""
+"""Unit of a time stamp [µs]."""
 
 LATE = 60 * 1_000_000 // UNIT_US
-"""A sender that was never heard may lag our time by this much: a minute, in units of 10 µs."""
+"""Maximum lag of a new sender's time stamp behind local time: a minute, in units of 10 µs."""
 
 MAX_STREAMS = 256
-"""Senders (link id, system, component) whose newest time stamps are kept."""
+"""Maximum number of senders (link id, system, component) with stored time stamps."""
 
 UNSIGNED_IDS = frozenset((0, 109, 246, 247))
-"""HEARTBEAT, RADIO_STATUS, ADSB_VEHICLE, COLLISION: what PX4 takes without a signature, as radios
+"""HEARTBEAT, RADIO_STATUS, ADSB_VEHICLE, COLLISION: accepted by PX4 without a signature, as radios
 and transponders have no key (PX4 PR 25284)."""
 
 _MARKER = 0xFD
@@ -48,30 +48,30 @@ _LAST = (1 << 48) - 1
 
 
 class Signing:
-    """A key, the newest time stamps, and what they decide. Shared by all links of a program."""
+    """Signing key and newest time stamps, shared by all links of a program."""
 
     def __init__(
         self, calendar_us: Callable[[], int], key: bytes | None = None, timestamp: int = 0
     ) -> None:
-        """Begin with a key of 32 bytes, or None: nothing is signed or required.
+        """Set a key of 32 bytes, or None to disable signing.
 
-        `calendar_us` returns the calendar time [µs since 1970], `timestamp` is the newest one that
-        was used with the key [10 µs since 2015].
+        `calendar_us` returns the calendar time [µs since 1970]; `timestamp` is the newest time
+        stamp used with the key [10 µs since 2015].
         """
         self._calendar_us = calendar_us
         self.key = key
         self.timestamp = timestamp
-        """The newest, ours or another's."""
+        """Newest time stamp, local or received."""
         self.refused = 0
-        """Frames that were unsigned, forged or old."""
+        """Number of unsigned, forged or outdated frames."""
         self.on_key: Callable[[], None] = lambda: None
-        """Called when the key changes."""
+        """Callback for a change of the key."""
         self._streams: dict[tuple[int, int, int], int] = {}
         self._began: Callable[[], hashlib._Hash] = hashlib.sha256
         self.change(key, timestamp)
 
     def change(self, key: bytes | None, timestamp: int = 0) -> None:
-        """Take another key, or None, with its newest time stamp [10 µs since 2015]."""
+        """Set a new key, or None, with its newest time stamp [10 µs since 2015]."""
         if key is not None and len(key) != KEY_BYTES:
             raise ValueError(f"a key of {len(key)} bytes: must have {KEY_BYTES}")
         self.key = key
@@ -82,7 +82,7 @@ class Signing:
         self.on_key()
 
     def sign(self, frame: bytes, link_id: int) -> bytes:
-        """Return an unsigned MAVLink 2 frame with a signature; as it is where there is no key."""
+        """Return a MAVLink 2 frame with a signature; unchanged if it is signed or without a key."""
         if self.key is None or frame[0] != _MARKER or frame[2] & _SIGNED:
             return frame
         self.timestamp = min(max(self.timestamp + 1, self._now()), _LAST)
@@ -101,9 +101,9 @@ class Signing:
         return covered + self._signature(covered)
 
     def accepts(self, frame: bytes) -> bool:
-        """Return whether a frame may be taken. One that may is too old the next time.
+        """Return True if a frame is accepted; its time stamp is then used up.
 
-        Without a key everything may. The frame's checksum is not looked at.
+        Without a key all frames are accepted. The frame's checksum is not verified.
         """
         if self.key is None:
             return True
@@ -143,13 +143,13 @@ class Signing:
 
 @functools.cache
 def _flag_in_checksum(length: int) -> int:
-    """Return what the signed flag changes in the checksum of a frame with so long a payload.
+    """Return the checksum's change by the signed flag, for a frame with a payload length.
 
-    The checksum (CRC-16/MCRF4XX) is linear: the change depends on how many bytes follow the flag,
-    and not on what they are. So nobody needs to know the messages to sign them.
+    The checksum (CRC-16/MCRF4XX) is linear: the change depends on the number of bytes after the
+    flag, not on their values. Signing therefore does not need the message definitions.
     """
     crc = 0
-    # From the flag on: eight more bytes of the header, the payload, the message's own CRC byte.
+    # From the flag on: eight more bytes of the header, the payload, the message's CRC_EXTRA byte.
     for byte in (_SIGNED, *bytes(_HEADER - 3 + length + 1)):
         crc ^= byte
         for _ in range(8):
@@ -158,7 +158,7 @@ def _flag_in_checksum(length: int) -> int:
 
 
 def frames_of(datagram: bytes) -> Iterator[bytes]:
-    """Yield the MAVLink 2 frames of a datagram, by their lengths; what is none is left out."""
+    """Yield the MAVLink 2 frames of a datagram, by their lengths; skips all other bytes."""
     start = 0
     while start + _HEADER + _CHECKSUM <= len(datagram):
         if datagram[start] != _MARKER:
@@ -172,13 +172,13 @@ def frames_of(datagram: bytes) -> Iterator[bytes]:
         start = end
 
 
-# --- the file of a key, for its owner alone, and that of the newest time stamp beside it
+# --- the key file, private to its owner, and the time stamp file beside it
 
 OPTION = "signing_key"
-"""The field of a scenario that names the file."""
+"""Field of a scenario with the path of the key file."""
 
 SAVE_EVERY_US = 60 * US_PER_S
-"""The newest time stamp is written so often [µs of wall time]."""
+"""Interval at which the newest time stamp is saved [µs of wall time]."""
 
 
 def read_key(path: Path) -> bytes:
@@ -201,7 +201,7 @@ def read_key(path: Path) -> bytes:
 
 
 def write_key(path: Path, key: bytes) -> None:
-    """Write a key to a file that only its owner can read, whole. Raises OSError."""
+    """Write a key atomically to a file that only its owner can read. Raises OSError."""
     partial = path.with_name(path.name + ".partial")
     partial.unlink(missing_ok=True)
     descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -213,10 +213,10 @@ def write_key(path: Path, key: bytes) -> None:
 
 
 class StoredSigning:
-    """A `Signing` whose key and newest time stamp outlive the program."""
+    """Signing with a key and a newest time stamp stored in files."""
 
     def __init__(self, path: Path | None, clock: Clock | None = None) -> None:
-        """Read both, or raise FieldError; without a path there is no key, and nothing is stored."""
+        """Read both, or raise FieldError; without a path, signing is off and nothing is stored."""
         self._path = path
         self._clock = clock or WallClock()
         self.signing = Signing(calendar_us)
@@ -226,15 +226,15 @@ class StoredSigning:
         self._next_us = self._clock.time_us() + SAVE_EVERY_US
 
     def save_due(self) -> None:
-        """Write the newest time stamp now and then; to be called often."""
+        """Save the newest time stamp at intervals; call often."""
         if self._path is not None and self._clock.time_us() >= self._next_us:
             self.save()
 
     def save(self) -> None:
-        """Write the newest time stamp, where it can be written: no flight ends over it.
+        """Save the newest time stamp; errors are ignored, as they must not end a flight.
 
-        A program that begins without it takes the calendar's time, and what was sent in the last
-        minute before could be replayed to it.
+        Without the file, a program starts with the calendar time. Messages of the last minute
+        before the start could then be replayed.
         """
         self._next_us = self._clock.time_us() + SAVE_EVERY_US
         if self._path is not None and self.signing.key is not None:
@@ -242,7 +242,7 @@ class StoredSigning:
                 replace_file(_stamp_path(self._path), f"{self.signing.timestamp}\n".encode())
 
     def _store_key(self) -> None:
-        """Keep a key that came over a link, or forget it."""
+        """Store a key received over a link, or delete it."""
         if self._path is None:
             return
         if self.signing.key is None:
@@ -253,7 +253,7 @@ class StoredSigning:
 
 
 def calendar_us() -> int:
-    """Return the calendar time [µs since 1970], which time stamps of signatures are made of."""
+    """Return the calendar time [µs since 1970] for time stamps of signatures."""
     return int(utc_now().timestamp() * US_PER_S)
 
 
@@ -265,4 +265,4 @@ def _read_stamp(path: Path) -> int:
     try:
         return max(0, int(path.read_text(encoding="ascii")))
     except (OSError, ValueError):
-        return 0  # the calendar is what else there is
+        return 0  # defaults to the calendar time

@@ -11,7 +11,7 @@ import numpy as np
 class Stream(IntEnum):
     """First word of a stream's key.
 
-    `arena.generate` has 0 to 3; the plant's sensors and gusts are 0 and 1 (`sensors_and_gusts`).
+    `arena.generate` uses 0 to 3; the plant's sensors and gusts are 0 and 1 (`sensors_and_gusts`).
     """
 
     AIRFRAME = 10
@@ -30,17 +30,17 @@ class Stream(IntEnum):
 
 
 def stream(seed: int, name: Stream, *more: int) -> np.random.Generator:
-    """Return the generator of one stream of an episode; `more` numbers tell its parts apart."""
-    # Compiled, and imported late: programs that only tell what they can do need no numba.
+    """Return the generator of one stream of an episode; `more` numbers identify its parts."""
+    # Imported late, as it is compiled: capability queries do not need numba.
     from airl_mav.core.seeding import seeded
 
     return seeded(seed, name, *more)
 
 
 def words_of(name: str) -> tuple[int, ...]:
-    """Return what tells the streams of a further camera apart, by its name; "": the main one's.
+    """Return the key words of an additional camera's streams, by its name; empty for "".
 
-    By its name, not its place in a list: what one camera draws does not change with the others.
+    Keys depend on names, not on positions in a list, so adding a camera does not change others.
     """
     return (crc32(name.encode()),) if name else ()
 
@@ -48,6 +48,6 @@ def words_of(name: str) -> tuple[int, ...]:
 def sensors_and_gusts(
     rng: np.random.Generator,
 ) -> tuple[np.random.Generator, np.random.Generator]:
-    """Return the generators of sensor noise and of gusts, from a new one of the episode's seed."""
+    """Return the generators of sensor noise and of gusts, spawned from an episode's generator."""
     sensors, gusts = rng.spawn(2)
     return sensors, gusts

@@ -1,7 +1,7 @@
-"""A process that is suspended, and surely resumed, also when whoever suspended it is killed.
+"""Suspension of a process, with a guaranteed resume even if the suspending program is killed.
 
-A stopped process does not see that the pipe from its parent has closed, and would be left behind
-for ever. While it is suspended, a guard reads a pipe for it.
+A stopped process cannot notice that the pipe from its parent has closed, and would never exit. A
+guard reads a pipe on its behalf during the suspension.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from contextlib import suppress
 
 
 class Suspension:
-    """Holds a process from its making to `end`."""
+    """Suspension of a process, from construction to `end`."""
 
     def __init__(self, pid: int) -> None:
-        """Suspend a process of ours (SIGSTOP)."""
+        """Suspend a child process (SIGSTOP)."""
         self._pid = pid
         os.kill(pid, signal.SIGSTOP)
         self._guard = subprocess.Popen(  # noqa: S603 - a list of arguments, no shell
@@ -28,7 +28,7 @@ class Suspension:
         )
 
     def end(self) -> None:
-        """Resume it; harmless when it has ended, or when called again."""
+        """Resume the process; no effect if it has ended or is already resumed."""
         _resume(self._pid)
         if self._guard.stdin is not None:
             self._guard.stdin.close()

@@ -1,1 +1,1 @@
-"""Training's side: N vehicles at a time on the same kernels as the rehearsal."""
+"""Training environments: N vehicles at a time on the same kernels as the rehearsal."""

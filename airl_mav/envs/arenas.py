@@ -1,4 +1,4 @@
-"""N arenas as padded arrays: what the fleet kernels collide with and look at."""
+"""N arenas as padded arrays, for collision checks and rendering in the fleet kernels."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from airl_mav.vehicle.rotation import Vec
 
 
 class ArenaBatch(NamedTuple):
-    """N arenas; obstacle arrays are padded to the greatest number, tours to the longest."""
+    """N arenas; obstacle arrays are padded to the maximum number, tours to the maximum length."""
 
     bounds: NDArray[np.float64]  # (n, 6) as Bounds.as_array
     n_obstacles: NDArray[np.int64]  # (n,) static ones first
     n_static: NDArray[np.int64]  # (n,)
     shape: NDArray[np.int8]  # (n, m)
-    center: NDArray[np.float64]  # (n, m, 3) NED [m]; moving ones are updated in flight
+    center: NDArray[np.float64]  # (n, m, 3) NED [m]; moving obstacles are updated in flight
     half_size: NDArray[np.float64]  # (n, m, 3) [m]
     yaw: NDArray[np.float64]  # (n, m) [rad]
     tour_times_s: NDArray[np.float64]  # (n, movers, k) padded with infinity
     tour_points: NDArray[np.float64]  # (n, movers, k, 2)
     tour_period_s: NDArray[np.float64]  # (n, movers)
-    tour_speed: NDArray[np.float64]  # (n,) greatest speed of any mover [m/s]
-    goal: NDArray[np.float64]  # (n, 3) north, east, down [m]; down is NaN where it has no height
-    heights: NDArray[np.float64]  # (n, h) `Relief.heights` of each
-    grid: NDArray[np.float64]  # (n, GRID_SIZE) `Relief.grid`; no rows: the ground is the floor
+    tour_speed: NDArray[np.float64]  # (n,) maximum speed of any mover [m/s]
+    goal: NDArray[np.float64]  # (n, 3) north, east, down [m]; down is NaN if the height is free
+    heights: NDArray[np.float64]  # (n, h) `Relief.heights` of each arena
+    grid: NDArray[np.float64]  # (n, GRID_SIZE) `Relief.grid`; without rows the ground is flat
 
 
 def empty_batch(n: int, obstacles: int, movers: int, points: int, heights: int = 0) -> ArenaBatch:
-    """Return room for n arenas of at most so many obstacles, movers, way-points and heights."""
+    """Return empty arrays for n arenas with maximum numbers of their elements."""
     return ArenaBatch(
         bounds=np.zeros((n, 6)),
         n_obstacles=np.zeros(n, np.int64),
@@ -57,7 +57,7 @@ def empty_batch(n: int, obstacles: int, movers: int, points: int, heights: int =
 
 
 def batch_of(arenas: Sequence[Arena]) -> ArenaBatch:
-    """Return the arenas as one batch, with exactly the room they need."""
+    """Return the arenas as one batch of minimum size."""
     tours = [tour for arena in arenas for tour in arena.tours]
     batch = empty_batch(
         len(arenas),
@@ -72,37 +72,37 @@ def batch_of(arenas: Sequence[Arena]) -> ArenaBatch:
 
 
 def with_room(batch: ArenaBatch, arena: Arena) -> ArenaBatch:
-    """Return a batch with the same arenas in which there is room for another one."""
+    """Return a copy of a batch that is large enough for another arena."""
     larger = empty_batch(len(batch.bounds), *map(max, _room_in(batch), _room_of(arena)))
     copy_rows(batch, larger)
     return larger
 
 
 def copy_rows(batch: Iterable[NDArray[Any]], larger: Iterable[NDArray[Any]]) -> None:
-    """Write arrays into the first places of others that have at least as much room."""
+    """Copy arrays into the leading part of others that are at least as large."""
     for old, new in zip(batch, larger, strict=True):
         new[tuple(map(slice, old.shape))] = old
 
 
 def _room_of(arena: Arena) -> tuple[int, int, int, int]:
-    """Return how many obstacles, movers, way-points and heights an arena has."""
+    """Return the numbers of obstacles, movers, waypoints and heights of an arena."""
     points = max((len(tour.times_s) for tour in arena.tours), default=0)
     return len(arena.obstacles), len(arena.tours), points, _heights_of(arena)
 
 
 def _heights_of(arena: Arena) -> int:
-    """Return how many heights the ground of an arena has."""
+    """Return the number of ground heights of an arena."""
     return 0 if arena.ground is None else arena.ground.heights.size
 
 
 def _room_in(batch: ArenaBatch) -> tuple[int, int, int, int]:
-    """Return how many of the same there is room for in a batch."""
+    """Return a batch's capacity for obstacles, movers, waypoints and heights."""
     _, movers, points = batch.tour_times_s.shape
     return batch.shape.shape[1], movers, points, batch.heights.shape[1]
 
 
 def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
-    """Write an arena into row i. Raises ValueError when it needs more room than there is."""
+    """Write an arena into row i. Raises ValueError if it exceeds the batch's capacity."""
     o = arena.obstacles
     need, room = _room_of(arena), _room_in(batch)
     if any(each > most for each, most in zip(need, room, strict=True)):
@@ -134,7 +134,7 @@ def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
 
 @kernel
 def _fastest(times_s: NDArray[np.float64], points: NDArray[np.float64]) -> float:
-    """Return the greatest speed [m/s] of a tour, as the fields of `Tour`."""
+    """Return the maximum speed [m/s] of a tour; arguments are fields of `Tour`."""
     greatest = 0.0
     for k in range(len(times_s) - 1):
         north, east = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
@@ -152,14 +152,14 @@ def relief_of(batch: ArenaBatch, i: int) -> Relief:
 
 @kernel
 def move_all_obstacles(batch: ArenaBatch, time_us: NDArray[np.int64]) -> None:
-    """Put the moving obstacles of all arenas where they are at a time (n,) of each episode."""
+    """Move the obstacles of all arenas to their positions at a time (n,) of each episode."""
     for i in range(len(time_us)):
         move_obstacles(batch, i, time_us[i])
 
 
 @kernel
 def move_obstacles(batch: ArenaBatch, i: int, time_us: int) -> None:
-    """Put the moving obstacles of arena i where they are `time_us` after its episode's start.
+    """Move the obstacles of arena i to their positions `time_us` after the episode's start.
 
     The same interpolation as `Arena.centers_at`.
     """
@@ -197,18 +197,18 @@ def clearance(
     half_size: NDArray[np.float64],
     relief: Relief | None = None,
 ) -> float:
-    """Return a distance [m] that the vehicle may move without touching anything; below 0 = unsure.
+    """Return a distance [m] that the vehicle may move without a contact; below 0 = unknown.
 
-    A lower bound: obstacles count as upright cylinders around their bounding boxes. The ground is
-    nowhere steeper than its steepest triangle: what lies a height above it is so far from it, less
-    what the cosine of that slope takes. Arguments as of `touches`.
+    A lower bound: obstacles count as upright cylinders around their bounding boxes. The distance to
+    the ground is at least the height above it times the cosine of the steepest triangle's slope.
+    Arguments as in `touches`.
     """
     x, y, z = position
     low = z + half_height
     beside = min(min(x - bounds[0], bounds[1] - x), min(y - bounds[2], bounds[3] - y)) - radius
     room: float = min(-low, max(beside, -bounds[4] - low))
     if relief is not None and len(relief.heights) > 0:
-        # From beyond a wall the nearest ground is that at its foot.
+        # Beyond a wall the nearest ground is at the wall's foot.
         north, east = min(max(x, bounds[0]), bounds[1]), min(max(y, bounds[2]), bounds[3])
         above = -low - extreme_within(relief, north, east, radius, 1.0)
         steepest = relief.grid[STEEPEST]
@@ -240,20 +240,20 @@ def touches(
 
     Args:
         position: Vehicle NED [m].
-        radius: Of the vehicle's disc [m].
-        half_height: Of the vehicle's disc [m].
-        bounds: As Bounds.as_array.
+        radius: Radius of the vehicle's disc [m].
+        half_height: Half height of the vehicle's disc [m].
+        bounds: `Bounds.as_array()`.
         count: Number of obstacles.
         shape: (m,).
         center: (m, 3) NED [m].
         half_size: (m, 3) [m].
         yaw: (m,) [rad].
-        relief: The ground, which is the floor where it rises; None: it does nowhere.
+        relief: The ground; None = flat. Contacts with it count as FLOOR.
     """
     x, y, z = position
     if z + half_height > 0.0:
         return FLOOR
-    # Beyond the walls, and without hills, it is minus infinity: there the floor is level.
+    # Beyond the walls and without hills the result is -infinity, so the ground is level.
     if relief is not None and z + half_height > -extreme_within(relief, x, y, radius, 1.0):
         return FLOOR
     if bounds[5] > 0.0 and z - half_height < -bounds[4]:
@@ -270,10 +270,10 @@ def touches(
         hx, hy, hz = half_size[i, 0], half_size[i, 1], half_size[i, 2]
         reach = hx + hy + radius
         if dx * dx + dy * dy > reach * reach:
-            continue  # far off, which nearly all are: no need for the shape
+            continue  # most obstacles are far away: no need for the shape
         gap_z = max(0.0, abs(dz) - half_height - (0.0 if shape[i] == _SPHERE else hz))
         if shape[i] == _SPHERE:
-            # The nearest point of the disc's rim or face to the centre.
+            # Nearest point of the disc's rim or face to the centre.
             gap = max(0.0, math.hypot(dx, dy) - radius)
             if gap * gap + gap_z * gap_z < hx * hx:
                 return i

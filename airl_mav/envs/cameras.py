@@ -1,4 +1,4 @@
-"""The cameras of n vehicles: when frames are taken, and what is on them.
+"""Cameras of n vehicles: frame timing, rendering, noise and faults.
 
 One compiled call renders the images of all vehicles.
 """
@@ -33,11 +33,11 @@ from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.conditions import SensorNoise
 
 NEVER_US = 1 << 50
-"""Later than any flight ends [µs]."""
+"""Time beyond the end of any flight [µs]."""
 
 
 class Eye(NamedTuple):
-    """A depth camera of n vehicles, as kernels take it."""
+    """Depth camera of n vehicles, as an argument for kernels."""
 
     mount: Mount
     lens: Lens
@@ -47,7 +47,7 @@ class Eye(NamedTuple):
 
 
 class Eyes:
-    """One camera of each of n vehicles: the images that it takes."""
+    """Images of one camera on each of n vehicles."""
 
     def __init__(
         self,
@@ -58,29 +58,29 @@ class Eyes:
         meshes: MeshesSeen | None,
         name: str = "",
     ) -> None:
-        """Make n cameras; `name` is that of a further one. The rest as of `Cameras`."""
+        """Create n cameras; `name` = an additional camera. Other arguments as in `Cameras`."""
         self.intrinsics = Intrinsics.of(camera)
         self.image = np.zeros((n, *self.intrinsics.shape), self.intrinsics.dtype)
-        """(n, ...) newest images, as `camera.frame.Frame.image` of each."""
+        """(n, ...) newest images, each as `camera.frame.Frame.image`."""
         self._noise = noise_of(camera, noise, name)
         self._mount = Mount.of(camera)
         self._lens = lens_of(self.intrinsics, camera.range_m)
         self._meshes = MeshesSeen(0) if meshes is None else meshes
         self._colour: ColourImages | None = None
-        """None: the cameras see depth."""
+        """Renderer of colour images; None for depth cameras."""
         if self.intrinsics.kind != "depth":
-            assert looks is not None  # noqa: S101 - whoever makes colour cameras has arenas for them
+            assert looks is not None  # noqa: S101 - colour cameras require arenas
             self._colour = ColourImages(self.intrinsics, self._mount, looks, self._meshes)
         self._formed: ImageFormation | None = None
-        """Takes images one by one, as the rehearsal does; None: the camera has no `imaging`.
-
-        Nothing outlasts an image (`conditions.check_twin_imaging`): it serves all vehicles."""
+        """Image formation for single images, as in the rehearsal; None without a table `imaging`.
+        It keeps no state between images (`conditions.check_twin_imaging`), so it serves all
+        vehicles."""
         if camera.imaging is not None and looks is not None:
             self._formed, self._looks = ImageFormation(camera, name), looks
 
     @property
     def eye(self) -> Eye | None:
-        """What kernels render by; None where there is more to an image than depth."""
+        """Camera for the depth kernels; None if images require more than depth rendering."""
         if self._formed is not None or self._colour is not None or self._noise is not None:
             return None
         return self._eye(self.image)
@@ -97,15 +97,15 @@ class Eyes:
         frames: NDArray[np.int64],
         out: NDArray[Any] | None = None,
     ) -> None:
-        """Take the images of the vehicles in `who` (n,), from where they are now.
+        """Take the images of the vehicles in `who` (n,) at their present poses.
 
         Args:
             fleet: Poses, motion and times.
-            arenas: One a vehicle.
-            who: (n,) whose image is taken; the others' stays as it is.
-            seeds: (n,) of the episodes, which noise is drawn from.
+            arenas: One per vehicle.
+            who: (n,) vehicles to render; other images are unchanged.
+            seeds: (n,) seeds of the episodes, for the noise.
             frames: (n,) numbers of the images in the episodes.
-            out: (n, ...) written; None: `image`.
+            out: (n, ...) written; None = `image`.
         """
         image: NDArray[Any] = self.image if out is None else out
         if self._formed is not None:
@@ -124,9 +124,9 @@ class Eyes:
 
 
 class Cameras(Stateful):
-    """Frames come at the main camera's rate; their phase to the decisions is drawn from the seed.
+    """Cameras of n vehicles; frames come at the main camera's rate, with a random phase.
 
-    Further cameras are triggered with it: a frame has the images of all.
+    The phase is drawn from the seed. Additional cameras are triggered with the main one.
     """
 
     def __init__(
@@ -145,54 +145,54 @@ class Cameras(Stateful):
         Args:
             n: Number of vehicles.
             camera: The main camera.
-            transport_us: From capture to decoded [µs].
-            noise: Conditions that their images are taken in.
-            faults: Those of the camera happen to all vehicles: `delay` to whole frames, others to
-                the main camera's images.
-            looks: How their arenas look, which colour cameras need.
-            meshes: Those of their arenas; None: there are none.
-            further: Those that are looked at beside the main one, by name; None: none.
+            transport_us: Time from capture to decoded frame [µs].
+            noise: Noise settings of the images.
+            faults: Camera faults of all vehicles: `delay` affects whole frames, others the main
+                camera's images.
+            looks: Appearance of the arenas; required by colour cameras.
+            meshes: Meshes of the arenas; None = no meshes.
+            further: Additional cameras by name; None = no additional cameras.
         """
         self._main = Eyes(n, camera, noise, looks, meshes)
         self.further = {
             name: Eyes(n, each, noise, looks, meshes, name)
             for name, each in (further or {}).items()
         }
-        """Those that are triggered with the main one, by name."""
+        """Additional cameras by name, triggered with the main camera."""
         failing = twin_faults(faults, "camera")
         self._late = [each for each in failing if each.fault.kind == "delay"]
         self._first_us = np.zeros(n, np.int64)
         self.times = FrameTimes(
             self._first_us, camera.period_us, transport_us, delays_of(self._late)
         )
-        """When frames are taken and decoded."""
+        """Times of capture and decoding of frames."""
         self._changed = [each for each in failing if each.fault.kind != "delay"]
-        """What changes pictures, in the order of the episode's faults."""
+        """Faults that change images, in the order of the episode's faults."""
         stuck = [each.number for each in failing if each.fault.kind == "stuck"]
         self._frozen = {number: np.zeros_like(self.image) for number in stuck}
-        """The picture that a camera shows that is stuck, by the fault's number."""
+        """Frozen image of a stuck camera, by the fault's number."""
         self._freeze_us = {number: np.zeros(n, np.int64) for number in stuck}
-        """When it was taken, or will be [µs]."""
+        """Capture time of the frozen image, past or future [µs]."""
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Of the main camera."""
+        """Intrinsics of the main camera."""
         return self._main.intrinsics
 
     @property
     def image(self) -> NDArray[Any]:
-        """(n, ...) newest images of the main cameras, as `camera.frame.Frame.image` of each."""
+        """(n, ...) newest images of the main cameras, each as `camera.frame.Frame.image`."""
         return self._main.image
 
     @property
     def latest_us(self) -> int:
-        """Longest time from capture to decoded [µs]."""
+        """Maximum time from capture to decoded frame [µs]."""
         late_s = sum(each.fault.amount for each in self._late)
         return self.times.transport_us + round(late_s * US_PER_S)
 
     @property
     def eye(self) -> Eye | None:
-        """What kernels render by; None where there is more to an image than depth."""
+        """Camera for the depth kernels; None if images require more than depth rendering."""
         if self._changed or self.further:
             return None
         return self._main.eye
@@ -202,22 +202,22 @@ class Cameras(Stateful):
         self._first_us[i] = -int(stream(seed, Stream.CAMERA).random() * self.times.period_us)
         for each in self._changed:
             if each.number in self._frozen:
-                # The first frame after its begin; of the start there is one, whenever it was taken.
+                # First frame after the fault's start; the start of the episode always has a frame.
                 since_us = each.from_us - int(self._first_us[i])
                 wait_us = -since_us % self.times.period_us if each.from_us else 0
                 self._freeze_us[each.number][i] = each.from_us + wait_us
 
     def delay_us(self, capture_us: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return by how much frames come later that were taken at a time (n,) [µs]."""
+        """Return the additional delay [µs] of frames captured at a time (n,) [µs]."""
         return later_us(self._late, capture_us)
 
     @property
     def may_freeze(self) -> bool:
-        """Whether any camera may be stuck."""
+        """True if any camera may be stuck."""
         return bool(self._freeze_us)
 
     def next_freeze_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64] | None:
-        """Return when the next picture is kept (n,), after these times; None: none ever is."""
+        """Return the time (n,) of the next frozen image after these times; None = never."""
         if not self._freeze_us:
             return None
         ticks = [(at - time_us + TICK_US // 2) // TICK_US for at in self._freeze_us.values()]
@@ -231,7 +231,7 @@ class Cameras(Stateful):
         arenas: ArenaBatch,
         seeds: NDArray[np.int64],
     ) -> None:
-        """Keep the pictures that are due to be: a stuck camera shows them from now on."""
+        """Store the images that are due; a stuck camera shows them from now on."""
         for number, at_us in self._freeze_us.items():
             who = np.abs(fleet.time_us - at_us) <= TICK_US // 2
             if who.any():
@@ -245,12 +245,12 @@ class Cameras(Stateful):
         who: NDArray[np.bool_],
         seeds: NDArray[np.int64],
     ) -> None:
-        """Take the frames of the vehicles in `who` (n,), from where they are now.
+        """Capture the frames of the vehicles in `who` (n,) at their present poses.
 
         The noise is drawn from the episodes' `seeds` (n,).
         """
         frames = self._frames(fleet.time_us)
-        # One type for kernels, whoever asks: they are compiled once.
+        # Always pass the same type, so that the kernels are compiled once.
         fleet = Seen(*(getattr(fleet, name) for name in Seen._fields))
         for eyes in (self._main, *self.further.values()):
             eyes.take(fleet, arenas, who, seeds, frames)
@@ -265,8 +265,8 @@ class Cameras(Stateful):
                 _make_noisy(self.image, noise, acts, own, frames)
 
     def _frames(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the numbers (n,) of frames that are taken at these times (n,) [µs]."""
-        # They are taken at whole ticks, up to half of one before their time.
+        """Return the numbers (n,) of frames captured at these times (n,) [µs]."""
+        # Captures happen at whole ticks, up to half a tick before their time.
         frames: NDArray[np.int64] = (
             time_us + TICK_US // 2 - self._first_us
         ) // self.times.period_us
@@ -274,7 +274,7 @@ class Cameras(Stateful):
 
     def _held(self) -> Mapping[str, Any]:
         held: dict[str, Any] = {"image": self.image, "first_us": self._first_us}
-        # What a checkpoint of an environment of one camera does not have.
+        # Omitted for one camera, as in earlier checkpoints.
         if self.further:
             held["further"] = {name: each.image for name, each in self.further.items()}
         return held
@@ -296,14 +296,14 @@ def _make_noisy(
 def render_images(
     fleet: Fleet | Seen, arenas: ArenaBatch, who: NDArray[np.bool_], eye: Eye | None
 ) -> None:
-    """Render the depth image of every vehicle in `who`, from where it is now.
+    """Render the depth image of every vehicle in `who` at its present pose.
 
     Args:
         fleet: Poses and times.
-        arenas: One a vehicle; moving obstacles are put where they are at its time.
-        who: (n,) whose image is rendered; the others' stays as it is.
-        eye: The camera. Its image is written: depth [mm], 0 = no return, rounded and clipped as
-            `camera.frame.depth_to_z16` does. None: nothing is rendered.
+        arenas: One per vehicle; moving obstacles are moved to its time.
+        who: (n,) vehicles to render; other images are unchanged.
+        eye: The camera. Writes its image: depth [mm], 0 = no return, rounded and clipped as in
+            `camera.frame.depth_to_z16`. None = nothing is rendered.
     """
     if eye is None:
         return
@@ -337,7 +337,7 @@ def render_images(
 
 @kernel
 def _to_z16(depth_m: NDArray[np.float32], out: NDArray[np.uint16]) -> None:
-    """Write depth [m] as millimetres: `camera.frame.depth_to_z16` without temporaries."""
+    """Write depth [m] as millimetres; `camera.frame.depth_to_z16` without temporaries."""
     for v in range(depth_m.shape[0]):
         for u in range(depth_m.shape[1]):
             mm = np.rint(depth_m[v, u] * np.float32(MM_PER_M))

@@ -1,4 +1,4 @@
-"""The colour images of n vehicles in one compiled call, and how their arenas look."""
+"""Colour images of n vehicles in one compiled call, and the appearance of their arenas."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from airl_mav.profiles.asset_files import ImageFile
 
 
 class LookBatch(NamedTuple):
-    """The looks of n arenas as `render_colour` takes them, padded to the most surfaces."""
+    """Appearance of n arenas for `render_colour`, padded to the maximum number of surfaces."""
 
     texture: NDArray[np.int8]  # (n, m)
     per_m: NDArray[np.float32]  # (n, m)
@@ -36,7 +36,7 @@ class LookBatch(NamedTuple):
 
 
 class GlossBatch(NamedTuple):
-    """What the surfaces of n arenas are beside matt, padded; see `camera.gloss.Gloss`."""
+    """Properties of non-matt surfaces in n arenas, padded; see `camera.gloss.Gloss`."""
 
     surface: NDArray[np.int8]  # (n, m)
     alpha: NDArray[np.float32]  # (n, m)
@@ -61,23 +61,23 @@ def _empty(n: int, surfaces: int) -> LookBatch:
 
 
 class Looks:
-    """How the arenas of n slots look."""
+    """Appearance of the arenas of n slots."""
 
     def __init__(self, n: int) -> None:
-        """Know none yet."""
+        """Start without any arena."""
         self.arenas: dict[int, Arena] = {}
-        """Those that it knows the looks of, by slot."""
+        """Arenas by slot."""
         self.batch = _empty(n, OBSTACLE)
-        """What the kernel looks at; replaced where an arena has more surfaces than all before."""
+        """Appearance for the kernel; replaced when an arena exceeds its number of surfaces."""
         self.gloss: GlossBatch | None = None
-        """As `batch`; None: all surfaces have been matt, and nothing is spent on others."""
+        """Surface properties as in `batch`; None while all surfaces are matt, at no cost."""
         self.images: tuple[ImageFile, ...] = ()
-        """Textures from files, of all arenas."""
+        """Image textures of all arenas."""
 
     def put(self, i: int, arena: Arena) -> None:
-        """Take the look of slot i's arena.
+        """Add the appearance of slot i's arena.
 
-        Raises UsageError where its images are others than those of the arenas before.
+        Raises UsageError if its images differ from the images of previous arenas.
         """
         if images := arena.look.finish.images:
             if self.images not in ((), images):
@@ -112,30 +112,30 @@ class Looks:
 
 
 class Lens(NamedTuple):
-    """The camera's constants; a tuple, so that compiled loops take it."""
+    """Constants of a camera; a tuple, because compiled loops require one."""
 
     focal: float
-    """Focal length [px] of a pinhole, columns for an angle [px/rad] of a cylinder."""
+    """Focal length [px] of a pinhole, columns per angle [px/rad] of a cylinder."""
     cx: float
     """Column of the optical axis [px]; pixel centres are at whole numbers."""
     cy: float
     """Row of the optical axis [px]."""
     range_m: float
-    """Greatest depth that gives a return [m]."""
+    """Maximum depth of a return [m]."""
     cylindrical: bool = False
-    """The image is a cylinder's."""
+    """True if the image is cylindrical."""
     bent: Bent | None = None
-    """The rays of a fisheye."""
+    """Rays of a fisheye."""
 
 
 def lens_of(intrinsics: Intrinsics, range_m: float) -> Lens:
-    """Return the lens of a camera that sees `range_m` [m] far."""
+    """Return the lens of a camera with a range `range_m` [m]."""
     k = intrinsics
     return Lens(k.focal, k.cx, k.cy, range_m, k.cylindrical, bent_of(k))
 
 
 class Canvas(NamedTuple):
-    """Room to work in for an image (h, w, ...)."""
+    """Work buffers for an image (h, w, ...)."""
 
     work: Work
     rgb: NDArray[np.uint8]
@@ -144,12 +144,12 @@ class Canvas(NamedTuple):
 
 
 class ColourImages:
-    """Renders the images of n vehicles with one colour camera each."""
+    """Renderer for n vehicles with one colour camera each."""
 
     def __init__(
         self, intrinsics: Intrinsics, mount: Mount, looks: Looks, meshes: MeshesSeen
     ) -> None:
-        """Take the camera, its place on the body, how the arenas look, and their meshes."""
+        """Store camera, mounting, arena appearance and meshes."""
         k, shape = intrinsics, (intrinsics.height, intrinsics.width)
         self._lens = lens_of(k, math.inf)
         self._mount, self._looks, self._meshes = mount, looks, meshes
@@ -169,7 +169,7 @@ class ColourImages:
 
 @kernel
 def _gloss_in(gloss: GlossBatch | None, i: int, surfaces: int) -> Gloss | None:
-    """Return what the surfaces of arena i are."""
+    """Return the surface properties of arena i."""
     if gloss is None:
         return None
     return Gloss(gloss.surface[i, :surfaces], gloss.alpha[i, :surfaces], gloss.lets[i, :surfaces])
@@ -189,10 +189,10 @@ def _render(
     patterns: NDArray[np.float32],
     out: NDArray[np.uint8],
 ) -> None:
-    """Render the colour image of every vehicle in `who`, from where it is now.
+    """Render the colour image of every vehicle in `who` at its present pose.
 
-    Moving obstacles are put where they are at its time. `out` (n, h, w, channels) is written: sRGB,
-    or grey where there is one channel.
+    Moving obstacles are moved to its time. `out` (n, h, w, channels) is written: sRGB, or grey for
+    one channel.
     """
     grey, rgb = out.shape[3] == 1, canvas.rgb
     for i in range(len(who)):

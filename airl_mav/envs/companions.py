@@ -1,7 +1,7 @@
-"""What the companions of n flights know: their own decisions, and what is seen when they act.
+"""Companion state of n flights: past decisions, and predicted observations.
 
-As `companion.pilot` keeps it for one: the account of the decisions, which a policy may be told, and
-where latency is compensated the newest images and states, carried forward.
+The batch counterpart of `companion.pilot`: a record of decisions as optional policy input, and with
+latency compensation the newest images and states, predicted forward.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Times = NDArray[np.int64]
 
 
 class Companions:
-    """The companions of n vehicles."""
+    """Companions of n vehicles."""
 
     def __init__(
         self,
@@ -38,11 +38,11 @@ class Companions:
 
         Args:
             n: Number of companions.
-            image: Of their cameras.
-            compensator: Carries forward what is seen; None: nothing does.
-            told: Whether the policy is told of its decisions.
-            earlier: How many images of the decisions before a policy sees.
-            further: Further cameras by name, and how many of their earlier images it sees.
+            image: Intrinsics of the main cameras.
+            compensator: Predicts observations; None = no compensation.
+            told: True if past decisions are a policy input.
+            earlier: Number of images of previous decisions as policy input.
+            further: Additional cameras by name, with the number of their earlier images.
         """
         self._n = n
         self._compensator = compensator
@@ -54,19 +54,19 @@ class Companions:
         elif told:
             self._memory = DecisionMemory(n)
         self._earlier = np.zeros((earlier, n, *image.shape), image.dtype)
-        """What the decisions before saw, the newest first; 0 = no return, black, or none yet."""
+        """Images of previous decisions, newest first; 0 = no return, black, or missing."""
         self._states = Kinematics(*(np.zeros((earlier, n, size)) for size in (3, 3, 4)))
-        """In what states."""
+        """States of previous decisions."""
         self._further = {
             name: np.zeros((count, n, *lens.shape), lens.dtype)
             for name, (lens, count) in (further or {}).items()
         }
-        """What further cameras showed them, by name."""
+        """Earlier images of additional cameras, by name."""
         self._age_us = np.zeros(n, np.int64)
-        """Of the frames, when their decisions begin."""
+        """Age of the frames at the start of their decisions."""
 
     def begin(self, i: int) -> None:
-        """Begin the flight of companion i, in a hover; its first frame is new."""
+        """Start the flight of companion i from a hover; its first frame has age 0."""
         if self._compensator is not None:
             self._compensator.begin(i)
         elif self._memory is not None:
@@ -78,23 +78,23 @@ class Companions:
 
     @property
     def account(self) -> bool:
-        """Whether they keep account of their decisions."""
+        """True if the companions record their decisions."""
         return self._memory is not None
 
     @property
     def remember(self) -> bool:
-        """Whether they keep what they saw: their policies see it again."""
+        """True if the companions keep earlier observations for the policy."""
         return len(self._earlier) > 0 or any(map(len, self._further.values()))
 
     def deciding(
         self, image: NDArray[Any], state: Kinematics, further: Mapping[str, NDArray[Any]]
     ) -> None:
-        """Keep what all decide on, of those that `remember`.
+        """Store the observations of all decisions; requires `remember`.
 
         Args:
             image: (n, ...) newest images of the main cameras.
             state: Telemetry.
-            further: (n, ...) those of further cameras, by name.
+            further: (n, ...) newest images of additional cameras, by name.
         """
         if self._compensator is not None:
             image, state = self._image, self._state
@@ -106,19 +106,19 @@ class Companions:
                 kept[0] = new
 
     def aged(self, age_us: Times) -> None:
-        """Take how old the frames (n,) are of which the next decisions are made."""
+        """Set the age (n,) of the next decisions' frames."""
         self._age_us[:] = age_us
 
     def decided(
         self, setpoints: NDArray[np.float64], t2_us: Times, sent_us: Times, stop_us: Times | None
     ) -> None:
-        """Take the setpoints that all have sent.
+        """Record the setpoints of all vehicles.
 
         Args:
             setpoints: (n, 4) as `Fleet.setpoint`.
-            t2_us: What the decisions took.
-            sent_us: When they were sent.
-            stop_us: When each is replaced by a stop if no other has come; None: never.
+            t2_us: Inference times of the decisions.
+            sent_us: Times of sending.
+            stop_us: Times at which a stop replaces each setpoint without a new one; None = never.
         """
         everyone = np.arange(self._n)
         if self._compensator is not None:
@@ -128,7 +128,7 @@ class Companions:
 
     @property
     def foresee(self) -> bool:
-        """Whether they look ahead: latency is compensated."""
+        """True if observations are predicted (latency compensation)."""
         return self._compensator is not None
 
     def look_ahead(
@@ -138,12 +138,12 @@ class Companions:
         now_us: Times,
         state: Kinematics,
     ) -> None:
-        """Carry what is seen forward to when the next decisions act, of those that `foresee`.
+        """Predict observations for the time at which the next decisions act; requires `foresee`.
 
         Args:
-            who: (n,) the companions that decide next.
+            who: (n,) companions that decide next.
             image: (n, h, w) newest depth images [mm], 0 = no return.
-            now_us: When their decisions begin.
+            now_us: Start times of their decisions.
             state: Telemetry of all n.
         """
         if self._compensator is None:
@@ -156,15 +156,15 @@ class Companions:
             kept[who] = found[who]
 
     def foreseen(self, rows: Rows) -> tuple[NDArray[Any], Kinematics]:
-        """Return what the decisions of those that `foresee` will act on: images and states."""
+        """Return predicted images and states for the next decisions; requires `foresee`."""
         return self._image[rows], self._state.rows(rows)
 
     def told(self, rows: Rows) -> InFlight | None:
-        """Return what policies may be told of the decisions; None: nobody keeps account."""
+        """Return past decisions as policy input; None without a record."""
         return None if self._memory is None else self._memory.in_flight(self._age_us).rows(rows)
 
     def earlier(self, rows: Rows) -> Earlier:
-        """Return what the decisions before saw, and in what states, the newest first."""
+        """Return images and states of previous decisions, newest first."""
         kept = (self._earlier, *self._states.known().values())
         return [
             (each[0][rows], Kinematics(*each[1:]).rows(rows)) for each in zip(*kept, strict=True)
@@ -173,14 +173,14 @@ class Companions:
     def views(
         self, images: Mapping[str, NDArray[Any]], lenses: Mapping[str, Intrinsics], rows: Rows
     ) -> dict[str, View]:
-        """Return what further cameras show, of their newest images (n, ...) by name."""
+        """Return the views of additional cameras from their newest images (n, ...) by name."""
         return {
             name: View(image[rows], lenses[name], tuple(each[rows] for each in self._further[name]))
             for name, image in images.items()
         }
 
     def held(self) -> Mapping[str, Any]:
-        """Return by name all arrays that change, for checkpoints."""
+        """Return all variable arrays by name, for checkpoints."""
         held: dict[str, Any] = {}
         if self.remember:
             held["earlier"] = {"depth_mm": self._earlier, **self._states.known()}

@@ -1,13 +1,13 @@
-"""One decision of each of n vehicles: what happens between its observation and the next one.
+"""Timing of one decision of n vehicles: the events between two observations.
 
 Sequential, as in the paper: observe, infer, act, hold, and observe again. Pipelined: the next
-decision begins with the newest frame as soon as the last one is ready; nothing is held.
+decision starts with the newest frame as soon as the last one is ready; no action is held.
 
-A decision is a list of events, each at a tick that counts from the observation. `flight.advance`
-flies from one to the next, without Python. Where body rates are commanded, the flight controller
-follows another kind of setpoint only when it publishes its control mode, twice a second
-(`control.demand.KIND_US`). A companion whose decision is overdue has it end the turn, then stop
-(`companion.watchdog`): zero rates are flown at once, the velocity of zero from then on.
+A decision is a list of events, each at a tick relative to the observation. `flight.advance`
+simulates from event to event without Python. With body rate commands, the flight controller only
+changes the setpoint type when it publishes its control mode, twice a second
+(`control.demand.KIND_US`). If a decision is overdue, the companion's watchdog stops the vehicle
+(`companion.watchdog`): first with zero rates, after the next publication with zero velocity.
 """
 
 from __future__ import annotations
@@ -37,32 +37,32 @@ from airl_mav.envs.fleet import (
 from airl_mav.policy.actions import ALTITUDE_P, MAX_VERTICAL_M_S
 
 RATES_FOLLOWED_US = KIND_US - 100_000
-"""Body rates are followed so long after a flight has begun at the earliest: until then the flight
-controller flies the velocity with which the companion has switched to offboard, a tenth of a second
-before (`companion.mavsdk_link.OFFBOARD_SETTLE_S`) [µs]."""
+"""Earliest time in a flight at which body rates take effect [µs]. Before, the flight controller
+follows the velocity setpoint that the companion sent a tenth of a second before the flight, when it
+switched to offboard (`companion.mavsdk_link.OFFBOARD_SETTLE_S`)."""
 
 NEVER_US: Final = 10**12
-"""Later than any flight ends [µs]."""
+"""Time beyond the end of any flight [µs]."""
 
 _SEND: Final = 0  # the setpoint leaves the companion
-_STOP: Final = 1  # a stop arrives: the last setpoint has expired
+_STOP: Final = 1  # a stop arrives because the last setpoint expired
 _ACCEPT: Final = 2  # the setpoint arrives
-_CAPTURE: Final = 3  # the frame of the next observation is taken
+_CAPTURE: Final = 3  # the next observation's frame is captured
 _END: Final = 4  # the next decision begins
-_ARRIVE: Final = 5  # a setpoint of an earlier decision arrives; the numbers behind it, older ones
-_MOST: Final = 6  # events of a decision, beside those of earlier setpoints
+_ARRIVE: Final = 5  # a setpoint of an earlier decision arrives; higher numbers are older ones
+_MOST: Final = 6  # maximum events of a decision, without earlier setpoints
 
 _FLYING: Final = int(Verdict.FLYING)
 
 
 class FrameTimes(NamedTuple):
-    """Frames come at a camera's rate; their phase to the decisions is each episode's own."""
+    """Frame timing at a camera's rate; the phase to the decisions differs between episodes."""
 
     first_us: NDArray[np.int64]
-    """(n,) when the first frame of each episode was taken [µs]."""
+    """(n,) capture time of each episode's first frame [µs]."""
     period_us: int
     transport_us: int
-    """From capture to decoded [µs]."""
+    """Time from capture to decoded frame [µs]."""
     late: NDArray[np.int64]
     """(k, 3) `faults.delays_of` the camera."""
 
@@ -72,48 +72,48 @@ class Timing(NamedTuple):
 
     pipelined: bool
     link_us: int
-    """Setpoint sent to accepted [µs]."""
+    """Time from sending a setpoint to its acceptance [µs]."""
     hold_us: int
-    """Sequential: how long an action is held before the next observation [µs]."""
+    """Sequential: time from sending an action to the next observation [µs]."""
     hover_us: int
-    """Sequential: the velocity is zeroed so long after the observation [µs]; negative = never."""
+    """Sequential: time after the observation at which velocity is zeroed [µs]; negative = never."""
     timeout: int
-    """Body rates: ticks from one setpoint to the stop that replaces it; negative = velocities."""
+    """Body rates: ticks after which a stop replaces a setpoint; negative = velocity commands."""
     altitude_m: float
-    """Height that is held where actions command no vertical speed [m]."""
+    """Altitude hold height for actions without a vertical speed [m]."""
     uplink: NDArray[np.int64]
     """(k, 3) `faults.delays_of` the uplink."""
     frames: FrameTimes
 
 
 class Decision(NamedTuple):
-    """The present decision of n vehicles; rows are updated in place."""
+    """Present decision of n vehicles; rows are updated in place."""
 
     timing: Timing
-    errors: NDArray[np.float64]  # (n, 9) of telemetry
+    errors: NDArray[np.float64]  # (n, 9) errors of telemetry
     began_us: NDArray[np.int64]  # (n,) time of the observation
     t2_us: NDArray[np.int64]  # (n,) inference
     before_m: NDArray[np.float64]  # (n,) distance to the goal at the observation
-    flying: NDArray[np.bool_]  # (n,) the flight had not ended then
+    flying: NDArray[np.bool_]  # (n,) True if the flight had not ended at the observation
     setpoint: NDArray[np.float64]  # (n, 4) as `Fleet.setpoint`
-    tick: NDArray[np.int64]  # (n, k) when events happen, from `began_us` on
+    tick: NDArray[np.int64]  # (n, k) ticks of events relative to `began_us`
     kind: NDArray[np.int64]  # (n, k)
     events: NDArray[np.int64]  # (n,) number of events
-    next: NDArray[np.int64]  # (n,) the next one
-    age: NDArray[np.int64]  # (n,) of the next observation's frame, in ticks
-    pause_us: NDArray[np.int64]  # (n,) when Python is needed
+    next: NDArray[np.int64]  # (n,) index of the next event
+    age: NDArray[np.int64]  # (n,) age of the next observation's frame in ticks
+    pause_us: NDArray[np.int64]  # (n,) time of the next call into Python
     seen: Seen
     accepted: NDArray[np.int64]  # (n,) tick
-    left: NDArray[np.int64]  # (n, k) ticks until earlier setpoints arrive, newest first; 0: none
-    in_flight: NDArray[np.float64]  # (n, k, 4) those setpoints
+    left: NDArray[np.int64]  # (n, k) ticks until earlier setpoints arrive, newest first; 0 = none
+    in_flight: NDArray[np.float64]  # (n, k, 4) the corresponding setpoints
     newest: NDArray[np.float64]  # (n, 4) the newest body rates and thrust
-    wanted: NDArray[np.bool_]  # (n,) whether they are newer than a velocity of zero
-    sent_us: NDArray[np.int64]  # (n,) when the last one was sent; 0: none
+    wanted: NDArray[np.bool_]  # (n,) True if `newest` is newer than a stop
+    sent_us: NDArray[np.int64]  # (n,) sending time of the last setpoint; 0 = none
 
 
 def new_decision(timing: Timing, errors: NDArray[np.float64]) -> Decision:
-    """Return room for the decisions of n vehicles with such errors (n, 9) of telemetry."""
-    # A pipelined decision lasts a tick at least.
+    """Return empty decisions of n vehicles with telemetry errors (n, 9)."""
+    # A pipelined decision takes at least one tick.
     n, room = len(errors), max(-(-timing.link_us // TICK_US), 1)
 
     def whole(*shape: int) -> NDArray[np.int64]:
@@ -145,14 +145,14 @@ def new_decision(timing: Timing, errors: NDArray[np.float64]) -> Decision:
 
 
 def begin_decision(decision: Decision, i: int) -> None:
-    """Begin the flight of vehicle i: nothing is in flight when a decision begins."""
+    """Start the flight of vehicle i with no setpoints in flight."""
     decision.left[i] = 0
     decision.newest[i], decision.wanted[i], decision.sent_us[i] = 0.0, False, 0
 
 
 @large_borrowing_kernel
 def plan(decision: Decision, fleet: Fleet) -> None:
-    """Write down the events of all decisions, whose setpoints and inference times are there."""
+    """Schedule the events of all decisions from their setpoints and inference times."""
     for i in range(len(decision.t2_us)):
         decision.began_us[i] = fleet.time_us[i]
         decision.flying[i] = fleet.verdict[i] == _FLYING
@@ -165,7 +165,7 @@ def plan(decision: Decision, fleet: Fleet) -> None:
 
 @borrowing_kernel
 def _add(decision: Decision, i: int, tick: int, kind: int) -> None:
-    """Insert an event of vehicle i behind all that happen no later."""
+    """Insert an event of vehicle i after all events at the same tick or earlier."""
     at = decision.events[i]
     ticks, kinds = decision.tick[i], decision.kind[i]
     while at > 0 and ticks[at - 1] > tick:
@@ -183,19 +183,19 @@ def _plan_sequential(decision: Decision, now_us: int, i: int, t2_us: int) -> Non
     stop_us = NEVER_US if timing.hover_us < 0 else timing.hover_us
     if timing.timeout >= 0:
         overdue = _overdue(decision, i, now_us)
-        # What is replaced in time never expires, though the next is on its way.
+        # A setpoint replaced in time never expires, even while the next one is in flight.
         if overdue < sent:
             stop_us = min(stop_us, overdue * TICK_US)
         decision.sent_us[i] = now_us + TICK_US * sent
-    # The stop takes as long to arrive as any setpoint.
+    # A stop has the same link delay as a setpoint.
     stop = ticks_of(stop_us + timing.link_us + later_in(timing.uplink, now_us + stop_us))
     _add(decision, i, sent, _SEND)
     if 0 <= stop < accepted:
-        # A stop is there before the setpoint is sent, or right behind.
+        # The stop arrives before the setpoint is sent, or shortly after.
         _add(decision, i, stop, _STOP)
     ended = sent + timing.hold_us // TICK_US
     _add(decision, i, accepted, _ACCEPT)
-    # Its tick is known once the setpoint is there.
+    # Its tick depends on the frame's age, known at acceptance.
     _add(decision, i, ended, _CAPTURE)
     _add(decision, i, ended, _END)
     decision.accepted[i] = accepted
@@ -205,12 +205,12 @@ def _plan_sequential(decision: Decision, now_us: int, i: int, t2_us: int) -> Non
 def _plan_pipelined(decision: Decision, now_us: int, i: int, t2_us: int) -> None:
     timing = decision.timing
     sent, accepted = ticks_of(t2_us), ticks_of(t2_us + timing.link_us)
-    # Up, or the frame would not be there yet.
+    # Rounded up, so that the frame is decoded by then.
     frame = -((now_us - decoded_after_us(timing.frames, i, now_us)) // TICK_US)
     ended = max(sent, frame)
     age = min(ticks_of(frame_age_us(timing.frames, i, now_us + ended * TICK_US)), ended)
     decision.age[i], decision.accepted[i] = age, accepted
-    # The oldest in flight is the first to arrive.
+    # The oldest setpoint in flight arrives first.
     for k in range(decision.left.shape[1] - 1, -1, -1):
         if 0 < decision.left[i, k] <= ended:
             _add(decision, i, decision.left[i, k], _ARRIVE + k)
@@ -219,7 +219,7 @@ def _plan_pipelined(decision: Decision, now_us: int, i: int, t2_us: int) -> None
     if accepted <= ended:
         _add(decision, i, accepted, _ACCEPT)
     if timing.timeout >= 0:
-        # A stop takes as long as any setpoint, but is there before the next, and by the end of the
+        # A stop has the link delay of a setpoint, but arrives before the next one, and within the
         # decision.
         overdue, link = _overdue(decision, i, now_us), timing.link_us // TICK_US
         again = sent + timing.timeout
@@ -233,19 +233,19 @@ def _plan_pipelined(decision: Decision, now_us: int, i: int, t2_us: int) -> None
 
 @borrowing_kernel
 def _overdue(decision: Decision, i: int, now_us: int) -> int:
-    """Return in how many ticks a companion stops that sends nothing; below 0: it has."""
+    """Return the ticks until the companion's timeout triggers a stop; negative = in the past."""
     overdue: int = (decision.sent_us[i] - now_us) // TICK_US + decision.timing.timeout
     return overdue
 
 
 @borrowing_kernel
 def next_stretch(decision: Decision, fleet: Fleet, i: int, state: State, j: int) -> int:
-    """Carry out what is due of the decision of vehicle i, which is in lane j.
+    """Execute the due events of vehicle i's decision; the vehicle is in SIMD lane j.
 
-    Of a flight that is over everything is due. Time and verdict of `fleet` are those of now.
+    After the end of a flight all events are due. Time and verdict of `fleet` must be up to date.
 
     Returns:
-        Ticks until something is due; 0: the decision is over, or Python is needed.
+        Ticks until the next event; 0 if the decision is complete, or Python is needed.
     """
     over = fleet.verdict[i] != _FLYING
     now = (fleet.time_us[i] - decision.began_us[i]) // TICK_US
@@ -274,14 +274,14 @@ def next_stretch(decision: Decision, fleet: Fleet, i: int, state: State, j: int)
 
 @kernel
 def _until_published(time_us: int) -> int:
-    """Return in how many ticks the flight controller publishes its control mode."""
+    """Return the ticks until the flight controller next publishes its control mode."""
     first, period = (RATES_FOLLOWED_US - time_us) // TICK_US, KIND_US // TICK_US
     return first if first >= 0 else first % period
 
 
 @borrowing_kernel
 def _carry_out(decision: Decision, fleet: Fleet, i: int, state: State, j: int, event: int) -> None:
-    """Let an event of vehicle i happen; arguments as of `next_stretch`."""
+    """Execute an event of vehicle i; arguments as in `next_stretch`."""
     timing = decision.timing
     kind = decision.kind[i, event]
     if kind == _SEND:
@@ -298,7 +298,7 @@ def _carry_out(decision: Decision, fleet: Fleet, i: int, state: State, j: int, e
     elif kind == _ACCEPT:
         take(decision, fleet, decision.setpoint[i], i, state, j)
         if not timing.pipelined:
-            # The frame and the end of the decision come next.
+            # The capture and end events come next.
             left = decision.tick[i, event + 2] - decision.tick[i, event]
             then_us = fleet.time_us[i] + left * TICK_US
             decision.age[i] = min(ticks_of(frame_age_us(timing.frames, i, then_us)), left)
@@ -311,7 +311,7 @@ def _carry_out(decision: Decision, fleet: Fleet, i: int, state: State, j: int, e
 def take(
     decision: Decision, fleet: Fleet, setpoint: NDArray[np.float64], i: int, state: State, j: int
 ) -> None:
-    """Give vehicle i a setpoint (4,); arguments as of `next_stretch`."""
+    """Set the setpoint (4,) of vehicle i; arguments as in `next_stretch`."""
     if decision.timing.timeout >= 0:
         for axis in range(4):
             decision.newest[i, axis] = setpoint[axis]
@@ -321,13 +321,13 @@ def take(
         return
     for axis in range(4):
         fleet.setpoint[i, axis] = setpoint[axis]
-    # It is turned into NED in the next tick.
+    # The next tick converts it to NED.
     state[YAW_RATE, j], fleet.repeat_us[i] = setpoint[3], fleet.time_us[i]
 
 
 @borrowing_kernel
 def expire(decision: Decision, fleet: Fleet, i: int, state: State, j: int) -> None:
-    """Have vehicle i stop; of body rates, end the turn. Arguments as of `next_stretch`."""
+    """Stop vehicle i; with body rates, zero the rates first. Arguments as in `next_stretch`."""
     if decision.timing.timeout >= 0:
         for axis in range(3):
             decision.newest[i, axis] = 0.0
@@ -342,7 +342,7 @@ def expire(decision: Decision, fleet: Fleet, i: int, state: State, j: int) -> No
 
 @borrowing_kernel
 def _follow(decision: Decision, fleet: Fleet, i: int, state: State, j: int) -> None:
-    """Have vehicle i fly the newest setpoint of the kind that it follows."""
+    """Apply the newest setpoint of the control mode that vehicle i follows."""
     for axis in range(4):
         fleet.setpoint[i, axis] = decision.newest[i, axis] if fleet.by_rates[i] else 0.0
     state[YAW_RATE, j], fleet.repeat_us[i] = fleet.setpoint[i, 3], fleet.time_us[i]
@@ -350,7 +350,7 @@ def _follow(decision: Decision, fleet: Fleet, i: int, state: State, j: int) -> N
 
 @borrowing_kernel
 def _look(seen: Seen, now_us: int, i: int, state: State, j: int) -> None:
-    """Note where vehicle i, in lane j, takes its frame."""
+    """Record the capture pose of vehicle i, in SIMD lane j."""
     seen.time_us[i] = now_us
     for axis in range(3):
         seen.position[i, axis] = state[POSITION + axis, j]
@@ -362,7 +362,7 @@ def _look(seen: Seen, now_us: int, i: int, state: State, j: int) -> None:
 
 @borrowing_kernel
 def _keep_in_flight(decision: Decision, i: int, ended: int) -> None:
-    """Keep the setpoints of vehicle i that have not arrived when its decision ends at a tick."""
+    """Keep the setpoints of vehicle i still in flight when its decision ends at a tick."""
     left, in_flight = decision.left[i], decision.in_flight[i]
     for k in range(len(left) - 1, -1, -1):
         left[k] = max((left[k - 1] if k > 0 else decision.accepted[i]) - ended, 0)
@@ -378,7 +378,7 @@ def ticks_of(time_us: int) -> int:
 
 @kernel
 def frame_age_us(times: FrameTimes, i: int, time_us: int) -> int:
-    """Return how old the newest decoded frame of vehicle i is at a time [µs] of its episode."""
+    """Return the age of vehicle i's newest decoded frame at a time [µs] of its episode."""
     since_us = time_us - times.transport_us - times.first_us[i]
     age: int = times.transport_us + since_us % times.period_us
     for k in range(len(times.late)):
@@ -388,10 +388,10 @@ def frame_age_us(times: FrameTimes, i: int, time_us: int) -> int:
 
 @kernel
 def _delayed(times: FrameTimes, i: int, time_us: int, age_us: int, k: int) -> int:
-    """Return the age of the newest frame where fault k delays those of a time, all in order."""
+    """Return the age of the newest frame with the delay of fault k; frames arrive in order."""
     from_us, to_us, delay_us = times.late[k, 0], times.late[k, 1], times.late[k, 2]
     healthy = time_us - age_us
-    # A frame of after the fault waits for the last one of it.
+    # Frames after the fault wait for the last delayed frame.
     last = _newest(times, i, to_us - 1)
     if healthy < from_us or time_us - times.transport_us >= last + delay_us:
         return age_us
@@ -403,14 +403,14 @@ def _delayed(times: FrameTimes, i: int, time_us: int, age_us: int, k: int) -> in
 
 @kernel
 def _newest(times: FrameTimes, i: int, time_us: int) -> int:
-    """Return when the newest frame of a time [µs] was taken."""
+    """Return the capture time of the newest frame at a time [µs]."""
     newest: int = time_us - (time_us - times.first_us[i]) % times.period_us
     return newest
 
 
 @kernel
 def decoded_after_us(times: FrameTimes, i: int, time_us: int) -> int:
-    """Return when the next frame of vehicle i is decoded after a time [µs] of its episode."""
+    """Return the decoding time of vehicle i's next frame after a time [µs] of its episode."""
     since_us = (time_us - times.transport_us - times.first_us[i]) % times.period_us
     decoded: int = time_us - since_us + times.period_us
     return decoded

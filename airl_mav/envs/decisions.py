@@ -1,4 +1,4 @@
-"""Decisions, rewards and the curriculum: what the environments put into Gymnasium's two APIs."""
+"""Decisions, rewards and curriculum: the common base of both Gymnasium APIs."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from airl_mav.policy.layouts import boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 
 FIRST_TRAINING_SEED = 1_000_000
-"""Episodes that draw their own seed draw it from here on: those below are for evaluation."""
+"""First seed that episodes draw automatically; lower seeds are reserved for evaluation."""
 
 LAST_TRAINING_SEED = 2**31
 
 MOST_SEED = 2**63 - 1
-"""Greatest seed of an episode."""
+"""Maximum seed of an episode."""
 
 FLYING = int(Verdict.FLYING)
-"""`Verdict.FLYING` as a number, which numpy compares several times faster."""
+"""`Verdict.FLYING` as an integer; numpy compares integers several times faster."""
 
 _FREE = Costs()
-"""Nothing is charged."""
+"""Default: no action costs."""
 
 UNBOUNDED = 1e6
-"""Bound of what a layout leaves unbounded, in its units: Gymnasium's checker warns of infinity."""
+"""Bound in place of infinity in unbounded spaces; Gymnasium's checker warns of infinity."""
 
 
 class Decisions:
-    """The flights of n vehicles, decision by decision; a base of the environments."""
+    """Flights of n vehicles, decision by decision; a base of the environments."""
 
     def __init__(self, spec: EnvironmentSpec | None, knobs: Mapping[str, Any], n: int) -> None:
-        """Take the specification, or its fields.
+        """Store the specification, or build it from its fields.
 
         Raises:
             UsageError: As `gymnasium_spec` and `Navigation`.
@@ -58,9 +58,9 @@ class Decisions:
             stages = len(self.navigation.stages)
             self.curriculum = CurriculumState(self.environment.curriculum, stages)
         self._zone: int | None = None
-        """Curriculum zone that `reset` was asked for."""
+        """Curriculum zone requested by `reset`."""
         self._before: Flights | None = None
-        """The flights at the present decision; None before the first reset."""
+        """Flights at the present decision; None before the first reset."""
 
     @property
     def _present_zone(self) -> int | None:
@@ -69,7 +69,7 @@ class Decisions:
         return self._zone
 
     def _begin(self, slots: Sequence[int], seeds: Sequence[int]) -> Flights:
-        """Begin episodes in the zone asked for, else that of the curriculum, else the whole."""
+        """Start episodes in the requested zone, else the curriculum's, else the whole arena."""
         self.navigation.begin(slots, seeds, self._present_zone)
         self._before = self.navigation.flights()
         return self._before
@@ -80,12 +80,12 @@ class Decisions:
         """Fly one decision of every vehicle.
 
         Args:
-            actions: One, or n of them.
-            lead: () of one, (n,) of n.
+            actions: One action, or n actions.
+            lead: () for one action, (n,) for n.
 
         Raises:
             ResetNeeded: Before the first reset.
-            InvalidAction: Not so many actions of the set.
+            InvalidAction: Wrong number of actions, or actions outside the space.
         """
         before, navigation, costs_of = self._before, self.navigation, self.environment.costs
         if before is None:
@@ -125,7 +125,7 @@ class Decisions:
 
 
 def outcome(flights: Flights, i: int) -> dict[str, Any]:
-    """Return what `info` has in addition for a flight that has ended."""
+    """Return the additional entries of `info` for a flight that has ended."""
     verdict = Verdict(int(flights.verdict[i]))
     return {"success": verdict == Verdict.SUCCESS, "outcome": verdict.name.lower()}
 
@@ -142,9 +142,9 @@ def observation_space(spec: ObservationSpec) -> gym.spaces.Dict:
 
 
 def action_space(spec: ActionSpec) -> gym.Space[Any]:
-    """Return Discrete(25) and the like, or Box(-1, 1, (2,)) of a continuous set.
+    """Return Discrete(25) or similar, or Box(-1, 1, (2,)) for a continuous set.
 
-    Where the actions have a vertical speed, the box is (3,).
+    With a vertical speed in the actions, the box is (3,).
     """
     number = discrete_actions(spec)
     if number is not None:
@@ -153,17 +153,17 @@ def action_space(spec: ActionSpec) -> gym.Space[Any]:
 
 
 def checked_actions(spec: ActionSpec, actions: Any, lead: tuple[int, ...]) -> NDArray[Any]:
-    """Return actions as an array, if they are such of a set.
+    """Return actions as an array after validation against an action set.
 
-    What a continuous set would cut off, -1..1, is left to it.
+    Continuous values outside -1..1 are accepted; the action set clips them.
 
     Args:
         spec: The action set.
-        actions: One, or n of them.
-        lead: () of one, (n,) of n.
+        actions: One action, or n actions.
+        lead: () for one action, (n,) for n.
 
     Raises:
-        InvalidAction: Another shape or type, no number, a whole number that the set does not have.
+        InvalidAction: Wrong shape or type, NaN, or an integer outside the set.
     """
     number = discrete_actions(spec)
     asked = np.asarray(actions)
@@ -173,7 +173,7 @@ def checked_actions(spec: ActionSpec, actions: Any, lead: tuple[int, ...]) -> ND
     if asked.dtype.kind not in ("iu" if number is not None else "iuf"):
         what = "whole numbers" if number is not None else "numbers"
         raise gym.error.InvalidAction(f"action of type {asked.dtype}: accepted: {what}")
-    # Not in the set: numpy would take a negative one from its end, and what is no number would fly.
+    # Reject these: numpy would accept negative indices, and NaN would reach the vehicle.
     if number is not None:
         wrong, accepted = (asked < 0) | (asked >= number), f"0 <= value <= {number - 1}"
     else:
@@ -184,7 +184,7 @@ def checked_actions(spec: ActionSpec, actions: Any, lead: tuple[int, ...]) -> ND
 
 
 def zone_option(options: Mapping[str, Any] | None) -> int | None:
-    """Return the zone that `reset` is asked for. Raises UsageError for anything else."""
+    """Return the zone option of `reset`. Raises UsageError for other options or types."""
     options = options or {}
     if unknown := [key for key in options if key != "zone"]:
         raise UsageError(f"options: {', '.join(map(str, unknown))}; accepted: zone")
@@ -195,13 +195,13 @@ def zone_option(options: Mapping[str, Any] | None) -> int | None:
 
 
 def episode_seed(seed: Any) -> int:
-    """Return the seed of an episode as a number of Python. Raises UsageError."""
+    """Return the seed of an episode as a Python int. Raises UsageError."""
     if not isinstance(seed, int | np.integer) or not 0 <= seed <= MOST_SEED:
         raise UsageError(f"seed = {seed!r}: accepted: a whole number, 0 to 2^63 - 1")
     return int(seed)
 
 
 def draw_seeds(rng: np.random.Generator, n: int) -> list[int]:
-    """Return the seeds of n episodes of training."""
+    """Return the seeds of n training episodes."""
     drawn: list[int] = rng.integers(FIRST_TRAINING_SEED, LAST_TRAINING_SEED, n).tolist()
     return drawn

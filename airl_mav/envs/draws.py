@@ -1,7 +1,7 @@
-"""Random draws of an episode, each from the episode's own seed.
+"""Random draws of an episode, generated from the episode's seed only.
 
-So an episode is the same however many fly beside it. Draws that a decision needs are made ahead, a
-block of decisions at a time.
+An episode is therefore independent of the number of parallel flights. Draws for decisions are made
+ahead, a block of decisions at a time.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from airl_mav.vehicle.wind import BLOCK as WIND_BLOCK
 from airl_mav.vehicle.wind import Wind, wind_of_episode
 
 BLOCK = 32
-"""Number of decisions that are drawn at a time."""
+"""Number of decisions drawn at a time."""
 
 NOT_BEGUN = -1
-"""Seed of a slot in which no episode has begun."""
+"""Seed of a slot without an episode."""
 
 
 class DrawnAhead(Stateful):
@@ -40,7 +40,7 @@ class DrawnAhead(Stateful):
         """Prepare n slots."""
         self._seeds = np.full(n, NOT_BEGUN, np.int64)
         self._blocks = np.zeros(n, np.int64)
-        """Blocks drawn in the slot's episode."""
+        """Number of blocks drawn in the slot's episode."""
 
     @abstractmethod
     def begin(self, i: int, seed: int) -> Any:
@@ -54,7 +54,7 @@ class DrawnAhead(Stateful):
         return {"seeds": self._seeds, "blocks": self._blocks}
 
     def set_state(self, state: State) -> None:
-        """Restore a saved state by repeating its draws. Raises UsageError if it does not fit."""
+        """Restore a saved state by repeating its draws. Raises UsageError for a mismatch."""
         super().set_state(state)
         for i in np.flatnonzero(self._seeds != NOT_BEGUN).tolist():
             blocks = int(self._blocks[i])
@@ -64,7 +64,7 @@ class DrawnAhead(Stateful):
 
 
 def source_of(injections: Sequence[Injection], seed: int) -> Injection:
-    """Return the source of t2, of one or more, that the episode of a seed has drawn."""
+    """Return the source of t2 for an episode's seed, drawn from one or more."""
     if len(injections) == 1:
         return injections[0]
     return injections[int(stream(seed, Stream.SOURCE).integers(len(injections)))]
@@ -80,8 +80,8 @@ class DelayDraws(DrawnAhead):
 
         Args:
             n: Number of slots.
-            injections: One or more; of several, each episode draws one.
-            native_us: t2 when nothing is injected [µs].
+            injections: One or more; each episode draws one of them.
+            native_us: t2 without injection [µs].
             draw: See `samplers.latency_generator`.
         """
         super().__init__(n)
@@ -90,13 +90,13 @@ class DelayDraws(DrawnAhead):
         self._draw = draw
         self._samplers: list[LatencySampler | None] = [None] * n
         self.block = np.full((n, BLOCK), native_us, np.int64)
-        """(n, BLOCK) t2 of the present decisions [µs]: of decision k in column k % BLOCK."""
+        """(n, BLOCK) t2 of the present decisions [µs]; decision k is in column k % BLOCK."""
 
     def begin(self, i: int, seed: int) -> None:
         """Start the episode of slot i. The companion draws the same latencies from this seed."""
         injection = source_of(self._injections, seed)
         self._seeds[i], self._blocks[i] = seed, 0
-        # A generator that nothing is drawn from takes its time all the same.
+        # Creating a generator takes time, even without draws.
         self._samplers[i] = (
             None
             if injection.latency is None
@@ -105,7 +105,7 @@ class DelayDraws(DrawnAhead):
         self.block[i] = self._native_us
 
     def draw(self, decision: NDArray[np.int64]) -> None:
-        """Draw the block of each slot whose `decision` (n,), counted from 0, begins one."""
+        """Draw the next block of slots whose `decision` (n,), counted from 0, starts a block."""
         for i in np.flatnonzero(decision % BLOCK == 0):
             self._draw_block(int(i))
 
@@ -117,20 +117,20 @@ class DelayDraws(DrawnAhead):
 
 
 class Winds(DrawnAhead):
-    """The wind of n episodes; from the seed of each the same history of gusts as the plant's."""
+    """Wind of n episodes; the same gust history per seed as in the plant."""
 
     def __init__(self, n: int, settings: WindSettings, faults: Sequence[Fault] = ()) -> None:
-        """Prepare n slots; what is added by `faults` of the wind blows in all of them."""
+        """Prepare n slots; `faults` of the wind act in all of them."""
         super().__init__(n)
         self._faults = twin_faults(faults, "wind")
         still = not (set(settings.model_dump(exclude={"gust_time_s"}).values()) - {0.0})
         self.calm = still and not self._faults
-        """Whether no wind blows in any episode."""
+        """True if no wind blows in any episode."""
         self._settings = settings
         self.gusty = settings.gust_m_s > 0.0 or bool(self._faults)
         self._winds: list[Wind | None] = [None] * n
         self.air = np.zeros((n, WIND_BLOCK if self.gusty else 0 if self.calm else 1, 3))
-        """(n, k, 3) as `flight.advance` takes it: the present blocks."""
+        """(n, k, 3) present blocks, as an argument of `flight.advance`."""
 
     def begin(self, i: int, seed: int) -> Vector:
         """Start the episode of slot i; return its steady wind (3,) NED [m/s]."""
@@ -143,11 +143,11 @@ class Winds(DrawnAhead):
         return wind.steady + lasting(self._faults) if self._faults else wind.steady
 
     def ends_us(self) -> NDArray[np.int64] | None:
-        """Return when the present blocks end (n,); None: the wind is steady."""
+        """Return the end times of the present blocks (n,); None for steady wind."""
         return self._blocks * WIND_BLOCK * TICK_US if self.gusty else None
 
     def blow(self, fleet: Fleet) -> None:
-        """Draw the next blocks of the flights that have come to the end of theirs."""
+        """Draw the next block of flights at the end of their block."""
         ends_us = self.ends_us()
         if ends_us is not None:
             due = (fleet.verdict == Verdict.FLYING) & (fleet.time_us >= ends_us)

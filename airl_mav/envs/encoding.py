@@ -1,6 +1,6 @@
-"""The network's images of n vehicles by a compiled loop: those of numpy, several times faster.
+"""Policy images of n vehicles in compiled loops, several times faster than numpy.
 
-`policy.images` says what they are; the companion, which has no numba, makes them with numpy.
+`policy.images` defines the images; the companion has no numba and computes them with numpy.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ from airl_mav.vehicle.rotation import Quat, Vec, multiply, yaw_of
 
 
 def level_scan(depth_mm: NDArray[np.uint16], rays: Rays, tilt: Tilt, bearings: int) -> Floats:
-    """Return what `policy.scans.level_scan` returns."""
+    """Return the same as `policy.scans.level_scan`."""
     found = np.full((len(depth_mm), bearings), np.inf)
     _level_scan(np.ascontiguousarray(depth_mm), rays, tilt, goes_round(rays.fov_rad), found)
     return found
 
 
 def carried(scans: Floats, moved: Moved, fov_rad: float) -> Floats:
-    """Return what `policy.scans.carried` returns."""
+    """Return the same as `policy.scans.carried`."""
     found = np.full(scans.shape, np.inf)
     _carry(scans, moved, fov_rad, goes_round(fov_rad), found)
     return found
 
 
 COMPILED_SCANNING = Scanning(level_scan, carried)
-"""As the batch twin does it."""
+"""Scan functions of the batch twin."""
 
 
 @kernel
@@ -104,21 +104,21 @@ def _carry(scans: Floats, moved: Moved, fov_rad: float, whole: bool, found: Floa
 def shrink_depth(
     depth_mm: NDArray[np.uint16], rows: int, columns: int, bytes_of: Bytes
 ) -> NDArray[np.uint8]:
-    """Return what `policy.images.shrink_depth` returns."""
+    """Return the same as `policy.images.shrink_depth`."""
     images = np.empty((len(depth_mm), rows, columns), np.uint8)
     _shrink(depth_mm, bytes_of.table, bytes_of.far_mm, images)
     return images
 
 
 def shrink_colour(image: NDArray[np.uint8], rows: int, columns: int) -> NDArray[np.uint8]:
-    """Return what `policy.images.shrink_colour` returns."""
+    """Return the same as `policy.images.shrink_colour`."""
     images = np.empty((len(image), image.shape[3], rows, columns), np.uint8)
     _shrink_colour(image, images)
     return images
 
 
 COMPILED = Shrink(shrink_depth, shrink_colour, COMPILED_SCANNING)
-"""As the batch twin does it."""
+"""Image functions of the batch twin."""
 
 
 @kernel
@@ -168,7 +168,7 @@ def _shrink(
                 for u in range(len(line)):
                     line[u] = min(line[u], np.uint16(depth_mm[i, row * tall + k, u] - 1))
             if wide == 2:
-                # The usual one: a stride that the compiler knows becomes vector instructions.
+                # The usual case: the compiler vectorizes a stride known at compile time.
                 for column in range(columns):
                     least[row, column] = min(line[2 * column], line[2 * column + 1])
             else:
@@ -188,7 +188,7 @@ def _to_bytes(
     far_mm: float,
     out: NDArray[np.uint8],
 ) -> None:
-    """Write the bytes of depths (k,), which are `less` more than the values of `Bytes`."""
+    """Write the bytes of depths (k,), which exceed the values in `Bytes` by `less`."""
     if far_mm == 0.0:
         for u in range(len(depths)):
             out[u] = table[np.uint16(depths[u] - less)]
@@ -200,7 +200,7 @@ def _to_bytes(
 
 
 class EncodedBody(NamedTuple):
-    """The arrays of the layout `body` of a depth image, of n vehicles."""
+    """Arrays of the layout `body` of a depth image, for n vehicles."""
 
     depth: NDArray[np.uint8]  # (n, h, w)
     velocity: NDArray[np.float32]  # (n, 3)
@@ -216,10 +216,10 @@ def encode_body(
     bytes_of: Bytes,
     out: EncodedBody,
 ) -> None:
-    """Write what networks see of n vehicles, as `observe` and `encode_layout` make it.
+    """Write the policy input of n vehicles, as `observe` and `encode_layout` do.
 
-    `errors` (n, 9) are those of telemetry, `depth_mm` (n, h, w) the newest images, and `goal` is
-    (n, 3) `ArenaBatch.goal`.
+    `errors` (n, 9) are the errors of telemetry, `depth_mm` (n, h, w) the newest images, and `goal`
+    is (n, 3) `ArenaBatch.goal`.
     """
     _shrink(depth_mm, bytes_of.table, bytes_of.far_mm, out.depth)
     for i in range(len(errors)):
@@ -240,9 +240,9 @@ def encode_body(
 
 @kernel
 def heading_told(quaternion: Quat, turn: Vec) -> tuple[float, float]:
-    """Return cosine and sine of the heading that telemetry reports of an attitude, body -> NED.
+    """Return cosine and sine of the heading that telemetry reports for an attitude, body -> NED.
 
-    `turn` is the attitude's error [rad], as of `estimation.perturbed`.
+    `turn` is the attitude error [rad], as in `estimation.perturbed`.
     """
     angle = math.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
     half = math.pi * (angle / (2.0 * math.pi))

@@ -1,4 +1,4 @@
-"""The arenas that N flights are in: made from their seeds, ahead of time where they are known."""
+"""Arenas of N flights, generated from seeds, ahead of time if the seeds are known."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from airl_mav.envs.spec import Curriculum, EnvironmentSpec
 from airl_mav.profiles.arena import ArenaSpec
 
 SLOWEST_M_S = 0.1
-"""Least speed of a moving obstacle that an arena may have [m/s]."""
+"""Minimum speed of a moving obstacle in an arena [m/s]."""
 
 WIDEST_M = 50.0
-"""Greatest gap between obstacles that an arena may ask for [m]."""
+"""Maximum gap between obstacles in an arena [m]."""
 
 
 class Stage(NamedTuple):
-    """Where the episodes of a stage are flown."""
+    """Arena and zone of a curriculum stage."""
 
     arena: ArenaSpec
     zone: int
-    """Of the arena: it bounds the goal."""
+    """Zone of the arena that bounds the goal."""
 
 
 def stages_of(settings: Curriculum | None, arena: ArenaSpec) -> list[Stage]:
-    """Return the stages of a curriculum, the easiest first; without one, the arena's zones."""
+    """Return the stages of a curriculum, easiest first; the arena's zones without a curriculum."""
     zones = len(arena.zones_m)
     settings = settings or Curriculum()
     count = settings.stages or zones
@@ -50,7 +50,7 @@ def stages_of(settings: Curriculum | None, arena: ArenaSpec) -> list[Stage]:
 
 
 def check_stage(stages: list[Stage], arena: ArenaSpec, stage: int | None) -> None:
-    """Raise UsageError when there is no such stage."""
+    """Raise UsageError for a stage out of range."""
     if stage is None or 0 <= stage < len(stages):
         return
     if len(stages) == len(arena.zones_m):
@@ -59,7 +59,7 @@ def check_stage(stages: list[Stage], arena: ArenaSpec, stage: int | None) -> Non
 
 
 def _eased(settings: Curriculum, arena: ArenaSpec, gone: float) -> ArenaSpec:
-    """Return an arena on the way from the first stage (gone = 0) to the last one (1)."""
+    """Return an arena between the first stage (gone = 0) and the last stage (gone = 1)."""
     if gone >= 1.0:
         return arena
     count = settings.count + (1.0 - settings.count) * gone
@@ -76,9 +76,9 @@ def _eased(settings: Curriculum, arena: ArenaSpec, gone: float) -> ArenaSpec:
 
 
 class CurriculumState:
-    """The open zone, and the outcomes that will open the next one.
+    """Open zone of the curriculum, and the outcomes that decide on the next one.
 
-    The window is a rolling one and must be full; it starts empty in every zone.
+    The window of outcomes is rolling and must be full; it starts empty in every zone.
     """
 
     def __init__(self, settings: Curriculum, zones: int) -> None:
@@ -89,7 +89,7 @@ class CurriculumState:
         self._outcomes: deque[bool] = deque(maxlen=settings.window)
 
     def record(self, zone: int, *, success: bool) -> None:
-        """Take an episode's outcome; one that was begun in an earlier zone no longer counts."""
+        """Record an episode's outcome; outcomes of earlier zones are ignored."""
         if zone != self.zone:
             return
         self._outcomes.append(success)
@@ -110,7 +110,7 @@ class CurriculumState:
 
 
 class EpisodeArenas:
-    """One arena a slot."""
+    """One arena per slot."""
 
     def __init__(
         self,
@@ -122,75 +122,75 @@ class EpisodeArenas:
         *,
         looks: bool = False,
     ) -> None:
-        """Make none yet.
+        """Start without arenas.
 
         Args:
-            spec: The environment: its curriculum, and what its arena is called.
+            spec: Environment, for its curriculum and the arena's name.
             arena: The arena's profile.
             n: Number of slots.
-            vehicle_width_m: A vehicle of this width has a way to each goal [m].
-            arena_seed: Seed of arena and goal of all episodes; None: each episode's own.
-            looks: Whether it matters how they look: a camera sees colours.
+            vehicle_width_m: Width of a vehicle with a path to each goal [m].
+            arena_seed: Seed of arena and goal of all episodes; None = the episode's seed.
+            looks: True if the appearance is needed, for colour cameras.
         """
         self.spec = arena
         self.stages = stages_of(spec.curriculum, arena)
         self._name, self._vehicle_width_m = Path(spec.arena).stem, vehicle_width_m
         self._arena_seed = arena_seed
         self.present: list[Arena | None] = [None] * n
-        """None where no episode has begun."""
+        """Arena of each slot; None before its first episode."""
         self.seeds = np.zeros(n, np.int64)
-        """(n,) of the episodes."""
+        """(n,) seeds of the episodes."""
         self.zones = np.full(n, -1, np.int64)
-        """(n,) zones, or stages, that bound the goals; -1: the whole arena."""
+        """(n,) zones, or stages, that bound the goals; -1 = the whole arena."""
         self.begun = np.zeros(n, np.bool_)
-        """(n,) whether an episode has begun."""
+        """(n,) True if an episode has started."""
         self.batch = batch_of([])
-        """What the kernels look at; replaced where an arena is larger than all before."""
+        """Arenas for the kernels; replaced when an arena exceeds their capacity."""
         self.looks = Looks(n) if looks else None
-        """How they look; None: nobody asks."""
+        """Appearance of the arenas; None if not needed."""
         self.meshes = MeshesSeen(n)
-        """Those that cameras see."""
+        """Meshes visible to cameras."""
         self._ahead: dict[tuple[int, int | None], Arena] = {}
-        """Arenas that were made ahead, by seed and zone."""
+        """Arenas generated ahead, by seed and zone."""
 
     def check_zone(self, zone: int | None) -> None:
-        """Raise UsageError if there is no such zone or stage."""
+        """Raise UsageError for a zone or stage out of range."""
         check_stage(self.stages, self.spec, zone)
 
     def begin(self, i: int, seed: int, zone: int | None) -> None:
-        """Put slot i into the arena of an episode. Raises UsageError when none can be made."""
+        """Put slot i into the arena of an episode. Raises UsageError if generation fails."""
         arena = self._ahead.pop((seed, zone), None) or self._made(seed, zone)
         self.present[i], self.begun[i] = arena, True
         self.seeds[i], self.zones[i] = seed, -1 if zone is None else zone
         self._look_at(i, arena)
         if len(self.batch.bounds) == 0:
-            # The others stay in the first one's until their own begin.
+            # Other slots use the first arena until their episodes start.
             self.batch = batch_of([arena] * len(self.present))
         try:
             put_arena(self.batch, i, arena)
         except ValueError:
-            # It is larger than all before.
+            # The arena exceeds the batch's capacity.
             self.batch = with_room(self.batch, arena)
             put_arena(self.batch, i, arena)
 
     def prepare(self, seeds: Sequence[int], zone: int | None) -> None:
-        """Make the arenas of episodes that are likely to begin soon, of no others from now on.
+        """Generate the arenas of likely next episodes; discards previously prepared ones.
 
-        It changes nothing but the time that `begin` takes. One after the other they take half as
-        long as one at a time between two steps, each of which empties the processor's caches.
+        Only affects the duration of `begin`. Generated in a row, arenas take half as long as one at
+        a time between two steps, each of which empties the processor's caches.
         """
         self._ahead.clear()
         for seed in seeds:
-            # One that cannot be made is an error where its episode begins.
+            # A failed arena raises an error when its episode starts.
             with suppress(UsageError):
                 self._ahead[seed, zone] = self._made(seed, zone)
 
     def prepared(self, seeds: Sequence[int], zone: int | None) -> bool:
-        """Return whether all of these arenas have been made ahead."""
+        """Return True if all of these arenas were generated ahead."""
         return all((seed, zone) in self._ahead for seed in seeds)
 
     def restore(self) -> None:
-        """Make all arenas again, from `seeds`, `zones` and `begun`."""
+        """Regenerate all arenas from `seeds`, `zones` and `begun`."""
         self.present[:] = [
             self._made(int(seed), None if zone < 0 else int(zone)) if begun else None
             for seed, zone, begun in zip(self.seeds, self.zones, self.begun, strict=True)
@@ -203,7 +203,7 @@ class EpisodeArenas:
                 self._look_at(i, arena)
 
     def _look_at(self, i: int, arena: Arena) -> None:
-        """Take what cameras see of slot i's arena."""
+        """Add meshes and appearance of slot i's arena for the cameras."""
         self.meshes.put(i, arena)
         if self.looks is not None:
             self.looks.put(i, arena)

@@ -1,11 +1,10 @@
 """Estimation error: the EKF's error as noise on the batch twin's true state.
 
-Nine errors a vehicle: position NED [m], velocity NED [m/s], attitude as a turn about north, east
-and down [rad]. Each is a stationary first-order Gauss-Markov process of its own. In truth they are
-not quite that: where the magnetic field dips steeply, a tilt about north turns the heading with it;
-and attitude is worst in the first seconds, until an acceleration has shown the sensors' biases.
-
-Every episode draws its random numbers from its own seed.
+Nine errors per vehicle: position NED [m], velocity NED [m/s], attitude as a rotation about north,
+east and down [rad]. Each is an independent stationary first-order Gauss-Markov process. This is an
+approximation: where the magnetic field is steep, a tilt about north also changes the heading, and
+attitude is worst in the first seconds, until an acceleration makes the sensor biases observable.
+Every episode draws its random numbers from its seed only.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ GROUPS: Final[dict[str, tuple[str, tuple[int, ...]]]] = {
     "tilt_rad": ("tilt_time_s", (6, 7)),
     "heading_rad": ("heading_time_s", (8,)),
 }
-"""`Estimation` field of the standard deviation -> field of the time, and the errors they are of."""
+"""`Estimation` field of the standard deviation -> field of the time constant, error indices."""
 
 Array = NDArray[np.float64]
 
@@ -55,8 +54,8 @@ class EstimationError:
     def from_profile(cls, table: Estimation, noise: float = 1.0) -> EstimationError:
         """Return the model of a vehicle profile's `estimation` table, its errors times `noise`.
 
-        The estimator's gains do not depend on the noise that its sensors have, as nobody tells it:
-        to first order its errors are in proportion to theirs.
+        The estimator's gains are independent of the actual sensor noise, so to first order its
+        errors are proportional to the noise.
         """
         sd, time_s = np.empty(N_ERRORS), np.empty(N_ERRORS)
         for name, (time_name, errors) in GROUPS.items():
@@ -65,10 +64,10 @@ class EstimationError:
         return cls(sd, time_s)
 
     def step(self, dt: float | Array) -> tuple[Array, Array]:
-        """Return how errors change in dt [s]: exact, so that steps may be of any length.
+        """Return the change of errors in dt [s]; exact for steps of any length.
 
         Returns:
-            (..., 9) the share that remains, and the standard deviation of what is added.
+            (..., 9) the remaining share, and the standard deviation of the added noise.
         """
         kept = np.exp(-np.asarray(dt)[..., None] / self.time_s)
         return kept, self.sd * np.sqrt(1.0 - kept * kept)
@@ -77,7 +76,7 @@ class EstimationError:
 def perturbed(
     position: Array, velocity: Array, quaternion: Array, errors: Array
 ) -> tuple[Array, Array, Array]:
-    """Return position, velocity and attitude as the flight controller reports them.
+    """Return position, velocity and attitude as reported by the flight controller.
 
     Args:
         position: (..., 3) true, NED [m].
@@ -101,7 +100,7 @@ def perturbed(
 
 @kernel
 def _turn(cos: Array, share: Array, turn: Array, quaternion: Array, out: Array) -> None:
-    """Write the Hamilton products (n, 4) of turns cos, share turn (n, 3) and quaternions (n, 4)."""
+    """Write the products (n, 4) of rotations cos, share turn (n, 3) and quaternions (n, 4)."""
     for i in range(len(out)):
         w = cos[i]
         x, y, z = share[i] * turn[i, 0], share[i] * turn[i, 1], share[i] * turn[i, 2]
@@ -113,26 +112,26 @@ def _turn(cos: Array, share: Array, turn: Array, quaternion: Array, out: Array) 
 
 
 class Drift(NamedTuple):
-    """How errors change over a decision, as kernels take it."""
+    """Error dynamics over a decision, as an argument for kernels."""
 
     kept: Array
-    """(ticks, 9) share of an error that remains after so many ticks."""
+    """(ticks, 9) remaining share of an error after a number of ticks."""
     added: Array
-    """(ticks, 9) standard deviation of what is added."""
+    """(ticks, 9) standard deviation of the added noise."""
     normals: Array
     """(n, BLOCK, 9) standard normal numbers of the present decisions."""
     sd: Array
-    """(9,) `EstimationError`, as the next one."""
+    """(9,) field of `EstimationError`, as is `time_s`."""
     time_s: Array
 
 
 TABLE_S = 60.0
-"""Decisions up to this long have their row in `Drift` [s]."""
+"""Maximum duration of decisions with a row in `Drift` [s]."""
 
 
 @borrowing_kernel
 def step_error(drift: Drift, errors: Array, i: int, decision: int, ticks: int) -> None:
-    """Step the errors (n, 9) of vehicle i after its n-th decision, which took so long."""
+    """Step the errors (n, 9) of vehicle i after its n-th decision, which took `ticks`."""
     row = decision % BLOCK
     for k in range(N_ERRORS):
         if ticks < len(drift.kept):
@@ -144,21 +143,21 @@ def step_error(drift: Drift, errors: Array, i: int, decision: int, ticks: int) -
 
 
 class Telemetry(Stateful):
-    """Telemetry of n episodes: the truth with errors that change once a decision."""
+    """Telemetry of n episodes: the true state plus errors that change once per decision."""
 
     def __init__(self, n: int, table: Estimation | None, noise: float = 1.0) -> None:
-        """Make n slots with the errors of a vehicle profile times `noise`; None: no errors."""
+        """Create n slots with the errors of a vehicle profile times `noise`; None = no errors."""
         self._model = None if table is None else EstimationError.from_profile(table, noise)
         self.errors = np.zeros((n, N_ERRORS))
-        """(n, 9) present ones."""
+        """(n, 9) present errors."""
         self._rngs: list[np.random.Generator | None] = [None] * n
         self._normals = np.zeros((n, BLOCK, N_ERRORS))
         """Standard normal numbers, `N_ERRORS` per decision, the first for the episode's start."""
 
     def drift(self) -> Drift | None:
-        """Return how errors change over decisions; None: there are none.
+        """Return the error dynamics for kernels; None without errors.
 
-        The table is numpy's exponential, which differs from a compiled one by a bit.
+        The table uses numpy's exponential, which differs from a compiled one by a bit.
         """
         if self._model is None:
             return None
@@ -174,7 +173,7 @@ class Telemetry(Stateful):
             self.errors[i] = self._model.sd * self._normals[i, 0]
 
     def draw(self, decisions: NDArray[np.int64]) -> None:
-        """Draw the numbers of slots whose n-th decision (n,) begins a block."""
+        """Draw the numbers of slots whose n-th decision (n,) starts a block."""
         if self._model is None:
             return
         for i in np.flatnonzero(decisions % BLOCK == 0):
@@ -183,7 +182,7 @@ class Telemetry(Stateful):
                 rng.standard_normal(out=self._normals[i])
 
     def report(self, truth: Kinematics, rows: Rows) -> Kinematics:
-        """Return the states of `rows` as telemetry reports them; body rates have no error."""
+        """Return the states of `rows` as reported by telemetry; body rates have no error."""
         if self._model is None:
             return truth
         errors = self.errors[rows]

@@ -1,4 +1,4 @@
-"""Fly a policy through seeded episodes: what evaluation and model selection rest on."""
+"""Evaluation of a policy in seeded episodes, also for model selection."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import Encoded
 
 Decide = Callable[[Encoded], NDArray[Any]]
-"""From the observations of n vehicles to their n actions; must treat each one for itself."""
+"""Function from observations of n vehicles to n actions; must treat each row independently."""
 
 SLOTS = 256
-"""Default number of flights at a time."""
+"""Default number of parallel flights."""
 
 OUTCOMES = {
     Verdict.SUCCESS: Outcome.SUCCESS,
@@ -35,12 +35,12 @@ OUTCOMES = {
     Verdict.BATTERY: Outcome.BATTERY,
     Verdict.TIMEOUT: Outcome.TIMEOUT,
 }
-"""The record's name of each verdict of the batch twin."""
+"""Recorded outcome of each verdict of the batch twin."""
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """How one episode went."""
+    """Result of one episode."""
 
     seed: int
     verdict: Verdict
@@ -51,34 +51,34 @@ class EpisodeResult:
 
 
 class Pilots(Protocol):
-    """Decides for n vehicles, for each as if it were alone."""
+    """Interface of pilots: decide for n vehicles, independently of each other."""
 
     def begin(self, slot: int, seed: int) -> None:
-        """An episode begins in a slot."""
+        """Start an episode in a slot."""
 
     def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return the velocity commands (n, 3), or (n, 4), as `Navigation.fly` takes them.
+        """Return the velocity commands (n, 3) or (n, 4) for `Navigation.fly`.
 
         Args:
             seen: The observations of n vehicles.
-            flying: (n,) vehicles whose command will be flown.
+            flying: (n,) vehicles that execute their command.
         """
 
 
 class LearnedPilots:
-    """A network that decides for all vehicles at once, or for each by itself if it must."""
+    """Pilot with a network, for all vehicles in one batch or one by one as required."""
 
     def __init__(self, policy: LearnedPolicy, chance: Callable[[int], np.random.Generator]) -> None:
-        """Take the policy; `chance` returns the generator of random actions for a seed."""
+        """Store the policy; `chance` returns the generator of random actions for a seed."""
         self._policy = policy
         self._chance = chance
-        # What chance draws must not depend on the neighbours, and what is remembered must be the
-        # companion's to the last bit, which n rows at a time do not give.
+        # Random actions must be independent of other rows, and memory must be bit-identical to the
+        # companion's, which a batch of n rows does not guarantee.
         self._alone = bool(policy.card.epsilon or policy.card.state)
         self._own: dict[int, LearnedPolicy] = {}
 
     def begin(self, slot: int, seed: int) -> None:
-        """Give the episode its own random actions and an empty memory."""
+        """Start an episode with a new random generator and empty memory."""
         if self._alone:
             self._own[slot] = self._policy.with_generator(self._chance(seed))
 
@@ -86,7 +86,7 @@ class LearnedPilots:
         """Return the commands; see `Pilots`.
 
         Raises:
-            UsageError: The network gives no numbers.
+            UsageError: The network's output contains NaN.
         """
         card = self._policy.card
         encoded = encode_layout(card.observation, seen)
@@ -103,7 +103,7 @@ class LearnedPilots:
 
 
 class SinglePilots:
-    """One policy object per vehicle, new with each episode: for policies with a memory."""
+    """Pilot with one policy object per vehicle and episode, for policies with memory."""
 
     def __init__(
         self,
@@ -111,14 +111,14 @@ class SinglePilots:
         max_speed_m_s: float,
         commands: CommandKind = "velocity",
     ) -> None:
-        """Take the policy's factory, the speed limit of its actions [m/s], and what it commands."""
+        """Store the policy factory, the speed limit of its actions [m/s], and the command kind."""
         self._make = make
         self._max_speed_m_s = max_speed_m_s
         self._commands: CommandKind = commands
         self._policies: dict[int, Policy] = {}
 
     def begin(self, slot: int, seed: int) -> None:  # noqa: ARG002
-        """Make the episode's policy."""
+        """Create the episode's policy."""
         self._policies[slot] = self._make()
 
     def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -137,7 +137,7 @@ class SinglePilots:
 
 
 class _EncodedPilots:
-    """A bare function of the environment's own encoding."""
+    """Pilot that calls a plain function with the environment's encoding."""
 
     def __init__(
         self, navigation: Navigation, decide: Decide, began: Callable[[int], None] | None
@@ -147,7 +147,7 @@ class _EncodedPilots:
         self._began = began
 
     def begin(self, slot: int, seed: int) -> None:  # noqa: ARG002
-        """Tell the function, if it wants to know."""
+        """Call the `began` callback, if any."""
         if self._began is not None:
             self._began(slot)
 
@@ -166,17 +166,17 @@ def fly_episodes(
     zone: int | None = None,
     began: Callable[[int], None] | None = None,
 ) -> Iterator[EpisodeResult]:
-    """Fly one episode a seed and yield each as it ends, in the order in which they end.
+    """Fly one episode per seed and yield each result as it ends, in order of completion.
 
-    An episode's result depends on its seed alone, not on what flies beside it.
+    An episode's result depends on its seed only, not on parallel flights.
 
     Args:
         spec: The environment.
         decide: The policy.
         seeds: Seeds of the episodes.
-        slots: Number of flights at a time.
-        zone: Curriculum zone that bounds the goals; None is the largest.
-        began: Called with the slot in which an episode begins: for a policy with a memory.
+        slots: Number of parallel flights.
+        zone: Curriculum zone that bounds the goals; None = the largest.
+        began: Callback with the slot of each starting episode, for policies with memory.
     """
     if not seeds:
         return
@@ -194,16 +194,16 @@ def fly_seeds(
     zone: int | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[tuple[int, EpisodeResult]]:
-    """Fly one episode a seed and yield slot and result of each as it ends.
+    """Fly one episode per seed and yield slot and result of each as it ends.
 
-    The slot shows the flight's end until the next item is asked for.
+    The slot keeps the flight's final state until the next item is requested.
 
     Args:
-        navigation: No more slots than seeds.
-        pilots: Decides.
+        navigation: Must not have more slots than seeds.
+        pilots: Pilots of all vehicles.
         seeds: Seeds of the episodes.
-        zone: Curriculum zone that bounds the goals; None is the largest.
-        stop: Asked before each decision; True leaves the flights in the air unfinished.
+        zone: Curriculum zone that bounds the goals; None = the largest.
+        stop: Called before each decision; if True, iteration ends without the unfinished flights.
     """
     n = navigation.n
     waiting = list(reversed(seeds))
@@ -242,7 +242,7 @@ def fly_seeds(
 
 
 def success_rate(flown: Sequence[EpisodeResult]) -> float:
-    """Return the share of the episodes that reached the goal."""
+    """Return the share of episodes that reached the goal."""
     return sum(each.verdict == Verdict.SUCCESS for each in flown) / len(flown)
 
 

@@ -1,9 +1,9 @@
-"""Experts: who is imitated. Each decides for the flights of a batch twin, in its action set.
+"""Experts for imitation learning. Each decides for the flights of a batch twin, in its action set.
 
-`greedy` is the classical baseline: it sees what a policy sees. `planner` knows the true arena,
-`gates` the openings of its gates, for which it decides by itself (`GatePilot`). Another expert
-chooses among commands of the action set: all of a discrete set, a fan of directions and
-speeds of the continuous one.
+`greedy` is the classical baseline with the policy's observations. `planner` uses the true arena,
+`gates` the true openings of its gates and computes its own actions (`GatePilot`). Other experts
+choose among commands of the action set: all of a discrete set, or a fan of directions and speeds of
+the continuous set.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ from airl_mav.policy.actions import fastest_climb
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
 
 AHEAD_S = 0.4
-"""How far ahead of the vehicle its place is taken: about its dead time and half its response."""
+"""Prediction time of the position [s]: about the dead time plus half the response time."""
 
 GAIN_1_S = 1.0
-"""Speed per metre off the middle of an opening, sideways and vertically."""
+"""Gain from lateral and vertical offset to an opening's middle to speed [1/s]."""
 
 STANDOFF_M = 2.0
-"""Where it waits before a wall until it is lined up [m]."""
+"""Waiting distance in front of a wall until the vehicle is lined up [m]."""
 
 BEHIND_M = 0.4
-"""So far behind the wall the vehicle turns to the next gate, its own radius added [m]."""
+"""Distance behind a wall, plus the vehicle's radius, at which to turn to the next gate [m]."""
 
 MARGIN_M = 0.35
-"""Gap to the frame from which on it flies at full speed [m]."""
+"""Gap to the frame at which full speed is reached [m]."""
 
 NOWHERE = 1e6
-"""North of everything [m]: where there is no further gate."""
+"""North coordinate of a missing gate [m]."""
 
 
 class GatePilot:
-    """Decides for the flights of a batch twin."""
+    """Pilot through gates for the flights of a batch twin."""
 
     def __init__(self, navigation: Navigation) -> None:
-        """Take the flights.
+        """Store the flights.
 
         Raises:
-            FieldError: The action set has no vertical speed, or is a discrete one.
+            FieldError: The action set has no vertical speed, or is discrete.
         """
         actions = navigation.spec.action_spec
         if actions.set not in VELOCITIES or actions.set not in VERTICAL:
@@ -66,7 +66,7 @@ class GatePilot:
         self._goal = np.zeros((navigation.n, 3))
 
     def begin(self, slots: Sequence[int]) -> None:
-        """Look at the arenas of the episodes that slots begin, or go on with."""
+        """Read the arenas of episodes that start or resume in slots."""
         for i in slots:
             arena = self._navigation.arenas[i]
             assert arena is not None  # noqa: S101 (an episode has begun in it)
@@ -98,7 +98,7 @@ class GatePilot:
         middle, half = self._middle[each, gate], self._half[each, gate]
         off = middle[:, 1:] - here[:, 1:]
         room = half[:, 1:] - np.array([vehicle.radius, vehicle.half_height]) - MARGIN_M
-        # 1: lined up; 0: not within the opening at all.
+        # 1 = lined up, 0 = outside the opening.
         share = np.abs(off) / np.maximum(room, 0.1)
         lined_up = np.clip(2.0 - 1.5 * share.max(axis=1), 0.0, 1.0)
         before = middle[:, 0] - half[:, 0] - here[:, 0]
@@ -117,26 +117,26 @@ class GatePilot:
 
 
 DIRECTIONS = 48
-"""Directions of the fan."""
+"""Number of directions in the fan."""
 
 SPEEDS = (0.2, 0.5, 0.75, 1.0)
-"""Its speeds, as shares of the fastest."""
+"""Speeds in the fan, relative to the maximum."""
 
 TURN_M = 1.5
-"""How far off a yaw rate of 1 rad/s too much is, as a speed [m/s]."""
+"""Weight of a yaw rate error: equivalent speed error [m/s] per 1 rad/s."""
 
 
 class Choices(NamedTuple):
-    """Actions that an expert chooses from."""
+    """Candidate actions of an expert."""
 
     actions: NDArray[Any]
-    """(c,) of a discrete set, (c, 2) of the continuous one."""
+    """(c,) for a discrete set, (c, 2) for the continuous set."""
     commands: NDArray[np.float64]
-    """(c, 3) what they command: forward, right [m/s], yaw rate [rad/s]."""
+    """(c, 3) corresponding commands: forward, right [m/s], yaw rate [rad/s]."""
 
 
 def choices(spec: ActionSpec) -> Choices:
-    """Return the actions that an expert chooses from."""
+    """Return the candidate actions of an expert."""
     count = discrete_actions(spec)
     if spec.set in VERTICAL:
         accepted = "one without a vertical speed; with one, expert gates"
@@ -155,22 +155,22 @@ def choices(spec: ActionSpec) -> Choices:
 
 
 class Chooser(Protocol):
-    """Decides for the flights of a batch twin."""
+    """Interface of experts: decide for the flights of a batch twin."""
 
     def begin(self, slots: Sequence[int]) -> None:
-        """Episodes begin in slots."""
+        """Start episodes in slots."""
 
     def decide(self) -> NDArray[np.int64]:
-        """Return the indices (n,) of the commands chosen for the present states."""
+        """Return the indices (n,) of the commands for the present states."""
 
 
 class GreedyPilots:
-    """The baseline, one a flight; the nearest command to its own is chosen. A `Chooser`."""
+    """Greedy baseline, one per flight; selects the nearest command. A `Chooser`."""
 
     def __init__(self, navigation: Navigation, known: NDArray[np.float64]) -> None:
-        """Take the flights, and the commands (c, 3) to choose from.
+        """Store the flights and the candidate commands (c, 3).
 
-        Raises FieldError where they see no depth.
+        Raises FieldError without a depth camera.
         """
         if navigation.camera.kind != "depth":
             accepted = f"planner with a camera of kind {navigation.camera.kind!r}"
@@ -181,12 +181,12 @@ class GreedyPilots:
         self.pilots = [GreedyPolicy(self._settings) for _ in range(navigation.n)]
 
     def begin(self, slots: Sequence[int]) -> None:
-        """Forget the flights before."""
+        """Reset the pilots of starting episodes."""
         for i in slots:
             self.pilots[i] = GreedyPolicy(self._settings)
 
     def decide(self) -> NDArray[np.int64]:
-        """Return the indices (n,) of the commands chosen for the present observations."""
+        """Return the indices (n,) of the commands for the present observations."""
         seen = self._navigation.see()
         actions = [pilot.act(seen.rows(i)) for i, pilot in enumerate(self.pilots)]
         wanted = np.array([(a.forward_m_s, a.right_m_s, a.yaw_rate_rad_s) for a in actions])
@@ -196,10 +196,10 @@ class GreedyPilots:
 
 
 class Expert(Stateful):
-    """An expert with its memory, as a checkpoint keeps it."""
+    """Expert and its memory, with checkpoint support."""
 
     def __init__(self, name: ExpertName, navigation: Navigation) -> None:
-        """Take an expert by name, for the flights of a batch twin."""
+        """Create an expert by name, for the flights of a batch twin."""
         self._navigation = navigation
         self._chooser: Planner | GreedyPilots | GatePilot
         self._choices: Choices | None = None
@@ -213,12 +213,12 @@ class Expert(Stateful):
         self._sides = np.ones(navigation.n)
 
     def begin(self, slots: Sequence[int]) -> None:
-        """Episodes begin in slots."""
+        """Start episodes in slots."""
         self._begun[list(slots)] = True
         self._chooser.begin(slots)
 
     def decide(self) -> NDArray[Any]:
-        """Return the actions of n vehicles in their present states, as a policy gives them."""
+        """Return the actions of n vehicles for their present states, in a policy's format."""
         decided = self._chooser.decide()
         return decided if self._choices is None else self._choices.actions[decided]
 
@@ -228,7 +228,7 @@ class Expert(Stateful):
         return {"begun": self._begun, "sides": self._sides}
 
     def set_state(self, state: State) -> None:
-        """Restore a saved state; the flights' own has been restored before."""
+        """Restore a saved state; restore the flights first."""
         super().set_state(state)
         self._chooser.begin(np.flatnonzero(self._begun).tolist())
         if isinstance(self._chooser, GreedyPilots):

@@ -1,7 +1,7 @@
-"""Faults in the batch twin: those of wind, camera and uplink, whose parts it has.
+"""Faults of wind, camera and uplink in the batch twin.
 
-Its flights begin where the policy takes over: time counts from there, the phase `offboard`. A fault
-is the same for all vehicles; what is random of it has the seed of each episode.
+Flights start when the policy takes over, in phase `offboard`, at time 0. A fault is the same for
+all vehicles; its random part uses the seed of each episode.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ from airl_mav.faults.model import Fault
 from airl_mav.faults.schedule import FOREVER_US, gust_share, window_us
 
 BEGINS = {"offboard": 0}
-"""Phases that have begun when a flight of the twin does [µs]."""
+"""Start times of phases that have begun at the start of a flight [µs]."""
 
 BEFORE_US = -FOREVER_US
-"""Begin of what has acted since before the flight."""
+"""Start time of faults active since before the flight."""
 
 
 class TwinFault(NamedTuple):
-    """A fault with its times in a flight of the twin."""
+    """Fault with its active times in a flight of the twin."""
 
     number: int
-    """Which one of the episode it is, from 0."""
+    """Index of the fault in the episode, from 0."""
     fault: Fault
     from_us: int
-    """`BEFORE_US`: since before the flight."""
+    """Start [µs]; `BEFORE_US` = active since before the flight."""
     to_us: int
 
     def at(self, time_us: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether it acts at each of these times [µs]."""
+        """Return True where the fault is active at these times [µs]."""
         acts: NDArray[np.bool_] = (time_us >= self.from_us) & (time_us < self.to_us)
         return acts
 
 
 def twin_faults(faults: Sequence[Fault], *parts: Part) -> list[TwinFault]:
-    """Return the faults of these parts, of those that the twin has, in the episode's order."""
+    """Return the faults of these parts that the twin supports, in the episode's order."""
     found = []
     for number, fault in enumerate(faults):
         if fault.part not in parts:
@@ -54,7 +54,7 @@ def twin_faults(faults: Sequence[Fault], *parts: Part) -> list[TwinFault]:
 
 
 def gusts(faults: Sequence[TwinFault], first_tick: int, ticks: int) -> Vector:
-    """Return the wind (ticks, 3) NED [m/s] that faults add, from the tick with this number on."""
+    """Return the wind (ticks, 3) NED [m/s] of faults, starting with tick number `first_tick`."""
     time_us = TICK_US * np.arange(first_tick, first_tick + ticks)
     more = np.zeros((ticks, 3))
     for each in faults:
@@ -68,14 +68,14 @@ def gusts(faults: Sequence[TwinFault], first_tick: int, ticks: int) -> Vector:
 
 
 def lasting(faults: Sequence[TwinFault]) -> Vector:
-    """Return the wind (3,) NED [m/s] of faults that has blown since before the flight."""
+    """Return the wind (3,) NED [m/s] of faults active since before the flight."""
     since = [each.fault.value for each in faults if each.from_us == BEFORE_US]
     total: Vector = np.sum(np.array(since).reshape(-1, 3), axis=0)
     return total
 
 
 def later_us(faults: Sequence[TwinFault], time_us: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return by how much what is sent at each of these times comes later, for faults `delay`."""
+    """Return the additional delay of messages sent at these times, for faults `delay`."""
     more = np.zeros_like(time_us)
     for each in faults:
         more += np.where(each.at(time_us), round(each.fault.amount * US_PER_S), 0)
@@ -83,14 +83,14 @@ def later_us(faults: Sequence[TwinFault], time_us: NDArray[np.int64]) -> NDArray
 
 
 def delays_of(faults: Sequence[TwinFault]) -> NDArray[np.int64]:
-    """Return faults `delay` for kernels: (k, 3) begin, end, and by how much, all [µs]."""
+    """Return faults `delay` for kernels: (k, 3) start, end and delay, all [µs]."""
     rows = [(each.from_us, each.to_us, round(each.fault.amount * US_PER_S)) for each in faults]
     return np.array(rows, np.int64).reshape(-1, 3)
 
 
 @kernel
 def later_in(delays: NDArray[np.int64], time_us: int) -> int:
-    """Return by how much what is sent at a time [µs] comes later; `delays` as of `delays_of`."""
+    """Return the additional delay of a message sent at a time [µs]; `delays` as in `delays_of`."""
     more = 0
     for k in range(len(delays)):
         if delays[k, 0] <= time_us < delays[k, 1]:
@@ -99,7 +99,7 @@ def later_in(delays: NDArray[np.int64], time_us: int) -> int:
 
 
 def acted(faults: Sequence[Fault], ended_us: int) -> list[tuple[str, int, int]]:
-    """Return what has acted in a flight that ended at a time [µs]: in words, from when to when."""
+    """Return the faults active in a flight until its end [µs]: text, start and end of each."""
     told = []
     for fault in faults:
         (each,) = twin_faults([fault], fault.part)

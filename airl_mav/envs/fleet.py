@@ -1,6 +1,6 @@
-"""The batch twin's vehicles: the state of n of them as arrays, and what they share.
+"""Vehicles of the batch twin: their state as arrays, and shared constants.
 
-`flight.advance` flies them.
+`flight.advance` simulates them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from airl_mav.vehicle.rotor import N_ROTORS, command_for, hover_speeds, lag
 
 
 class Verdict(IntEnum):
-    """How a flight ended, or that it goes on; `flight.judge.Outcome` for arrays."""
+    """Status of a flight: flying, or the reason of its end; `flight.judge.Outcome` for arrays."""
 
     FLYING = 0
     SUCCESS = 1
@@ -38,42 +38,42 @@ class Verdict(IntEnum):
 
 
 class Rules(NamedTuple):
-    """What ends a flight besides collision and battery; as `flight.judge.Task`."""
+    """End conditions of a flight besides collision and battery; as `flight.judge.Task`."""
 
     goal_radius: float
-    """The goal is reached closer than this: seen from above, if it has no height [m]."""
+    """Maximum distance to the goal for success [m]; horizontal if the goal has no height."""
     time_limit_us: int
-    """Longest flight [µs]."""
+    """Maximum flight time [µs]."""
 
 
 class Fleet(NamedTuple):
     """State of n vehicles; rows are updated in place."""
 
-    time_us: NDArray[np.int64]  # (n,) since each one's start
+    time_us: NDArray[np.int64]  # (n,) since the flight's start
     position: NDArray[np.float64]  # (n, 3) NED [m]
     velocity: NDArray[np.float64]  # (n, 3) NED [m/s]
     quaternion: NDArray[np.float64]  # (n, 4) body -> NED
     omega: NDArray[np.float64]  # (n, 3) FRD [rad/s]
     rotor: NDArray[np.float64]  # (n, 4) speeds, fraction of full
-    felt: NDArray[np.float64]  # (n, 3) acceleration NED as the power model takes it [m/s²]
-    memory: NDArray[np.float64]  # (n, MEMORY_SIZE) of the cascade
+    felt: NDArray[np.float64]  # (n, 3) acceleration NED for the power model [m/s²]
+    memory: NDArray[np.float64]  # (n, MEMORY_SIZE) state of the cascade
     setpoint: NDArray[np.float64]  # (n, 4) forward, right, down [m/s], yaw rate [rad/s]; or, ...
     by_rates: NDArray[np.bool_]  # (n,) ... body rates FRD [rad/s] and thrust 0..1
-    velocity_ned: NDArray[np.float64]  # (n, 3) the setpoint as PX4 holds it
+    velocity_ned: NDArray[np.float64]  # (n, 3) the setpoint as stored by PX4
     repeat_us: NDArray[np.int64]  # (n,) time of the next repeat
-    distance: NDArray[np.float64]  # (n,) flown since the start [m]
-    energy: NDArray[np.float64]  # (n,) of the vehicle since the start, its computer apart [J]
+    distance: NDArray[np.float64]  # (n,) path length since the start [m]
+    energy: NDArray[np.float64]  # (n,) used since the start, without the computer [J]
     battery: NDArray[np.float64]  # (n,) state of charge, 1 full to 0 empty
-    room: NDArray[np.float64]  # (n,) it and the obstacles move so far without contact; 0: look [m]
+    room: NDArray[np.float64]  # (n,) lower bound of the combined motion to a contact; 0 = check [m]
     touched: NDArray[np.int64]  # (n,) first contact: obstacle, FLOOR, ..., or NOTHING
     verdict: NDArray[np.int64]  # (n,) Verdict
-    airframe: NDArray[np.float64]  # (n, fields of Airframe) each one's own
+    airframe: NDArray[np.float64]  # (n, fields of Airframe) parameters of each vehicle
 
 
 class Seen(NamedTuple):
-    """When and where the newest frames of n vehicles were taken; rows are updated in place."""
+    """Time and pose of the newest frames of n vehicles; rows are updated in place."""
 
-    time_us: NDArray[np.int64]  # (n,) of each episode
+    time_us: NDArray[np.int64]  # (n,) in each episode
     position: NDArray[np.float64]  # (n, 3) NED [m]
     quaternion: NDArray[np.float64]  # (n, 4) body -> NED
     velocity: NDArray[np.float64]  # (n, 3) NED [m/s]
@@ -84,23 +84,23 @@ class Flights(NamedTuple):
     """Status of n flights; arrays (n,)."""
 
     verdict: NDArray[np.int64]
-    """`Verdict`."""
+    """`Verdict` of each flight."""
     touched: NDArray[np.int64]
-    """Index of the obstacle that is touched, or `arenas.FLOOR`, `CEILING`, `WALL`, `NOTHING`."""
+    """Index of the touched obstacle, or `arenas.FLOOR`, `CEILING`, `WALL`, `NOTHING`."""
     time_s: NDArray[np.float64]
     distance_m: NDArray[np.float64]
-    """Flown so far [m]."""
+    """Path length so far [m]."""
     energy_j: NDArray[np.float64]
     goal_distance_m: NDArray[np.float64]
-    """True; seen from above, where the goal has no height."""
+    """True distance [m]; horizontal if the goal has no height."""
     speed_m_s: NDArray[np.float64]
-    """Three-dimensional, true."""
+    """True speed in three dimensions."""
     battery: NDArray[np.float64]
-    """Charge left, 1 to 0."""
+    """Remaining charge, 1 to 0."""
 
 
 class Pack(NamedTuple):
-    """The battery's constants."""
+    """Constants of the battery."""
 
     empty_v: float
     """Open-circuit voltage of the empty pack [V]."""
@@ -110,17 +110,17 @@ class Pack(NamedTuple):
 
 
 class Vehicle(NamedTuple):
-    """The constants that all vehicles of a fleet share."""
+    """Constants shared by all vehicles of a fleet."""
 
     airframe: Airframe
-    """Nominal: what `hover` gives a vehicle that is not given its own."""
+    """Nominal airframe; default of `hover`."""
     gains: Gains
     power: PowerModel
     pack: Pack
     computer_w: float
-    """Of the onboard computer, from the pack [W]."""
+    """Power of the onboard computer from the pack [W]."""
     radius: float
-    """Of the collision disc [m]."""
+    """Radius of the collision disc [m]."""
     half_height: float
 
 
@@ -131,8 +131,8 @@ def vehicle_of(
 
     Args:
         profile: The vehicle.
-        parameter: Lookup of PX4-named parameters: the flight controller's, so that both fly alike.
-        computer_w: What the onboard computer draws from the pack [W].
+        parameter: Lookup of PX4-named parameters, the same as in the flight controller.
+        computer_w: Power of the onboard computer from the pack [W].
     """
     b = profile.battery
     return Vehicle(
@@ -149,7 +149,7 @@ def vehicle_of(
 
 
 def new_fleet(n: int) -> Fleet:
-    """Return n vehicles at rest in the origin."""
+    """Return n vehicles at rest at the origin."""
     quaternion = np.zeros((n, 4))
     quaternion[:, 0] = 1.0
     return Fleet(
@@ -176,7 +176,7 @@ def new_fleet(n: int) -> Fleet:
 
 
 def put_vehicle(fleet: Fleet, i: int, of: Fleet, j: int) -> None:
-    """Make vehicle i what vehicle j of another fleet is."""
+    """Copy the state of vehicle j of another fleet to vehicle i."""
     for array, theirs in zip(fleet, of, strict=True):
         array[i] = theirs[j]
 
@@ -194,16 +194,16 @@ def hover(
     battery: float = 1.0,
     wind: Vec = STILL,
 ) -> None:
-    """Put vehicle i into a hover above the origin, heading north, all counters at zero.
+    """Set vehicle i to a hover above the origin, heading north, all counters at zero.
 
-    In wind it leans against it, as after a while in hover: nothing has to settle first.
+    In wind the vehicle starts at the steady-state tilt, so no settling time is needed.
 
     Args:
-        fleet: Where vehicle i is.
+        fleet: Fleet that contains vehicle i.
         i: Row.
         altitude_m: Height above the floor [m].
-        vehicle: What all vehicles share.
-        airframe: This vehicle's own; None = the nominal one.
+        vehicle: Constants shared by all vehicles.
+        airframe: Airframe of this vehicle; None = nominal.
         battery: State of charge at the start, 1 full to 0 empty.
         wind: Steady wind NED [m/s].
     """
@@ -233,25 +233,25 @@ def hover(
 
 
 LANES = 4
-"""How many vehicles fly a tick together: as many doubles as AVX2 has in a register. With eight, a
-thousand vehicles fly 2 to 4 % faster and a single one takes 1.5 times as long."""
+"""Number of vehicles simulated together: the doubles in an AVX2 register. With eight, a thousand
+vehicles are 2 to 4 % faster and a single one takes 1.5 times as long."""
 
 State = NDArray[np.float64]
-"""(ROWS, LANES): a column is a vehicle."""
+"""(ROWS, LANES): one column per vehicle."""
 
-# Rows that are the vehicle's between two ticks; see `Fleet`.
+# Rows that persist between two ticks; see `Fleet`.
 POSITION, VELOCITY, ATTITUDE, RATES, ROTOR, FELT = 0, 3, 6, 10, 13, 17
 WANTED, YAW_RATE = 20, 23  # the setpoint: velocity NED [m/s], yaw rate [rad/s]
 ENERGY, BATTERY, DISTANCE = 24, 25, 26
-ROTOR_LEFT = 27  # what remains of a rotor's speed error after a tick
-# Rows that hold from one loop of a tick to the next.
-WIND, MOVED = 28, 31  # NED [m/s]; the way of the tick [m]
-FIRST = 32  # 1: the filters were settled in this tick
-PUBLISHED, PUBLISHED_YAW_RATE, PUBLISHED_THRUST = 33, 37, 38  # what the attitude loop flies
+ROTOR_LEFT = 27  # remaining share of a rotor's speed error after a tick
+# Rows that pass values between the loops of a tick.
+WIND, MOVED = 28, 31  # NED [m/s]; path length of the tick [m]
+FIRST = 32  # 1 = the filters were initialized in this tick
+PUBLISHED, PUBLISHED_YAW_RATE, PUBLISHED_THRUST = 33, 37, 38  # setpoint of the attitude loop
 REDUCED, HALF_TURN = 39, 43  # of the attitude loop
 TORQUE, COLLECTIVE, MOTORS = 44, 47, 48  # of the rate loop
-FITS = 52  # 1: no motor command is out of range
-BY_RATES = 53  # 1: `WANTED` holds body rates [rad/s], and `YAW_RATE` the thrust
+FITS = 52  # 1 = all motor commands are in range
+BY_RATES = 53  # 1 = `WANTED` holds body rates [rad/s], and `YAW_RATE` the thrust
 AIRFRAME = 54
 AIRFRAME_SIZE = len(Airframe._fields)
 MEMORY = AIRFRAME + AIRFRAME_SIZE
@@ -272,7 +272,7 @@ def quat(state: State, row: int, j: int) -> Quat:
 
 @borrowing_kernel
 def load(fleet: Fleet, i: int, state: State, j: int) -> None:
-    """Put vehicle i into lane j."""
+    """Copy vehicle i to lane j."""
     for axis in range(3):
         state[POSITION + axis, j] = fleet.position[i, axis]
         state[VELOCITY + axis, j] = fleet.velocity[i, axis]

@@ -1,12 +1,12 @@
-"""How the batch twin flies: every vehicle's rigid body and cascade at 250 Hz, one compiled call.
+"""Flight dynamics of the batch twin: rigid body and cascade at 250 Hz, in one compiled call.
 
-The same kernels as the rehearsal (`airl_mav.vehicle`, `airl_mav.control`), without estimator and
-MAVLink: control sees the true state. A setpoint in the heading frame is turned into NED when it
-arrives and again at each of MAVSDK's 20 Hz repeats, as PX4 does it.
+Uses the rehearsal's kernels (`airl_mav.vehicle`, `airl_mav.control`), without estimator and
+MAVLink: control uses the true state. A setpoint in the heading frame is converted to NED when it
+arrives and again at each of MAVSDK's 20 Hz repeats, as in PX4.
 
-A few vehicles fly each tick together (`LANES`); when one has flown its ticks, or its flight is
-over, the next takes its place. What calls functions that have no vector form, or is rarely needed,
-stands in loops of its own between those that are compiled to vector instructions.
+`LANES` vehicles are simulated together; when one has completed its ticks or its flight, the next
+takes its lane. Function calls without a vector form, and rare cases, are in separate loops between
+the vectorized ones.
 """
 
 from __future__ import annotations
@@ -109,15 +109,15 @@ from airl_mav.vehicle.rotation import Vec, rotate
 from airl_mav.vehicle.rotor import settle, wrench
 
 REPEAT_US = 50_000
-"""MAVSDK repeats the newest setpoint at 20 Hz [µs]."""
+"""Interval of MAVSDK's setpoint repeats, 20 Hz [µs]."""
 
 _ROUNDING_M = 1e-6
-"""Distances are this exact, and far more."""
+"""Upper bound of rounding errors in distances [m]."""
 
 NAN3: Vec = (math.nan, math.nan, math.nan)
 
 _NOBODY = -1
-"""In an empty lane."""
+"""Marker of an empty lane."""
 
 _FLYING = int(Verdict.FLYING)
 _SUCCESS = int(Verdict.SUCCESS)
@@ -134,22 +134,22 @@ def advance(
     rules: Rules,
     air: NDArray[np.float64] | None,
 ) -> None:
-    """Fly every vehicle whose verdict is FLYING for its number of ticks on its setpoint.
+    """Fly every vehicle with verdict FLYING for its number of ticks on its setpoint.
 
-    A flight ends in the tick that decides it, and its `time_us` stays there. Tests and their order
-    are the referee's (`flight.judge`): goal, collision, battery, time limit.
+    A flight ends in the tick that decides it, and its `time_us` remains at that tick. Tests and
+    their order match the referee (`flight.judge`): goal, collision, battery, time limit.
 
-    A setpoint that was changed since the last call takes effect at once: set `repeat_us` to the
-    vehicle's time to have it turned into NED by the present heading.
+    A setpoint changed since the last call takes effect at once: set `repeat_us` to the vehicle's
+    time to convert it to NED with the present heading.
 
     Args:
         fleet: Updated in place.
-        arenas: One a vehicle; the moving obstacles' centres are updated in place.
-        ticks: (n,) how many ticks each one flies.
-        vehicle: What all vehicles share.
-        rules: What ends a flight.
-        air: (n, k, 3) wind NED [m/s]; of the k rows each tick since the start of a flight takes the
-            next, after the last one the first again. None, or k = 0: calm.
+        arenas: One per vehicle; the moving obstacles' centres are updated in place.
+        ticks: (n,) number of ticks to fly.
+        vehicle: Constants shared by all vehicles.
+        rules: End conditions.
+        air: (n, k, 3) wind NED [m/s]; ticks since the start of a flight use the k rows in turn,
+            cyclically. None, or k = 0: calm.
     """
     n, never = len(ticks), np.zeros((0, 3), np.int64)
     timing = Timing(False, 0, 0, -1, -1, 0.0, never, FrameTimes(np.zeros(n, np.int64), 1, 0, never))
@@ -173,16 +173,16 @@ def fly(
     air: NDArray[np.float64],
     decision: Decision,
 ) -> None:
-    """Fly vehicles as `advance` does, `LANES` at a time, where `todo` is not 0; it becomes 0.
+    """Fly vehicles as in `advance`, `LANES` at a time, where `todo` is not 0; it becomes 0.
 
-    A vehicle whose decision has events flies it to its end, or to where Python is needed; another
-    one flies `todo` ticks. Moving obstacles are moved where they matter.
+    A vehicle whose decision has events flies until its end, or until Python is needed; other
+    vehicles fly `todo` ticks. Obstacles are only moved for contact checks.
     """
     weights, kept = filters(vehicle.gains, TICK_S), felt_share(vehicle.power, TICK_S)
-    # Made here with sizes that are constants: so the compiler knows that no two rows overlap.
+    # Allocated here with constant sizes, so that the compiler knows that rows do not overlap.
     state, spare = np.zeros((ROWS, LANES)), np.zeros((MEMORY_SIZE, LANES))
     who, left = np.full(LANES, _NOBODY), np.zeros(LANES, np.int64)
-    # Those whose position loops are due at the same ticks fly together: one loop runs for all.
+    # Vehicles whose position loops are due at the same ticks share lanes: the loop runs for all.
     coming, odd = np.zeros(2, np.int64), 0
     while True:
         aloft = _fill(fleet, decision, todo, coming, odd, who, left, state)
@@ -208,7 +208,7 @@ def fly(
             if i != _NOBODY:
                 here, hit = vec(state, POSITION, j), NOTHING
                 fleet.time_us[i] += TICK_US
-                # Nothing is touched before both have moved as far as they were apart.
+                # Contact is impossible until the combined motion exceeds the clearance.
                 fleet.room[i] -= state[MOVED, j] + TICK_S * arenas.tour_speed[i]
                 if fleet.room[i] < _ROUNDING_M:
                     fleet.room[i], hit = _contact(arenas, i, here, fleet.time_us[i], vehicle)
@@ -231,9 +231,9 @@ def _fill(
     left: NDArray[np.int64],
     state: State,
 ) -> int:
-    """Let vehicles go on whose ticks are flown, or put others into their lanes; return how many.
+    """Continue vehicles in their lanes, or fill lanes with others; return the number of vehicles.
 
-    Arguments as of `_next` and `fly`, and of all lanes: who is in each, how many ticks are left.
+    Arguments as in `_next` and `fly`, and for all lanes the vehicle and its remaining ticks.
     """
     aloft = 0
     for j in range(len(who)):
@@ -262,9 +262,9 @@ def _next(
     odd: int,
     coming: NDArray[np.int64],
 ) -> int:
-    """Return the next vehicle that has to fly and whose position loop is due now, or nobody.
+    """Return the next waiting vehicle whose position loop is due now; `_NOBODY` without one.
 
-    Where `odd` is 1, it is due a tick later. `coming` (2,) is where the search resumes for both.
+    With `odd` = 1, the loop is due a tick later. `coming` (2,) holds the search position for both.
     """
     while coming[odd] < len(todo):
         i: int = coming[odd]
@@ -276,9 +276,9 @@ def _next(
 
 @borrowing_kernel
 def _repeat(fleet: Fleet, i: int, state: State, j: int) -> None:
-    """Turn the setpoint of vehicle i, in lane j, into NED by the present heading.
+    """Convert the setpoint of vehicle i, in lane j, to NED with the present heading.
 
-    Body rates stay what they are.
+    Body rates are unchanged.
     """
     if fleet.by_rates[i]:
         for axis in range(3):
@@ -297,7 +297,7 @@ def _repeat(fleet: Fleet, i: int, state: State, j: int) -> None:
 
 @borrowing_kernel
 def _blow(air: NDArray[np.float64], time_us: int, state: State, j: int) -> None:
-    """Put the wind of a tick, of the rows `air` (k, 3) of a vehicle, into its lane j."""
+    """Write the wind of a tick, from a vehicle's rows `air` (k, 3), to lane j."""
     row = time_us // TICK_US % len(air)
     for axis in range(3):
         state[WIND + axis, j] = air[row, axis]
@@ -312,11 +312,11 @@ def _outer_loops(
     gains: Gains,
     weights: Filters,
 ) -> bool:
-    """Run the first half of `cascade_tick` in every lane: to what the attitude loop flies.
+    """Run the first half of `cascade_tick` in every lane, up to the attitude loop's setpoint.
 
-    `spare` (MEMORY_SIZE, LANES) is room to work in, `who` (LANES,) the vehicle in each lane or
-    nobody, `aloft` the number of vehicles, `weights` is `filters(gains, TICK_S)`. Return whether
-    body rates are commanded in any lane; there nothing is run but a filter.
+    `spare` (MEMORY_SIZE, LANES) is a buffer, `who` (LANES,) the vehicle in each lane or `_NOBODY`,
+    `aloft` the number of vehicles, `weights` is `filters(gains, TICK_S)`. Return True if any lane
+    has body rate commands; such lanes only update a filter.
     """
     due, by_rates = 0, 0
     for j in range(state.shape[1]):
@@ -327,7 +327,7 @@ def _outer_loops(
         due += who[j] != _NOBODY and memory[WAIT] == 0.0
         _publish(state, j)
     if due > 0:
-        # In all lanes, or none would be fast; those that are not due keep what they had.
+        # Run in all lanes to vectorize; lanes that are not due are restored afterwards.
         kept = due < aloft or by_rates > 0
         if kept:
             for row in range(MEMORY_SIZE):
@@ -355,16 +355,16 @@ def _outer_loops(
 
 @kernel
 def _restore(state: State, spare: NDArray[np.float64], j: int) -> None:
-    """Write the memory of lane j back."""
+    """Restore the memory of lane j."""
     for row in range(MEMORY_SIZE):
         state[MEMORY + row, j] = spare[row, j]
 
 
 @kernel
 def _inner_loops(state: State, who: NDArray[np.int64], gains: Gains, weights: Filters) -> None:
-    """Run the second half of `cascade_tick` in every lane: to the motor commands.
+    """Run the second half of `cascade_tick` in every lane, up to the motor commands.
 
-    Arguments as of `_outer_loops`.
+    Arguments as in `_outer_loops`.
     """
     for j in range(state.shape[1]):
         q, q_sp = quat(state, ATTITUDE, j), quat(state, PUBLISHED, j)
@@ -402,9 +402,9 @@ def _inner_loops(state: State, who: NDArray[np.int64], gains: Gains, weights: Fi
 
 @kernel
 def _prepare_rates(state: State, who: NDArray[np.int64]) -> None:
-    """Have the rate loop fly what is commanded, where body rates are, as `rate_tick` does.
+    """Set the rate loop's setpoint to the command, for body rates, as in `rate_tick`.
 
-    It flies what the attitude loop has published before: here that is the command.
+    The rate loop uses the previously published setpoint, which is the command here.
     """
     for j in range(state.shape[1]):
         if who[j] != _NOBODY and state[BY_RATES, j] != 0.0:
@@ -416,7 +416,7 @@ def _prepare_rates(state: State, who: NDArray[np.int64]) -> None:
 
 @kernel
 def _keep_rates(state: State, who: NDArray[np.int64]) -> None:
-    """Leave the memory as `rate_tick` does, where body rates are commanded."""
+    """Update the memory as in `rate_tick`, for body rate commands."""
     for j in range(state.shape[1]):
         if who[j] != _NOBODY and state[BY_RATES, j] != 0.0:
             for axis in range(3):
@@ -430,7 +430,7 @@ def _keep_rates(state: State, who: NDArray[np.int64]) -> None:
 
 @kernel
 def _publish(state: State, j: int) -> None:
-    """Keep what the inner loops fly in this tick."""
+    """Store the setpoints of the inner loops for this tick."""
     q_sp, yaw_rate, thrust = attitude_sp(state[MEMORY:ROWS, j])
     for k in range(4):
         state[PUBLISHED + k, j] = q_sp[k]
@@ -457,7 +457,7 @@ def _move(state: State, vehicle: Vehicle, kept: float) -> None:
         force = (lift[0] + drag[0], lift[1] + drag[1], lift[2] + drag[2])
         k = airframe.drag_angular
         damped = (torque[0] - k * w[0], torque[1] - k * w[1], torque[2] - k * w[2])
-        # Of the state in which this tick's forces act, as the drag.
+        # Power at the start of the tick, as for the drag.
         acceleration = vec(state, FELT, j)
         power = flight_power_w(thrust, v, q, wind, acceleration, airframe, vehicle.power)
         p_new, v_new, q_new, w_new = step(p, v, q, w, force, damped, airframe, TICK_S)
@@ -484,8 +484,8 @@ def _move(state: State, vehicle: Vehicle, kept: float) -> None:
 
 @kernel
 def _verdict(here: Vec, goal: Vec, hit: int, battery: float, time_us: int, rules: Rules) -> int:
-    """Return what a tick has decided, FLYING mostly."""
-    # Never given the whole fleet: counting the references to its arrays takes longer than a tick.
+    """Return the verdict after a tick."""
+    # Takes no fleet argument: reference counting of its arrays would take longer than a tick.
     away = (here[0] - goal[0]) ** 2 + (here[1] - goal[1]) ** 2
     if not math.isnan(goal[2]):
         away += (here[2] - goal[2]) ** 2
@@ -502,7 +502,7 @@ def _verdict(here: Vec, goal: Vec, hit: int, battery: float, time_us: int, rules
 def _contact(
     arenas: ArenaBatch, i: int, position: Vec, time_us: int, vehicle: Vehicle
 ) -> tuple[float, int]:
-    """Return how far [m] vehicle i surely is from everything, and what it touches."""
+    """Return a lower bound of vehicle i's clearance [m], and the touched object."""
     move_obstacles(arenas, i, time_us)
     bounds, count = arenas.bounds[i], arenas.n_obstacles[i]
     shape, center = arenas.shape[i], arenas.center[i]

@@ -1,7 +1,7 @@
-"""The meshes of n arenas as arrays, hills among them: what the cameras of the batch twin see.
+"""Meshes of n arenas as arrays, hills included, for the cameras of the batch twin.
 
-The trees of files are there once, whichever arenas they stand in. Each arena has ground of its own:
-behind the trees of files there is room for that of every arena.
+Trees of files are stored once, for all arenas. The ground differs between arenas: behind the trees
+of files there is space for each arena's ground.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from airl_mav.profiles.asset_files import MeshFile
 
 
 class MeshBatch(NamedTuple):
-    """The meshes of n arenas, padded to the most obstacles and meshes; see `camera.bvh.Meshes`."""
+    """Meshes of n arenas, padded to the maximum obstacles and meshes; see `camera.bvh.Meshes`."""
 
     bvh: Bvh
     present: NDArray[np.int64]  # (n,) number of meshes of each arena
@@ -31,7 +31,7 @@ class MeshBatch(NamedTuple):
 
 @kernel
 def meshes_in(batch: MeshBatch | None, i: int, obstacles: int, relief: Relief) -> Meshes | None:
-    """Return the meshes of arena i, which has so many obstacles, and such ground; None: none."""
+    """Return the meshes of arena i, for its number of obstacles and ground; None without any."""
     if batch is None:
         return None
     k = batch.present[i]
@@ -46,30 +46,29 @@ def meshes_in(batch: MeshBatch | None, i: int, obstacles: int, relief: Relief) -
 
 
 class MeshesSeen:
-    """The meshes of the arenas of n slots."""
+    """Meshes of the arenas of n slots."""
 
     def __init__(self, n: int) -> None:
-        """Know none yet."""
+        """Start without any arena."""
         self.batch: MeshBatch | None = None
-        """What colour cameras look at; None: no arena has had a mesh, and nothing is spent on any.
-        """
+        """Meshes for colour cameras; None until an arena has one, at no cost."""
         self.by_depth: MeshBatch | None = None
-        """What depth passes by and ends on: `batch`, without what is of glass; None as there."""
+        """Meshes for depth cameras: `batch` without glass; None as for `batch`."""
         self._arenas: list[Arena | None] = [None] * n
         self._files: dict[MeshFile, None] = {}
-        """All that have been seen, in order."""
+        """Files of all meshes so far, in order."""
         self._glass = False
-        """Whether any arena has had an obstacle of glass."""
+        """True if any arena so far has an obstacle of glass."""
         self._bare: MeshBatch | None = None
-        """What there is in place of `batch` where there is glass, and no mesh."""
+        """Replacement of `batch` for arenas with glass but without meshes."""
         self._room = (0, 0)
-        """Nodes and triangles that there is room for in the tree of each arena's ground."""
+        """Capacity for nodes and triangles in the tree of each arena's ground."""
 
     def put(self, i: int, arena: Arena) -> None:
-        """Take the meshes of slot i's arena.
+        """Add the meshes of slot i's arena.
 
         Raises:
-            UsageError: The file of one cannot be read, or is another one.
+            UsageError: A mesh's file is unreadable, or has changed.
         """
         self._arenas[i] = arena
         before = len(self._files)
@@ -83,7 +82,7 @@ class MeshesSeen:
         self._leave_glass_out(i, arena)
 
     def _leave_glass_out(self, i: int, arena: Arena) -> None:
-        """Bring `by_depth` up to date with slot i's arena, and with `batch`."""
+        """Update `by_depth` for slot i's arena, and for `batch`."""
         if not self._glass and arena.clear is None:
             self.by_depth = self.batch
             return
@@ -110,13 +109,13 @@ class MeshesSeen:
                 depth.owner[k, : len(each.obstacles)][each.clear] = UNSEEN
 
     def _fits(self, batch: MeshBatch, arena: Arena) -> bool:
-        """Return whether an arena has room in a batch."""
+        """Return True if an arena fits into a batch."""
         room = batch.owner.shape[1], batch.first.shape[1], *self._room
         need = len(arena.obstacles), _meshes_of(arena), *_room_of(arena)
         return all(each <= most for each, most in zip(need, room, strict=True))
 
     def _made(self, forest: Forest) -> MeshBatch:
-        """Return a batch in which all present arenas have room, with their meshes."""
+        """Return a batch that fits all present arenas, with their meshes."""
         present = [arena for arena in self._arenas if arena is not None]
         n = len(self._arenas)
         obstacles = max(len(arena.obstacles) for arena in present)
@@ -137,7 +136,7 @@ class MeshesSeen:
         return batch
 
     def _put(self, batch: MeshBatch, forest: Forest, i: int, arena: Arena) -> None:
-        """Write the meshes of slot i's arena, which fits."""
+        """Write the meshes of slot i's arena, which must fit."""
         n, k = len(arena.obstacles), _meshes_of(arena)
         batch.present[i] = k
         roots = forest.roots
@@ -151,14 +150,14 @@ class MeshesSeen:
 
 
 def _meshes_of(arena: Arena) -> int:
-    """Return how many meshes an arena has; its hills are one."""
+    """Return the number of meshes of an arena; hills count as one."""
     return len(arena.meshes) + (arena.ground is not None)
 
 
 def _room_of(arena: Arena) -> tuple[int, int]:
-    """Return how many nodes and triangles the tree of an arena's ground may have.
+    """Return the maximum numbers of nodes and triangles in the tree of an arena's ground.
 
-    As many as if all of its triangles rose above the floor: other seeds of an arena fit as well.
+    All triangles count as if above the floor, so other seeds of the arena also fit.
     """
     if arena.ground is None:
         return 0, 0
@@ -168,7 +167,7 @@ def _room_of(arena: Arena) -> tuple[int, int]:
 
 
 def _with_room(bvh: Bvh, n: int, room: tuple[int, int]) -> Bvh:
-    """Return trees with room for n more behind them, of so many nodes and triangles each."""
+    """Return trees with space for n more behind them, `room` = nodes and triangles of each."""
     nodes, faces = room
     if nodes == 0:
         return bvh
@@ -182,7 +181,7 @@ def _with_room(bvh: Bvh, n: int, room: tuple[int, int]) -> Bvh:
 
 
 def _plant(bvh: Bvh, tree: Bvh, node: int, face: int) -> None:
-    """Write a tree into others, its nodes and triangles from some places on."""
+    """Write a tree into others, its nodes from `node` and its triangles from `face` on."""
     nodes, faces = slice(node, node + len(tree.boxes)), slice(face, face + len(tree.corners))
     bvh.boxes[nodes], bvh.corners[faces], bvh.normals[faces] = (
         tree.boxes,

@@ -1,9 +1,9 @@
 """N flights at a time: the companion's decision loop around the batch twin.
 
-A decision, as `companion.pilot` flies it: the frame was taken a moment ago, the state is that of
-now; while the network computes, and until its setpoint arrives, the last one keeps flying. The
-hold counts from when the setpoint is sent, so that a decision takes t2 and the hold, not the link
-as well. Everything is in ticks of simulated time, so nothing depends on the machine.
+Decisions follow `companion.pilot`: the frame is older than the state, and the previous setpoint
+remains active during inference and until the new setpoint arrives. The hold starts when the
+setpoint is sent, so a decision takes t2 plus the hold, without the link. All times are ticks of
+simulated time, so results are independent of the machine.
 """
 
 from __future__ import annotations
@@ -65,11 +65,11 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import draw_airframe, spreads
 
 EVERYONE = slice(None)
-"""The rows of all n vehicles."""
+"""Rows of all n vehicles."""
 
 
 class WholeTruth(NamedTuple):
-    """What no policy is told, for experts that are imitated."""
+    """True state, hidden from policies, for experts in imitation learning."""
 
     fleet: Fleet
     arenas: ArenaBatch
@@ -77,7 +77,7 @@ class WholeTruth(NamedTuple):
 
 
 class Navigation(Stateful):
-    """N vehicles, each flying to its goal. No slot resets by itself."""
+    """N vehicles, each flying to its goal. Slots do not reset automatically."""
 
     def __init__(
         self,
@@ -101,30 +101,29 @@ class Navigation(Stateful):
         Args:
             spec: The environment.
             n: Number of vehicles.
-            vehicle: The vehicle with all that it carries, where it has been loaded; None: that of
-                `spec`, with the computer of `spec.delay` on board.
-            arena: The same of the arena.
-            injection: Source of t2; None: that of `spec.delay`.
-            latency_draw: Another number gives other draws of the same latency.
-            arena_seed: Seed of arena and goal of all episodes; None: each episode's own.
-            trace: Records the flights; None records nothing, and changes nothing.
-            computer_w: What the computer on board of that `vehicle` draws from the pack [W].
+            vehicle: Loaded vehicle with payload and computer; None = vehicle of `spec` with the
+                computer of `spec.delay`.
+            arena: Loaded arena; None = arena of `spec`.
+            injection: Source of t2; None = `spec.delay`.
+            latency_draw: Number of the latency realization; another number gives other draws.
+            arena_seed: Seed of arena and goal of all episodes; None = the episode's seed.
+            trace: Recorder of the flights; None = no recording. Does not affect results.
+            computer_w: Power of the onboard computer of `vehicle` from the pack [W].
             battery_charge: State of charge at the start of every flight, 1 full to 0 empty.
-            compensator: Carries forward what is seen, of n companions; None: that of the vehicle,
-                where `spec` compensates.
-            faults: What happens in every flight, of what the twin has (`envs.faults`); no part of
-                a saved state.
-            commands: What `fly` is given, velocity or body_rates; None: what the actions of `spec`
-                command.
+            compensator: Latency compensator of n companions; None = created if `spec` compensates.
+            faults: Faults of every flight, as supported by the twin (`envs.faults`); not part of a
+                saved state.
+            commands: Command type of `fly`, velocity or body_rates; None = as in the actions of
+                `spec`.
 
         Raises:
-            UsageError: A profile cannot be used, or the camera does not serve the layout; a fault
-                is none that the twin can fly.
+            UsageError: A profile is unusable, the camera does not match the layout, or the twin
+                does not support a fault.
         """
         self.spec = spec
         self.n = n
         self.by_rates: bool = (commands or spec.action_spec.commands) == "body_rates"
-        """Whether body rates and thrusts are commanded, and not velocities."""
+        """True for body rate and thrust commands, False for velocities."""
         if vehicle is None:
             vehicle, computer = equipped(spec.vehicle, spec.delay.computer, Payload())
             computer_w = computer.onboard_watts
@@ -154,9 +153,9 @@ class Navigation(Stateful):
         self.fleet, self._calm_start = new_fleet(n), new_fleet(1)
         hover(self._calm_start, 0, rules.altitude_m, self._vehicle, battery=battery_charge)
         self._number = np.zeros(n, np.int64)
-        """(n,) of the present decisions in their episodes, from 0 on."""
+        """(n,) number of the present decision in each episode, from 0."""
         self._before_draw = 0
-        """Decisions that are flown before any of their draws are due."""
+        """Number of decisions before the next draw."""
         self._extra_us = np.zeros(n, np.int64)
         self._delays = DelayDraws(
             n, self.injections, round(spec.delay.native_ms * US_PER_MS), draw=latency_draw
@@ -174,17 +173,17 @@ class Navigation(Stateful):
         self._uplink = twin_faults(faults, "uplink")
         self._decision = new_decision(self._times(pipelined=pipelined), self._telemetry.errors)
         self._stops = trace is not None or self._winds.gusty or self.cameras.may_freeze
-        """Whether Python may be needed while a decision is flown."""
+        """True if decisions may need Python before their end."""
         own = spec.reward not in SHIPPED_REWARDS
         self._reward = -1 if own else SHIPPED_REWARDS.index(spec.reward)
         self._world: World | None = None
         self._status: Flights | None = None
         self.paid = np.zeros(n)
-        """(n,) rewards of the last decisions, by the formula of `spec`, if it is a shipped one."""
+        """(n,) rewards of the last decisions if `spec` names a built-in reward."""
         self.ending = np.zeros(n, np.int64)
-        """(n,) how the last decisions have ended flights: `world.GOES_ON` and the others."""
+        """(n,) end of flight in the last decisions: `world.GOES_ON` or another value."""
         self._encoded: Encoded | None = None
-        """What networks see now, if it is known and nobody has it."""
+        """Encoded present observations, if computed but not yet returned."""
         if compensator is None and spec.compensate:
             compensator = Compensator(n, self.vehicle, self.intrinsics)
         self._companions = Companions(
@@ -199,14 +198,14 @@ class Navigation(Stateful):
         )
         self._drift = self._telemetry.drift()
         self._renders = self.cameras.eye is not None
-        """Whether kernels take the frames; else Python does."""
+        """True if kernels capture the frames; otherwise Python does."""
         self._encoding = self._encoding_of(spec) if self._renders else None
 
     def _times(self, *, pipelined: bool) -> Timing:
-        """Return the times of decisions.
+        """Return the timing of decisions.
 
         Raises:
-            UsageError: The hold is so short that a decision would have to wait for its frame.
+            UsageError: The hold is too short: a decision would have to wait for its frame.
         """
         rules, cameras = self.spec.episode, self.cameras
         hold_us = round(rules.hold_s * US_PER_S)
@@ -234,21 +233,21 @@ class Navigation(Stateful):
         )
 
     def _encoding_of(self, spec: EnvironmentSpec) -> Bytes | None:
-        """Return how kernels encode what networks see; None: Python does."""
+        """Return the constants for encoding in kernels; None for encoding in Python."""
         if spec.layout != "body" or spec.frames > 1 or spec.in_flight or spec.goal_height:
             return None
         return None if self._companions.foresee else body_bytes(self.camera.range_m)
 
     def begin(self, slots: Sequence[int], seeds: Sequence[int], zone: int | None = None) -> None:
-        """Start episodes: each in a hover above its start, the first frame taken.
+        """Start episodes: each hovers above its start, with the first frame taken.
 
         Args:
-            slots: Which of the n.
-            seeds: Of the episodes, one a slot.
-            zone: Curriculum zone, or stage, that bounds the goals; None is the whole arena.
+            slots: Indices of the vehicles.
+            seeds: Seeds of the episodes, one per slot.
+            zone: Curriculum zone, or stage, that bounds the goals; None = the whole arena.
 
         Raises:
-            UsageError: No arena can be made of a seed, or there is no such zone.
+            UsageError: Arena generation failed for a seed, or the zone is out of range.
         """
         self._places.check_zone(zone)
         who = np.zeros(self.n, np.bool_)
@@ -263,11 +262,11 @@ class Navigation(Stateful):
         self._look_ahead(who)
 
     def prepare(self, seeds: Sequence[int], zone: int | None = None) -> None:
-        """Make the arenas of episodes that are likely to begin soon; see `EpisodeArenas`."""
+        """Generate the arenas of likely next episodes; see `EpisodeArenas`."""
         self._places.prepare(seeds, zone)
 
     def prepared(self, seeds: Sequence[int], zone: int | None = None) -> bool:
-        """Return whether all of these arenas have been made ahead."""
+        """Return True if all of these arenas were generated ahead."""
         return self._places.prepared(seeds, zone)
 
     def _begin(self, i: int, seed: int, zone: int | None) -> None:
@@ -297,10 +296,10 @@ class Navigation(Stateful):
         self._companions.begin(i)
 
     def see(self, slots: Sequence[int] | None = None) -> Observation:
-        """Return the present observations of all vehicles, or of those in `slots`.
+        """Return the present observations of all vehicles, or of vehicles in `slots`.
 
-        With a leading axis (n,). Where latency is compensated, they are those of when the decision
-        is expected to act.
+        With a leading axis (n,). With latency compensation, observations are predicted for the time
+        at which the decision is expected to act.
         """
         rows, known = EVERYONE if slots is None else slots, self._companions
         if known.foresee:
@@ -323,7 +322,7 @@ class Navigation(Stateful):
     def observe(self, slots: Sequence[int] | None = None) -> Encoded:
         """Return the present observations in the environment's layout.
 
-        Of all vehicles, or of those in `slots`.
+        For all vehicles, or for vehicles in `slots`.
         """
         encoded, self._encoded = self._encoded, None
         if encoded is not None and slots is None:
@@ -331,11 +330,11 @@ class Navigation(Stateful):
         return encode_layout(self.observation, self.see(slots), COMPILED)
 
     def kinematics(self, rows: Rows = EVERYONE) -> Kinematics:
-        """Return the state of all n as telemetry reports it: with the estimator's error."""
+        """Return the states as reported by telemetry, with the estimator's error."""
         return self._telemetry.report(self.truth(rows), rows)
 
     def flights(self) -> Flights:
-        """Return the status of all flights; nothing changes it."""
+        """Return the status of all flights; it is never modified."""
         if self._status is None:
             numbers, whole = self._room_for_status()
             status(self.fleet, self._places.batch.goal, numbers, whole)
@@ -343,14 +342,14 @@ class Navigation(Stateful):
         return self._status
 
     def truth(self, rows: Rows = EVERYONE) -> Kinematics:
-        """Return the true state of all n; a copy."""
+        """Return a copy of the true states."""
         fleet = self.fleet
         state = (fleet.position, fleet.velocity, fleet.quaternion, fleet.omega)
         return Kinematics(*(np.array(each[rows]) for each in state))
 
     def whole_truth(self) -> WholeTruth:
-        """Return all that the twin knows, the very arrays that it flies on: to look at only."""
-        if self._places.begun.any():  # Until then there is no arena.
+        """Return the twin's complete state: live arrays, read-only by convention."""
+        if self._places.begun.any():  # Before the first episode there is no arena.
             move_all_obstacles(self._places.batch, self.fleet.time_us)
         return WholeTruth(self.fleet, self._places.batch, self._vehicle)
 
@@ -358,13 +357,13 @@ class Navigation(Stateful):
         """Fly one decision of every flight that has not ended.
 
         Args:
-            commands: (n, 3) forward, right [m/s], yaw rate [rad/s]: an altitude is held; or
-                (n, 4): behind them the downward speed [m/s], NaN where the altitude is held. Or,
-                `by_rates`, (n, 4) body rates FRD [rad/s] and thrust 0..1.
-            encode: `observe` comes next.
+            commands: (n, 3) forward, right [m/s], yaw rate [rad/s] with altitude hold; or (n, 4)
+                with an additional downward speed [m/s], NaN = altitude hold. With `by_rates`, (n,
+                4) body rates FRD [rad/s] and thrust 0..1.
+            encode: True if `observe` is called next.
 
         Raises:
-            ValueError: Not n commands.
+            ValueError: Wrong number or width of commands.
         """
         least = 4 if self.by_rates else 3
         if commands.ndim != 2 or len(commands) != self.n or not least <= commands.shape[1] <= 4:
@@ -390,7 +389,7 @@ class Navigation(Stateful):
         self._tell()
 
     def _fly(self, world: World, commands: NDArray[np.float64], seen: EncodedBody) -> None:
-        """Fly a decision, with stops where Python is needed."""
+        """Fly a decision, with pauses for Python."""
         numbers, whole = self._room_for_status()
         waiting, resumed = self.n, False
         while waiting > 0:
@@ -409,7 +408,7 @@ class Navigation(Stateful):
             self._take_frames(np.ones(self.n, np.bool_))
 
     def _next_stop_us(self) -> NDArray[np.int64]:
-        """Return when Python is needed (n,) [µs]."""
+        """Return the time of the next pause for Python (n,) [µs]."""
         limits = [self._winds.ends_us(), self.cameras.next_freeze_us(self.fleet.time_us)]
         if self._trace is not None:
             limits.append(self._trace.next_us(self.fleet))
@@ -419,7 +418,7 @@ class Navigation(Stateful):
         return soonest
 
     def _tell(self) -> None:
-        """Note the decisions that were flown where anybody keeps account of them."""
+        """Record the completed decisions in the trace and the companions."""
         decision = self._decision
         began_us, t2_us = decision.began_us, decision.t2_us
         if self._trace is not None:
@@ -440,7 +439,7 @@ class Navigation(Stateful):
             self._look_ahead(self.fleet.verdict == Verdict.FLYING)
 
     def _draw(self) -> None:
-        """Draw latencies and errors ahead for those whose decisions have none left."""
+        """Draw the next block of latencies and errors where it is due."""
         if self._before_draw > 0:
             self._before_draw -= 1
             return
@@ -453,12 +452,12 @@ class Navigation(Stateful):
         return np.empty((len(Flights._fields) - 1, self.n)), np.empty((3, self.n), np.int64)
 
     def _moving(self) -> Seen:
-        """Return when and where the vehicles are."""
+        """Return time and motion of the vehicles."""
         fleet = self.fleet
         return Seen(fleet.time_us, fleet.position, fleet.quaternion, fleet.velocity, fleet.omega)
 
     def _made_world(self) -> World:
-        """Return what the kernels work on: made anew where an arena or its meshes may be."""
+        """Return the kernels' arguments, rebuilt after changes of arenas or meshes."""
         eye = self.cameras.eye
         self._world = World(
             *(self.fleet, self._places.batch, self._vehicle, self._rules, self._decision),
@@ -468,20 +467,20 @@ class Navigation(Stateful):
         return self._world
 
     def compile_dynamics(self) -> None:
-        """Compile how decisions are flown, or load it; nobody flies."""
+        """Compile or load the flight kernels; no vehicle moves."""
         fly(
             *(self.fleet, self._places.batch, np.zeros(self.n, np.int64), self._vehicle),
             *(self._rules, self._winds.air, self._decision),
         )
 
     def _look_ahead(self, who: NDArray[np.bool_]) -> None:
-        """Let the companions in `who` see what their next decisions will act on."""
+        """Predict observations for the next decisions of the companions in `who`."""
         if self._companions.foresee:
             now_us, state = self.fleet.time_us, self.kinematics()
             self._companions.look_ahead(who, self.cameras.image, now_us, state)
 
     def _held(self) -> Mapping[str, Any]:
-        # What a checkpoint of before there were body rates does not have is not in one without.
+        # Keeps velocity checkpoints compatible with versions before body rates.
         unsaved = ("room",) if self.by_rates else ("room", "by_rates")
         held: dict[str, Any] = {
             "navigation": {
@@ -491,13 +490,13 @@ class Navigation(Stateful):
                 "decision": self._number,
                 "extra_us": self._extra_us,
             },
-            # Its room is looked for anew.
+            # `room` is recomputed.
             "fleet": {k: v for k, v in self.fleet._asdict().items() if k not in unsaved},
             "delays": self._delays,
             "telemetry": self._telemetry,
             "cameras": self.cameras,
         }
-        # What a checkpoint of an environment without them does not have.
+        # Optional parts are only saved if used, as in earlier checkpoints.
         if not self._winds.calm:
             held["winds"] = self._winds
         decision = self._decision
@@ -513,10 +512,10 @@ class Navigation(Stateful):
         return held
 
     def set_state(self, state: State) -> None:
-        """Restore a saved state; arenas are generated again from their seeds.
+        """Restore a saved state; arenas are regenerated from their seeds.
 
         Raises:
-            UsageError: It is not one of this environment.
+            UsageError: The state is from another environment.
         """
         super().set_state(state)
         self._places.restore()
@@ -525,7 +524,7 @@ class Navigation(Stateful):
         self._encoded = None
 
     def _take_frames(self, who: NDArray[np.bool_]) -> None:
-        """Take the frames of those in `who` (n,), from where they were when these were due."""
+        """Capture the frames of vehicles in `who` (n,) at their poses when the frames were due."""
         seen, arenas = self._decision.seen, self._places.batch
         if self.cameras.may_freeze and (seen.time_us[who] == 0).any():
             self.cameras.freeze(self.fleet, arenas, self.seeds)

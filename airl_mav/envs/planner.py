@@ -1,13 +1,13 @@
-"""The planner: an expert that knows the true arena, moving obstacles' tours included.
+"""Planner: an expert that uses the true arena, including the tours of moving obstacles.
 
-Only the batch twin knows so much: nothing of this flies. It is there to be imitated
-(`training.imitation`).
+Only the batch twin provides this information. The planner is a teacher for imitation learning
+(`training.imitation`), not a flight policy.
 
-An episode begins with a map of the way to the goal (`Map`). A decision tries actions of
-the set: each is flown ahead on the response of the vehicle's profile, to the end of its hold, then
-straight on for a while, and then to a stand, past the obstacles where they will be. Of those that
-touch nothing the one with the least time to go wins (a dynamic window approach: Fox, Burgard,
-Thrun, IEEE Robotics & Automation Magazine 4(1), 1997).
+At the start of an episode it computes a map of the time to the goal (`Map`). A decision evaluates
+actions of the set: each is simulated with the vehicle profile's response, to the end of its hold,
+then straight on for a while, then braking to a stop, against the predicted positions of obstacles.
+The collision-free action with the minimum time to the goal wins (a dynamic window approach: Fox,
+Burgard, Thrun, IEEE Robotics & Automation Magazine 4(1), 1997).
 """
 
 from __future__ import annotations
@@ -33,55 +33,54 @@ from airl_mav.envs.spec import Delay
 from airl_mav.latency.injection import Injection
 
 CELLS = 125
-"""Cells of the map along the longer side of an arena, at most."""
+"""Maximum number of map cells along an arena's longer side."""
 
 FINEST_M = 0.4
-"""Least side of a cell [m]."""
+"""Minimum side of a cell [m]."""
 
 COMFORT_M = 1.2
-"""Gap to what stands from which on the way there is as good as any [m]."""
+"""Gap to static obstacles from which on the map allows full speed [m]."""
 
 SLOWEST = 0.25
-"""Share of the speed on the map where the vehicle just fits."""
+"""Relative speed on the map at zero gap."""
 
 BLOCKED = 0.02
-"""The same where it does not: small, so that the way out is still downhill."""
+"""Relative speed on the map inside obstacles: small, so that the way out is still downhill."""
 
 OVER_M = 0.3
-"""What is lower than the vehicle's lower side by this, or higher than its upper, is not in the way
-[m]."""
+"""Vertical margin [m]; obstacles below or above the vehicle by more than this are ignored."""
 
 _BOX = int(Shape.BOX)
 
 FAR = 1e9
-"""Farther than any place is [m], or longer than any way [s]."""
+"""Upper bound of distances [m] and of path times [s]."""
 
 
 class Map(NamedTuple):
-    """What an episode's planning needs of its arena; cells (rows north, columns east)."""
+    """Planning map of an episode's arena; cells are (rows north, columns east)."""
 
     north: float
-    """Of the first cell's centre [m]."""
+    """North coordinate of the first cell's centre [m]."""
     east: float
     cell: float
     """Side of a cell [m]."""
     gap: NDArray[np.float64]
-    """From a cell's centre to the nearest thing that stands, or hill [m]; negative inside."""
+    """Distance from a cell's centre to the nearest static obstacle or hill [m]; negative inside."""
     to_go: NDArray[np.float64]
     """Time to the goal at 1 m/s [s]."""
 
 
 class Body(NamedTuple):
-    """The vehicle, as the planner flies it."""
+    """Vehicle parameters of the planner."""
 
     radius: float
     half_height: float
     altitude: float
-    """Height that it holds [m]."""
+    """Altitude hold height [m]."""
     top_speed: float
-    """Of the action set [m/s]."""
+    """Maximum speed of the action set [m/s]."""
     arrived: float
-    """How near the goal it has arrived [m]."""
+    """Goal radius [m]."""
 
 
 def map_of(batch: ArenaBatch, i: int, body: Body) -> Map:
@@ -103,7 +102,7 @@ def map_of(batch: ArenaBatch, i: int, body: Body) -> Map:
 def beside(
     batch: ArenaBatch, i: int, obstacle: int, body: Body, north: float, east: float
 ) -> float:
-    """Return the distance [m] from a place at flight altitude to an obstacle, seen from above."""
+    """Return the horizontal distance [m] from a position at flight altitude to an obstacle."""
     half_size = batch.half_size[i, obstacle]
     center = batch.center[i, obstacle]
     if abs(-body.altitude - center[2]) > half_size[2] + body.half_height + OVER_M:
@@ -126,10 +125,10 @@ def _to_hills(
     cell: float,
     shape: tuple[int, int],
 ) -> NDArray[np.float64]:
-    """Return the distances (rows, columns) [m] to ground that is higher; negative in it.
+    """Return the distances (rows, columns) [m] to ground above `most_m`; negative inside it.
 
-    No more than a quarter of a cell too far, and little more than a cell too near: by the exact
-    Euclidean distances between the centres of cells of both kinds.
+    Overestimates by at most a quarter of a cell, and underestimates by little more than a cell, due
+    to exact Euclidean distances between centres of high and low cells.
     """
     high = np.empty(shape, np.bool_)
     _fill_high(batch, i, most_m, first, cell, high)
@@ -150,7 +149,7 @@ def _fill_high(
     cell: float,
     high: NDArray[np.bool_],
 ) -> None:
-    """Write in which cells (rows, columns), out to their corners, any ground is higher [m]."""
+    """Mark the cells (rows, columns) that reach ground higher than `most_m`, corners included."""
     relief, corner = relief_of(batch, i), cell / math.sqrt(2.0)
     for row in range(high.shape[0]):
         for column in range(high.shape[1]):
@@ -189,7 +188,7 @@ def _fill_times(
     goal: tuple[float, float],
     to_go: NDArray[np.float64],
 ) -> None:
-    """Solve the eikonal equation from the goal outwards; `to_go` comes in as far as can be."""
+    """Solve the eikonal equation outwards from the goal; `to_go` is initialized to `FAR`."""
     rows, columns = gap.shape
     slow = np.empty((rows, columns))
     for row in range(rows):
@@ -234,7 +233,7 @@ def _fill_times(
 
 @kernel
 def read_at(known: Map, field: NDArray[np.float64], north: float, east: float) -> float:
-    """Return a field of the map at a place, between its cells."""
+    """Return a field of the map at a position, by bilinear interpolation."""
     rows, columns = field.shape
     x = min(max((north - known.north) / known.cell, 0.0), rows - 1.001)
     y = min(max((east - known.east) / known.cell, 0.0), columns - 1.001)
@@ -247,64 +246,64 @@ def read_at(known: Map, field: NDArray[np.float64], north: float, east: float) -
 
 
 STEP_S = 0.1
-"""Step of the flight ahead [s]."""
+"""Time step of the prediction [s]."""
 
 AHEAD_S = 2.5
-"""How long beyond the hold each way is flown ahead [s]."""
+"""Prediction time after the hold [s]."""
 
 STRAIGHT_ON_S = (0.0, 0.5, 1.3, 2.5)
-"""How long beyond the hold a way goes straight on before the vehicle brakes [s].
+"""Times of straight flight after the hold, before the vehicle brakes [s].
 
-One that can only brake has no way out when something comes towards it where it would stand: among
+With immediate braking only, the vehicle cannot avoid an obstacle that approaches its stop: among
 the 30 moving obstacles of `crowded` it loses a fifth of the flights.
 """
 
 MOST_M_S2 = 6.0
-"""Greatest acceleration on the way [m/s2]; the first-order response alone would be quicker."""
+"""Maximum acceleration in the prediction [m/s2]; limits the first-order response."""
 
 LEAST_GAP_M = 0.3
-"""A lesser gap is as bad as a contact [m]."""
+"""Minimum gap [m]; smaller gaps count as a contact."""
 
 WARY_GAP_M = 2.0
-"""A lesser gap to a moving obstacle costs something [m].
+"""Gap to a moving obstacle below which a cost applies [m].
 
-The planner itself would need less; who learns from it knows less than the planner does.
+Larger than the planner requires, because its students have less information.
 """
 
 WARY = 4.0
-"""What a second is worth in which such a gap is 1 m less [s]."""
+"""Cost per second at a gap 1 m below `WARY_GAP_M` [s]."""
 
 TURN_S = 0.4
-"""What a radian between the nose and the way is worth [s], unless the camera sees all round."""
+"""Cost per radian between nose and path [s], unless the camera has a 360 degree view."""
 
 LATENCIES = 64
-"""Draws that the mean latency is of."""
+"""Number of draws for the mean latency."""
 
 
 class Timing(NamedTuple):
-    """When a decision acts [s], counted from its observation, and how fast the vehicle answers."""
+    """Timing of a decision relative to its observation [s], and the vehicle's response."""
 
     lead: float
-    """Until the vehicle begins to answer the new setpoint; the last one flies on."""
+    """Time until the vehicle responds to the new setpoint; the previous one is active before."""
     dead: float
-    """The part of it in which the vehicle flies as it was told before."""
+    """Dead time: the part of `lead` after the new setpoint arrives."""
     hold: float
     response: float
     """Time constant of the velocity."""
     turn_response: float
-    """The same of the yaw rate, here a delay."""
+    """Time constant of the yaw rate, modelled as a delay."""
     turn: float
-    """What a radian between the nose and the way is worth."""
+    """Cost per radian between nose and path."""
 
 
 class Planner:
-    """Decides for the flights of a batch twin. Implements `experts.Expert`."""
+    """Planner for the flights of a batch twin. Implements `experts.Expert`."""
 
     def __init__(self, navigation: Navigation, commands: NDArray[np.float64]) -> None:
-        """Take the flights, and the commands (c, 3) to choose from.
+        """Store the flights and the candidate commands (c, 3).
 
         Raises:
-            FieldError: The vehicle's profile does not say how it answers setpoints.
+            FieldError: The vehicle's profile has no setpoint response.
         """
         self._navigation = navigation
         self._commands = commands
@@ -335,13 +334,13 @@ class Planner:
         self._maps: dict[int, Map] = {}
 
     def begin(self, slots: Sequence[int]) -> None:
-        """Make the maps of the episodes that slots begin, or go on with after `set_state`."""
+        """Compute the maps of episodes that start in slots, or resume after `set_state`."""
         arenas = self._navigation.whole_truth().arenas
         for i in slots:
             self._maps[i] = map_of(arenas, i, self._body)
 
     def decide(self) -> NDArray[np.int64]:
-        """Return the indices (n,) of the commands chosen for the present states."""
+        """Return the indices (n,) of the commands for the present states."""
         fleet, arenas, _ = self._navigation.whole_truth()
         _, _, yaw = quats_to_euler(fleet.quaternion)
         chosen = np.zeros(self._navigation.n, np.int64)
@@ -364,7 +363,7 @@ class Planner:
 
 
 def _mean_t2_us(injection: Injection, delay: Delay) -> float:
-    """Return the mean latency of a decision [µs], over draws of its own."""
+    """Return the mean latency of a decision [µs], from a separate random generator."""
     sampler = injection.sampler(np.random.default_rng(0))
     if sampler is None:
         return delay.native_ms * US_PER_MS
@@ -373,9 +372,9 @@ def _mean_t2_us(injection: Injection, delay: Delay) -> float:
 
 @kernel
 def _follow_movers(batch: ArenaBatch, i: int, time_s: float, places: NDArray[np.float64]) -> None:
-    """Write where the moving obstacles will be: places (steps, movers, 2) north, east [m].
+    """Write the predicted positions of moving obstacles: (steps, movers, 2) north, east [m].
 
-    The batch's own centres stay as they are: those of the present.
+    The batch's obstacle centres remain unchanged.
     """
     for j in range(places.shape[1]):
         times, at = batch.tour_times_s[i, j], batch.tour_points[i, j]
@@ -395,9 +394,9 @@ def _follow_movers(batch: ArenaBatch, i: int, time_s: float, places: NDArray[np.
 def _to_movers(
     batch: ArenaBatch, i: int, body: Body, north: float, east: float, places: NDArray[np.float64]
 ) -> float:
-    """Return the distance [m] to the nearest moving obstacle, if they are at places (movers, 2).
+    """Return the distance [m] to the nearest moving obstacle at positions `places` (movers, 2).
 
-    Those that are farther than matters are passed over.
+    Obstacles beyond `WARY_GAP_M` are skipped.
     """
     least = FAR
     for j in range(places.shape[0]):
@@ -406,7 +405,7 @@ def _to_movers(
         half = batch.half_size[i, obstacle]
         reach = half[0] + half[1] + body.radius + WARY_GAP_M
         if dx * dx + dy * dy < reach * reach:
-            # As if the vehicle were elsewhere, not the obstacle.
+            # Shift the vehicle instead of the obstacle.
             x, y = dx + batch.center[i, obstacle, 0], dy + batch.center[i, obstacle, 1]
             least = min(least, beside(batch, i, obstacle, body, x, y))
     return least
@@ -429,17 +428,17 @@ def best_command(
     """Return the index of the best of the commands (c, 3) for flight i.
 
     Args:
-        batch: The arenas; obstacles where they are now.
-        i: Which flight.
-        known: Its map.
+        batch: The arenas, with obstacles at their present positions.
+        i: Index of the flight.
+        known: Map of the flight's arena.
         body: The vehicle.
-        timing: When the decision acts.
+        timing: Timing of the decision.
         commands: Forward, right [m/s], yaw rate [rad/s].
-        last: The command that flies until then.
+        last: The command until the decision acts.
         position: North, east [m].
-        velocity: The same [m/s].
+        velocity: North, east [m/s].
         yaw: Heading [rad].
-        time_s: Since the start of the flight [s].
+        time_s: Time since the start of the flight [s].
     """
     best, least = 0, math.inf
     share = 1.0 - math.exp(-STEP_S / timing.response)
@@ -447,7 +446,7 @@ def best_command(
     horizon = turned + AHEAD_S
     places = np.empty((int(horizon / STEP_S) + 2, batch.n_obstacles[i] - batch.n_static[i], 2))
     _follow_movers(batch, i, time_s, places)
-    # A setpoint is turned by the heading at which it arrives, a dead time before it is answered.
+    # PX4 converts a setpoint with the heading on arrival, a dead time before the response.
     facing = yaw - last[2] * timing.dead
     for c in range(len(commands)):
         for straight_on in STRAIGHT_ON_S:
@@ -455,7 +454,7 @@ def best_command(
             t, step, cost = 0.0, 0, 0.0
             there, looked = False, timing.turn == 0.0
             cn, sn = math.cos(nose), math.sin(nose)
-            # What is no better than the best so far is not flown to its end.
+            # Stop early once the cost exceeds the best.
             while t < horizon and cost + t < least and not there:
                 forward, right, rate = commands[c, 0], commands[c, 1], commands[c, 2]
                 if t < timing.lead:
@@ -480,7 +479,7 @@ def best_command(
                 moving = _to_movers(batch, i, body, x, y, places[step]) - body.radius
                 step += 1
                 if min(standing, moving) < LEAST_GAP_M:
-                    # Nothing is as bad, but later is better, and so is less deep.
+                    # A contact dominates all other costs; later and shallower contacts cost less.
                     cost += 1000.0 - 100.0 * min(t, 5.0) - 10.0 * max(-5.0, min(standing, moving))
                     break
                 if moving < WARY_GAP_M:
@@ -497,7 +496,7 @@ def best_command(
 
 @kernel
 def _off_the_way(known: Map, north: float, east: float, nose: float) -> float:
-    """Return the angle between the nose and the way to the goal [rad], 0 to pi."""
+    """Return the angle between the nose and the path to the goal [rad], 0 to pi."""
     cell = known.cell
     down_x = read_at(known, known.to_go, north - cell, east)
     down_x -= read_at(known, known.to_go, north + cell, east)

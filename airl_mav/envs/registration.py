@@ -1,11 +1,10 @@
 """Registers `airl/Navigation-v0` with Gymnasium.
 
-`import airl_mav` sees to it that this is imported once Gymnasium is, so that
+`import airl_mav` imports this module as soon as Gymnasium is imported, so
 `gymnasium.make("airl_mav:airl/Navigation-v0", arena="dense-obstacles")` needs no other import.
-`gymnasium.make_vec` gives n at a time on the compiled kernels. Keyword arguments are the fields of
-`airl_mav.envs.spec.EnvironmentSpec`, its tables as dicts; where neither size of the image is given,
-the network sees the camera's own. (Gymnasium has had no plugins that register themselves since
-1.0.)
+`gymnasium.make_vec` creates n environments on the compiled kernels. Keyword arguments are fields of
+`airl_mav.envs.spec.EnvironmentSpec`, its tables as dicts; without an image size, the network
+receives the camera's native size. (Gymnasium dropped self-registering plugins in 1.0.)
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Images of an episode: the arena from above, what the network sees, and the figures.
+"""Images of an episode: top view of the arena, network input, and flight data.
 
-What stays the same over an episode is drawn once; a frame adds the moving parts.
+Static parts are drawn once per episode; a frame adds the moving parts.
 """
 
 from __future__ import annotations
@@ -29,57 +29,57 @@ from airl_mav.profiles.camera_kind import CameraKind
 WIDTH_PX, HEIGHT_PX = 960, 540
 DPI = 100
 VEHICLE_M = 1.4
-"""Length of the drawn vehicle, larger than any real one to be visible [m]."""
+"""Length of the drawn vehicle, larger than real vehicles for visibility [m]."""
 
 TRAIL_COLOUR = "#c0392b"
 CIRCLE = np.linspace(0.0, 2.0 * math.pi, 25)[:-1]
 
 
 RENDER_MODES = ("rgb_array", "human")
-"""Pictures as arrays, or in a window."""
+"""Render modes: pictures as arrays, or in a window."""
 
 
 class Moment(NamedTuple):
-    """What a picture shows."""
+    """Content of a picture."""
 
     arena: Arena
     flights: Flights
-    """Of one vehicle: arrays (1,)."""
+    """Status of one vehicle: arrays (1,)."""
     position: NDArray[np.float64]
-    """(3,) NED, true [m]."""
+    """True position (3,) NED [m]."""
     yaw: float
     """True heading [rad]."""
     scene_us: int
-    """Since the moving obstacles have set out [µs]."""
+    """Time since the moving obstacles started [µs]."""
     image: NDArray[np.uint8]
-    """(h, w), or (h, w, 3) in colour, as the network sees it."""
+    """Network input (h, w), or (h, w, 3) in colour."""
 
 
 class Pictures:
-    """Pictures of an environment's episodes, as its `render_mode` asks for them."""
+    """Pictures of an environment's episodes, according to its `render_mode`."""
 
     def __init__(self, spec: EnvironmentSpec, kind: CameraKind, mode: str | None) -> None:
-        """Open the window of mode human.
+        """Open a window in mode human.
 
         Args:
             spec: The environment.
-            kind: Of the camera whose image the network sees.
-            mode: None, or one of `RENDER_MODES`.
+            kind: Camera kind of the network input.
+            mode: None or a mode in `RENDER_MODES`.
 
         Raises:
-            UsageError: There is no such mode, or no display for a window.
+            UsageError: Unknown mode, or no display for a window.
         """
         if mode is not None and mode not in RENDER_MODES:
             accepted = ", ".join(RENDER_MODES)
             raise UsageError(f"render_mode = {mode!r}: accepted: None, {accepted}")
-        # A picture a decision: shown so often, a video of them runs in the time of the flight.
+        # One picture per decision: a video at this rate runs in real time.
         fps = 1.0 / spec.episode.hold_s
-        # Gymnasium's checker opens every mode that is offered.
+        # Gymnasium's checker opens every listed mode.
         offered = [each for each in RENDER_MODES if each != "human" or display_found()]
         self.metadata: dict[str, Any] = {"render_modes": offered, "render_fps": fps}
-        """What the environment's `metadata` says of them."""
+        """Entries for the environment's `metadata`."""
         self.wanted = mode is not None
-        """Whether any will be asked for."""
+        """True if pictures will be requested."""
         self._spec, self._kind, self._mode = spec, kind, mode
         self._renderer: EpisodeRenderer | None = None
         self._trail: list[NDArray[np.float64]] = []
@@ -87,21 +87,21 @@ class Pictures:
         self._window = Window(fps) if mode == "human" else None
 
     def begin(self) -> None:
-        """Begin an episode."""
+        """Start an episode."""
         self._trail.clear()
 
     def see(self, now: Moment) -> None:
-        """Take the moment of a decision; a window shows it."""
+        """Store the state at a decision; a window shows it."""
         self._now = now
         self._trail.append(now.position[:2].copy())
         if self._window is not None:
             self._window.show(self._draw())
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the picture (540, 960, 3) of now with `rgb_array`; a window is shown by itself.
+        """Return the present picture (540, 960, 3) in mode `rgb_array`, otherwise None.
 
         Raises:
-            ResetNeeded: No episode has begun.
+            ResetNeeded: No episode has started.
         """
         return self._draw() if self._mode == "rgb_array" else None
 
@@ -119,10 +119,10 @@ class Pictures:
 
 
 class EpisodeRenderer:
-    """Draws a flight; pictures are (HEIGHT_PX, WIDTH_PX, 3) uint8."""
+    """Renderer of a flight; pictures are (HEIGHT_PX, WIDTH_PX, 3) uint8."""
 
     def __init__(self, spec: EnvironmentSpec, kind: CameraKind) -> None:
-        """Take the environment, and the kind of the camera whose image the network sees."""
+        """Store the environment, and the camera kind of the network input."""
         self._spec, self._kind = spec, kind
         self._figure = Figure(figsize=(WIDTH_PX / DPI, HEIGHT_PX / DPI), dpi=DPI)
         self._canvas = FigureCanvasAgg(self._figure)
@@ -131,7 +131,7 @@ class EpisodeRenderer:
         self._outlines: list[NDArray[np.float64]] = []
 
     def _begin(self, arena: Arena) -> None:
-        """Draw what will not change in an episode."""
+        """Draw the static parts of an episode."""
         spec = self._spec
         self._arena = arena
         self._figure.clear()
@@ -175,7 +175,7 @@ class EpisodeRenderer:
         self._background = None
 
     def draw(self, now: Moment, trail: Sequence[NDArray[np.float64]]) -> NDArray[np.uint8]:
-        """Return the picture of a moment; `trail` is the path so far, north, east [m]."""
+        """Return the picture of a state; `trail` is the path so far, north, east [m]."""
         arena = now.arena
         if arena is not self._arena:
             self._begin(arena)
@@ -209,17 +209,17 @@ class EpisodeRenderer:
 
 
 def display_found() -> bool:
-    """Return whether this machine has a display that a window may open on."""
+    """Return True if this machine has a display for windows."""
     if not sys.platform.startswith("linux"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 class Window:
-    """Shows pictures on a display."""
+    """Window for pictures."""
 
     def __init__(self, fps: float) -> None:
-        """Open it; every picture stays for 1 / fps [s]. Raises UsageError without a display."""
+        """Open the window; pictures stay for 1 / fps [s]. Raises UsageError without a display."""
         from matplotlib import pyplot
 
         self._pyplot = pyplot
@@ -228,7 +228,7 @@ class Window:
             self._figure = pyplot.figure(
                 figsize=(WIDTH_PX / DPI, HEIGHT_PX / DPI), dpi=DPI, num="airl/Navigation-v0"
             )
-        except ImportError as error:  # a backend that was asked for and cannot be had
+        except ImportError as error:  # the configured backend is unavailable
             raise _no_display(str(error)) from None
         if type(self._figure.canvas).required_interactive_framework is None:
             pyplot.close(self._figure)
@@ -238,14 +238,14 @@ class Window:
         self._image: Any = None
 
     def show(self, picture: NDArray[np.uint8]) -> None:
-        """Show a picture; events of the window are handled while it stays."""
+        """Show a picture and process window events while it is shown."""
         if self._image is None:
             self._image = self._axes.imshow(picture)
         self._image.set_data(picture)
         self._pyplot.pause(self._seconds)
 
     def close(self) -> None:
-        """Close it."""
+        """Close the window."""
         self._pyplot.close(self._figure)
 
 
@@ -273,13 +273,13 @@ def _outline(obstacles: Obstacles, i: int) -> NDArray[np.float64]:
 
 
 def _arrow(yaw: float) -> NDArray[np.float64]:
-    """Return the outline (4, 2) east, north [m] of a vehicle in the origin."""
+    """Return the outline (4, 2) east, north [m] of a vehicle at the origin."""
     tip, tail, wing = 0.6 * VEHICLE_M, -0.4 * VEHICLE_M, 0.4 * VEHICLE_M
     return _turned(np.array([[tip, 0.0], [tail, wing], [0.5 * tail, 0.0], [tail, -wing]]), yaw)
 
 
 def _turned(points: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
-    """Turn points (k, 2) forward, right by a heading; return them as east, north."""
+    """Rotate points (k, 2) forward, right by a heading; return them as east, north."""
     c, s = math.cos(yaw), math.sin(yaw)
     north, east = c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]
     return np.stack([east, north], axis=1)

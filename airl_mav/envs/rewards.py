@@ -1,12 +1,12 @@
 """Rewards of a decision, for n vehicles at a time.
 
-`shaped` is the default. `timed` is for decisions of unequal length, as latencies that vary make
-them: it charges the time, not the decision, and a failure three times as much. `progress` is for
-policies that decide with every image: progress is most of it; `paced` the same without haste.
-`paper` is the paper's equation 2 to the letter: it does not train, its terms being a thousand times
-too large for any learner with a usual scale. `paper-scaled` is the same divided by 1000. Any other
-is the user's: a function of a `Step`, or a class, made without arguments, whose object is one.
-`costs` are taken off any of them.
+`shaped` is the default. `timed` is for decisions of varying duration, as with random latencies: it
+charges time instead of decisions, and three times as much for a failure. `progress` is for policies
+that decide on every image: progress dominates; `paced` is the same without a time cost. `paper` is
+equation 2 of the paper, unchanged: it does not train, because its terms are a thousand times too
+large for learners of usual scale. `paper-scaled` is `paper` divided by 1000. Custom rewards are
+functions of a `Step`, or classes without constructor arguments whose objects are such functions.
+`costs` are subtracted from any reward.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from airl_mav.policy.action_sets import PAPER_SPEED_M_S
 from airl_mav.policy.actions import BodyRates
 
 PROGRESS_1_M = 0.02
-"""`shaped`: per metre of progress towards the goal; 50 m of it are worth as much as the goal."""
+"""`shaped`: reward per metre of progress towards the goal; 50 m equal the goal's reward."""
 
 DECISION_COST = 0.005
-"""`shaped`: cost of every decision, so that faster is better."""
+"""`shaped`: cost per decision, so that faster is better."""
 
 TIME_COST_1_S = 0.015
-"""`timed`: cost of a second of flight."""
+"""`timed`: cost per second of flight."""
 
 FAILURE_COST = 3.0
-"""`timed`: cost of a collision or an empty battery; the goal is worth 1."""
+"""`timed`: cost of a collision or an empty battery; the goal's reward is 1."""
 
 AGILE_BONUS = 4.0
-"""`progress`: of the goal, and what a failure costs."""
+"""`progress`: reward of the goal, and cost of a failure."""
 
 AGILE_1_M, AGILE_1_S, AGILE_TURN = 0.3, 0.1, 0.002
-"""`progress`: per metre of progress, per second, and per (rad/s)² that a decision commands."""
+"""`progress`: weights per metre of progress, per second, and per (rad/s)² of commanded rates."""
 
 PACE_M_S, PACE_SPREAD_M_S = 4.0, 12.0
-"""`paced`: progress beyond that speed is worth nothing, and up to it the less the faster."""
+"""`paced`: speed limit of rewarded progress; range above it over which progress loses weight."""
 
 PAPER_BONUS = 1000.0
 
@@ -59,39 +59,39 @@ _BATTERY = int(Verdict.BATTERY)
 
 @dataclass(frozen=True)
 class Step:
-    """A decision of n vehicles, as it was flown: all that a reward may depend on."""
+    """Decision of n vehicles as executed; the input of a reward."""
 
     before: Flights
-    """At the decision."""
+    """Status at the start of the decision."""
     now: Flights
-    """At its end."""
+    """Status at the end of the decision."""
     commands: NDArray[np.float64]
-    """(n, 3) forward and right [m/s] in the heading frame, yaw rate [rad/s]; of actions that
-    command body rates (n, 4), as `policy.actions.BodyRates`."""
+    """(n, 3) forward and right [m/s] in the heading frame, yaw rate [rad/s]; for body rate actions
+    (n, 4), as `policy.actions.BodyRates`."""
     hold_s: float
-    """How long an action is held [s]."""
+    """Hold time of an action [s]."""
 
     @property
     def success(self) -> NDArray[np.bool_]:
-        """(n,) the goal is reached."""
+        """(n,) True if the goal is reached."""
         reached: NDArray[np.bool_] = self.now.verdict == Verdict.SUCCESS
         return reached
 
     @property
     def failure(self) -> NDArray[np.bool_]:
-        """(n,) a collision, or an empty battery. A timeout is no failure."""
+        """(n,) True for a collision or an empty battery; False for a timeout."""
         verdict = self.now.verdict
         failed: NDArray[np.bool_] = (verdict == Verdict.COLLISION) | (verdict == Verdict.BATTERY)
         return failed
 
     @property
     def progress_m(self) -> NDArray[np.float64]:
-        """(n,) how much nearer the goal has come [m]."""
+        """(n,) decrease of the distance to the goal [m]."""
         return self.before.goal_distance_m - self.now.goal_distance_m
 
 
 Reward = Callable[[Step], NDArray[np.float64]]
-"""Returns the rewards (n,) of a decision, of each vehicle from its own row alone."""
+"""Function from a decision to rewards (n,), each from the vehicle's row only."""
 
 
 @kernel
@@ -99,11 +99,11 @@ def pay(
     name: int, verdict: int, before_m: float, now_m: float, passed_s: float, speed_m_s: float,
     turned: float, hold_s: float,
 ) -> float:  # fmt: skip
-    """Return a shipped reward of one vehicle's decision; a timeout is no failure.
+    """Return a built-in reward of one vehicle's decision; a timeout is no failure.
 
-    `name` is the index in `SHIPPED_REWARDS`; `verdict`, the distance to the goal `now_m` and
-    `speed_m_s` are those of its end, `before_m` of its begin. `turned` is the sum of the squares of
-    the commanded rates [rad²/s²].
+    `name` is the index in `SHIPPED_REWARDS`; `verdict`, distance to the goal `now_m` and
+    `speed_m_s` are values at the end of the decision, `before_m` at its start. `turned` is the sum
+    of squares of the commanded rates [rad²/s²].
     """
     success = 1.0 if verdict == _SUCCESS else 0.0
     failure = 1.0 if verdict in (_COLLISION, _BATTERY) else 0.0
@@ -118,14 +118,14 @@ def pay(
         ended = AGILE_BONUS * ended - AGILE_TURN * turned
         return ended + AGILE_1_M * nearer_m - AGILE_1_S * passed_s
     if name == _PACED:
-        # Where haste pays, full thrust is learnt first: then nothing is seen but the ground, and no
-        # gradient leads back from beyond the range of an action.
+        # A time cost makes the policy learn full thrust first: then the camera sees only the
+        # ground, and the clipped actions have no gradient.
         worth = min(max(1.0 - (speed_m_s - PACE_M_S) / PACE_SPREAD_M_S, 0.0), 1.0)
         nearer_m = min(nearer_m, PACE_M_S * passed_s) * worth
         return AGILE_BONUS * ended + AGILE_1_M * nearer_m - AGILE_TURN * turned
     # Krishnan et al. 2021, appendix B, eqs. 2 and 3: r = 1000 a - 1000 b - D_g + g D_c. As printed,
-    # D_c = (V_max - V_now) t_max is added, and only on the way to the goal: it pays slowness there,
-    # although the text calls it a penalty on speeding away. V_max is 5 m/s for every action set.
+    # D_c = (V_max - V_now) t_max is added, and only while approaching the goal: it rewards slow
+    # flight, but the text calls it a penalty on speeding away. V_max is 5 m/s for every action set.
     correction = (PAPER_SPEED_M_S - speed_m_s) * hold_s
     paid = PAPER_BONUS * ended - now_m + (correction if now_m < before_m else 0.0)
     return paid if name == _PAPER else paid / PAPER_BONUS
@@ -143,10 +143,10 @@ def _shipped(name: int, step: Step) -> NDArray[np.float64]:
 
 
 def reward_of(name: str) -> Reward:
-    """Return a reward by its name; one of the user's is loaded, and held to give (n,) numbers.
+    """Return a reward by name; custom rewards are loaded and checked for n finite values.
 
     Raises:
-        FieldError: There is no such reward, or it cannot be made.
+        FieldError: Unknown reward, or its construction failed.
     """
     if name in SHIPPED_REWARDS:
         return partial(_shipped, SHIPPED_REWARDS.index(name))
@@ -162,14 +162,14 @@ def reward_of(name: str) -> Reward:
 
 
 class _Checked:
-    """A reward of the user's whose numbers a learner can take."""
+    """Custom reward with validation of its values."""
 
     def __init__(self, name: str, own: Callable[[Step], Any]) -> None:
         self._name = name
         self._own = own
 
     def __call__(self, step: Step) -> NDArray[np.float64]:
-        """Return the rewards (n,). Raises UsageError for anything else."""
+        """Return the rewards (n,). Raises UsageError for wrong shapes, NaN and infinity."""
         n = len(step.now.verdict)
         paid = np.asarray(self._own(step), np.float64)
         if paid.shape != (n,) or not np.isfinite(paid).all():
@@ -179,12 +179,12 @@ class _Checked:
 
 
 def costs(weights: Costs, last: NDArray[np.float64], step: Step) -> NDArray[np.float64]:
-    """Return what a decision costs (n,), to be taken off its reward.
+    """Return the action costs of a decision (n,), to be subtracted from its reward.
 
     Args:
-        weights: What is how dear.
-        last: (n, 3) the commands that flew until now: forward, right [m/s], yaw rate [rad/s]; zero
-            at the start of a flight, and where the watchdog has let the vehicle hover.
+        weights: Weights of the costs.
+        last: (n, 3) previous commands: forward, right [m/s], yaw rate [rad/s]; zero at the start of
+            a flight, and after the watchdog's hover.
         step: The decision.
     """
     change = np.abs(step.commands - last)

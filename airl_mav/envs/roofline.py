@@ -1,6 +1,6 @@
-"""The roofline of a vehicle: how fast it may fly for how often it decides, and computers on it.
+"""Roofline of a vehicle: safe speed over decision rate, and computers on it.
 
-After the F-1 model (`latency.f1_model`), with the braking as measured, and as flown.
+Based on the F-1 model (`latency.f1_model`), with measured braking, and verified in flights.
 """
 
 from __future__ import annotations
@@ -41,38 +41,38 @@ from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import VehicleProfile
 
 Bound = Literal["body", "sensor", "computer", "hold", "link"]
-"""What a vehicle would have to be better at to fly faster."""
+"""Component that limits the speed."""
 
 
 class Shares(ProfileModel):
-    """What the longest reaction time is made of [s]."""
+    """Contributions to the longest reaction time [s]."""
 
     sensor: float
     """Frame period and transport."""
     computer: float
     """Twice the longest t2."""
     hold: float
-    """How long the policy's action is held."""
+    """Hold time of the policy's action."""
     link: float
     """Link, and a tick of the flight controller."""
 
 
 class RooflinePoint(ProfileModel):
-    """A computer on the roofline of the vehicle that carries it."""
+    """Computer on the roofline of its vehicle."""
 
     computer: str
     description: str
     mass_g: float
-    """On board [g]."""
+    """Mass on board [g]."""
     watts: float
-    """From the pack [W]."""
+    """Power from the pack [W]."""
     latency: str
-    """What its t2 is, in words."""
+    """Description of t2."""
     vehicle_kg: float
     room_m: float
-    """Sensing distance but for the hull: d of the model [m]."""
+    """Sensing distance minus the hull's overhang: d of the model [m]."""
     reaction_s: float
-    """T: an obstacle comes up -> motors answer [s]."""
+    """T: time from an obstacle's appearance to the motors' response [s]."""
     shares: Shares
     max_acceleration_m_s2: float
     """a of the F-1 model: tilt limit and thrust [m/s²]."""
@@ -84,38 +84,38 @@ class RooflinePoint(ProfileModel):
     measured_m_s: float
     """Safe velocity by the measured braking [m/s]."""
     roof_m_s: float
-    """By the measured braking, at T = 0 [m/s]."""
+    """Safe velocity by the measured braking at T = 0 [m/s]."""
     knee_hz: float
-    """Rate 1 / T at which that reaches the knee's share of its roof [Hz]."""
+    """Rate 1 / T at which the safe velocity reaches `knee_share` of the roof [Hz]."""
     flown_m_s: float
-    """Greatest speed at which no flight touched the obstacle [m/s]."""
+    """Maximum speed without a collision in any flight [m/s]."""
     binds: Bound
     power_w: float
-    """Of level flight at the measured safe velocity, with the computer [W]."""
+    """Power of level flight at the measured safe velocity, with the computer [W]."""
     missions_per_charge: float
 
     @property
     def rate_hz(self) -> float:
-        """1 / T [Hz]."""
+        """Decision rate 1 / T [Hz]."""
         return 1.0 / self.reaction_s
 
 
 class LeftOut(ProfileModel):
-    """A computer that has no place on the roofline."""
+    """Computer that is not on the roofline, and the reason."""
 
     computer: str
     why: str
 
 
 class Roofline(ProfileModel):
-    """A vehicle and its computers."""
+    """Roofline of a vehicle and its computers."""
 
     vehicle: str
     policy: str
     workload: str
     sensing_distance_m: float
     noticed_m: tuple[float, ...] = Field(description="depths at which the policy took notice")
-    """Empty where the sensing distance was given [m]."""
+    """Depths at which the policy reacts [m]; empty if the sensing distance was given."""
     frame_rate_hz: float
     hold_s: float
     knee_share: float
@@ -137,17 +137,17 @@ def roofline_point(
     draws: int,
     seed: int,
 ) -> RooflinePoint:
-    """Put a computer on the roofline of the vehicle that carries it, and fly it there.
+    """Compute a computer's point on the roofline of its vehicle, and fly it.
 
     Args:
-        name: Of the computer's profile.
+        name: Name of the computer's profile.
         computer: The computer.
-        task: The vehicle as loaded with it, its decisions and its sensing distance.
-        injection: t2 as measured on the computer; it has a latency.
+        task: The vehicle with this computer, its decision loop and its sensing distance.
+        injection: t2 as measured on the computer; must have a latency.
         knee_share: Share of the roof at which the knee lies, 0 < q < 1.
         mission_m: Length of a mission [m].
-        draws: Flights at each speed that is tried.
-        seed: Of their draws.
+        draws: Flights at each tested speed.
+        seed: Seed of the draws.
 
     Raises:
         ValueError: The injection has no latency.
@@ -197,10 +197,10 @@ def roofline_point(
 
 
 HALF_WIDTHS_M = (0.5, 1.0, 1.5)
-"""Of the box ahead: from the narrowest to the widest of the shipped arenas."""
+"""Half widths of the box ahead, covering the built-in arenas [m]."""
 
 ASIDE = (-1.0, -0.5, 0.0, 0.5, 1.0)
-"""How far the box's middle lies beside the vehicle's way, in its half widths: always in the way."""
+"""Offset of the box's middle from the flight path, in half widths; it is always in the way."""
 
 GOALS = ((15.0, 0.0), (25.0, -0.3), (25.0, 0.0), (25.0, 0.3), (40.0, 0.0))
 """Distance [m] and bearing [rad] of the goal."""
@@ -209,23 +209,23 @@ STEP_M = 0.2
 HALF_HEIGHT_M = 2.0
 
 SAME = 0.01
-"""Commands that differ by less than this share of the fastest are the same."""
+"""Tolerance for equal commands, relative to the maximum speed."""
 
 
 def noticed_m(policy: LearnedPolicy, vehicle: VehicleProfile) -> NDArray[np.float64]:
-    """Return at which depths a policy takes notice of a box ahead, one a situation (75,) [m].
+    """Return the depths at which a policy reacts to a box ahead, one per situation (75,) [m].
 
-    The vehicle flies level and straight at the policy's fastest speed, and the box is in its way.
-    The depth is the greatest from which on, at every smaller one, the policy does another thing
-    than in open space; 0 where there is none.
+    The vehicle flies level and straight at the policy's maximum speed towards the box. The depth is
+    the maximum at which, as at all smaller depths, the action differs from the action in open
+    space; 0 = no such depth.
 
     Args:
-        policy: Its camera must be the vehicle's.
-        vehicle: With the camera.
+        policy: Its camera must match the vehicle's.
+        vehicle: Vehicle with the camera.
     """
     camera, card = vehicle.camera, policy.card
     depths = np.arange(STEP_M, camera.range_m, STEP_M)
-    n = len(depths) + 1  # the last one flies in open space
+    n = len(depths) + 1  # the last row flies in open space
     fleet, arenas, shared = new_fleet(n), open_space(n, obstacles=1), twin_of(vehicle)
     for i in range(n):
         hover(fleet, i, ALTITUDE_M, shared)
@@ -246,7 +246,7 @@ def noticed_m(policy: LearnedPolicy, vehicle: VehicleProfile) -> NDArray[np.floa
             *(cameras.image, Intrinsics.of(camera), state, arenas.goal[:, :2]),
             InFlight.of_first_decisions(n),
         )
-        # As at the first decision of a flight, where the policy has a memory.
+        # For policies with memory: the first decision of a flight.
         fresh = policy.with_generator(np.random.default_rng(0)) if card.state else policy
         chosen = commands(card.actions, fresh.act_batch(encode_layout(card.observation, seen)))
         moved = np.abs(chosen[:-1] - chosen[-1]).max(axis=1)

@@ -17,21 +17,21 @@ State = dict[str, NDArray[Any]]
 
 
 class Stateful(ABC):
-    """Something whose state a checkpoint keeps."""
+    """Base class of objects with checkpoint support."""
 
     @abstractmethod
     def _held(self) -> Mapping[str, Any]:
-        """Return by name all that changes: arrays, lists of generators, tables of them, parts."""
+        """Return all variable state by name: arrays, lists of generators, nested dicts, parts."""
 
     def get_state(self) -> State:
         """Return the whole state, as copies."""
         return _taken(self._held())
 
     def set_state(self, state: State) -> None:
-        """Restore a saved state: the next step is as it would have been.
+        """Restore a saved state; the next step continues as without interruption.
 
         Raises:
-            UsageError: It is of another environment.
+            UsageError: The state is from another environment.
         """
         _put_back(self._held(), state)
 
@@ -62,7 +62,7 @@ def _put_back(held: Mapping[str, Any], state: State) -> None:
 
 
 def state_of_part(state: State, part: str) -> State:
-    """Return the state of one part. Raises UsageError when there is none."""
+    """Return the state of one part. Raises UsageError if it is missing."""
     prefix = f"{part}/"
     found = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
     if not found:
@@ -71,7 +71,7 @@ def state_of_part(state: State, part: str) -> State:
 
 
 def _restore_array(target: NDArray[Any], state: State, key: str) -> None:
-    """Write a saved array over one in place. Raises UsageError when it does not fit."""
+    """Write a saved array over one in place. Raises UsageError for another shape or type."""
     value = saved_array(state, key)
     if value.shape != target.shape or value.dtype != target.dtype:
         raise UsageError(
@@ -81,19 +81,19 @@ def _restore_array(target: NDArray[Any], state: State, key: str) -> None:
 
 
 def saved_array(state: State, key: str) -> NDArray[Any]:
-    """Return a saved array. Raises UsageError when it is missing."""
+    """Return a saved array. Raises UsageError if it is missing."""
     if key not in state:
         raise UsageError(f"state: {key} is missing: not of this environment")
     return np.asarray(state[key])
 
 
 def pack(value: Any) -> NDArray[np.uint8]:
-    """Return anything that JSON can hold as bytes (k,)."""
+    """Return any JSON-compatible value as bytes (k,)."""
     return np.frombuffer(json.dumps(value).encode(), np.uint8).copy()
 
 
 def unpack(array: NDArray[Any]) -> Any:
-    """Return what `pack` took; tuples come back as lists."""
+    """Return the value from `pack`; tuples become lists."""
     return json.loads(array.astype(np.uint8).tobytes())
 
 

@@ -1,4 +1,4 @@
-"""The vectorised environment as a stable-baselines3 VecEnv."""
+"""stable-baselines3 VecEnv adapter of the vectorized environment."""
 
 from __future__ import annotations
 
@@ -19,42 +19,42 @@ from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.observation_spec import Encoded
 
 QUALITY = ("success", "outcome", "flight_time_s", "distance_m", "energy_j", "seed", "zone")
-"""Keys of `info` that go into SB3's `episode` info, beside return, length and time."""
+"""Keys of `info` in SB3's `episode` info, in addition to return, length and time."""
 
 
 class Watcher(Protocol):
-    """Looks on at the first of the vehicles, and changes nothing."""
+    """Passive observer of the first vehicle."""
 
     def begun(self) -> None:
-        """All episodes begin now."""
+        """Handle the start of all episodes."""
 
     def decided(
         self, seed: int, zone: int, action: NDArray[Any], reward: float, outcome: str | None
     ) -> None:
-        """A decision was flown.
+        """Handle a completed decision.
 
         Args:
-            seed: Of the episode.
-            zone: That bounds its goal; -1: none does.
-            action: What was chosen.
-            reward: Of the decision.
-            outcome: How it has ended the episode, after which the next one has begun; None: the
-                episode goes on.
+            seed: Seed of the episode.
+            zone: Zone that bounds the goal; -1 = the whole arena.
+            action: The action.
+            reward: Reward of the decision.
+            outcome: Outcome of an episode that ended, after which the next episode has already
+                started; None otherwise.
         """
 
 
 class NavigationVecEnv(Stateful, VecEnv):
     """Adapter of `NavigationVectorEnv`: SB3's auto-reset, `terminal_observation`, `episode`.
 
-    The info of a step is empty but for the episodes that end in it. `episode` is what SB3's Monitor
-    writes, so there is no need of one; its time `t` is that of the flight [s].
+    The info of a step is empty except for episodes that end in the step. `episode` has the format
+    of SB3's Monitor, so no Monitor is needed; its time `t` is the flight time [s].
     """
 
     def __init__(self, env: NavigationVectorEnv, watcher: Watcher | None = None) -> None:
-        """Wrap a vectorised environment; `watcher` looks on.
+        """Wrap a vectorized environment; `watcher` observes it.
 
         Raises:
-            UsageError: It resets at another time than stable-baselines3 expects.
+            UsageError: The environment's autoreset mode does not match stable-baselines3.
         """
         if env.autoreset_mode != AutoresetMode.SAME_STEP:
             raise UsageError(
@@ -70,12 +70,12 @@ class NavigationVecEnv(Stateful, VecEnv):
         self._length = np.zeros(env.num_envs, np.int64)
 
     def teach(self, name: ExpertName) -> Expert:
-        """Return an expert that looks on, for a learner that imitates it."""
+        """Return an expert that labels the flown states, for imitation learning."""
         self._expert = Expert(name, self.env.navigation)
         return self._expert
 
     def reset(self) -> Encoded:
-        """Begin n episodes, as `seed()` and `set_options()` have set."""
+        """Start n episodes with the settings of `seed()` and `set_options()`."""
         seed = next((s for s in self._seeds if s is not None), None)
         observation, _ = self.env.reset(seed=seed, options=self._options[0])
         self._reset_seeds()
@@ -89,7 +89,7 @@ class NavigationVecEnv(Stateful, VecEnv):
         return observation
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Take the actions of the next step."""
+        """Store the actions of the next step."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -130,14 +130,14 @@ class NavigationVecEnv(Stateful, VecEnv):
         return held if self._expert is None else held | {"expert": self._expert}
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing; there are no resources to release."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of the wrapped environment, once for every index asked for."""
+        """Return an attribute of the wrapped environment, once per requested index."""
         return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute; the n environments are one object. Raises ValueError for a part."""
+        """Set an attribute of the shared environment. Raises ValueError for a subset of indices."""
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError("indices: accepted: all environments, which are one object")
         setattr(self.env, attr_name, value)
@@ -150,14 +150,14 @@ class NavigationVecEnv(Stateful, VecEnv):
         return [result] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Return whether a wrapper's job is done: only Monitor's is."""
+        """Return True for Monitor, whose function is built in; False for other wrappers."""
         return [wrapper_class is Monitor] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Return nothing to see: render the single environment instead."""
+        """Return None for each environment; render a single environment instead."""
         return [None] * self.num_envs
 
 
 def _plain(value: Any) -> Any:
-    """Return a number of numpy as one of Python."""
+    """Return a numpy scalar as a Python scalar."""
     return value.item() if isinstance(value, np.generic) else value

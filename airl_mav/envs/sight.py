@@ -1,4 +1,4 @@
-"""What the networks of an environment see by: cameras of its vehicle, and their layout."""
+"""Camera input of an environment's networks: vehicle cameras and their layout."""
 
 from __future__ import annotations
 
@@ -21,35 +21,35 @@ from airl_mav.profiles.vehicle import VehicleProfile
 
 
 class Sight(NamedTuple):
-    """Cameras that are looked at, and what a network sees of them."""
+    """Cameras in use, and their observation layout."""
 
     camera: Camera
-    """The main one."""
+    """Main camera."""
     further: dict[str, Camera]
-    """Those of the vehicle's others that the environment names."""
+    """Additional cameras of the vehicle that the environment names."""
     observation: ObservationSpec
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Of the main camera."""
+        """Intrinsics of the main camera."""
         return Intrinsics.of(self.camera)
 
     @property
     def lenses(self) -> dict[str, Intrinsics]:
-        """Of the further ones."""
+        """Intrinsics of the additional cameras by name."""
         return {name: Intrinsics.of(each) for name, each in self.further.items()}
 
     @property
     def coloured(self) -> bool:
-        """Whether any of them sees colours."""
+        """True if any camera is a colour or grey camera."""
         return any(each.kind != "depth" for each in (self.camera, *self.further.values()))
 
 
 def sight_of(spec: EnvironmentSpec, vehicle: VehicleProfile) -> Sight:
-    """Return what an environment's networks see by.
+    """Return the camera input of an environment's networks.
 
     Raises:
-        UsageError: The vehicle's cameras do not serve the layout, or it lacks one.
+        UsageError: The vehicle's cameras do not match the layout, or a camera is missing.
     """
     camera = spec.camera.of(vehicle.camera)
     observation = ObservationSpec(
@@ -78,10 +78,10 @@ def sight_of(spec: EnvironmentSpec, vehicle: VehicleProfile) -> Sight:
 
 
 def further_seen(spec: EnvironmentSpec, vehicle: VehicleProfile) -> dict[str, SeenCamera]:
-    """Return what networks see of the further cameras that an environment names.
+    """Return the observation layout of additional cameras by name.
 
     Raises:
-        FieldError: The vehicle has none of such a name.
+        FieldError: The vehicle has no camera with this name.
     """
     found = {}
     for name, asked in spec.cameras.items():
@@ -104,7 +104,7 @@ def further_seen(spec: EnvironmentSpec, vehicle: VehicleProfile) -> dict[str, Se
 
 
 def check_conditions(sight: Sight, spec: EnvironmentSpec, faults: Sequence[Fault]) -> None:
-    """Raise FieldError for conditions that images cannot be taken in, at this level."""
+    """Raise FieldError for camera conditions that the twin does not support."""
     further = sight.further.values()
     check_noise(sight.camera, spec.randomisation, faults, "randomisation", further)
     check_twin_imaging(sight.camera)

@@ -29,13 +29,12 @@ from airl_mav.policy.observation_spec import Encoded
 
 
 class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
-    """One vehicle that flies to its goal; a step is a decision and its hold.
+    """Environment of one vehicle that flies to its goal; a step is a decision and its hold.
 
-    Observation: a Dict of `velocity`, `goal` and the image, whose key is what the camera gives:
-    `depth`, `rgb` or `grey` (`airl_mav.policy.layouts`). `info`
-    carries `seed`, `zone` (-1: the whole arena), `flight_time_s`, `distance_m`, `energy_j` and
-    `goal_distance_m`; at the end also `success` and `outcome` (success, collision, battery,
-    timeout). Only a timeout is a truncation.
+    Observation: a Dict of `velocity`, `goal` and the image under the key `depth`, `rgb` or `grey`,
+    depending on the camera (`airl_mav.policy.layouts`). `info` contains `seed`, `zone` (-1: the
+    whole arena), `flight_time_s`, `distance_m`, `energy_j` and `goal_distance_m`; at the end also
+    `success` and `outcome` (success, collision, battery, timeout). Only a timeout is a truncation.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 2}  # noqa: RUF012
@@ -43,16 +42,16 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
     def __init__(
         self, spec: EnvironmentSpec | None = None, *, render_mode: str | None = None, **knobs: Any
     ) -> None:
-        """Make the environment.
+        """Create the environment.
 
         Args:
-            spec: What it is made of; or
+            spec: The specification; or
             render_mode: None, `rgb_array` or `human` (a window, which needs a display; without one
-                `metadata` does not offer it).
+                `metadata` does not list it).
             knobs: the fields of an EnvironmentSpec.
 
         Raises:
-            UsageError: A knob or a profile cannot be used, or there is no display.
+            UsageError: A knob or a profile is invalid, or no display is available.
         """
         super().__init__(spec, knobs, 1)
         self.observation_space: gym.Space[Any] = observation_space(self.navigation.observation)
@@ -64,18 +63,18 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Encoded, dict[str, Any]]:
-        """Begin an episode.
+        """Start an episode.
 
         Args:
-            seed: That of the episode itself: the arena, the goal and all that chance decides in
-                it. Left out: drawn, as `NavigationVectorEnv` draws it.
-            options: `zone`: curriculum zone that bounds the goal, of the episodes that follow too,
-                until a reset with a seed or options; left out: that of the curriculum, or the
-                whole arena.
+            seed: Seed of the episode: arena, goal and all random draws. Default: drawn as in
+                `NavigationVectorEnv`.
+            options: `zone`: curriculum zone that bounds the goal, in this and all following
+                episodes until a reset with a seed or options. Default: the curriculum's zone, or
+                the whole arena.
 
         Raises:
-            UsageError: A wrong option or seed, or no arena can be made of the seed.
-            gymnasium.error.Error: The seed is negative, or no whole number of Python.
+            UsageError: Invalid option or seed, or arena generation failed for the seed.
+            gymnasium.error.Error: The seed is negative, or not a Python int.
         """
         if seed is not None or options:
             self._zone = zone_option(options)
@@ -89,8 +88,8 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
         """Fly one decision; see Gymnasium's Env.step.
 
         Raises:
-            ResetNeeded: No episode has begun, or it has ended.
-            InvalidAction: The action is none of the set; numbers beyond -1..1 are cut off.
+            ResetNeeded: No episode has started, or the episode has ended.
+            InvalidAction: The action is outside the set; values beyond -1..1 are clipped.
         """
         if self._before is not None and self._before.verdict[0] != FLYING:
             raise gym.error.ResetNeeded("step() after the end of the episode")
@@ -102,7 +101,7 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
         return self._observe(), reward.item(), how == TERMINATED, how == TRUNCATED, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the picture (540, 960, 3) of now with `rgb_array`; a window is shown by itself."""
+        """Return the present picture (540, 960, 3) in mode `rgb_array`, otherwise None."""
         return self._pictures.render()
 
     def close(self) -> None:

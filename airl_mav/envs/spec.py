@@ -85,7 +85,7 @@ class EpisodeRules(ProfileModel):
 
 
 class CameraChange(ProfileModel):
-    """Changes to the vehicle's camera; what is left out stays as it is."""
+    """Changes to the vehicle's camera; omitted fields keep the vehicle's values."""
 
     width_px: int | None = quantity("image width", "px", ge=8, le=640, default=None)
     height_px: int | None = quantity("image height", "px", ge=1, le=480, default=None)
@@ -107,7 +107,7 @@ class CameraChange(ProfileModel):
     )
 
     def of(self, camera: Camera) -> Camera:
-        """Return a vehicle's camera with the changes. Raises FieldError where they do not fit."""
+        """Return a vehicle's camera with the changes. Raises FieldError for a mismatch."""
         made = camera.model_copy(update=self.model_dump(exclude_none=True))
         fov_deg = made.horizontal_fov_deg
         check_fov("camera.horizontal_fov_deg", made.projection, fov_deg)
@@ -118,7 +118,7 @@ class CameraChange(ProfileModel):
 
 
 class FurtherView(ProfileModel):
-    """The image of a further camera, as the network sees it."""
+    """Image of an additional camera as network input."""
 
     image_width_px: int | None = quantity(
         "image that the network sees; left out: as wide as the camera's",
@@ -175,9 +175,9 @@ class Delay(ProfileModel):
 
 
 class SafeVelocity(ProfileModel):
-    """Actions no faster than the vehicle can stop for what it sees, deciding as late as it does.
+    """Speed limit from the stopping distance, with sensing distance and decision latency.
 
-    `envs.stopping` says how.
+    Defined in `envs.stopping`.
     """
 
     sensing_distance_m: float = quantity(
@@ -190,9 +190,9 @@ class SafeVelocity(ProfileModel):
 
 
 class Randomisation(SensorNoise, Spread):
-    """Domain randomisation, drawn with every episode around the profile's value; 0 is none.
+    """Domain randomization, drawn with every episode around the profile's value; 0 = none.
 
-    With the fields of a scenario's tables `spread` and `sensors`.
+    Includes the fields of a scenario's tables `spread` and `sensors`.
     """
 
     estimation: bool = Field(
@@ -205,7 +205,7 @@ class Randomisation(SensorNoise, Spread):
 
 
 class Costs(ProfileModel):
-    """What a decision costs beside the reward, whichever that is: 0 is nothing."""
+    """Action costs of a decision, subtracted from any reward; 0 = no cost."""
 
     command_step: float = quantity(
         "per m/s by which the velocity command differs from the one before",
@@ -232,10 +232,10 @@ class Costs(ProfileModel):
 
 
 class Curriculum(ProfileModel):
-    """Zones of growing radius around the start (the paper's): the goal is drawn inside.
+    """Zones of growing radius around the start, as in the paper; goals are drawn inside.
 
-    Obstacles can grow more, faster and denser with them, stage by stage; the last stage is the
-    arena as it is.
+    Obstacles can become more numerous, faster and denser from stage to stage; the last stage is the
+    unchanged arena.
     """
 
     window: int = quantity("last episodes that count", "1", ge=1, le=1_000_000, default=1000)
@@ -273,7 +273,7 @@ class Curriculum(ProfileModel):
 
 
 class EnvironmentSpec(ProfileModel):
-    """An environment: vehicle, arena, observation, actions, reward, latency, randomisation."""
+    """Environment: vehicle, arena, observation, actions, reward, latency, randomization."""
 
     vehicle: str = Field(default="quad", description="vehicle profile")
     arena: str = Field(default="static-obstacles", description="arena profile")
@@ -385,14 +385,14 @@ class EnvironmentSpec(ProfileModel):
 
     @property
     def action_spec(self) -> ActionSpec:
-        """The action set with its fastest speed."""
+        """Action set with its maximum speed."""
         return ActionSpec(
             set=self.actions, max_speed_m_s=self.max_speed_m_s, max_rate_deg_s=self.max_rate_deg_s
         )
 
 
 def spec_of(spec: EnvironmentSpec | None, knobs: Mapping[str, Any]) -> EnvironmentSpec:
-    """Return the specification, or make it from its fields, nested tables as dicts.
+    """Return the specification, or create it from its fields, with nested tables as dicts.
 
     Raises:
         UsageError: A knob is unknown, of the wrong type or out of range, or both are given.
@@ -405,15 +405,15 @@ def spec_of(spec: EnvironmentSpec | None, knobs: Mapping[str, Any]) -> Environme
 
 
 def gymnasium_spec(spec: EnvironmentSpec | None, knobs: Mapping[str, Any]) -> EnvironmentSpec:
-    """Return the specification that the environments of Gymnasium's API are made from.
+    """Return the specification for environments in Gymnasium's API.
 
-    As `spec_of`, but with knobs that say nothing of the image's size the network sees the camera's
-    own image, which other people's image networks have room for: stable-baselines3's needs 36 px
-    each way. (A training file's image is smaller by default: its networks are made for that.)
+    As `spec_of`, but without an image size the network receives the camera's native image: common
+    image networks need larger images than the default of training files, stable-baselines3's at
+    least 36 px each way.
 
     Raises:
-        UnexpectedArgumentError: A knob that there is not.
-        UsageError: As `spec_of`, or the vehicle's profile cannot be used.
+        UnexpectedArgumentError: Unknown knob.
+        UsageError: As `spec_of`, or the vehicle's profile is invalid.
     """
     try:
         made = spec_of(spec, knobs)

@@ -1,7 +1,7 @@
-"""How fast a vehicle may fly that stops for what its camera shows late; and the flights that try.
+"""Safe velocity with delayed camera images: stopping distance, its measurement, and test flights.
 
-The worst moment for an obstacle to come up is just after a frame was taken that a decision is made
-on: that decision flies on, for its inference and its hold, and only the next one stops.
+In the worst case an obstacle appears just after the capture of a decision's frame: this decision
+ignores the obstacle during inference and hold, and only the next one stops.
 """
 
 from __future__ import annotations
@@ -39,66 +39,66 @@ SCHEMA = 1
 """Version of the stored measurement."""
 
 SPEEDS = 24
-"""Commanded speeds that are flown, evenly up to the fastest that the autopilot flies."""
+"""Number of commanded speeds, evenly spaced up to the autopilot's maximum."""
 
 MOMENTS_S = tuple(float(each) for each in np.arange(0.25, 8.01, 0.25))
-"""Times after the start from the hover at which a vehicle is told to stop [s]. The velocity loop
-overshoots its setpoint by 3 % after three seconds and comes down to it within twenty: the fastest
-and longest of these moments counts."""
+"""Times after the start from hover at which stops are tested [s]. The velocity loop overshoots its
+setpoint by 3 % after three seconds and settles within twenty: the maximum speed and distance over
+these times count."""
 
 ALTITUDE_M = 2.5
 
 FAR_M = 1e6
-"""Where walls and goal are, so that nothing but what is meant ends a flight [m]."""
+"""Distance of walls and goal [m]; beyond reach, so that only intended events end a flight."""
 
 RULES = Rules(goal_radius=1.0, time_limit_us=1 << 60)
-"""Nothing but a collision ends a flight."""
+"""End conditions of test flights: collision only."""
 
 _STEP_TICKS = 5
-"""The place of a vehicle is noted so often while it brakes: 20 ms from its turning point it is
-less than a millimetre away."""
+"""Sampling interval of the position while braking; 20 ms from its turning point the vehicle is less
+than a millimetre away."""
 
 _LONGEST_STOP_S = 60.0
 
 
 class Braking(ProfileModel):
-    """What a vehicle does that is told to fly at a speed and then to stand: n speeds, ascending.
+    """Stopping distance of a vehicle over commanded speed: n speeds, ascending.
 
-    It is told to stop at the worst moment since its start.
+    Stops start at the worst time since the start of the flight.
     """
 
     vehicle_sha256: str
-    """Digest of the vehicle, with all that it carries."""
+    """Digest of the vehicle with payload and computer."""
     commanded_m_s: tuple[float, ...]
     """Speed of the setpoint [m/s]."""
     flown_m_s: tuple[float, ...]
-    """Greatest speed that the vehicle reached on it [m/s]."""
+    """Maximum speed reached with the setpoint [m/s]."""
     distance_m: tuple[float, ...]
-    """Longest way from the setpoint of zero velocity to a stand [m]."""
+    """Maximum distance from the zero velocity setpoint to the stop [m]."""
 
     @property
     def fastest_m_s(self) -> float:
-        """The greatest speed that was commanded: the autopilot flies none beyond it [m/s]."""
+        """Maximum commanded speed [m/s]; the autopilot's limit."""
         return self.commanded_m_s[-1]
 
     def stopping_m(self, commanded_m_s: float, reaction_s: float) -> float:
-        """Return the way until a vehicle stands that is told to after a reaction time [m].
+        """Return the stopping distance including a reaction time [m].
 
         Args:
-            commanded_m_s: Speed of its setpoint until then, 0 to `fastest_m_s` [m/s].
-            reaction_s: How long it flies on [s].
+            commanded_m_s: Speed of the setpoint before the stop, 0 to `fastest_m_s` [m/s].
+            reaction_s: Time before the vehicle starts to brake [s].
         """
         flown, distance = self._curves
         return float(flown(commanded_m_s) * reaction_s + distance(commanded_m_s))
 
     def safe_velocity(self, reaction_s: float, room_m: float) -> float:
-        """Return the greatest commanded speed from which the vehicle stands within a room [m/s].
+        """Return the maximum commanded speed with a stop within a distance [m/s].
 
         At most `fastest_m_s`.
 
         Args:
-            reaction_s: How long it flies on before it is told to stop, >= 0 [s].
-            room_m: How far it may move in all, > 0 [m].
+            reaction_s: Time before the vehicle starts to brake, >= 0 [s].
+            room_m: Available distance, > 0 [m].
         """
         top = self.fastest_m_s
         if self.stopping_m(top, reaction_s) <= room_m:
@@ -107,7 +107,7 @@ class Braking(ProfileModel):
         return float(found)
 
     def distance_from_m(self, speed_m_s: float) -> float:
-        """Return the way from a true speed to a stand [m]; beyond what was flown, as v² has it."""
+        """Return the stopping distance from a true speed [m]; as v² beyond the measurement."""
         flown, distance = np.array([0.0, *self.flown_m_s]), np.array([0.0, *self.distance_m])
         beyond = max(1.0, speed_m_s / float(flown[-1])) ** 2
         return float(np.interp(speed_m_s, flown, distance)) * beyond
@@ -124,10 +124,10 @@ class Braking(ProfileModel):
 
 
 def braking_of(vehicle: VehicleProfile) -> Braking:
-    """Return the braking of a vehicle, with all that it carries: measured once, and stored.
+    """Return the stopping distances of a vehicle with payload and computer; measured once, cached.
 
-    The measurement lies beside the compiled kernels, in a folder of this source and all that it
-    imports, under the digest of the vehicle: another payload, computer or parameter is another one.
+    The cache is next to the compiled kernels, in a folder for this source and all its imports,
+    under the vehicle's digest: payload, computer and parameters are part of the key.
     """
     return _braking(vehicle.model_dump_json())
 
@@ -150,7 +150,7 @@ def _braking(vehicle_json: str) -> Braking:
 
 
 def measure_braking(vehicle: VehicleProfile) -> Braking:
-    """Fly a vehicle at all speeds and stop it at all moments; see `Braking`. Half a second."""
+    """Stop a vehicle at all speeds and times; see `Braking`. Takes half a second."""
     shared = twin_of(vehicle)
     top_m_s = shared.gains.vel_max_xy
     speeds = top_m_s * np.arange(1, SPEEDS + 1) / SPEEDS
@@ -160,7 +160,7 @@ def measure_braking(vehicle: VehicleProfile) -> Braking:
     start = fleet.position[:, 0].copy()
     stop(fleet, open_space(len(start)), shared)
     distance = (fleet.position[:, 0] - start).reshape(shape).max(axis=0)
-    # A faster command never counts for less: what the tilt limit cuts off is flat but for noise.
+    # Enforce monotonic curves: at the tilt limit they are constant except for noise.
     return Braking(
         vehicle_sha256=profile_digest(vehicle),
         commanded_m_s=tuple(speeds.tolist()),
@@ -170,12 +170,12 @@ def measure_braking(vehicle: VehicleProfile) -> Braking:
 
 
 def twin_of(vehicle: VehicleProfile) -> Vehicle:
-    """Return the batch twin's constants of a vehicle on its own parameters."""
+    """Return the batch twin's constants of a vehicle, with the vehicle's parameters."""
     return vehicle_of(vehicle, flown_values(vehicle.autopilot_parameters()).__getitem__)
 
 
 def open_space(n: int, obstacles: int = 0) -> ArenaBatch:
-    """Return n arenas without walls in reach, and room for obstacles that are not there yet."""
+    """Return n arenas without walls in reach, with capacity for obstacles."""
     batch = empty_batch(n, obstacles, 0, 0)
     batch.bounds[:] = [-FAR_M, FAR_M, -FAR_M, FAR_M, 1e-3, 0.0]
     batch.goal[:, :2] = [-FAR_M, 0.0]
@@ -184,15 +184,15 @@ def open_space(n: int, obstacles: int = 0) -> ArenaBatch:
 
 
 def run_ups(vehicle: Vehicle, speeds: ArrayLike, moments_s: Sequence[float]) -> Fleet:
-    """Return vehicles at moments of their flight north from a hover, on setpoints of some speeds.
+    """Return vehicles during their acceleration north from hover, at several setpoint speeds.
 
     Args:
-        vehicle: What flies.
-        speeds: (n,) of the setpoints [m/s].
+        vehicle: Constants of the vehicle.
+        speeds: (n,) speeds of the setpoints [m/s].
         moments_s: k times since the start, ascending [s].
 
     Returns:
-        n k vehicles: those of the first moment first.
+        n k vehicles, grouped by time.
     """
     wanted = np.asarray(speeds, np.float64)
     n = len(wanted)
@@ -210,9 +210,9 @@ def run_ups(vehicle: Vehicle, speeds: ArrayLike, moments_s: Sequence[float]) -> 
 
 
 def stop(fleet: Fleet, arenas: ArenaBatch, vehicle: Vehicle) -> None:
-    """Give all vehicles a setpoint of zero velocity and fly them until none moves north.
+    """Set all setpoints to zero velocity and fly until no vehicle moves north.
 
-    A vehicle stays at its farthest point, or where it touches something.
+    A vehicle remains at its turning point, or at its point of contact.
     """
     fleet.setpoint[:] = 0.0
     fleet.repeat_us[:] = fleet.time_us
@@ -226,29 +226,29 @@ def stop(fleet: Fleet, arenas: ArenaBatch, vehicle: Vehicle) -> None:
 
 
 WALL_HALF_M = (0.5, 20.0, 5.0)
-"""Half extents of the obstacle: too wide to fly around."""
+"""Half extents of the obstacle: too wide to fly around [m]."""
 
 SPEED_STEP_M_S = 0.01
-"""How closely the greatest speed without a touch is looked for."""
+"""Resolution of the search for the maximum collision-free speed [m/s]."""
 
 _LEAST_SPEED_M_S = 0.01
 
 
 @dataclass(frozen=True)
 class DecisionLoop:
-    """When a companion sees and acts, but for the inference t2; simulated time."""
+    """Timing of a companion's decisions in simulated time, without the inference t2."""
 
     frame_period_s: float
     transport_s: float
-    """Frame taken -> decoded."""
+    """Time from capture to decoded frame."""
     hold_s: float
-    """Setpoint sent -> next observation."""
+    """Time from sending a setpoint to the next observation."""
     link_s: float
-    """Setpoint sent -> motors follow it."""
+    """Time from sending a setpoint to the motors' response."""
 
     @classmethod
     def of(cls, vehicle: VehicleProfile, hold_s: float, delay: Delay | None = None) -> DecisionLoop:
-        """Return the loop of a vehicle's camera; without delays given, with the twin's own."""
+        """Return the loop for a vehicle's camera; the default delays are the twin's."""
         delay = delay or Delay()
         return cls(
             frame_period_s=vehicle.camera.period_us / US_PER_S,
@@ -258,53 +258,53 @@ class DecisionLoop:
         )
 
     def reaction_s(self, t2_s: float) -> float:
-        """Return the longest time from an obstacle's coming up to the motors' answer [s].
+        """Return the maximum time from an obstacle's appearance to the motors' response [s].
 
-        T = frame period + transport + t2 + hold + t2 + link, and a tick of the flight controller.
-        The newest frame of a decision is up to a frame period and the transport old, and may just
-        lack the obstacle. This decision infers and holds; the next one sees the obstacle, infers,
-        and its setpoint goes out.
+        T = frame period + transport + t2 + hold + t2 + link, and a tick of the flight controller. A
+        decision's newest frame is up to a frame period plus the transport old, and may just miss
+        the obstacle. This decision infers and holds; the next one sees the obstacle, infers, and
+        sends its setpoint.
 
         Args:
-            t2_s: The longest inference that is reckoned with [s].
+            t2_s: Maximum inference time [s].
         """
         waited = self.frame_period_s + self.transport_s
         return waited + t2_s + self.hold_s + t2_s + self.link_s + TICK_S
 
     def inference_s(self, reaction_s: float) -> float:
-        """Return the longest inference with that reaction time [s]; below 0: there is none."""
+        """Return the maximum inference time for a reaction time [s]; negative = infeasible."""
         return 0.5 * (reaction_s - self.reaction_s(0.0))
 
 
 @dataclass(frozen=True)
 class StoppingTask:
-    """A vehicle, how late it decides, and how far ahead it takes notice of an obstacle."""
+    """Vehicle with its decision timing and sensing distance."""
 
     vehicle: VehicleProfile
-    """With all that it carries."""
+    """Vehicle with payload and computer."""
     loop: DecisionLoop
     sensing_distance_m: float
-    """D: depth at which an obstacle is taken notice of, from the camera to its surface [m]."""
+    """D: distance from the camera to an obstacle's surface when the policy reacts [m]."""
 
     @property
     def room_m(self) -> float:
-        """How far the vehicle may move before its hull touches what the camera sees at D [m].
+        """Distance to the hull's contact with an obstacle seen at D [m].
 
-        The camera sits ahead of the centre of mass by its mount, the hull by half its width.
+        The camera is ahead of the centre of mass by its mount, the hull by half its width.
         """
         body, camera = self.vehicle.body, self.vehicle.camera
         return self.sensing_distance_m + camera.forward_m - 0.5 * body.width_m
 
     def safe_velocity(self, t2_s: float) -> float:
-        """Return the greatest speed to command, with v T + brake(v) <= D but for the hull [m/s].
+        """Return the maximum speed with v T + brake(v) <= D minus the hull's overhang [m/s].
 
-        At most what the autopilot flies.
+        At most the autopilot's maximum speed.
 
         Args:
-            t2_s: The longest inference that is reckoned with [s].
+            t2_s: Maximum inference time [s].
 
         Raises:
-            FieldError: The hull reaches farther than the camera sees.
+            FieldError: The sensing distance ends within the hull.
         """
         if self.room_m <= 0.0:
             hull_m = self.sensing_distance_m - self.room_m
@@ -316,10 +316,10 @@ class StoppingTask:
         return braking_of(self.vehicle).safe_velocity(self.loop.reaction_s(t2_s), self.room_m)
 
     def inference_budget_s(self, speed_m_s: float) -> float:
-        """Return the longest inference with which a speed is safe [s]; below 0: there is none.
+        """Return the maximum inference time at which a speed is safe [s]; negative = infeasible.
 
         Args:
-            speed_m_s: Of the setpoint, > 0 and at most what the autopilot flies [m/s].
+            speed_m_s: Speed of the setpoint, > 0 and at most the autopilot's maximum [m/s].
         """
         braking = braking_of(self.vehicle)
         braked_m = braking.stopping_m(speed_m_s, 0.0)
@@ -330,22 +330,21 @@ class StoppingTask:
 def fly_into(
     task: StoppingTask, speed_m_s: float, latency: Injection, native_s: float, draws: int, seed: int
 ) -> NDArray[np.bool_]:
-    """Fly level at a speed towards an obstacle that comes up at the worst moment, and stop for it.
+    """Fly level towards an obstacle that appears at the worst time, and stop.
 
-    A wall stands at the sensing distance from one moment on, just after a frame was taken that a
-    decision is made on. Each flight has its own latencies, phase of camera to decision, and moment
-    since the vehicle's start out of a hover.
+    A wall appears at the sensing distance, just after the capture of a decision's frame. Latencies,
+    phase between camera and decision, and time since the start from hover differ between flights.
 
     Args:
-        task: What flies, and what it sees.
-        speed_m_s: Of the setpoint until the vehicle is told to stop, > 0 [m/s].
+        task: Vehicle, timing and sensing distance.
+        speed_m_s: Speed of the setpoint before the stop, > 0 [m/s].
         latency: Source of t2.
-        native_s: t2 where that injects none [s].
+        native_s: t2 without injection [s].
         draws: Number of flights, n.
-        seed: Of flight 0; flight i draws from seed + i.
+        seed: Seed of flight 0; flight i draws from seed + i.
 
     Returns:
-        (n,) whether the vehicle touched the obstacle.
+        (n,) True for flights that touched the obstacle.
     """
     rngs = [latency_generator(seed + i) for i in range(draws)]
     samplers = [latency.sampler(rng) or FixedSampler(_us(native_s)) for rng in rngs]
@@ -357,7 +356,7 @@ def fly_into(
     flying = run_ups(shared, [speed_m_s], MOMENTS_S)
     fleet = Fleet._make(array[moments] for array in flying)
     walls = _walls(fleet.position, task)
-    # A setpoint waits for the flight controller's next tick.
+    # A setpoint takes effect at the flight controller's next tick.
     advance(fleet, walls, -(-reaction_us // TICK_US), shared, RULES, None)
     stop(fleet, walls, shared)
     touched: NDArray[np.bool_] = fleet.verdict == Verdict.COLLISION
@@ -367,9 +366,9 @@ def fly_into(
 def greatest_speed(
     task: StoppingTask, latency: Injection, native_s: float, draws: int, seed: int
 ) -> float:
-    """Return the greatest speed at which no flight of `fly_into` touches, by bisection [m/s].
+    """Return the maximum speed without a collision in `fly_into`, by bisection [m/s].
 
-    At most what the autopilot flies; 0 where the vehicle touches at any speed. Arguments as of
+    At most the autopilot's maximum; 0 if the vehicle collides at any speed. Arguments as in
     `fly_into`.
     """
 
@@ -394,10 +393,10 @@ def _us(time_s: float) -> int:
 def _reactions_us(
     loop: DecisionLoop, samplers: list[LatencySampler], phases: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Return how long each flight takes from the obstacle's coming up to the motors (n,) [µs].
+    """Return the time of each flight from the obstacle's appearance to the motors (n,) [µs].
 
-    The frame at time 0 lacks the obstacle, those a period later and on have it. Decisions are made
-    on the newest decoded frame, the first of them on that of time 0.
+    The frame at time 0 does not show the obstacle, later frames do. Decisions use the newest
+    decoded frame; the first one uses the frame of time 0.
     """
     period_us, transport_us = _us(loop.frame_period_s), _us(loop.transport_s)
     times = np.zeros(len(samplers), np.int64)
@@ -412,7 +411,7 @@ def _reactions_us(
 
 
 def _walls(position: NDArray[np.float64], task: StoppingTask) -> ArenaBatch:
-    """Return a wall for each vehicle (n, 3) that its camera sees at the sensing distance."""
+    """Return a wall for each vehicle (n, 3), at the sensing distance from its camera."""
     walls = open_space(len(position), obstacles=1)
     walls.n_obstacles[:] = 1
     walls.shape[:] = Shape.BOX
@@ -428,15 +427,15 @@ class SpeedBound:
     """The safe velocity of an environment, and its inputs."""
 
     reaction_s: float
-    """T: an obstacle comes up -> motors answer, at the worst moment and the longest t2 [s]."""
+    """T: worst-case time from an obstacle's appearance to the motors' response [s]."""
     sensing_distance_m: float
     safe_velocity_m_s: float
     asked_m_s: float
-    """Fastest action without the bound [m/s]."""
+    """Speed of the fastest action without the bound [m/s]."""
 
     @property
     def max_speed_m_s(self) -> float:
-        """Fastest action."""
+        """Speed of the fastest action [m/s]."""
         return min(self.asked_m_s, self.safe_velocity_m_s)
 
     def describe(self) -> str:
@@ -452,7 +451,7 @@ class SpeedBound:
 
 
 def injections_of(delay: Delay) -> tuple[Injection, ...]:
-    """Return the sources of t2. Raises UsageError for an invalid one."""
+    """Return the sources of t2. Raises UsageError for an invalid source."""
     if delay.latency:
         option = "environment.delay.latency"
         return tuple(parse_latency(source, option) for source in delay.latency)
@@ -462,12 +461,11 @@ def injections_of(delay: Delay) -> tuple[Injection, ...]:
 def speed_bound(spec: EnvironmentSpec) -> SpeedBound | None:
     """Return the safe velocity of an environment; None if it has no bound.
 
-    The latency is the longest of all its sources; the vehicle is that of the profile, which flies
-    in the environment.
+    Uses the maximum latency of all sources and the profile's vehicle, as in the environment.
 
     Raises:
-        UsageError: A profile or a source of latency cannot be used, or the sensing distance ends
-            within the hull.
+        UsageError: A profile or a source of latency is invalid, or the sensing distance ends within
+            the hull.
     """
     asked, delay = spec.safe_velocity, spec.delay
     if asked is None:
@@ -489,9 +487,9 @@ def speed_bound(spec: EnvironmentSpec) -> SpeedBound | None:
 
 
 def bounded(spec: EnvironmentSpec) -> EnvironmentSpec:
-    """Return an environment with its fastest action bounded by its safe velocity, if it has one.
+    """Return an environment with its actions bounded by its safe velocity, if it has one.
 
-    Bounding again changes nothing. Raises UsageError as `speed_bound`.
+    Idempotent. Raises UsageError as `speed_bound`.
     """
     bound = speed_bound(spec)
     if bound is None or bound.max_speed_m_s == spec.max_speed_m_s:

@@ -1,6 +1,6 @@
-"""Record of a batch twin's flight: its path at 50 Hz and the stamps of its decisions.
+"""Record of a batch twin's flight: its path at 50 Hz and the timestamps of its decisions.
 
-The files are those of a rehearsal (docs/run-folder.md), so that one report serves all levels.
+The files have the format of a rehearsal (docs/run-folder.md), so all levels use the same report.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ STAMPS = (
     "motor_us",
     "held_until_us",
 )
-"""Stamps of a decision, as in `latency.npz`; link and control are one here, so nothing says when
-the autopilot accepted the setpoint."""
+"""Timestamps of a decision, as in `latency.npz`; link and control are combined, so the time of
+acceptance by the autopilot is missing."""
 
 
 class _Tables:
-    """A growing table for each of n slots."""
+    """Growing table for each of n slots."""
 
     def __init__(self, n: int, width: int, dtype: type[np.generic]) -> None:
         self._rows: NDArray[Any] = np.zeros((n, 256, width), dtype)
         self._count = np.zeros(n, np.int64)
 
     def clear(self, i: int) -> None:
-        """Forget the rows of a slot."""
+        """Delete the rows of a slot."""
         self._count[i] = 0
 
     def append(self, who: NDArray[np.int64], values: NDArray[Any]) -> None:
@@ -58,10 +58,10 @@ class _Tables:
 
 
 class Trace:
-    """Records n flights; a slot's record lasts until its next flight begins."""
+    """Recorder of n flights; a slot's record is kept until its next flight starts."""
 
     def __init__(self, n: int, commands: CommandKind = "velocity") -> None:
-        """Record n flights of policies that command a velocity, or what else `commands` says."""
+        """Create a recorder for policies with a command type, by default velocity."""
         self._column = SETPOINTS[commands]
         self._samples = _Tables(n, STATE, np.float64)
         self._stamps = _Tables(n, len(STAMPS), np.int64)
@@ -70,21 +70,21 @@ class Trace:
         self._sampled_j = np.zeros(n)
         self._deciding = self._started_us = np.zeros(0, np.int64)
         self.seen_us = np.zeros(n, np.int64)
-        """(n,) when the frames were taken that are being decided on [µs]."""
+        """(n,) capture times of the frames of the present decisions [µs]."""
 
     def begin(self, i: int, fleet: Fleet) -> None:
-        """Begin the record of slot i, whose vehicle is at the start."""
+        """Start the record of slot i, with its vehicle at the start."""
         for tables in (self._samples, self._stamps, self._setpoints):
             tables.clear(i)
         self._take(fleet, np.array([i]))
 
     def next_us(self, fleet: Fleet) -> NDArray[np.int64]:
-        """Return when the next samples are due (n,) [µs]."""
+        """Return the times of the next samples (n,) [µs]."""
         return (fleet.time_us // SAMPLE_US + 1) * SAMPLE_US
 
     def sample(self, fleet: Fleet) -> None:
-        """Sample the flights that have come to the time of a sample, or to their end."""
-        # A flight's last moment is kept wherever it falls, as `TrajectoryRecorder` does.
+        """Sample the flights that are at a sampling time, or at their end."""
+        # The final state is always recorded, as in `TrajectoryRecorder`.
         due = (fleet.time_us % SAMPLE_US == 0) | (fleet.verdict != Verdict.FLYING)
         self._take(fleet, np.flatnonzero(due & (fleet.time_us > self._sampled_us)))
 
@@ -99,7 +99,7 @@ class Trace:
         self._sampled_us[who], self._sampled_j[who] = now, fleet.energy[who]
 
     def deciding(self, fleet: Fleet, seen_us: NDArray[np.int64]) -> None:
-        """Note that every flight that goes on begins a decision, on a frame of that time (n,)."""
+        """Start a decision of every active flight, on a frame captured at `seen_us` (n,)."""
         self._deciding = np.flatnonzero(fleet.verdict == Verdict.FLYING)
         self._started_us, self.seen_us = fleet.time_us.copy(), seen_us.copy()
 
@@ -111,22 +111,22 @@ class Trace:
         transport_us: NDArray[np.int64],
         link_us: NDArray[np.int64],
     ) -> None:
-        """Note the decision that `deciding` began, once it has been flown.
+        """Record the decision that `deciding` started, after its completion.
 
         Args:
-            fleet: As it is when the next decision begins.
-            setpoint: (n, 4) what was decided, as `Fleet.setpoint`.
-            t2_us: (n,) inference as modelled, before it was rounded to ticks [µs].
-            transport_us: (n,) capture to decoded [µs].
+            fleet: State at the start of the next decision.
+            setpoint: (n, 4) result of the decision, as `Fleet.setpoint`.
+            t2_us: (n,) inference as modelled, before rounding to ticks [µs].
+            transport_us: (n,) capture to decoded frame [µs].
             link_us: (n,) setpoint sent to first motor command [µs].
         """
         who = self._deciding
         capture, start, end = self.seen_us[who], self._started_us[who], fleet.time_us[who]
-        # The frame of the start is there at once.
+        # The first frame of a flight is available at once.
         decoded = np.minimum(capture + transport_us[who], start)
         sent = start + t2_us[who]
         rows = np.column_stack([capture, decoded, start, sent, sent, sent + link_us[who], end])
-        # What lies behind the end of the flight never came; nor does a hold without its action.
+        # Clear events after the end of the flight, and holds of unsent actions.
         rows[rows > end[:, None]] = NO_STAMP
         rows[sent > end, -1] = NO_STAMP
         self._stamps.append(who, rows)
@@ -135,7 +135,7 @@ class Trace:
     def trajectory(self, i: int) -> Trajectory:
         """Return the path of slot i: a row at the start, every 20 ms, and at the end.
 
-        No power flows before the first row: it has that of the second.
+        The first row has no preceding interval; its mean power is copied from the second row.
         """
         rows = self._samples.of(i)
         if len(rows) > 1:

@@ -39,17 +39,17 @@ from airl_mav.envs.world import GOES_ON, TERMINATED, TRUNCATED
 from airl_mav.policy.observation_spec import Encoded
 
 AHEAD = 32
-"""Arenas that are made ahead at a time."""
+"""Number of arenas generated ahead at a time."""
 
 
 class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
     """N flights; by default they reset in the step in which they end (Gymnasium's SAME_STEP).
 
-    `info` is what Gymnasium's SyncVectorEnv makes of n `NavigationEnv`: `seed`, `zone`,
-    `flight_time_s`, `distance_m`, `energy_j` and `goal_distance_m` of the episodes that go on; in
-    `final_info` those of the ones that ended, with `success` and `outcome`, and in `final_obs` the
-    observation each ended with; a mask `_key` beside every key. Where the reset comes later, what
-    an episode ended with is in `info` itself.
+    `info` has the format of Gymnasium's SyncVectorEnv with n `NavigationEnv`: `seed`, `zone`,
+    `flight_time_s`, `distance_m`, `energy_j` and `goal_distance_m` of the present episodes.
+    `final_info` contains these keys for episodes that ended, with `success` and `outcome`, and
+    `final_obs` their last observations. Every key has a mask `_key`. In the other autoreset modes
+    the final values are in `info` itself.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
@@ -64,19 +64,19 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         **knobs: Any,
     ) -> None:
-        """Make n environments.
+        """Create n environments.
 
         Args:
             num_envs: N.
-            spec: What they are made of; or
-            render_mode: None. A single environment is what can be looked at.
-            autoreset_mode: When an episode that ended is followed by the next: in that step
-                (SAME_STEP), in the next one, whose action it does not fly (NEXT_STEP), or with a
-                reset whose `options["reset_mask"]` names it (DISABLED).
+            spec: The specification; or
+            render_mode: None; only a single environment supports rendering.
+            autoreset_mode: Reset after the end of an episode: in the same step (SAME_STEP), in the
+                next step, which ignores its action (NEXT_STEP), or by a reset with a mask
+                `options["reset_mask"]` (DISABLED).
             knobs: the fields of an EnvironmentSpec.
 
         Raises:
-            UsageError: A knob or a profile cannot be used.
+            UsageError: A knob or a profile is invalid.
         """
         if num_envs < 1:
             raise UsageError(f"num_envs = {num_envs}: accepted: value >= 1")
@@ -104,19 +104,18 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
         seed: int | Sequence[int | None] | NDArray[np.int64] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Encoded, dict[str, Any]]:
-        """Begin n episodes.
+        """Start n episodes.
 
         Args:
-            seed: One number seeds the generator that all episodes' seeds are drawn from. A list
-                gives the first episodes' own seeds, as in `NavigationEnv.reset(seed)`; None in it
-                draws one.
+            seed: A number seeds the generator of all episodes' seeds. A list contains the seeds of
+                the first episodes, as in `NavigationEnv.reset(seed)`; None in the list = drawn.
             options: `zone`, as in `NavigationEnv.reset`; `reset_mask`, (n,) booleans: only these
-                begin anew, and `info` is about them.
+                flights restart, and `info` covers only these.
 
         Raises:
-            UsageError: A wrong option or seed, or not n seeds.
-            ResetNeeded: A mask leaves out a flight that has not begun.
-            gymnasium.error.Error: The one seed is negative.
+            UsageError: Invalid option or seed, or wrong number of seeds.
+            ResetNeeded: A mask omits a flight that has not started.
+            gymnasium.error.Error: The seed is a negative number.
         """
         options = dict(options or {})
         chosen = self._chosen(options.pop("reset_mask", None))
@@ -143,7 +142,7 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
         return self.navigation.observe(), _masked(self._quality(flights), chosen)
 
     def _chosen(self, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-        """Return (n,) which flights `reset` begins. Raises UsageError and ResetNeeded."""
+        """Return the mask (n,) of flights to reset. Raises UsageError and ResetNeeded."""
         if mask is None:
             return np.ones(self.num_envs, np.bool_)
         mask = np.asarray(mask)
@@ -162,8 +161,9 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
         """Fly one decision of every vehicle; see Gymnasium's VectorEnv.step.
 
         Raises:
-            ResetNeeded: No episodes have begun; or one has ended, and resets are not automatic.
-            InvalidAction: Not n actions of the set; numbers beyond -1..1 are cut off.
+            ResetNeeded: No episodes have started; or an episode has ended in mode DISABLED.
+            InvalidAction: Wrong number of actions, or outside the set; values beyond -1..1 are
+                clipped.
         """
         over = self._over()
         if over.any() and self.autoreset_mode == AutoresetMode.DISABLED:
@@ -189,17 +189,17 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
         return seen, reward, ending == TERMINATED, ending == TRUNCATED, info
 
     def _over(self) -> NDArray[np.bool_]:
-        """Return (n,) which flights have ended in an earlier step and not begun anew."""
+        """Return the mask (n,) of flights that ended in an earlier step and have not restarted."""
         if self._before is None:
             return np.zeros(self.num_envs, np.bool_)
         over: NDArray[np.bool_] = self._before.verdict != FLYING
         return over
 
     def _next_seeds(self, n: int) -> list[int]:
-        """Draw the seeds of n episodes; when their arenas are missing, make those of more ahead."""
+        """Draw the seeds of n episodes; if their arenas are missing, generate more ahead."""
         zone, seeds = self._present_zone, draw_seeds(self.np_random, n)
         if not self.navigation.prepared(seeds, zone):
-            # As the generator will draw them; it stays where it is.
+            # From a copy of the generator, so the same seeds will be drawn later.
             following = draw_seeds(deepcopy(self.np_random), AHEAD)
             self.navigation.prepare([*seeds, *following], zone)
         return seeds
@@ -233,10 +233,10 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
         return super().get_state() | {f"env/{key}": array for key, array in own.items()}
 
     def set_state(self, state: State) -> None:
-        """Restore a saved state: the next step is as it would have been.
+        """Restore a saved state; the next step continues as without interruption.
 
         Raises:
-            UsageError: It is of another environment.
+            UsageError: The state is from another environment.
         """
         own = state_of_part(state, "env")
         self._check_same(unpack(saved_array(own, "spec")))
@@ -250,7 +250,7 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
 
     def _check_same(self, theirs: dict[str, Any]) -> None:
         ours = self.environment.model_dump(mode="json")
-        # A state of an earlier version has the defaults of what it does not name.
+        # Fields missing in an earlier version's state get their defaults.
         theirs = spec_of(None, theirs).model_dump(mode="json")
         changed = [key for key in ours if theirs.get(key) != ours[key]]
         if changed:
@@ -258,7 +258,7 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
 
 
 def _outcomes(flights: Flights, ended: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
-    """Return what `info` has in addition for flights that have ended."""
+    """Return the additional entries of `info` for flights that have ended."""
     outcomes = np.full(len(ended), None, dtype=object)
     for i in np.flatnonzero(ended).tolist():
         outcomes[i] = outcome(flights, i)["outcome"]
@@ -268,7 +268,7 @@ def _outcomes(flights: Flights, ended: NDArray[np.bool_]) -> dict[str, NDArray[A
 def _masked(
     values: dict[str, NDArray[Any]], told: NDArray[np.bool_] | None = None
 ) -> dict[str, Any]:
-    """Add masks of the rows that are told, all of them by default; the others become 0 or None."""
+    """Add masks of the valid rows, by default all; other rows become 0 or None."""
     if told is None:
         every = np.ones(len(values["seed"]), np.bool_)
         return values | dict.fromkeys([f"_{key}" for key in values], every)

@@ -10,7 +10,7 @@ from airl_mav.profiles.camera_kind import CameraKind
 
 
 def compile_vectorized(kind: CameraKind) -> None:
-    """Compile the whole: a flight of some decisions."""
+    """Compile all kernels by a flight of a few decisions."""
     flying = _navigation(kind)
     flying.begin([0], [1])
     for _ in range(3):

@@ -1,7 +1,7 @@
-"""The flights of n vehicles as one argument: one compiled call flies a decision of all.
+"""Arguments of a decision for n vehicles in one object, for a single compiled call.
 
 Numba unpacks every array of every argument at each call, which takes longer than a vehicle's
-decision. A `World` holds them, unpacked once.
+decision. A `World` is unpacked once.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from airl_mav.envs.rewards import pay
 from airl_mav.policy.images import Bytes
 
 GOES_ON, TERMINATED, TRUNCATED = 0, 1, 2
-"""How a decision has ended a flight; a flight that had ended before goes on as it is."""
+"""End of flight in a decision; GOES_ON also for flights that had ended before."""
 
 _FLYING, _TIMEOUT = int(Verdict.FLYING), int(Verdict.TIMEOUT)
 
 
 @structref.register
 class _WorldType(types.StructRef):  # type: ignore[misc]
-    """Numba's type of a `World`; it depends on the types of the parts."""
+    """Numba type of a `World`; depends on the types of the parts."""
 
 
 class World(structref.StructRefProxy):  # type: ignore[misc]
-    """What a decision of n vehicles needs; arrays are those of its parts, not copies."""
+    """Arguments of a decision of n vehicles; arrays are shared with its parts, not copied."""
 
     fleet: Fleet
     arenas: ArenaBatch
@@ -49,17 +49,17 @@ class World(structref.StructRefProxy):  # type: ignore[misc]
     t2_us: NDArray[np.int64]
     """(n, BLOCK) `DelayDraws.block`."""
     extra_us: NDArray[np.int64]
-    """(n,) added to it."""
+    """(n,) additional delay, added to `t2_us` [µs]."""
     number: NDArray[np.int64]
-    """(n,) of the present decisions in their episodes."""
+    """(n,) number of the present decision in each episode."""
     air: NDArray[np.float64]
     drift: Drift | None
     eye: Eye | None
-    """None: Python takes the images."""
+    """Camera for kernels; None = Python captures the images."""
     encoding: Bytes | None
-    """None: Python makes what networks see."""
+    """Constants for encoding; None = Python encodes observations."""
     reward: int
-    """As of `rewards.pay`."""
+    """Index of the reward, as in `rewards.pay`."""
     hold_s: float
 
     def __new__(cls, *parts: Any) -> World:  # noqa: D102
@@ -85,20 +85,20 @@ def decide(
     whole: NDArray[np.int64],
     seen: EncodedBody,
 ) -> int:
-    """Fly one decision of every vehicle, take the frames of the next one, and encode them.
+    """Fly one decision of every vehicle, capture the frames of the next one, and encode them.
 
     Args:
         world: The vehicles.
-        commands: (n, 3) or (n, 4) as of `Navigation.fly`.
-        resumed: The decisions have begun; Python has done what it was needed for.
-        numbers: (7, n) written: the numbers of `Flights` in their order, and the rewards.
-        whole: (3, n) written: verdict, what is touched, and how the decision has ended the flight.
-        seen: Written where networks see so, and there is room.
+        commands: (n, 3) or (n, 4) as in `Navigation.fly`.
+        resumed: True to continue decisions after a pause for Python.
+        numbers: (7, n) written: the float fields of `Flights` in order, and the rewards.
+        whole: (3, n) written: verdict, touched object, and end of flight in the decision.
+        seen: Encoded observations; written unless empty.
 
     Returns:
-        How many decisions wait for Python; the frames are taken once none does.
+        Number of decisions that wait for Python; frames are captured once it is 0.
     """
-    # Once: each time numba counts the holders of all arrays. It does not in the loops.
+    # Read fields once: each access counts references of all arrays. The loops do not.
     w, decision, fleet, goal = world, world.decision, world.fleet, world.arenas.goal
     if not resumed:
         _begin(decision, fleet, goal, commands, w.t2_us, w.number, w.extra_us)
@@ -126,7 +126,7 @@ def _begin(
     number: NDArray[np.int64],
     extra_us: NDArray[np.int64],
 ) -> None:
-    """Take commands as setpoints, and draws as latencies; arguments as of `World` and `decide`."""
+    """Set commands as setpoints, and draws as latencies; arguments as in `World` and `decide`."""
     for i in range(len(commands)):
         decision.t2_us[i] = t2_us[i, number[i] % BLOCK] + extra_us[i]
         decision.before_m[i] = goal_distance(fleet, goal, i)
@@ -136,7 +136,7 @@ def _begin(
                 setpoint[axis] = command[axis]
             continue
         setpoint[0], setpoint[1], setpoint[3] = command[0], command[1], command[2]
-        # NaN: decided when it is sent.
+        # NaN = altitude hold, computed when the setpoint is sent.
         setpoint[2] = command[3] if len(command) == 4 else math.nan
 
 
@@ -148,7 +148,7 @@ def _end(
     number: NDArray[np.int64],
     going: NDArray[np.int64],
 ) -> int:
-    """Count the decisions that are over, of those that were `going`; return how many go on."""
+    """Count completed decisions among `going`; return the number of unfinished ones."""
     waiting = 0
     for i in range(len(going)):
         if decision.next[i] < decision.events[i]:
@@ -177,7 +177,7 @@ def _judge(
     reward: int,
     hold_s: float,
 ) -> None:
-    """Write rewards, and which flights have just ended; arguments as of `World` and `decide`."""
+    """Write rewards and ends of flights; arguments as in `World` and `decide`."""
     for i in range(len(commands)):
         verdict, command = whole[0, i], commands[i]
         ended = decision.flying[i] and verdict != _FLYING
@@ -192,7 +192,7 @@ def _judge(
 
 @borrowing_kernel
 def goal_distance(fleet: Fleet, goal: NDArray[np.float64], i: int) -> float:
-    """Return the distance of vehicle i to its goal [m]; level, where the goal has no height."""
+    """Return the distance of vehicle i to its goal [m]; horizontal if the goal has no height."""
     p = fleet.position[i]
     away, below = math.hypot(goal[i, 0] - p[0], goal[i, 1] - p[1]), goal[i, 2] - p[2]
     return away if math.isnan(below) else math.hypot(away, below)

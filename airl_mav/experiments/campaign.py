@@ -1,4 +1,4 @@
-"""Campaigns: the evaluations of an experiment, flown by one executor, each into its run folder."""
+"""Campaigns: evaluations of an experiment, flown by one executor, with separate run folders."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
 
 @dataclass(frozen=True)
 class LockstepFlier:
-    """Level lockstep: one flight at a time in each worker. Implements `Flier`."""
+    """Flier of level lockstep: one flight at a time in each worker. Implements `Flier`."""
 
     scenario: ResolvedScenario
 
     def episodes_per_job(self, episodes: int, workers: int) -> int:  # noqa: ARG002
-        """Return how many episodes make a job; see `Flier`."""
+        """Return the episodes per job; see `Flier`."""
         return 1
 
-    def start(self, folder: run_folder.RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (asked between flights)
-        """Load everything; see `Flier`."""
-        # Here: flight controller and MAVSDK are for those who fly, not for those who have it flown.
+    def start(self, folder: run_folder.RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (polled between flights)
+        """Load simulator and policy once; see `Flier`."""
+        # Imported here: only workers need the flight controller and MAVSDK.
         from airl_mav.lockstep.flight import fly
         from firmware_sim.warm_up import warm_up
 
         scenario = self.scenario
         warm_up(scenario.vehicle, scenario.scenario.plant)
-        log = folder.path / run_folder.FIRMWARE_PRINTS  # of flights side by side, mixed
+        log = folder.path / run_folder.FIRMWARE_PRINTS  # shared by parallel flights
 
         def fly_all(episodes: Sequence[PlannedEpisode]) -> Iterator[run_folder.FlownEpisode]:
             for episode in episodes:
@@ -53,7 +53,7 @@ class LockstepFlier:
 
 
 def _gym_flier(scenario: ResolvedScenario) -> Flier:
-    # Here: with the batch twin, which level lockstep would wait for in vain.
+    # Imported here: level lockstep does not need the vectorized simulator.
     from airl_mav.experiments.gym_flier import GymFlier
 
     return GymFlier(scenario)
@@ -63,7 +63,7 @@ FLIERS: dict[str, Callable[[ResolvedScenario], Flier]] = {
     "gym": _gym_flier,
     "lockstep": LockstepFlier,
 }
-"""Levels whose flights go to workers."""
+"""Levels whose flights run in workers."""
 
 
 @dataclass(frozen=True)
@@ -71,55 +71,55 @@ class Cell:
     """One evaluation of a campaign: one policy in one arena, under one set of conditions."""
 
     name: str
-    """Its run folder inside that of the campaign."""
+    """Name of the run folder inside the campaign's folder."""
     title: str
     scenario: ResolvedScenario
     label: str = ""
-    """What it is called in the comparison; empty: the title. The next two as in its `RunEntry`."""
+    """Label in the comparison; empty = the title. For role and group see `RunEntry`."""
     role: str = ""
     group: str = ""
 
     def __post_init__(self) -> None:
-        """Raise UsageError if the level's own environment cannot fly the scenario."""
+        """Raise UsageError if the level's environment does not support the scenario."""
         if self.scenario.scenario.level in FLIERS:
             _ = self.flier
 
     @property
     def flier(self) -> Flier:
-        """How its episodes are flown."""
+        """Flier of the cell's episodes."""
         return FLIERS[self.scenario.scenario.level](self.scenario)
 
 
 @dataclass(frozen=True)
 class CellRun:
-    """A cell as far as it has been flown."""
+    """Cell with its results so far."""
 
     cell: Cell
     path: Path
-    """Its run folder; cells with the same flights share that of the first."""
+    """Run folder; cells with the same flights share the first cell's folder."""
     episodes: tuple[EpisodeRecord, ...]
-    """All that the folder holds, by index."""
+    """All episodes in the folder, by index."""
     new: int
-    """How many of them were flown now."""
+    """Number of episodes flown by this call."""
 
     @property
     def complete(self) -> bool:
-        """Whether all episodes have been flown."""
+        """True if all episodes have been flown."""
         return len(self.episodes) == len(self.cell.scenario.seeds)
 
 
 @dataclass(frozen=True)
 class CampaignRun:
-    """What a campaign came to."""
+    """Result of a campaign."""
 
     cells: tuple[CellRun, ...]
-    """Those that were begun, now or before, in the order of the campaign."""
+    """Started cells, in the order of the campaign, including earlier calls."""
     complete: bool
-    """Whether all episodes of all cells have been flown."""
+    """True if all episodes of all cells have been flown."""
     ended: Ended
-    """Also interrupted where the last flight had ended by then: what comes after must not begin."""
+    """Also "interrupted" if the last flight had ended: subsequent work must not start."""
     error: str | None
-    """Why it was broken off: a job failed, or lost its worker too often."""
+    """Error that ended the campaign: a job failed, or lost its worker too often."""
 
 
 def run_cell(
@@ -130,7 +130,7 @@ def run_cell(
     progress: Progress | None = None,
     stop: Stop = never,
 ) -> CampaignRun:
-    """Fly the rest of one evaluation; see `run_cells`. Without `out` its folder is a new one."""
+    """Fly the rest of one evaluation; see `run_cells`. Without `out` a new folder is created."""
     return _run({cell.name: out}, [cell], executor, progress or Progress(), stop)
 
 
@@ -143,10 +143,10 @@ def run_cells(
     stop: Stop = never,
     ended: Callable[[CellRun], None] = lambda _: None,
 ) -> CampaignRun:
-    """Fly the rest of a campaign until `stop`, which is polled several times a second.
+    """Fly the rest of a campaign until `stop`, which is polled several times per second.
 
-    `cells` have different names; those with the same flights share a run folder. `ended` is called
-    for each complete cell, also if it was complete before.
+    `cells` have unique names; cells with the same flights share a run folder. `ended` is called for
+    each complete cell, also if it was complete before.
     """
     first_of = shared_flights(cells)
     unique = [cell for cell in cells if first_of[cell.name] is cell]
@@ -162,7 +162,7 @@ def run_cells(
 
 
 def shared_flights(cells: Sequence[Cell]) -> dict[str, Cell]:
-    """Return, by the name of each cell, the first cell that has the same flights: often itself."""
+    """Return, by cell name, the first cell with the same flights, usually the cell itself."""
     firsts: list[Cell] = []
     first_of: dict[str, Cell] = {}
     for cell in cells:
@@ -182,32 +182,32 @@ def shared_flights(cells: Sequence[Cell]) -> dict[str, Cell]:
 
 @dataclass(frozen=True)
 class _Job:
-    """Episodes of one cell."""
+    """Episodes of one cell, flown as one job."""
 
     cell: str
     folder: run_folder.RunFolder
     episodes: tuple[PlannedEpisode, ...]
 
     def seeds(self) -> str:
-        """Return the seeds as messages name them."""
+        """Return the seeds as text for messages."""
         first, last = self.episodes[0].seed, self.episodes[-1].seed
         return f"seed {first}" if len(self.episodes) == 1 else f"seeds {first} to {last}"
 
 
 @dataclass(frozen=True)
 class _Start:
-    """What a worker is made of. A worker holds one cell at a time: the next one replaces it."""
+    """Initializer of a worker. A worker holds one cell at a time; the next cell replaces it."""
 
     fliers: Mapping[str, Flier]
 
     def __call__(self, stop: Stop) -> Callable[[_Job], Iterable[run_folder.FlownEpisode]]:
-        """Return what carries out a job."""
+        """Return the function that carries out a job."""
         loaded: tuple[str, FlyEpisodes] | None = None
 
         def fly(job: _Job) -> Iterable[run_folder.FlownEpisode]:
             nonlocal loaded
             if loaded is None or loaded[0] != job.cell:
-                loaded = None  # Large networks of two cells might not fit into the memory.
+                loaded = None  # Memory may be too small for the networks of two cells.
                 loaded = job.cell, self.fliers[job.cell].start(job.folder, stop)
             return loaded[1](job.episodes)
 
@@ -215,7 +215,7 @@ class _Start:
 
 
 class _OpenCell:
-    """A cell that is being flown: its folder locked, its flights saved as they come."""
+    """Cell in flight, with a locked folder and each flight saved when it ends."""
 
     def __init__(self, cell: Cell, out: Path | None, progress: Progress) -> None:
         self.cell = cell
@@ -237,7 +237,7 @@ class _OpenCell:
         self.episodes = {record.index: record for record in self.done}
 
     def add(self, episode: run_folder.FlownEpisode) -> None:
-        """Take an episode that has just ended."""
+        """Save a finished episode."""
         record = episode.record
         self._saver.add(episode)
         self.episodes[record.index] = record
@@ -245,11 +245,11 @@ class _OpenCell:
 
     @property
     def complete(self) -> bool:
-        """Whether all episodes have been flown."""
+        """True if all episodes have been flown."""
         return len(self.episodes) == len(self.cell.scenario.seeds)
 
     def run(self) -> CellRun:
-        """Return what it has come to."""
+        """Return the results so far."""
         episodes = tuple(self.episodes[index] for index in sorted(self.episodes))
         return CellRun(self.cell, self.folder.path, episodes, len(episodes) - len(self.done))
 
@@ -262,10 +262,10 @@ def _run(
     stop: Stop,
     tell: Callable[[CellRun], None] = lambda _: None,
 ) -> CampaignRun:
-    """Fly what is left of cells with different flights, each into its folder."""
+    """Fly the remaining episodes of cells with different flights, each into its folder."""
     opened: dict[str, _OpenCell] = {}
     error: str | None = None
-    # Of one cell its own bar says it all. What was flown before is found as cells are opened.
+    # A single cell has its own bar. Opening a cell finds its earlier flights.
     several = progress if len(cells) > 1 else Progress()
     planned = sum(len(cell.scenario.seeds) for cell in cells)
     with ExitStack() as stack:
@@ -303,7 +303,7 @@ def _run(
             return job.seeds() if len(cells) == 1 else f"{job.cell}: {job.seeds()}"
 
         if cells:
-            # Also when nothing is to be flown any more, what is there can be told.
+            # Open the first cell even if no flights remain, to report its results.
             open_cell(cells[0])
         results = executor.run(
             jobs(),

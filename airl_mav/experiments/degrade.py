@@ -1,4 +1,4 @@
-"""The latency curve: the same policies at latencies that grow, on the same seeds."""
+"""Latency curve: the same policies and seeds at increasing latencies."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from airl_mav.policy.registry import find_policy
 from airl_mav.scenario.model import Scenario
 
 NATIVE = "native"
-"""Stands for no injected latency."""
+"""Name for no injected latency."""
 
 LATENCIES = (NATIVE, "150ms", "300ms", "400ms", "950ms")
 
@@ -29,12 +29,12 @@ def degrade(
     out: Path | str | None = None,
     progress: bool = False,
 ) -> experiment.ExperimentResult:
-    """Fly policies at growing latencies and compare the results. Raises as `evaluate`.
+    """Fly policies at increasing latencies and compare the results. Raises as `evaluate`.
 
     Args:
         scenario: Flight settings; latency and workload are ignored.
-        latencies: Sources of t2, growing, the reference first; `native` = none injected.
-        policies: Names or folders; empty = the scenario's.
+        latencies: Sources of t2, increasing, the reference first; `native` = none injected.
+        policies: Names or folders; empty = the scenario's policy.
         compensated: Also fly each policy with latency compensation.
         out: Folder to create or resume; None = `runs/<UTC time>-degradation-...`.
         progress: Draw progress bars on standard error.

@@ -1,4 +1,4 @@
-"""Evaluations: policies in arenas, each pair a run of seeded episodes."""
+"""Evaluations: policies in arenas, one run of seeded episodes per pair."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from airl_mav.scenario.model import DEFAULT_ARENA, Scenario
 SHARED = (
     *("level", "vehicle", "computer", "workload", "latency", "ablate", "zone", "episodes", "seed"),
 )
-"""Fields that head a table: the same for all of it."""
+"""Fields in the header of a table: equal for all its runs."""
 
 NOT_THE_POLICYS_OWN = (
     "ablate",
@@ -37,7 +37,7 @@ NOT_THE_POLICYS_OWN = (
     "faults",
     "renderer",
 )
-"""Fields whose results are not written onto a policy's card when they are given."""
+"""Fields that, when set, keep results off the policy's card."""
 
 
 def evaluate(
@@ -53,12 +53,12 @@ def evaluate(
     Args:
         scenario: Flight settings; policy and arena are ignored.
         policies: Names or folders.
-        arenas: Names or paths; empty = those of the policies' training.
+        arenas: Names or paths; empty = the policies' training arenas.
         out: Folder to create or resume; None = `runs/<UTC time>-matrix-...`.
         progress: Draw progress bars on standard error.
 
     Raises:
-        UsageError: Something cannot be flown, or `out` holds something else.
+        UsageError: A scenario cannot be flown, or `out` contains other data.
         RehearsalError: Processes or workers were lost too often.
         KeyboardInterrupt: Ctrl-C; finished flights are kept.
     """
@@ -115,12 +115,12 @@ def evaluation_cells(
 
 
 def training_arena(policy: PolicyInfo) -> str:
-    """Return the arena that a policy was trained in, or the default one."""
+    """Return the training arena of a policy, or the default arena."""
     return (None if policy.card is None else policy.card.training.arena) or DEFAULT_ARENA
 
 
 def check_plain(cells: Sequence[Cell]) -> None:
-    """Raise UsageError for results that are not the policies' own: none goes onto a card."""
+    """Raise UsageError if settings keep the results off the policies' cards."""
     for cell in cells:
         asked, usual = cell.scenario.scenario, Scenario()
         for field in NOT_THE_POLICYS_OWN:
@@ -131,7 +131,7 @@ def check_plain(cells: Sequence[Cell]) -> None:
 
 
 def write_on_card(cell: Cell, episodes: Sequence[EpisodeRecord]) -> None:
-    """Write what a finished evaluation found onto the policy's card, in place of an earlier one."""
+    """Write the results of a finished evaluation onto the policy's card, replacing earlier ones."""
     asked, folder = cell.scenario.scenario, cell.scenario.policy.folder
     if folder is None:
         return
@@ -150,7 +150,7 @@ def write_on_card(cell: Cell, episodes: Sequence[EpisodeRecord]) -> None:
 
 
 def _check_names(field: str, names: Sequence[str]) -> None:
-    """Raise FieldError when two of them would share a row, a column and a folder."""
+    """Raise FieldError for duplicate names, which would share a row, a column and a folder."""
     for name in names:
         if names.count(name) > 1:
             raise FieldError(field, name, "each name once")

@@ -18,46 +18,46 @@ J = TypeVar("J")
 R = TypeVar("R")
 
 Stop = Callable[[], bool]
-"""Asked again and again; True ends the work."""
+"""Polled repeatedly; True ends the work."""
 
 Work = Callable[[J], Iterable[R]]
-"""Carries out a job: gives its results, of which there may be several."""
+"""Carries out a job and yields its results."""
 
 Start = Callable[[Stop], Work[J, R]]
-"""Called once in each worker, to load everything. Goes there by pickle. It is given what asks
-whether the work is to be stopped, for work in this process. Other workers are ended instead."""
+"""Initializer, called once in each worker to load everything. Sent to workers by pickle. Its
+argument is polled for a stop in this process only: other workers are terminated instead."""
 
 Results = Generator[tuple[J, R], None, None]
-"""Results as they come, each with its job. Closing it ends the workers, whatever they do."""
+"""Results in order of completion, each with its job. Closing the generator ends running workers."""
 
 POLL_S = 0.2
-"""Interval at which `stop` is asked while results are awaited [wall s]."""
+"""Interval at which `stop` is polled while waiting for results [wall s]."""
 
 ONE_THREAD = dict.fromkeys(
     ("MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
 )
-"""Environment of a worker: it has one core."""
+"""Environment of a worker, which has one core."""
 
 
 class WorkerError(Exception):
-    """A job cannot be carried out; the message names it and the reason."""
+    """Failure of a job; the message contains its name and the reason."""
 
 
 def never() -> bool:
-    """Return False: nobody wants to stop."""
+    """Return False: never stop."""
     return False
 
 
 class Executor(Protocol):
-    """Carries out jobs, several at a time."""
+    """Executor of parallel jobs."""
 
     @property
     def workers(self) -> int:
-        """Number of jobs at a time."""
+        """Number of parallel jobs."""
 
     @property
     def streams(self) -> bool:
-        """Whether results are yielded while their job goes on, not at its end."""
+        """True if results are yielded while their job is running, not at its end."""
 
     def run(
         self,
@@ -71,9 +71,9 @@ class Executor(Protocol):
     ) -> Results[J, R]:
         """Run jobs, taken lazily, on free workers and yield their results in any order.
 
-        `start` initializes a worker; `stop` is polled several times a second and aborts the running
-        jobs; `lost` is told in one line of each lost worker, whose job restarts without partial
-        results; `compiling` is called when local workers begin and end compiling kernels.
+        `start` initializes a worker; `stop` is polled several times per second and aborts running
+        jobs; `lost` gets a one-line message for each lost worker, whose job restarts without
+        partial results; `compiling` is called when local workers begin and end compiling kernels.
 
         Raises:
             UsageError: A job rejects its input.
@@ -82,7 +82,7 @@ class Executor(Protocol):
 
 
 class InProcessExecutor:
-    """This process, job by job; results are streamed and errors raised as they are."""
+    """Executor in this process, one job at a time; streams results and raises errors unchanged."""
 
     workers: ClassVar[int] = 1
     streams: ClassVar[bool] = True
@@ -94,10 +94,10 @@ class InProcessExecutor:
         *,
         name: Callable[[J], str] = str,
         stop: Stop = never,
-        lost: Callable[[str], None] = lambda _: None,  # noqa: ARG002 (nobody is lost here)
+        lost: Callable[[str], None] = lambda _: None,  # noqa: ARG002 (never lost here)
         compiling: Heard = lambda _: None,
     ) -> Results[J, R]:
-        """Carry out jobs; see `Executor`."""
+        """Run jobs; see `Executor`."""
         work: Work[J, R] | None = None
         with heard_compiling(compiling):
             for job in jobs:
@@ -112,28 +112,28 @@ class InProcessExecutor:
 
 
 class ExecutorSettings(Workers):
-    """Who carries out the jobs of an experiment, and what a job takes."""
+    """Executor of an experiment and the resources of a job."""
 
     ray_gpus: float = quantity("share of a GPU for each job", "1", ge=0.0, le=8.0, default=0.0)
 
 
-# --- what the executors with workers have in common
+# --- shared by executors with workers
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A worker's answer when a job could not be carried out."""
+    """Answer of a worker for a failed job."""
 
     message: str
     usage: bool
 
     def error(self, job: str) -> UsageError | WorkerError:
-        """Return what is raised for a job of that name."""
+        """Return the exception for a job of a given name."""
         return (UsageError if self.usage else WorkerError)(f"{job}: {self.message}")
 
 
 def answer(work: Callable[[], Iterable[R]]) -> list[R] | Failure:
-    """Return a worker's answer: all results of a job, or why there are none."""
+    """Return a worker's answer: all results of a job, or its failure."""
     try:
         return list(work())
     except UsageError as error:
@@ -155,7 +155,7 @@ FlyEpisodes = Callable[[Sequence[PlannedEpisode]], Iterable[FlownEpisode]]
 
 
 class Flier(Protocol):
-    """How the episodes of a scenario are flown. Goes to workers by pickle."""
+    """Interface to fly the episodes of a scenario. Sent to workers by pickle."""
 
     def episodes_per_job(self, episodes: int, workers: int) -> int:
         """Return the episodes per job for executors that do not stream results."""

@@ -27,23 +27,23 @@ from airl_mav.scenario.resolve import resolve
 
 @dataclass(frozen=True)
 class Experiment:
-    """What is flown, and how it is compared."""
+    """Cells to fly, and their comparison."""
 
     kind: Kind
     name: str
     facts: dict[str, Any]
     cells: tuple[Cell, ...]
     remarks: tuple[str, ...] = ()
-    """What a person should know before it flies."""
+    """Warnings to print before the first flight."""
 
     def root(self, out: Path | None) -> Path:
-        """Return the folder: as asked, or a new one under `runs`."""
+        """Return `out`, or a new folder under `runs`."""
         name = f"{utc_now():%Y%m%dT%H%M%SZ}-{self.kind}-{file_name(self.name)}"
         return out or Path("runs") / name
 
     @property
     def declaration(self) -> Declaration:
-        """What the folder says of it."""
+        """Content of the folder's declaration file."""
         shared = shared_flights(self.cells)
         return Declaration(
             kind=self.kind,
@@ -63,24 +63,24 @@ class Experiment:
 
 @dataclass(frozen=True)
 class ExperimentRun:
-    """An experiment as far as it has been flown."""
+    """Experiment with its results so far."""
 
     experiment: Experiment
     path: Path
-    """Its folder; a run folder for each cell lies in it."""
+    """Folder of the experiment, with a run folder for each cell."""
     cells: tuple[CellRun, ...]
-    """Those that have flights, in the order of the experiment."""
+    """Cells with flights, in the order of the experiment."""
     ended: Ended
     problem: str = ""
 
     @property
     def runs(self) -> dict[str, Run]:
-        """The run of each cell, by its name."""
+        """Runs by cell name."""
         return {flown.cell.name: Run(flown.path) for flown in self.cells}
 
     def compare(self) -> tuple[Comparison, dict[str, LoadedRun]]:
-        """Return the comparison and its runs by name. Raises UsageError: no cell has flights."""
-        # Imported here: the figures, which a single evaluation does without, are part of it.
+        """Return the comparison and its runs by name. Raises UsageError if no cell has flights."""
+        # Imported here: a single evaluation does not need the figures.
         from airl_mav.report.comparison.show import build_comparison
 
         here, experiment = self.path.absolute(), self.experiment
@@ -93,17 +93,17 @@ class ExperimentRun:
 
 @dataclass(frozen=True)
 class ExperimentResult:
-    """What an experiment has come to, for Python."""
+    """Result of an experiment."""
 
     path: Path
     runs: dict[str, Run]
     comparison: Comparison
-    """Figures of every run, and the differences between them over pairs of flights."""
+    """Statistics of every run, and paired differences between runs."""
     page: Path
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: what came out, the figures and the first picture."""
-        # Imported here: matplotlib is half a second that who only flies need not wait for.
+        """Return the notebook view: results, statistics and the first figure."""
+        # Imported here: matplotlib takes half a second, which flights do not need.
         from airl_mav.report.notebook import comparison_html
 
         loaded = {name: load(run.path) for name, run in self.runs.items()}
@@ -111,7 +111,7 @@ class ExperimentResult:
 
 
 def file_name(text: str) -> str:
-    """Return a text as the name of a folder."""
+    """Return a text as a valid folder name."""
     return "".join(c if c.isalnum() or c in "._-" else "-" for c in text)
 
 
@@ -119,12 +119,12 @@ def make_cell(
     name: str, title: str, scenario: Scenario, *, label: str = "", role: str = "", group: str = ""
 ) -> Cell:
     """Resolve a scenario as a cell. Raises UsageError if it cannot be flown."""
-    # A copy without the loaded network: many large ones would fill the memory.
+    # A copy without the loaded network: many large networks would fill the memory.
     return Cell(name, title, replace(resolve(scenario)), label, role, group)
 
 
 def entry_of(cell: Cell, folder: str) -> RunEntry:
-    """Return what the run of a cell, in a folder below that of the comparison, is there."""
+    """Return a cell's entry in the comparison; `folder` is relative to the comparison's folder."""
     card = cell.scenario.policy.card
     trained_in = None if card is None else card.training.arena
     return RunEntry(
@@ -142,7 +142,7 @@ def entry_of(cell: Cell, folder: str) -> RunEntry:
 def run_and_compare(
     experiment: Experiment, out: Path | str | None, *, progress: bool
 ) -> ExperimentResult:
-    """Fly an experiment and compare its runs, for the API's functions; raises as `evaluate`."""
+    """Fly an experiment and compare its runs, for the Python API; raises as `evaluate`."""
     from airl_mav.report.comparison.show import write_comparison
 
     with shown(progress) as shows:
@@ -221,13 +221,13 @@ def _fly_live(
 
 
 def outcome_line(run: CellRun) -> str:
-    """Return how the flights of a cell ended."""
+    """Return the outcomes of a cell's flights as text."""
     told = count_outcomes([episode.outcome for episode in run.episodes])
     return told if run.new else f"{told} (flown before)"
 
 
 def known_seeds(cells: Sequence[Cell]) -> list[str]:
-    """Return a warning for each policy that may know its episodes from training."""
+    """Return a warning for each policy whose training may have included the seeds."""
     warnings: dict[str, str] = {}
     for cell in cells:
         policy, asked = cell.scenario.policy, cell.scenario.scenario

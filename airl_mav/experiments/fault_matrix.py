@@ -1,4 +1,4 @@
-"""The fault matrix: every fault in every phase, many seeds, and how each flight ended."""
+"""Fault matrix: flights with every fault in every phase and many seeds, and their outcomes."""
 
 from __future__ import annotations
 
@@ -33,42 +33,42 @@ from firmware_sim.crash_detector import TOUCHDOWN_M_S
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 AFTER_S = 0.5
-"""A fault begins so long after its phase [s]."""
+"""Time from the start of the phase to the fault [s]."""
 
 ALTITUDE_M = 5.0
 FENCE_M = 100.0
-"""Further from home, or higher, is flown away [m]."""
+"""Distance from home beyond which a flight counts as flown away [m]."""
 
 LONGEST_S = 75.0
 OPERATOR_S = 10.0
-"""So long after the flight controller has taken over, an operator commands to land [s]."""
+"""Time from the flight controller's takeover to the operator's command to land [s]."""
 
 _REPEAT_US = 50_000
 _LOOK_TICKS = 25
-"""Numbers are looked at so often."""
+"""Ticks between two checks for non-finite values."""
 
 
 @dataclass(frozen=True)
 class FaultFlight:
-    """How a flight with a fault went."""
+    """Result of a flight with a fault."""
 
     fault: str
     phase: Phase
     seed: int
     end: End
     touchdown_m_s: float | None
-    """Fastest contact with the floor; None: there was none."""
+    """Maximum contact speed with the floor [m/s]; None = no contact."""
     farthest_m: float
     mode: str
     said: tuple[str, ...]
-    """Texts for the operator after the fault had begun."""
+    """Texts for the operator after the start of the fault."""
 
 
 def fly_fault(vehicle: VehicleProfile, fault: str, phase: Phase, seed: int) -> FaultFlight:
-    """Fly to 5 m, hold, fly north in offboard or by a mission, and land, with a fault on the way.
+    """Fly to 5 m, hold, fly north in offboard or mission mode, and land, with a fault on the way.
 
-    The result is deterministic. The simulated pilot leaves unexpected modes alone and commands to
-    land after `OPERATOR_S`. The compiled plant suffices, in 80 % less time than pybullet.
+    The result is deterministic. The simulated pilot ignores unexpected modes, but commands to land
+    after `OPERATOR_S`. The compiled plant takes 80 % less time than pybullet.
     """
     words = Fault.model_validate(fault).model_copy(update={"phase": phase, "at_s": AFTER_S})
     setup = EpisodeSetup(vehicle, None, seed, Aircraft(faults=(words,), plant="kernel"))
@@ -85,7 +85,7 @@ def fly_fault(vehicle: VehicleProfile, fault: str, phase: Phase, seed: int) -> F
 
 
 class _Flight:
-    """The parts of one flight."""
+    """Simulated pilot of one flight."""
 
     def __init__(
         self,
@@ -131,7 +131,7 @@ class _Flight:
         )
 
     def _tick(self) -> End | None:
-        """Fly a tick; return the end where this is one."""
+        """Fly a tick; return the end if the flight is over, otherwise None."""
         simulation, flight = self._simulation, self._autopilot.flight
         if self._streams and simulation.time_us % _REPEAT_US < TICK_US:
             self._offer()
@@ -147,20 +147,20 @@ class _Flight:
         self._farthest_m = max(self._farthest_m, distance_m)
         if distance_m > FENCE_M:
             return "flown away"
-        for hit in simulation.plant.collisions:  # those of this tick: nothing is recorded
+        for hit in simulation.plant.collisions:  # collisions of this tick only: nothing is recorded
             self._touchdowns.append(hit.speed_m_s)
             if hit.speed_m_s >= TOUCHDOWN_M_S and flown:
                 return "crashed"
         return None
 
     def _offer(self) -> None:
-        """Give an offboard setpoint: to the north."""
+        """Send an offboard setpoint to the north."""
         north = np.array([2.0, 0.0, 0.0])
         setpoint = Setpoint(np.full(3, math.nan), north, 0.0, math.nan)
         self._autopilot.offer_setpoint(setpoint, self._simulation.time_us)
 
     def _waypoint(self) -> PlanItem:
-        """Return a mission item: farther to the north than is flown."""
+        """Return a mission item north of any position that is reached."""
         origin = self._autopilot.estimator.origin
         if origin is None:
             raise ValueError("a mission without a position")
@@ -175,7 +175,7 @@ class _Flight:
         )
 
     def _pilot(self) -> Iterator[End | None]:
-        """Say what a pilot does, a tick at a time; yield the end where that is known."""
+        """Act as the pilot, one tick per step; yield the end when it is known."""
         autopilot = self._autopilot
         while autopilot.flight.phase is Commander.BOOT:
             if self._simulation.time_us > 20 * US_PER_S:
@@ -212,7 +212,7 @@ class _Flight:
     def _fly_as(
         self, mode: Mode, limit_s: float, until: Mode | None = None
     ) -> Iterator[End | None]:
-        """Wait while a mode is flown, at most so long."""
+        """Wait while a mode is active, at most `limit_s` [s]."""
         end_us = self._simulation.time_us + limit_s * US_PER_S
         flight = self._autopilot
         while flight.flight.mode is mode and self._simulation.time_us < end_us:
@@ -223,7 +223,7 @@ class _Flight:
             flight.set_mode(until)
 
     def _until_down(self, limit_s: float) -> Iterator[End | None]:
-        """Wait until the motors are off, at most so long."""
+        """Wait until the motors are off, at most `limit_s` [s]."""
         end_us = self._simulation.time_us + limit_s * US_PER_S
         while self._simulation.time_us < end_us:
             if self._autopilot.flight.phase < Commander.GROUND:
@@ -238,7 +238,7 @@ class _Flight:
 SCHEMA = 2
 
 ANY: frozenset[End] = frozenset({"not armed", "landed", "crashed"})
-"""How a flight with a fault that is not in the catalogue may end."""
+"""Accepted ends of a flight with a fault outside of the catalogue."""
 
 
 @dataclass(frozen=True)
@@ -251,19 +251,19 @@ class Cell:
 
     @property
     def ends(self) -> Mapping[End, int]:
-        """How often each end was, the most frequent first."""
+        """Number of flights by end, the most frequent end first."""
         return dict(Counter(flight.end for flight in self.flights).most_common())
 
     @property
     def unexpected(self) -> tuple[FaultFlight, ...]:
-        """Flights that ended otherwise than documented."""
+        """Flights with an undocumented end."""
         case = CASE_OF.get(self.fault, Case(self.fault, ANY))
         allowed = case.allowed(self.phase)
         return tuple(flight for flight in self.flights if flight.end not in allowed)
 
     @property
     def touchdown_m_s(self) -> float | None:
-        """Fastest touch-down of the flights that landed."""
+        """Maximum touchdown speed of the landed flights [m/s]; None = no contact."""
         speeds = [f.touchdown_m_s for f in self.flights if f.end == "landed"]
         return max((speed for speed in speeds if speed is not None), default=None)
 
@@ -278,7 +278,7 @@ def fly_matrix(
     known: Sequence[Cell] = (),
     flown: Callable[[Cell], None] = lambda _: None,
 ) -> list[Cell]:
-    """Fly every fault in every phase with every seed that is not known; deterministic."""
+    """Fly every fault in every phase, except for `known` cells with equal seeds; deterministic."""
     kept = {
         (cell.fault, cell.phase): cell
         for cell in known
@@ -299,12 +299,12 @@ def _flown_cells(
     kept: Mapping[tuple[str, Phase], Cell],
     workers: int,
 ) -> Iterator[Cell]:
-    """Yield the cells of the jobs, in their order."""
+    """Yield the cells of the jobs, in the order of the jobs."""
     if workers == 1:
         for job in jobs:
             yield kept.get(job) or _fly_cell(vehicle, *job, seeds)
         return
-    # A fresh process each: pybullet and compiled kernels do not survive a fork beside threads.
+    # Spawned processes: pybullet and compiled kernels do not survive a fork beside threads.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
         waiting = {
@@ -320,7 +320,7 @@ def _fly_cell(vehicle: VehicleProfile, fault: str, phase: Phase, seeds: Sequence
 
 
 def markdown(cells: Sequence[Cell]) -> str:
-    """Return the matrix as a table, a fault a row; `!` marks what is not documented."""
+    """Return the matrix as a table with a row per fault; `!` marks undocumented ends."""
     phases = list(dict.fromkeys(cell.phase for cell in cells))
     by_key = {(cell.fault, cell.phase): cell for cell in cells}
     lines = [f"| fault | {' | '.join(phases)} |", f"|---|{'---|' * len(phases)}"]
@@ -331,7 +331,7 @@ def markdown(cells: Sequence[Cell]) -> str:
 
 
 def cell_text(cell: Cell) -> str:
-    """Return how the flights of a cell ended: "19 landed (0.8 m/s), 1 crashed !"."""
+    """Return the ends of a cell's flights: "19 landed (0.8 m/s), 1 crashed !"."""
     parts = []
     for end, count in cell.ends.items():
         speed = cell.touchdown_m_s if end == "landed" else None
@@ -341,12 +341,12 @@ def cell_text(cell: Cell) -> str:
 
 
 class Matrix(NamedTuple):
-    """What `faults.json` holds."""
+    """Content of `faults.json`."""
 
     made: dict[str, Any]
-    """With what it was flown (`core.provenance`)."""
+    """Software and machine of the flights (`core.provenance`)."""
     vehicle: str
-    """SHA-256 of its profile."""
+    """SHA-256 of the vehicle profile."""
     cells: tuple[Cell, ...]
 
 
@@ -354,7 +354,7 @@ _FLIGHTS = TypeAdapter(tuple[FaultFlight, ...])
 
 
 def with_cells(matrix: Matrix, cells: Sequence[Cell]) -> Matrix:
-    """Return a matrix with these cells in place of its own of the same fault and phase."""
+    """Return a matrix with its cells of equal fault and phase replaced by these cells."""
     new = {(cell.fault, cell.phase) for cell in cells}
     kept = (cell for cell in matrix.cells if (cell.fault, cell.phase) not in new)
     return matrix._replace(cells=(*cells, *kept))
@@ -366,14 +366,14 @@ def vehicle_digest(vehicle: VehicleProfile) -> str:
 
 
 def save(matrix: Matrix, path: Path) -> None:
-    """Write every flight of a matrix as JSON, whole or not at all."""
+    """Write every flight of a matrix as JSON, atomically."""
     flights = [asdict(flight) for cell in matrix.cells for flight in cell.flights]
     head = {"schema": SCHEMA, "made": matrix.made, "vehicle": matrix.vehicle}
     write_json(path, {**head, "flights": flights})
 
 
 def load(path: Path) -> Matrix:
-    """Read a matrix. Raises UsageError: it is missing or damaged."""
+    """Read a matrix. Raises UsageError if it is missing or damaged."""
     data = read_json(path, SCHEMA, "fault matrix")
     try:
         flights = _FLIGHTS.validate_python(data["flights"])
@@ -389,7 +389,7 @@ def load(path: Path) -> Matrix:
 
 
 def resumed(path: Path, made: Mapping[str, Any], vehicle: str) -> Matrix:
-    """Return a stopped run's matrix, or an empty one; UsageError if it is another vehicle's."""
+    """Return a stopped run's matrix, or an empty one; UsageError for another vehicle's matrix."""
     if not path.exists():
         return Matrix(dict(made), vehicle, ())
     found = load(path)

@@ -1,4 +1,4 @@
-"""A scenario, flown into its run folder at any level; a run that was interrupted goes on."""
+"""Flights of a scenario into its run folder, at any level; resumes interrupted runs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from airl_mav.scenario.resolved import ResolvedScenario
 
 
 def workers_of(asked: Scenario) -> AbstractContextManager[Executor | None]:
-    """Give who flies a scenario; None at level sitl, whose processes are those of one run."""
+    """Return the executor of a scenario; None at level sitl, whose processes serve one run."""
     return (
         nullcontext()
         if asked.level == "sitl"
@@ -36,7 +36,7 @@ def fly_scenario(
     *,
     executor: Executor | None = None,
 ) -> FlownRun:
-    """Fly the rest of a scenario at any level, several flights at a time if possible."""
+    """Fly the rest of a scenario at any level, several flights in parallel if possible."""
     asked = scenario.scenario
     name = run_name(scenario)
     if asked.level == "sitl":
@@ -51,22 +51,22 @@ def fly_scenario(
 
 
 def run_name(scenario: ResolvedScenario) -> str:
-    """Return the name of a run: what was flown where."""
+    """Return the default name of a run."""
     ablate = scenario.scenario.ablate
     without = f"-no-{ablate}" if ablate else ""
     return f"{scenario.policy.name}{without}-{scenario.arena_name}-{scenario.scenario.level}"
 
 
 def rehearse(scenario: Scenario, *, out: Path | str | None = None, progress: bool = False) -> Run:
-    """Fly a scenario and return the run; the same `out` resumes an interrupted one.
+    """Fly a scenario and return the run; the same `out` resumes an interrupted run.
 
     Args:
-        scenario: The scenario.
+        scenario: Scenario to fly.
         out: Run folder; None = `runs/<UTC time>-...`.
         progress: Draw a progress bar on standard error.
 
     Raises:
-        UsageError: The scenario cannot be flown, or `out` holds another run.
+        UsageError: The scenario cannot be flown, or `out` contains another run.
         RehearsalError: Processes or workers were lost too often.
         KeyboardInterrupt: Ctrl-C; finished flights are kept in `out`.
     """
@@ -78,7 +78,7 @@ def rehearse(scenario: Scenario, *, out: Path | str | None = None, progress: boo
 
 @contextmanager
 def shown(progress: bool) -> Iterator[Progress]:
-    """Give a progress that draws on standard error, or one that is silent."""
+    """Yield a progress that draws on standard error, or a silent one."""
     if not progress:
         yield Progress()
         return
@@ -87,7 +87,7 @@ def shown(progress: bool) -> Iterator[Progress]:
 
 
 def raise_unless_complete(ended: Ended, problem: str) -> None:
-    """Raise what a caller in Python expects of work that ended early."""
+    """Raise RehearsalError or KeyboardInterrupt for work that ended early."""
     if ended == "broken off":
         raise RehearsalError(problem)
     if ended == "interrupted":

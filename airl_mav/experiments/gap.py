@@ -1,4 +1,4 @@
-"""The hardware gap: a policy on a workstation and on an onboard computer, also mitigated."""
+"""Hardware gap: a policy on a workstation and on an onboard computer, also with mitigation."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import REFERENCE_COMPUTER, Scenario
 
 DEFAULT_UNMITIGATED, DEFAULT_MITIGATED = "static-obstacles", "static-obstacles-ras-pi-4"
-"""Shipped policies of one kind of training: as fast as a workstation decides, and as late as the
-paper's Raspberry Pi."""
+"""Shipped policies with equal training except for latency: a workstation's, and the paper's
+Raspberry Pi's."""
 
 DEFAULT_WORKLOAD = "template-5x32"
-"""The paper's network for No Obstacles, and that of its mitigation: 396 ms on the Raspberry Pi."""
+"""The paper's network for No Obstacles and for its mitigation: 396 ms on the Raspberry Pi."""
 
 NOT_MITIGATED = "none"
-"""In place of the mitigated policy: fly the gap alone."""
+"""Name that disables the mitigated policy."""
 
 TRAINING_LATENCY_SEED = 1
-"""The latencies of the training's conditions are drawn anew. With the same draws as the target's,
-the mitigated policy would be compared with itself."""
+"""Seed of the latencies of training conditions. It differs from the target's seed: with equal
+latencies the mitigated policy would be compared with itself."""
 
 
 COMPENSATED, PIPELINED, BOTH = "compensated", "compensated-pipelined", "mitigated-compensated"
@@ -39,7 +39,7 @@ COMPENSATION: dict[str, dict[str, Any]] = {
     PIPELINED: {"compensate": True, "decisions": "pipelined"},
     BOTH: {"compensate": True},
 }
-"""Runs whose latency is compensated in flight, by their roles: fields of the scenario."""
+"""Runs with latency compensation in flight: scenario fields by role."""
 
 COMPENSATION_TITLES = {
     COMPENSATED: "compensated",
@@ -50,22 +50,22 @@ COMPENSATION_TITLES = {
 
 @dataclass(frozen=True)
 class Conditions:
-    """A computer with its latency."""
+    """Computer and its latency."""
 
     name: str
-    """For people and folders: the computer, or the latency where that was given."""
+    """Name in labels and folders: the computer, or the latency if it was given."""
     computer: str
     workload: str | None
     latency: str | None = None
 
     @property
     def fields(self) -> dict[str, Any]:
-        """The scenario's fields that they set."""
+        """Scenario fields of the conditions."""
         return {"computer": self.computer, "workload": self.workload, "latency": self.latency}
 
     @property
     def label(self) -> str:
-        """How a title calls them."""
+        """Label in a title."""
         return f"on {self.name}" if self.latency is None else f"at {Path(self.name).name}"
 
 
@@ -81,9 +81,10 @@ def gap(
 ) -> ExperimentResult:
     """Measure a policy's loss on an onboard computer, with and without mitigation.
 
-    On the same seeds: the policy on the reference and on the onboard computer, there also with
-    latency compensation and with pipelined decisions; and a policy trained with that latency,
-    there, compensated, under its training conditions, and on the reference. Raises as `evaluate`.
+    All runs use the same seeds. The policy flies on the reference and on the onboard computer,
+    there also with latency compensation and with pipelined decisions. A policy trained with that
+    latency flies there, compensated, under its training conditions, and on the reference. Raises as
+    `evaluate`.
 
     Args:
         scenario: Policy, onboard computer with workload or latency (default: the paper's network on
@@ -92,7 +93,7 @@ def gap(
         reference: Reference computer profile.
         reference_workload: Workload of the reference; None = the target's if the reference has it,
             otherwise the measurement of the same policy.
-        arenas: Arena profiles, with a table each; empty = the scenario's.
+        arenas: Arena profiles, with a table each; empty = the scenario's arena.
         out: Folder to create or resume; None = `runs/<UTC time>-gap-...`.
         progress: Draw progress bars on standard error.
     """
@@ -184,7 +185,7 @@ def declare_gap(
 def _ways_of_compensation(
     scenario: Scenario, policy: PolicyInfo
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the roles in which the policy is flown compensated on the target, and remarks."""
+    """Return the roles of the policy's compensated runs on the target, and remarks."""
     if scenario.compensate is not None:
         return (), ()
     if policy.commands != "velocity":
@@ -202,7 +203,7 @@ def _ways_of_compensation(
 
 
 def _mitigated(name: str, *, trust: bool = False) -> PolicyInfo | None:
-    """Return the mitigated policy; None: not asked for. Raises UsageError."""
+    """Return the mitigated policy; None = disabled. Raises UsageError."""
     if name == NOT_MITIGATED:
         return None
     try:
@@ -219,7 +220,7 @@ def _mitigated(name: str, *, trust: bool = False) -> PolicyInfo | None:
 
 
 def _target(scenario: Scenario) -> Conditions:
-    """Return the onboard computer as it is flown."""
+    """Return the onboard computer with its latency."""
     if scenario.latency is None:
         workload = DEFAULT_WORKLOAD if scenario.workload is None else scenario.workload
         return Conditions(Path(scenario.computer).stem, scenario.computer, workload)
@@ -229,7 +230,7 @@ def _target(scenario: Scenario) -> Conditions:
 
 
 def _reference(computer: str, workload: str | None, target: Conditions) -> Conditions:
-    """Return the computer that the gap is measured from."""
+    """Return the reference computer with its workload."""
     if workload is None and target.workload in load_computer(computer).workloads:
         workload = target.workload
     return Conditions(Path(computer).stem, computer, workload)
@@ -261,12 +262,12 @@ def _training(
         sources = (f"{found.native_ms:g}ms",) if found.native_ms else ()
     elif found.workload in load_computer(found.computer).workloads:
         sources = (f"{found.computer}/{found.workload}",)
-    else:  # An estimate: it needs the policy beside the computer.
+    else:  # An estimate needs the policy and the computer.
         return (Conditions("training", found.computer, found.workload),), remarks
     return tuple(Conditions(s, target.computer, None, s) for s in sources), remarks
 
 
 def training_environment(card: PolicyCard) -> Mapping[str, Any] | None:
-    """Return the environment that a policy was trained in; None: its card does not say."""
+    """Return the training environment of a policy; None = not on its card."""
     environment = card.training.config.get("environment")
     return environment if isinstance(environment, Mapping) else None

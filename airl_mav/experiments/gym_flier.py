@@ -1,4 +1,4 @@
-"""Level gym: the batch twin flies many episodes at a time."""
+"""Flier of level gym: many episodes in parallel in the vectorized simulator."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ from airl_mav.scenario.piloting import action_generator
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
 
 BLOCK_SLOTS = 4
-"""Episodes a job and slot: in a shorter job most slots would wait for the longest flights."""
+"""Episodes per job and slot: in shorter jobs most slots would wait for the longest flights."""
 
 
 def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
-    """Return the environment of the batch twin in which a scenario is flown."""
+    """Return the vectorized simulator's environment for a scenario."""
     asked, card = scenario.scenario, scenario.policy.card
     shape: dict[str, Any]
     if card is None:
-        # It looks at the camera's own image.
+        # Policies without a card use the camera's native resolution.
         camera = scenario.vehicle.camera
         shape = {"image_width_px": camera.width_px, "image_height_px": camera.height_px}
         if scenario.policy.program is not None:
@@ -69,7 +69,7 @@ def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
             },
         }
     pilot = scenario.pilot
-    # Velocities persist in the twin.
+    # The vectorized simulator repeats velocity commands without a timeout.
     by_rates = pilot.commands == "body_rates"
     return spec_of(
         None,
@@ -107,7 +107,7 @@ def navigation_of(
     trace: Trace | None = None,
     compensator: Compensator | None = None,
 ) -> Navigation:
-    """Return the vectorized simulator of a scenario, `slots` flights at a time, or UsageError."""
+    """Return the vectorized simulator of a scenario, `slots` flights in parallel, or UsageError."""
     asked = scenario.scenario
     return Navigation(
         environment_of(scenario),
@@ -128,24 +128,24 @@ def navigation_of(
 
 @dataclass(frozen=True)
 class GymFlier:
-    """Flies episodes in the vectorized simulator, whatever the slots. Implements `Flier`."""
+    """Flier in the vectorized simulator; results do not depend on the slots. Implements `Flier`."""
 
     scenario: ResolvedScenario
 
     def __post_init__(self) -> None:
-        """Raise UsageError for rules that the batch twin cannot fly by."""
+        """Raise UsageError for settings that the vectorized simulator does not support."""
         environment = environment_of(self.scenario)
         pipelined = environment.decisions == "pipelined"
         check_twin(self.scenario.scenario.faults, pipelined=pipelined)
 
     def episodes_per_job(self, episodes: int, workers: int) -> int:
-        """Return how many episodes make a job; see `fliers.Flier`."""
+        """Return the episodes per job; see `executors.Flier`."""
         return max(
             1, min(BLOCK_SLOTS * self.scenario.scenario.slots, math.ceil(episodes / workers))
         )
 
     def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (no logs here)
-        """Load the policy; see `fliers.Flier`."""
+        """Load the policy; see `executors.Flier`."""
         scenario = self.scenario
         pilots = pilots_of(scenario)
 
@@ -163,7 +163,7 @@ class GymFlier:
     def _episode(
         self, navigation: Navigation, trace: Trace, slot: int, flown: EpisodeResult, index: int
     ) -> FlownEpisode:
-        """Return the flight whose end its slot still shows."""
+        """Return the finished flight in a slot."""
         arena, rules = navigation.arenas[slot], navigation.spec.episode
         assert arena is not None  # noqa: S101 (it has just been flown in)
         outcome = OUTCOMES[flown.verdict]
@@ -181,7 +181,7 @@ class GymFlier:
             goal=arena.goal_point,
             goal_radius_m=rules.goal_radius_m,
             time_limit_s=rules.time_limit_s,
-            # The twin begins in a hover above the start: there is no take-off.
+            # The vectorized simulator starts in a hover above the start, without a take-off.
             started_us=0,
             navigation_us=0,
             ended_us=ended_us,
@@ -205,10 +205,10 @@ class GymFlier:
 
 
 def pilots_of(scenario: ResolvedScenario) -> Pilots:
-    """Return who decides for all vehicles."""
+    """Return the pilots of all vehicles."""
     loaded = scenario.fresh_policy(scenario.scenario.seed)
     if isinstance(loaded, LearnedPolicy):
-        # As the companion draws them.
+        # With the companion's random generator.
         return LearnedPilots(loaded, action_generator)
     seed = scenario.scenario.seed
     pilot = scenario.pilot
@@ -216,7 +216,7 @@ def pilots_of(scenario: ResolvedScenario) -> Pilots:
 
 
 def _reason(outcome: Outcome, flights: Flights, slot: int, arena: Arena, limit_s: float) -> str:
-    """Return why a flight ended, in the referee's words."""
+    """Return the reason for a flight's end, in the referee's words."""
     if outcome is Outcome.COLLISION:
         return f"hit {_name(arena, int(flights.touched[slot]))}"
     if outcome is Outcome.BATTERY:
@@ -226,6 +226,6 @@ def _reason(outcome: Outcome, flights: Flights, slot: int, arena: Arena, limit_s
 
 
 def _name(arena: Arena, touched: int) -> str:
-    """Return what was hit, as the plant calls it."""
+    """Return the name of the object that was hit, as in the plant."""
     room = {FLOOR: "floor", WALL: "wall", CEILING: "ceiling"}
     return room[touched] if touched in room else arena.name_of(touched)

@@ -1,4 +1,4 @@
-"""The fidelity ladder: the same policy and seeds at several levels."""
+"""Fidelity ladder: the same policy and seeds at several levels."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from airl_mav.scenario.model import LevelName, Scenario
 LEVELS: tuple[LevelName, ...] = ("gym", "lockstep", "sitl")
 
 SITL_EPISODES = 10
-"""Episodes at level sitl unless asked for: they take real time."""
+"""Default number of episodes at level sitl, which runs in real time."""
 
 FACTS = ("arena", "vehicle", "computer", "workload", "latency", "seed")
-"""Fields that head a ladder, beside the policy."""
+"""Fields in the header of a ladder, besides the policy."""
 
 
 def ladder(
@@ -68,7 +68,7 @@ def declare_ladder(
 
 
 def _at(level: LevelName, sitl_episodes: int) -> dict[str, object]:
-    """Return what differs at a level: fields that only others have are left at their default."""
+    """Return the changed fields at a level; fields without support there get their defaults."""
     if level == "sitl":
         return {"level": level, "episodes": sitl_episodes, "workers": None, "tlogs": False}
     return {"level": level, "speed": None}

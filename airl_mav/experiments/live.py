@@ -1,4 +1,4 @@
-"""Flights one after the other for `airl-sitl`; light to import, to start processes at once."""
+"""Sequential flights for `airl-sitl`; light to import, to start processes immediately."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ EXIT_CODES: dict[Ended, int] = {
 
 @dataclass(frozen=True)
 class FlownRun:
-    """What a run has come to."""
+    """Result of a run."""
 
     path: Path
     ended: Ended
     episodes: tuple[EpisodeRecord, ...]
-    """All that the folder holds, by index."""
+    """All episodes in the folder, by index."""
     new: int
-    """How many of them were flown now."""
+    """Number of episodes flown by this call."""
     problem: str = ""
 
 
@@ -57,7 +57,7 @@ def fly_live(
     announce: Callable[[], None] = lambda: None,
     view: ViewRequest | None = None,
 ) -> FlownRun:
-    """Fly the rest of a scenario one flight after the other, at level sitl or lockstep."""
+    """Fly the rest of a scenario, one flight after the other, at level sitl or lockstep."""
     asked = scenario.scenario
     if asked.level == "gym":
         raise FieldError("level", asked.level, "lockstep or sitl; airl evaluate flies the twin")
@@ -66,7 +66,7 @@ def fly_live(
     known = out is not None and (out / RUN_FILE).exists()
     with ExitStack() as held, terminated_as_interrupted():
         if out is not None:
-            # First of all: the processes of a run that was killed may be about to write.
+            # Lock first: processes of a killed run may still be writing.
             keeps = held.enter_context(locked(out, say))
         folder, done = open_folder(out, name or f"{asked.level}-{scenario.policy.name}", scenario)
         if out is None:
@@ -83,7 +83,7 @@ def fly_live(
         ended: Ended = "complete"
         problem = ""
         try:
-            # No process waits for another one meanwhile.
+            # Compile before any process waits for another one.
             compile_first([plan_of(scenario)], progress)
             if view is not None:
                 ends, observer = held.enter_context(_watched(scenario, view, live, progress))
@@ -118,8 +118,8 @@ def fly_live(
 def _watched(
     scenario: ResolvedScenario, asked: ViewRequest, onwards: Observer, progress: Progress
 ) -> Iterator[tuple[ViewEnds, Observer]]:
-    """Show flights: give where they connect, and who tells of them and passes it on."""
-    # Imported here: a run that nobody watches does without.
+    """Start a viewer; yield its connections and an observer that also notifies `onwards`."""
+    # Imported here: only runs with a viewer need it.
     from airl_mav.rehearsal.view_observer import ViewObserver
     from airl_mav.view.viewer import Viewer, ViewError, request_of
 
@@ -136,7 +136,7 @@ def _watched(
 
 
 def tell_end(path: Path, ended: Ended, problem: str, progress: Progress) -> None:
-    """Say why a run ended early, and how it goes on."""
+    """Report why a run ended early, and how to resume it."""
     if problem:
         progress.note(f"error: {problem}", "red")
     if ended != "complete":

@@ -1,7 +1,7 @@
-"""Worker processes of this machine: each takes one job after the other, a lost one is replaced.
+"""Executor with worker processes on this machine: each runs job after job; lost ones are replaced.
 
-Each worker has a pipe of its own, so a killed one cannot hold up the others. Workers are spawned,
-never forks: threads of MAVSDK and of ONNX Runtime do not survive one. A worker ends with its
+Each worker has a separate pipe, so a killed worker cannot block the others. Workers are spawned,
+never forked: threads of MAVSDK and ONNX Runtime do not survive a fork. A worker ends with its
 parent.
 """
 
@@ -30,11 +30,11 @@ from airl_mav.scenario.aircraft import GREATEST_INSTANCE, Aircraft
 from airl_mav.scenario.model import GREATEST_WORKERS, Workers
 
 END_S = 5.0
-"""A worker without work ends by itself in so long, or is killed [wall s]."""
+"""Timeout for an idle worker to exit before it is killed [wall s]."""
 
 
 class ProcessExecutor:
-    """At most `workers` worker processes of one thread each, which serve several runs."""
+    """Executor of at most `workers` single-threaded worker processes, shared by several runs."""
 
     streams: ClassVar[bool] = False
 
@@ -43,11 +43,11 @@ class ProcessExecutor:
         self._idle: list[_Idle] = []
 
     def __enter__(self) -> ProcessExecutor:
-        """Return it: no process is started before it has a job."""
+        """Return the executor; processes start with their first job."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the workers."""
+        """End all workers."""
         self.close()
 
     def run(
@@ -60,7 +60,7 @@ class ProcessExecutor:
         lost: Callable[[str], None] = lambda _: None,
         compiling: Heard = lambda _: None,
     ) -> executors.Results[executors.J, executors.R]:
-        """Carry out jobs; see `executors.Executor`. Only workers that are busy end with it."""
+        """Run jobs; see `executors.Executor`. Closing the generator ends only busy workers."""
         waiting = iter(jobs)
         pool: _Pool[executors.J] = _Pool(start, self._idle)
         try:
@@ -88,7 +88,7 @@ class ProcessExecutor:
                         continue
                     if isinstance(told, executors.Failure):
                         raise told.error(name(job))
-                    # The worker goes on before anything is done with its results.
+                    # The worker gets its next job before its results are processed.
                     pool.give(connection, waiting)
                     for result in told:
                         yield job, result
@@ -98,7 +98,7 @@ class ProcessExecutor:
             pool.end()
 
     def close(self) -> None:
-        """End the workers, which have nothing to do."""
+        """End all workers, which must be idle."""
         for idle in self._idle:
             idle.connection.close()
         for idle in self._idle:
@@ -108,7 +108,7 @@ class ProcessExecutor:
 
 
 class _Idle(NamedTuple):
-    """A worker without work."""
+    """Idle worker."""
 
     connection: Connection
     process: BaseProcess
@@ -116,32 +116,32 @@ class _Idle(NamedTuple):
 
 @dataclass
 class _Worker(Generic[executors.J]):
-    """A worker as its parent sees it."""
+    """State of a busy worker in the parent."""
 
     process: BaseProcess
     job: executors.J
     attempt: int
-    """Number of workers that this job has been given to."""
+    """Number of workers that have received this job."""
     compiles: bool = False
 
 
 class _Pool(Generic[executors.J]):
-    """The worker processes of one run."""
+    """Worker processes of one run."""
 
     def __init__(self, start: executors.Start[executors.J, Any], idle: list[_Idle]) -> None:
         self._start = start
         self.busy: dict[Connection, _Worker[executors.J]] = {}
         self._idle = idle
-        """Those without work: they are taken before new ones are started."""
+        """Idle workers, used before new ones are started."""
 
     def hire(self, job: executors.J, attempt: int = 1) -> None:
-        """Take a worker and give it its first job of this run."""
+        """Assign a worker to this run and send its first job."""
         worker = self._take_idle() or _spawn()
         self.busy[worker.connection] = _Worker(worker.process, job, attempt)
         _send(worker.connection, (self._start, job))
 
     def _take_idle(self) -> _Idle | None:
-        """Return a worker without work; those that were lost meanwhile are passed over."""
+        """Return an idle worker and remove lost ones; None if there is no idle worker."""
         while self._idle:
             worker = self._idle.pop()
             if worker.process.is_alive():
@@ -151,7 +151,7 @@ class _Pool(Generic[executors.J]):
         return None
 
     def give(self, connection: Connection, waiting: Iterator[executors.J]) -> None:
-        """Give a worker its next job, or let it wait for the next run."""
+        """Send a worker its next job, or keep it idle for the next run."""
         worker = self.busy[connection]
         try:
             worker.job, worker.attempt = next(waiting), 1
@@ -162,7 +162,7 @@ class _Pool(Generic[executors.J]):
             _send(connection, (None, worker.job))
 
     def bury(self, connection: Connection) -> str:
-        """Remove a worker that was lost; return how it ended."""
+        """Remove a lost worker; return the cause."""
         process = self.busy.pop(connection).process
         connection.close()
         process.kill()
@@ -172,7 +172,7 @@ class _Pool(Generic[executors.J]):
         return cause
 
     def end(self) -> None:
-        """End the workers that are at work, at once."""
+        """Kill all busy workers."""
         for connection, worker in self.busy.items():
             worker.process.kill()
             connection.close()
@@ -182,14 +182,14 @@ class _Pool(Generic[executors.J]):
 
 
 def _remove(process: BaseProcess) -> None:
-    """End a process, if it has not ended by itself, and free what is kept of it."""
+    """Kill a process that is still running, and release its resources."""
     process.kill()
     process.join()
     process.close()
 
 
 def _send(connection: Connection, job: Any) -> None:
-    # A worker that is lost shows when its answer is awaited.
+    # A lost worker is detected on reception of its answer.
     with suppress(OSError):
         connection.send(job)
 
@@ -197,7 +197,7 @@ def _send(connection: Connection, job: Any) -> None:
 def _spawn() -> _Idle:
     """Start a worker; return the parent's end of its pipe, and the process."""
     context = multiprocessing.get_context("spawn")
-    # Would be started with the first worker otherwise, and let Ctrl-C through again.
+    # Otherwise it would start with the first worker, and unblock Ctrl-C again.
     resource_tracker.ensure_running()
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs,), daemon=True)
@@ -212,7 +212,7 @@ def _spawn() -> _Idle:
 
 @contextmanager
 def _environment(values: dict[str, str]) -> Iterator[None]:
-    """Set environment variables for a while: a new process reads them before it runs anything."""
+    """Set environment variables temporarily; a new process reads them first."""
     before = {key: os.environ.get(key) for key in values}
     os.environ.update(values)
     try:
@@ -227,7 +227,7 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
 
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Block Ctrl-C while starting processes; the parent decides about its workers."""
+    """Block Ctrl-C while starting processes; the parent controls its workers."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -237,7 +237,7 @@ def _interrupts_blocked() -> Iterator[None]:
 
 @contextmanager
 def _program_hidden() -> Iterator[None]:
-    """Hide the user's program while starting processes, which "spawn" would run again."""
+    """Hide the user's main module while starting processes: "spawn" would run it again."""
     program = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -258,13 +258,13 @@ def _cause(exitcode: int | None) -> str:
 
 @dataclass(frozen=True)
 class _Compiling:
-    """A worker compiles kernels before it can answer, or has done so."""
+    """Message of a worker at the start and the end of kernel compilation."""
 
     begins: bool
 
 
 def _serve(connection: Connection) -> None:
-    """Carry out jobs until the pipe is closed; the first one of a run says how to start."""
+    """Run jobs until the pipe is closed; the first job of a run includes its initializer."""
     _end_with_parent()
     start: executors.Start[Any, Any] | None = None
     work: executors.Work[Any, Any] | None = None
@@ -272,13 +272,13 @@ def _serve(connection: Connection) -> None:
     def carry_out(job: Any) -> Iterable[Any]:
         nonlocal start, work
         if start is not None:
-            work = None  # What was loaded for the run before goes first.
+            work = None  # Release the previous run's data first.
             work, start = start(executors.never), None
         assert work is not None  # noqa: S101 (no run begins without a start)
         return work(job)
 
     def tell(begins: bool) -> None:
-        with suppress(OSError):  # The parent has gone, as is found with the answer.
+        with suppress(OSError):  # The parent has exited; the answer fails, too.
             connection.send(_Compiling(begins))
 
     while True:
@@ -291,12 +291,12 @@ def _serve(connection: Connection) -> None:
             told = executors.answer(partial(carry_out, job))
         try:
             connection.send(told)
-        except OSError:  # The parent has gone.
+        except OSError:  # The parent has exited.
             return
 
 
 def _end_with_parent() -> None:
-    """Start the parent-death guard: it ends this process, in the middle of anything."""
+    """Start the parent-death guard: it ends this process at any time."""
     parent = multiprocessing.parent_process()
     assert parent is not None  # noqa: S101 (this is a worker)
 
@@ -317,7 +317,7 @@ def side_by_side(settings: Workers) -> int:
 
 @contextmanager
 def open_executor(settings: Workers, *, in_process: bool = False) -> Iterator[executors.Executor]:
-    """Open the executor of the settings; one worker may be this process if `in_process`."""
+    """Open the configured executor; a single worker may be this process if `in_process`."""
     cores = min(usable_cores(), GREATEST_WORKERS)
     if settings.executor == "ray":
         # Imported here: Ray is an extra.

@@ -1,4 +1,4 @@
-"""A policy in 8-bit integers: calibrated with frames of its own flights, compared, and its card."""
+"""Quantization of a policy to 8-bit integers: calibration frames, comparison, and card."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ from airl_mav.scenario.piloting import action_generator
 from airl_mav.scenario.resolve import resolve
 
 FIRST_SEED = 900_000
-"""Evaluations fly from 1 on, the choice of the best weights from 500,000 on, training from
-1,000,000 on."""
+"""First seed of calibration flights. Evaluations start at seed 1, the choice of the best weights at
+500,000, and training at 1,000,000."""
 
 FLIGHTS = 200
 FRAMES, CHECKED = 512, 512
-"""Drawn from all frames of the flights: for the ranges, and for the comparison."""
+"""Numbers of random frames for calibration of the ranges, and for the comparison."""
 
 
 @dataclass
 class _Witness:
-    """A network that decides for all vehicles, and keeps what it saw. Implements `Pilots`."""
+    """Pilots of all vehicles with one network, recording its inputs. Implements `Pilots`."""
 
     pilots: LearnedPilots
     policy: LearnedPolicy
@@ -65,13 +65,13 @@ class _Witness:
 
 
 def frames_of(folder: Path, *, flights: int = FLIGHTS) -> tuple[Encoded, str, int]:
-    """Return a policy's inputs of flights on its own seeds, its training arena, the last seed."""
+    """Return inputs of a policy on reserved seeds, its training arena, and the last seed."""
     card = load_card(folder)
     arena = card.training.arena or DEFAULT_ARENA
     environment = training_environment(card) or {}
     asked: dict[str, Any] = {"arena": arena, "seed": FIRST_SEED, "episodes": flights}
     if "vehicle" in environment:
-        # Its camera fits the network.
+        # The vehicle's camera fits the network.
         asked["vehicle"] = environment["vehicle"]
     scenario = resolve(Scenario(level="gym", policy=str(folder), **asked))
     loaded = scenario.fresh_policy(FIRST_SEED)
@@ -97,8 +97,8 @@ def export_int8(
 ) -> PolicyCard:
     """Write a policy in 8-bit integers with its card, without the float policy's results.
 
-    Without a name it is called as the source, with `-int8`. Raises UsageError if the source is no
-    float policy, or cannot be flown or quantised, or `out` is the source or not writable.
+    The default name is the source's name with `-int8`. Raises UsageError if the source is not a
+    float policy, cannot be flown or quantized, or if `out` is the source or not writable.
     """
     card = load_card(source)
     if card.quantisation is not None:

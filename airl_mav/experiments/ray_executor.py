@@ -1,4 +1,4 @@
-"""Jobs as tasks of a Ray cluster, or of a local Ray; lost tasks restart here, with a message."""
+"""Executor on a Ray cluster or a local Ray; lost tasks restart here, with a message."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from airl_mav.experiments import executors
 from airl_mav.scenario.model import Workers
 
 LOCAL = "local"
-"""Address that starts a Ray of its own on this machine."""
+"""Address that starts a new Ray instance on this machine."""
 
 AUTO = "auto"
-"""Address of the Ray that runs on this machine."""
+"""Address of the running Ray instance on this machine."""
 
 MAX_PORT = 65_535
 
 CONNECT_S = 10.0
-"""Longest wait for a cluster's head to answer [wall s]."""
+"""Timeout for the connection to a cluster's head [wall s]."""
 
 
 @dataclass(frozen=True)
 class RayExecutor:
-    """Tasks of the Ray that `connected` has reached, one core each."""
+    """Executor of Ray tasks with one core each, created by `connected`."""
 
     workers: int
-    """Tasks given to Ray at a time; those without a free core wait there."""
+    """Maximum number of submitted tasks; tasks without a free core wait in Ray."""
     gpus: float = 0.0
-    """Share of a GPU that Ray keeps for a task."""
+    """Share of a GPU that Ray reserves for a task."""
     streams: ClassVar[bool] = False
 
     def run(
@@ -51,7 +51,7 @@ class RayExecutor:
         lost: Callable[[str], None] = lambda _: None,
         compiling: Heard = lambda _: None,  # noqa: ARG002 (see there)
     ) -> executors.Results[executors.J, executors.R]:
-        """Carry out jobs; see `executors.Executor`."""
+        """Run jobs; see `executors.Executor`."""
         import ray
 
         task = ray.remote(num_cpus=1, num_gpus=self.gpus, max_retries=0)(_carry_out)
@@ -77,7 +77,7 @@ class RayExecutor:
                     try:
                         told = ray.get(ref)
                     except ray.exceptions.RayTaskError as error:
-                        # Not the job, which answers for itself: it could not even begin.
+                        # The task failed before its job began: jobs return their own failures.
                         last = f"{error}".strip().splitlines()[-1]
                         raise executors.WorkerError(f"{name(job)}: {last}") from None
                     except ray.exceptions.RayError as error:
@@ -97,16 +97,16 @@ class RayExecutor:
 
 
 _started: dict[str, executors.Work[Any, Any]] = {}
-"""What this worker of Ray has loaded, by its key: of one run at a time."""
+"""Initialized work of one run in this Ray worker, by its key."""
 
 
 def _carry_out(key: str, pickled: bytes, job: Any) -> Any:
-    """Carry out a job, in a worker of Ray."""
+    """Run a job in a Ray worker."""
 
     def work() -> Iterable[Any]:
         if key not in _started:
             _started.clear()
-            # Before numba and its like are imported, which they are from here on.
+            # Set before numba and similar libraries are imported.
             os.environ.update(executors.ONE_THREAD)
             _started[key] = pickle.loads(pickled)(executors.never)  # noqa: S301 (from the driver, by Ray)
         results: Iterable[Any] = _started[key](job)
@@ -116,7 +116,7 @@ def _carry_out(key: str, pickled: bytes, job: Any) -> Any:
 
 
 def _check_reachable(address: str) -> None:
-    """Raise UsageError unless something listens at HOST:PORT: Ray itself would wait minutes."""
+    """Raise UsageError unless HOST:PORT accepts connections: Ray would wait for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) <= MAX_PORT:
         accepted = "local, auto, HOST:PORT or ray://HOST:PORT"
@@ -137,10 +137,10 @@ def connected(settings: Workers, cores: int, gpus: float) -> Iterator[RayExecuto
     if address not in (LOCAL, AUTO):
         _check_reachable(address)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # A task without a GPU hides all GPUs from itself in any case.
+    # Tasks without a GPU hide all GPUs in any case.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "1")
     if local:
-        # Its workers find this very package, installed or not.
+        # Lets Ray's workers import this package, installed or not.
         here = f"{Path(__file__).resolve().parents[2]}"
         known = os.environ.get("PYTHONPATH")
         os.environ["PYTHONPATH"] = here if known is None else f"{here}{os.pathsep}{known}"

@@ -1,4 +1,4 @@
-"""A recorded flight, rehearsed on what was fitted to it, as a whole and part by part."""
+"""Rehearsals of a recorded flight with its fitted parameters, all together and part by part."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from airl_mav.refitting.files import REFIT_FILE, VEHICLE_FILE
 from airl_mav.refitting.refit import SCHEMA
 
 PARTS_FOLDER, PARTS_FILE = "parts", "parts.json"
-"""Of the rehearsals with one part each, and of what came of them."""
+"""Folder of the rehearsals with one part each, and file of their results."""
 
 NOTHING, LATENCY, VEHICLE, WIND, ALL = "nothing", "latency", "vehicle", "wind", "all"
-"""What of a refit a rehearsal has; `nothing`: the profile in calm air, decided at once."""
+"""Parts of a refit in a rehearsal; `nothing`: profile, calm air, no injected latency."""
 
 PARTS_SCHEMA = 1
 
 
 @dataclass(frozen=True)
 class _Wind:
-    """As `refit.json` has it."""
+    """Wind in `refit.json`."""
 
     north_m_s: Annotated[float, Field(ge=-50, le=50)]
     east_m_s: Annotated[float, Field(ge=-50, le=50)]
@@ -35,7 +35,7 @@ class _Wind:
 
 @dataclass(frozen=True)
 class _Refit:
-    """What of `refit.json` a rehearsal needs."""
+    """Fields of `refit.json` that rehearsals need."""
 
     vehicle: str
     wind: _Wind | None
@@ -43,21 +43,21 @@ class _Refit:
 
 @dataclass(frozen=True)
 class PartFlown:
-    """Rehearsals with a part of a refit, beside the flight."""
+    """Rehearsals with a part of a refit, compared with the flight."""
 
     part: str
     rehearsals: int
     reached: int
     time_s: float | None
-    """Their median time [s]; None: none came."""
+    """Median time of the successful rehearsals [s]; None = no success."""
     time_share: float | None
-    """How far that is from the flight's, as a share of it."""
+    """Difference from the flight's time, as a share of the flight's time; None = no success."""
     apart_m: float
-    """Median distance of the flown path from a rehearsed one [m], median of the rehearsals."""
+    """Median distance of the flown path from a rehearsed path [m], median of the rehearsals."""
 
 
 def changes_of(folder: Path) -> Changes:
-    """Return what rehearsals have by a refit. Raises UsageError where the folder holds none."""
+    """Return the changes by a refit. Raises UsageError if the folder does not contain a refit."""
     told = _read(folder)
     wind = None if told.wind is None else WindSettings(**vars(told.wind))
     return Changes(vehicle=str(folder / VEHICLE_FILE), wind=wind)
@@ -77,8 +77,8 @@ def refly_parts(
 ) -> tuple[Reflight, tuple[PartFlown, ...]]:
     """Rehearse a recorded flight with a whole refit, each part of it, and none, on equal seeds.
 
-    The change made by one part alone is what it explains. The parts need not add up. `out` gets
-    `parts` beside the folders of `refly`, which has the other arguments.
+    The change made by one part alone is the contribution of that part. Contributions need not add
+    up. `out` gets `parts` beside the folders of `refly`; see there for the other arguments.
     """
     everything, base = changes_of(folder), _read(folder).vehicle
     nothing = Changes(vehicle=base, prompt=True)

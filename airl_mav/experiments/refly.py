@@ -1,4 +1,4 @@
-"""A recorded flight, rehearsed: the same policy, goal and latencies in lockstep, beside it."""
+"""Rehearsals of a recorded flight: the same policy, goal and latencies in lockstep."""
 
 from __future__ import annotations
 
@@ -32,33 +32,33 @@ from airl_mav.scenario.model import Decisions, Scenario
 from airl_mav.scenario.resolve import resolve
 
 FLOWN, REHEARSED = "flown", "rehearsed"
-"""Folders of the two runs, and what they are called."""
+"""Folders and names of the two runs."""
 
 ARENA_FILE = "arena.toml"
 LATENCIES_FILE = "latencies.txt"
 
 CLEAR_M = 30.0
-"""Walls of an arena that is made for a flight are this far from its start and its goal [m]. Farther
-than any shipped camera sees."""
+"""Distance from start and goal to the walls of a generated arena [m]. Exceeds the range of all
+shipped cameras."""
 
 SAME_GOAL_M = 1.0
-"""The goals of a flight and of its arena may be this far apart [m]."""
+"""Maximum distance between the goals of a flight and of its arena [m]."""
 
 
 @dataclass(frozen=True)
 class Changes:
-    """What rehearsals of a flight have otherwise than the flight's own settings say."""
+    """Changes to the flight's settings in its rehearsals."""
 
     vehicle: str | None = None
     wind: WindSettings | None = None
-    """In the flight's own directions; None: calm."""
+    """Wind in the flight's frame; None = calm."""
     latency: str | None = None
-    """As `Scenario.latency`; None: that of the flight, decision by decision."""
+    """Latency as in `Scenario.latency`; None = the recorded latency of each decision."""
     computer: str | None = None
-    """With a workload: where the latency is from, in the place of the flight's."""
+    """Computer whose latency replaces the flight's, with its workload; None = no replacement."""
     workload: str | None = None
     prompt: bool = False
-    """Whether nothing is injected: decisions take what a desktop computer takes."""
+    """True disables injected latency: decisions take as long as on a desktop computer."""
 
 
 AS_FLOWN = Changes()
@@ -66,28 +66,28 @@ AS_FLOWN = Changes()
 
 @dataclass(frozen=True)
 class Reflight:
-    """What a flight did, and what its rehearsals did."""
+    """Result of a flight and its rehearsals."""
 
     outcome: Outcome
     flown_s: float
-    """Its time from the start of navigation [s]."""
+    """Flight time from the start of navigation [s]."""
     rehearsals: int
     rehearsed_s: tuple[float, ...]
-    """The same of those rehearsals that reached the goal."""
+    """Flight times of the successful rehearsals [s]."""
     apart_m: NDArray[np.float64]
-    """(n,) horizontal distance of the points of the flown path from the nearest one of all
-    rehearsed paths [m]."""
+    """Horizontal distances (n,) from the flown path's points to the nearest point of all rehearsals
+    [m]."""
     each_apart_m: tuple[float, ...] = ()
-    """The median of that from each rehearsed path by itself [m]."""
+    """Median distance for each rehearsed path alone [m]."""
 
     @property
     def rehearsed_time_s(self) -> float | None:
-        """Median time of the rehearsals that reached the goal [s]; None: none did."""
+        """Median flight time of the successful rehearsals [s]; None = no success."""
         return float(np.median(self.rehearsed_s)) if self.rehearsed_s else None
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Say it."""
+        """Summary as sentences."""
         times = sorted(self.rehearsed_s)
         reached = f"{len(times)} of {self.rehearsals} rehearsals reached the goal"
         if times:
@@ -117,15 +117,14 @@ def refly(
 ) -> Reflight:
     """Rehearse a recorded flight several times, with different sensor noise.
 
-    Discrete decisions amplify centimetres into another way around a tree. So flights differ by
-    sensor noise. The recorded flight is compared with all rehearsals. Without an arena they fly
-    over an empty plain, and both paths start at the origin, heading north. An arena, which the
-    flight was in, keeps its frame. Its seed is the flight's unless another is given. The policy is
-    the recorded one, by its name, unless another is given. `out` becomes the folder of the run
-    folders `flown` and `rehearsed`.
+    Discrete decisions amplify centimetres into another path around a tree. Sensor noise therefore
+    varies between rehearsals, and the recorded flight is compared with all of them. Without an
+    arena they fly over an empty plain, and both paths start at the origin, heading north. With the
+    flight's arena, its frame is kept. Arena seed and policy are the flight's by default. `out`
+    becomes the folder of the run folders `flown` and `rehearsed`.
 
-    Raises UsageError for a recording without navigation or with unusable settings, and if `out`
-    holds something.
+    Raises UsageError for a recording without navigation or with unusable settings, and if `out` is
+    not empty.
     """
     box = read_black_box(path)
     episode, info = episode_of(box), info_of(box)
@@ -198,7 +197,7 @@ def from_its_start(episode: FlownEpisode) -> FlownEpisode:
 
 
 def turned_wind(wind: WindSettings, angle_rad: float) -> WindSettings:
-    """Return a wind whose direction is turned by an angle about down [rad]."""
+    """Return a wind with its direction rotated by an angle about down [rad]."""
     north, east = wind.north_m_s, wind.east_m_s
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     turned = {"north_m_s": cos * north - sin * east, "east_m_s": sin * north + cos * east}
@@ -206,14 +205,14 @@ def turned_wind(wind: WindSettings, angle_rad: float) -> WindSettings:
 
 
 def _begun(episode: FlownEpisode) -> int:
-    """Return the number of the newest sample when navigation began."""
+    """Return the index of the newest sample at the start of navigation."""
     navigation_us = episode.record.navigation_us or 0
     before = int(np.searchsorted(episode.trajectory.time_us, navigation_us, side="right")) - 1
     return max(before, 0)
 
 
 def _first_yaw(episode: FlownEpisode) -> float:
-    """Return the heading with which navigation began [rad]."""
+    """Return the heading at the start of navigation [rad]."""
     return quat_yaw(episode.trajectory.quaternion[_begun(episode)])
 
 
@@ -230,7 +229,7 @@ def _changed(changes: Changes, wind: WindSettings | None) -> dict[str, Any]:
 
 
 def distances(flown: Trajectory, rehearsed: Trajectory) -> NDArray[np.float64]:
-    """Return how far the points (n,) of a path are from the nearest ones of another [m], level."""
+    """Return the horizontal distances (n,) of a path's points from the nearest of another [m]."""
     between = flown.position[:, None, :2] - rehearsed.position[None, :, :2]
     return np.asarray(np.linalg.norm(between, axis=2).min(axis=1), np.float64)
 
@@ -240,7 +239,7 @@ def _navigated(path: Trajectory, record: Any) -> Trajectory:
 
 
 def _write_latencies(episode: FlownEpisode, path: Path) -> None:
-    """Write the latencies of the decisions, as `--latency FILE` reads them."""
+    """Write the latencies of all decisions in the format of `--latency FILE`."""
     t2_us = episode.latency["action_ready_us"] - episode.latency["infer_start_us"]
     lines = [f"{value / US_PER_MS:.3f}\n" for value in t2_us]
     replace_file(path, "".join(lines).encode())
@@ -276,7 +275,7 @@ def _plain(episode: FlownEpisode, path: Path) -> str:
 
 
 def _scenario(box: BlackBox, latencies: Path, given: dict[str, Any]) -> Scenario:
-    """Return the rehearsal of a flight: what its companion was asked for, in lockstep."""
+    """Return the scenario of a flight's rehearsals: the companion's settings, at level lockstep."""
     asked = box.run["config"]
     names = (*Decisions.model_fields, "vehicle", "policy", "seed")
     kept = {name: asked[name] for name in names if name in asked}
@@ -284,7 +283,7 @@ def _scenario(box: BlackBox, latencies: Path, given: dict[str, Any]) -> Scenario
         "level": "lockstep",
         "latency": str(latencies),
         "time_limit_s": settings_of(box).limits.flight_s,
-        "cpu_quota": None,  # What its processor took is in the latencies.
+        "cpu_quota": None,  # Recorded latencies include its effect.
     }
     return validated(Scenario, {**kept, **how, **given}, box.path)
 

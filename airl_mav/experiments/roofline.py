@@ -1,4 +1,4 @@
-"""The roofline: how fast a vehicle may fly for how fast it reacts, and where computers put it."""
+"""Roofline: maximum safe speed against reaction rate, with the points of computers."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ SCHEMA = 1
 RESULT_FILE = "roofline.json"
 
 OWN_WORKLOAD = "policy"
-"""In place of a workload: what was measured for the very policy."""
+"""Workload name for measurements of the policy itself."""
 
 
 class RooflineRequest(ProfileModel):
-    """A vehicle, what it sees and who decides, and the computers that it might carry."""
+    """Vehicle, sensing, policy and candidate computers of a roofline."""
 
     computers: tuple[str, ...] = Field(
         default=(model.ONBOARD_COMPUTER, model.REFERENCE_COMPUTER),
@@ -94,12 +94,12 @@ class RooflineRequest(ProfileModel):
 
 @dataclass(frozen=True)
 class RooflineResult:
-    """What `roofline` found, and where it lies."""
+    """Result of `roofline`."""
 
     found: Roofline
     document: Document
     page: Path
-    """roofline.html; beside it roofline.json, roofline.md and roofline.png."""
+    """Path of roofline.html, in a folder with roofline.json, roofline.md and roofline.png."""
 
 
 def roofline(
@@ -108,7 +108,7 @@ def roofline(
     """Compute and fly the roofline of a vehicle.
 
     Args:
-        request: The request; None = made of `knobs`.
+        request: Roofline settings; None = built from `knobs`.
         out: Folder; None = `runs/<UTC time>-roofline-<vehicle>`.
         knobs: Fields of the request.
 
@@ -128,7 +128,7 @@ def roofline(
 
 
 def find_roofline(request: RooflineRequest) -> Roofline:
-    """Work out and fly a roofline; see `roofline`. Nothing is written. Raises UsageError."""
+    """Compute and fly a roofline without writing files; see `roofline`. Raises UsageError."""
     if request.workload == ESTIMATE:
         raise FieldError("workload", ESTIMATE, f"a measured workload, or {OWN_WORKLOAD}")
     if len(set(request.computers)) < len(request.computers) or not request.computers:
@@ -194,7 +194,7 @@ def _with_frame_rate(vehicle: VehicleProfile, rate_hz: float | None) -> VehicleP
 def _noticed(
     policy: PolicyInfo, vehicle: VehicleProfile, request: RooflineRequest
 ) -> tuple[float, ...]:
-    """Measure at which depths the policy takes notice. Raises UsageError where it cannot be."""
+    """Return the depths at which the policy reacts [m]. Raises UsageError if not measurable."""
     if policy.card is None or policy.folder is None:
         raise FieldError(
             "sensing_distance_m", problem=f"needed: policy {policy.name} is no network"
@@ -218,7 +218,7 @@ def _noticed(
 
 
 def _measured(computer: ComputerProfile, workload: str, policy: PolicyInfo) -> Injection | str:
-    """Return the latency of a computer, or why there is none."""
+    """Return the latency of a computer, or the reason why it is missing."""
     if workload == OWN_WORKLOAD:
         found = choose_injection(computer, policy_sha256=policy.sha256)
         if found.latency is None:

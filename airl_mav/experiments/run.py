@@ -1,4 +1,4 @@
-"""A run as Python sees it: its episodes, quality of flight, latencies, paths and report."""
+"""Python API of a run: episodes, quality of flight, latencies, paths and report."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder, read. What is large is read when it is first asked for."""
+    """Loaded run folder. Large data is read on first access."""
 
     path: Path
 
@@ -26,12 +26,12 @@ class Run:
 
     @property
     def info(self) -> RunInfo:
-        """What was flown on what: settings, seeds, versions, machine."""
+        """Settings, seeds, versions and machine of the run."""
         return self._loaded.info
 
     @property
     def episodes(self) -> tuple[EpisodeRecord, ...]:
-        """The record of each episode, by index."""
+        """Records of all episodes, by index."""
         return self._loaded.episodes
 
     @cached_property
@@ -56,30 +56,30 @@ class Run:
 
     @property
     def sha256(self) -> str | None:
-        """Fingerprint of all lockstep flights, equal if bit-identical; None at other levels."""
+        """Digest of all lockstep flights, equal if bit-identical; None at other levels."""
         return run_sha256(self.episodes)
 
     @property
     def complete(self) -> bool:
-        """Whether all planned episodes have been flown."""
+        """True if all planned episodes have been flown."""
         return len(self.episodes) == len(self.info.seeds)
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: the verdict, the figures and a map of the flights."""
+        """Return the notebook view: the verdict, the statistics and a map of the flights."""
         from airl_mav.report.notebook import run_html
 
         return run_html(self._loaded)
 
     def report(self) -> Path:
         """Write the page and pictures of the run and return the page, or raise UsageError."""
-        # Here: matplotlib is half a second that a run without a page need not wait for.
+        # Imported here: matplotlib takes half a second, which runs without a page do not need.
         from airl_mav.report.run_report import write_report
 
         return write_report(self.path)
 
 
 def load_run(path: Path | str) -> Run:
-    """Read a run folder; raise UsageError if it holds no run or is damaged."""
+    """Read a run folder; raise UsageError if it is damaged or contains no run."""
     run = Run(Path(path))
-    _ = run.info  # What is wrong with the folder is found now.
+    _ = run.info  # Checks the folder.
     return run

@@ -1,9 +1,9 @@
-"""The folder of a campaign: resumable evaluations or trainings that belong together.
+"""Campaign folders: resumable evaluations or trainings that belong together.
 
-    campaign.json   the declaration: the cells, comparisons, settings
-    <cell>/         the run folder of an evaluation, the training folder of a trial
+    campaign.json   the declaration: cells, comparisons, settings
+    <cell>/         run folder of an evaluation, or training folder of a trial
 
-The declaration is written first and atomically. The cells' folders alone say what is done.
+The declaration is written first and atomically. Progress is derived from the cells' folders.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class DeclaredCell:
-    """One evaluation, or one trial."""
+    """One evaluation or one training trial."""
 
     title: str
     settings: dict[str, Any] = field(default_factory=dict)
-    """What is done; a cell with other settings is another one."""
+    """Settings of the flights or the training, which identify the cell."""
     folder: str | None = None
-    """The cell that has the same flights; None: it has its own."""
+    """Cell with the same flights, whose folder is shared; None = a separate folder."""
     role: str = ""
-    """What it is in the comparison: `reference`, `target`, a latency, a level."""
+    """Role in the comparison: `reference`, `target`, a latency, a level."""
     group: str = ""
-    """Cells of one group are compared with each other."""
+    """Group of cells that are compared with each other."""
 
 
 @dataclass(frozen=True)
 class Declaration:
-    """What a campaign is made of."""
+    """Contents of a campaign."""
 
     kind: str
-    """Which experiment: gap, ladder, sweep, ..."""
+    """Kind of experiment: gap, ladder, sweep, ..."""
     settings: dict[str, Any]
     cells: dict[str, DeclaredCell]
-    """By name: that of the cell's folder."""
+    """Cells by name, which is the name of the cell's folder."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a name that cannot be a folder's."""
+        """Raise ValueError for a cell name that is not a valid folder name."""
         for name in self.cells:
             if Path(name).name != name or name in ("", "..", CAMPAIGN_FILE):
                 raise ValueError(f"cell {name!r}: accepted: the name of a folder")
@@ -59,11 +59,11 @@ class Declaration:
 
 @dataclass(frozen=True)
 class Campaign:
-    """What `campaign.json` holds."""
+    """Content of `campaign.json`."""
 
     declaration: Declaration
     made: dict[str, Any]
-    """With what it was begun: `created_utc`, `command`, `versions`, `machine`, `git`."""
+    """Provenance at creation: `created_utc`, `command`, `versions`, `machine`, `git`."""
     schema: int = SCHEMA
 
 
@@ -77,7 +77,7 @@ def load_campaign(path: Path) -> Campaign:
 
 @dataclass(frozen=True)
 class CampaignStore:
-    """A campaign on disk. Goes to other processes by pickle."""
+    """Campaign on disk. Sent to other processes by pickle."""
 
     path: Path
     campaign: Campaign
@@ -100,8 +100,8 @@ def open_campaign(
     """Open and lock a campaign's folder, new or to resume; cells may be added or left for later.
 
     Settings in `free`, or in tables named there, may differ on resumption. Numeric cell settings in
-    `growing` may grow. `say` is called when another process has the folder. Raises UsageError if
-    the content or a setting is another one.
+    `growing` may grow. `say` is called when another process has locked the folder. Raises
+    UsageError for other content or changed settings.
     """
     path = path.absolute()
     with locked(path, say):
@@ -115,7 +115,7 @@ def _declare(
     free: Collection[str],
     growing: Collection[str],
 ) -> Campaign:
-    """Write the declaration, unless it contradicts the one that is there."""
+    """Write the declaration; raise UsageError if it contradicts an existing one."""
     check_folder(path, CAMPAIGN_FILE)
     if not (path / CAMPAIGN_FILE).exists():
         campaign = Campaign(declaration, provenance(command))
@@ -136,7 +136,7 @@ def _declare(
 def _difference(
     held: Declaration, asked: Declaration, free: Collection[str], growing: Collection[str]
 ) -> str | None:
-    """Return the first setting that differs, or None."""
+    """Return a description of the first difference, or None."""
     if held.kind != asked.kind:
         return f"kind = {held.kind!r}, not {asked.kind!r}"
     if difference := another_config(held.settings, asked.settings, free):

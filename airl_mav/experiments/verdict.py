@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SoughtVerdict:
-    """What was flown, and what it came to."""
+    """Result of a sequential test."""
 
     path: Path
-    """Its folder: a run folder for the onboard computer and one for the reference."""
+    """Folder with a run folder for the onboard computer and one for the reference."""
     ended: Ended
     verdict: OverallVerdict | None = None
-    """None: it was interrupted or broken off."""
+    """Verdict; None = the test was interrupted or ended with an error."""
     comparison: Comparison | None = None
     runs: show.Runs | None = None
 
@@ -52,7 +52,7 @@ def seek_verdict(
     out: Path | None = None,
     progress: Progress,
 ) -> SoughtVerdict:
-    """Fly a policy on its onboard computer until it is decided, then the reference."""
+    """Fly a policy on its onboard computer until the test is decided, then on the reference."""
     tests = [each.test() for each in requirements if each.least_rate]
     if not tests:
         raise FieldError("require", accepted="at least one least success rate: 'success >= 95 %'")
@@ -76,17 +76,17 @@ def seek_verdict(
                 return SoughtVerdict(out, flown.ended)
             reached = reached_goals(flown.episodes)
             decided = all(test.decide(reached) is not Decision.UNDECIDED for test in tests)
-            # Of flights that stayed invalid there is no verdict, and more do not make one.
+            # Flights that remain invalid prevent a verdict; further flights do not help.
             if decided or len(reached) < n:
                 break
         flown = fly(undelayed, max(n, _planned(out / undelayed.name)))
     if flown.ended != "complete":
         return SoughtVerdict(out, flown.ended)
-    # Imported here: no flight waits for figures to be loaded.
+    # Imported here: flights do not need the figures.
     from airl_mav.report.comparison import show
 
     facts = {**declared.facts, "episodes": n, show.FLOWN_UNTIL: "the success rate was decided"}
-    # The number planned is that of the last look, as the run says itself.
+    # The last interim analysis sets the planned number, which the run folder contains.
     entries = [replace(entry_of(cell, cell.name), planned=None) for cell in (undelayed, target)]
     comparison, runs = show.build_comparison(out, declared.kind, facts, entries)
     verdict = show.judge_comparison(comparison, runs, requirements)
@@ -96,13 +96,13 @@ def seek_verdict(
 def _fly(
     cell: Cell, n: int, *, out: Path, progress: Progress, executor: Executor | None
 ) -> FlownRun:
-    """Fly the first n episodes of a cell, as far as they are not there."""
+    """Fly the missing episodes among the first n of a cell."""
     asked = cell.scenario.scenario.model_copy(update={"episodes": n})
     return fly_scenario(resolve(asked), out / cell.name, progress, executor=executor)
 
 
 def _planned(run: Path) -> int:
-    """Return how many episodes a run folder plans; 0: there is none."""
+    """Return the planned number of episodes of a run folder; 0 = no run."""
     return len(load_info(run).seeds) if (run / RUN_FILE).exists() else 0
 
 

@@ -1,1 +1,1 @@
-"""Faults of a flight: what can fail, how it is written down, and when it acts."""
+"""Faults of a flight: catalogue, text format and schedule."""

@@ -1,4 +1,4 @@
-"""The faults of the matrix, and how a flight may end with each of them."""
+"""Faults of the matrix, and the allowed results of a flight with each."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from typing import Literal
 from airl_mav.faults.kinds import Phase
 
 End = Literal["not armed", "landed", "crashed", "flying", "flown away", "broken"]
-"""How a flight can end.
+"""Result of a flight.
 
-not armed: it was refused; landed: on the ground, motors off, touched down slower than a landing may
-be; crashed: faster, or upside down; flying: still in the air at the end of the time; flown away:
-further from home, or higher, than the bound; broken: a number that is none, or an exception.
+not armed: arming was rejected; landed: on the ground, motors off, touchdown below the maximum
+landing speed; crashed: faster, or upside down; flying: still in the air at the end; flown away:
+further from home, or higher, than the bound; broken: NaN or infinity, or an exception.
 """
 
 MATRIX_PHASES: tuple[Phase, ...] = (*("ground", "climb", "hold", "offboard", "mission", "landing"),)
 
 SAFE: frozenset[End] = frozenset({"landed"})
 FALLS: frozenset[End] = frozenset({"landed", "crashed"})
-"""Nothing is left to fly with: it comes down, and stays within the bounds."""
+"""Results without control: the vehicle falls, within the bounds."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One fault of the matrix."""
+    """Fault of the matrix."""
 
     fault: str
-    """In words, without a time."""
+    """Fault specification as text, without a time."""
     ends: frozenset[End] = SAFE
-    """How a flight may end that was in the air when it happened."""
+    """Allowed results if the fault began in the air."""
     on_ground: frozenset[End] = frozenset({"not armed", "landed"})
-    """How a flight may end that was on the ground."""
+    """Allowed results if the fault began on the ground."""
 
     def allowed(self, phase: Phase) -> frozenset[End]:
-        """Return how a flight may end."""
+        """Return the allowed results for a phase."""
         return self.on_ground | self.ends if phase == "ground" else self.ends
 
 
@@ -72,11 +72,11 @@ CASES: tuple[Case, ...] = (
     Case("wind gust 6,0,0m/s for 4s"),
     Case("wind step 5,0,0m/s"),
 )
-"""What PX4 is expected to survive, and what no quadrotor does. Of the flight controller alone: the
-camera, and the link beyond what it carries, are the companion's."""
+"""Faults that PX4 is expected to survive, and faults that no quadrotor survives. Covers the flight
+controller alone: camera and link faults belong to the companion."""
 
 STANDS: frozenset[End] = frozenset({"landed", "flying"})
-"""It comes down safely, and may not be told that it stands: its motors go on."""
+"""Results without a landing detection: safe, but the motors may keep running."""
 
 FITTED_CASES: tuple[Case, ...] = (
     Case("rangefinder off"),
@@ -87,6 +87,6 @@ FITTED_CASES: tuple[Case, ...] = (
     Case("flow stuck"),
     Case("flow noise 5x"),
 )
-"""Of sensors that not every vehicle has: in no matrix but one that asks for them."""
+"""Faults of optional sensors, flown only on request."""
 
 CASE_OF: Mapping[str, Case] = {case.fault: case for case in (*CASES, *FITTED_CASES)}

@@ -1,7 +1,7 @@
-"""What can fail, how, and by how much: the one table of all faults.
+"""Table of all faults: parts, kinds and amounts.
 
-A fault is a part and a kind: `gps off`, `motor2 weak`. Each kind says what its amount means, in
-which unit and range, and at which levels of the fidelity ladder it can be flown.
+A fault is a part and a kind: `gps off`, `motor2 weak`. Each kind defines its amount's meaning, unit
+and range, and the fidelity levels that support the fault.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ Part = Literal[
     "companion",
     "firmware",
 ]
-"""What fails. Motors have PX4's numbers: 1 front right, 2 rear left, 3 front left, 4 rear right.
-`uplink` is from the companion to the flight controller, `downlink` the other way, `link` both.
+"""Part that fails. Motors use PX4's order: 1 front right, 2 rear left, 3 front left, 4 rear right.
+`uplink` is from the companion to the flight controller, `downlink` the reverse, `link` both.
 `companion` and `firmware` are the processes of a rehearsal."""
 
 Phase = Literal["ground", "climb", "hold", "offboard", "mission", "return", "landing"]
-"""Phases of a flight that can set a fault off, by what the flight controller flies."""
+"""Flight phase that can trigger a fault, by the flight controller's mode."""
 
 SENSORS: tuple[Part, ...] = (
     *("accel", "gyro", "mag", "baro", "gps"),
@@ -53,9 +53,9 @@ PROCESSES: tuple[Part, ...] = ("companion", "firmware")
 
 ANY_LEVEL = ("gym", "lockstep", "sitl")
 WITH_FIRMWARE = ("lockstep", "sitl")
-"""The batch twin has no such part."""
+"""Levels with firmware; the vectorized simulator lacks these parts."""
 WITH_PROCESSES = ("sitl",)
-"""Elsewhere it is no process of its own."""
+"""Levels where the firmware is a separate process."""
 
 _SECONDS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3}
 _SHARE: Mapping[str, float] = {"": 1.0, "%": 0.01}
@@ -64,47 +64,47 @@ _TIMES: Mapping[str, float] = {"": 1.0, "x": 1.0}
 
 @dataclass(frozen=True)
 class Amount:
-    """How much of a fault: one number, or three along the axes."""
+    """Amount of a fault: one number, or several along the axes."""
 
     meaning: str
     unit: str
-    """Unit of the numbers as they are kept; "" when they have none."""
+    """Stored unit of the numbers; "" = no unit."""
     low: float
     high: float
-    """Least and greatest number allowed."""
+    """Minimum and maximum."""
     units: Mapping[str, float]
-    """Units that may be written, and what a number in each is multiplied by."""
+    """Accepted units, each with its factor to the stored unit."""
     width: int = 1
-    """Numbers: 1 or 3."""
+    """Number of values: 1, 2 or 3."""
 
     @property
     def accepted(self) -> str:
-        """What is accepted, in words: "three numbers, -100 <= value <= 100 m"."""
+        """Return the accepted range as text: "three numbers, -100 <= value <= 100 m"."""
         limits = f"{self.low:g} <= value <= {self.high:g}" + (f" {self.unit}" if self.unit else "")
         return limits if self.width == 1 else f"three numbers, {limits}"
 
 
 @dataclass(frozen=True)
 class Kind:
-    """One way in which a part can fail."""
+    """Failure mode of a part."""
 
     meaning: str
     amount: Amount | None = None
-    """None: it has no amount."""
+    """Amount; None: no amount."""
     lasts: bool = True
-    """Whether it can be given a duration; if not, it happens once and is not undone."""
+    """True if it can have a duration; False: it happens once and stays."""
     needs_duration: bool = False
     levels: tuple[str, ...] = WITH_FIRMWARE
-    """Rungs of the fidelity ladder at which it acts."""
+    """Fidelity levels at which it acts."""
 
 
 @dataclass(frozen=True)
 class _Sensor:
-    """What the faults of one sensor are measured in."""
+    """Units and bounds of a sensor's faults."""
 
     unit: str
     bias: float
-    """Greatest bias."""
+    """Maximum bias."""
     units: Mapping[str, float]
     width: int = 3
     off: str = "it measures nothing any more"
@@ -256,28 +256,28 @@ KINDS: Mapping[tuple[Part, str], Kind] = {
     **{(part, kind): what for part in MOTORS for kind, what in _MOTOR_KINDS.items()},
     **_OTHER_KINDS,
     **{(part, kind): what for part in LINKS for kind, what in _LINK_KINDS.items()},
-    # The twin has setpoints, and no telemetry or commands that could be late.
+    # The vectorized simulator has delayed setpoints, but no telemetry or commands.
     ("uplink", "delay"): replace(_LINK_KINDS["delay"], levels=ANY_LEVEL),
 }
 """All faults, by part and kind."""
 
 
 NOISE_SEED = 1 << 32
-"""Times a fault's number from 1 this is added to the episode's seed where it makes a camera noisy.
-That noise is not the healthy camera's."""
+"""Multiplied by a camera noise fault's number, from 1, and added to the episode's seed, so that its
+noise differs from the healthy camera's."""
 
 
 def kind_of(part: str, kind: str) -> Kind | None:
-    """Return what the table says of a fault; None for what is none."""
+    """Return the entry of a fault; None for an unknown fault."""
     return next((what for known, what in KINDS.items() if known == (part, kind)), None)
 
 
 def kinds_of(part: str) -> tuple[str, ...]:
-    """Return the names of the ways in which a part can fail; none for what is no part."""
+    """Return the kinds of a part; empty for an unknown part."""
     return tuple(kind for known, kind in KINDS if known == part)
 
 
-# --- faults in words: `gps off at 8s for 5s`, `motor2 weak 60% at offboard+2s`
+# --- faults as text: `gps off at 8s for 5s`, `motor2 weak 60% at offboard+2s`
 #
 #     FAULT  = PART KIND [AMOUNT] [at WHEN] [for TIME]
 #     AMOUNT = NUMBER[,NUMBER,NUMBER][ ][UNIT]
@@ -297,7 +297,7 @@ KIND_WORDS = {
     "delayed": "delay",
     "late": "delay",
 }
-"""Other words for kinds; only where the part has no kind of that very name."""
+"""Synonyms of kinds, used only if the part has no kind with this name."""
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _AMOUNT = re.compile(rf"({_NUMBER}(?:,{_NUMBER})*)(.*)")
@@ -306,7 +306,7 @@ _MS_PER_S = 1000.0
 
 
 def read_fault(text: str) -> dict[str, Any]:
-    """Return the fields of a fault in words. Raises ValueError with place and accepted words."""
+    """Return the fields of a fault text. Raises ValueError with position and accepted words."""
     words = text.split()
     if len(words) > 1 and words[0] == "motor" and f"motor{words[1]}" in MOTORS:
         words = [f"motor{words[1]}", *words[2:]]
@@ -339,7 +339,7 @@ def read_fault(text: str) -> dict[str, Any]:
 
 
 def fault_text(fields: Mapping[str, Any]) -> str:
-    """Return a fault in words that `read_fault` reads as the same fields."""
+    """Return a fault as text that `read_fault` parses into the same fields."""
     part, kind = fields["part"], fields["kind"]
     words = [part, kind]
     amount = KINDS[part, kind].amount
@@ -356,7 +356,7 @@ def fault_text(fields: Mapping[str, Any]) -> str:
 
 
 def _amount_text(values: Sequence[float], amount: Amount) -> str:
-    """Return an amount in its own unit, or in the one in which six digits say it exactly."""
+    """Return an amount in the stored unit, or in a unit in which six digits are exact."""
     for unit, factor in [(amount.unit, 1.0), *amount.units.items()]:
         text = ",".join(f"{v / factor:g}" for v in values) + unit
         if _amount(text, amount, text) == list(values):
@@ -365,7 +365,7 @@ def _amount_text(values: Sequence[float], amount: Amount) -> str:
 
 
 def _numbers(values: Sequence[float]) -> str:
-    """Return numbers as short as they can be read back exactly."""
+    """Return numbers in their shortest exact form."""
     return ",".join(f"{v:g}" if float(f"{v:g}") == v else repr(v) for v in values)
 
 
@@ -380,7 +380,7 @@ def _amount(said: str, amount: Amount, text: str) -> list[float]:
     numbers = [float(number) for number in found[1].split(",")]
     if factor == 1.0:
         return numbers
-    # Rounded to what a person wrote: 95 * 0.01 is not 0.95.
+    # Rounded to the written decimal: 95 * 0.01 is not 0.95.
     return [float(f"{number * factor:.15g}") for number in numbers]
 
 

@@ -1,4 +1,4 @@
-"""One fault of a flight: what fails, how, how much, from when and for how long."""
+"""Fault of a flight: part, kind, amount, start and duration."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ LONGEST_S = 100_000.0
 
 
 class Fault(ProfileModel):
-    """A fault, as a table of a scenario file: `[[faults]]`, or in words, as `gps off at 8s for 5s`.
+    """Fault as a table of a scenario file, `[[faults]]`, or as text: `gps off at 8s for 5s`.
 
-    Raises ValueError if the words, or the fields together, describe no fault (as pydantic has it).
+    Raises pydantic's ValueError if the text, or the fields together, are no valid fault.
     """
 
     part: Part = Field(description="what fails")
@@ -48,13 +48,13 @@ class Fault(ProfileModel):
     @model_validator(mode="before")
     @classmethod
     def _of_words(cls, data: Any) -> Any:
-        """Accept a fault that is written in words."""
+        """Accept a fault written as text."""
         return read_fault(data) if isinstance(data, str) else data
 
     @field_validator("value", mode="before")
     @classmethod
     def _of_one_number(cls, value: Any) -> Any:
-        """Accept one number where a list of one is meant."""
+        """Accept one number in place of a list of one."""
         return (value,) if isinstance(value, int | float) else value
 
     @model_validator(mode="after")
@@ -83,39 +83,39 @@ class Fault(ProfileModel):
 
     @property
     def about(self) -> Kind:
-        """What the table says of it."""
+        """Return the table entry of the fault."""
         return KINDS[self.part, self.kind]
 
     @property
     def for_good(self) -> bool:
-        """Whether nothing comes after it in a flight: a process that does not go on."""
+        """Return True if the fault ends a process for the rest of the flight."""
         return self.kind == "killed" or (self.kind == "stopped" and self.for_s is None)
 
     @property
     def amount(self) -> float:
-        """The one number of its value. Raises ValueError where it has none, or three."""
+        """Return a single-number value. Raises ValueError for none or several."""
         (number,) = self.value
         return number
 
     def __str__(self) -> str:
-        """Return it in words that read as the same fault."""
+        """Return the fault as text that parses into the same fault."""
         told: Mapping[str, Any] = self.model_dump()
         return fault_text(told)
 
 
 def link_fails(faults: Iterable[Fault]) -> bool:
-    """Return whether any of these is a fault of the link between companion and firmware."""
+    """Return True if any fault affects the link between companion and firmware."""
     return any(fault.part in LINKS for fault in faults)
 
 
-# --- faults that the batch twin can fly; its flights begin where the policy takes over
+# --- faults supported by the vectorized simulator; its flights begin at the policy's takeover
 
 TWIN = "gym"
-"""The batch twin's rung of the fidelity ladder."""
+"""Fidelity level of the vectorized simulator."""
 
 
 def check_twin(faults: Sequence[Fault], *, pipelined: bool = False) -> None:
-    """Raise FieldError for a fault that the twin cannot fly, with decisions `pipelined` or not."""
+    """Raise FieldError for a fault that the vectorized simulator does not support."""
     for fault in faults:
         levels = fault.about.levels
         if TWIN not in levels:
@@ -131,9 +131,9 @@ def check_twin(faults: Sequence[Fault], *, pipelined: bool = False) -> None:
 
 
 def _in_flight(fault: Fault) -> bool:
-    """Return whether it begins in the flight, or has acted since before it.
+    """Return True if it begins in the flight, or acts since before the flight.
 
-    What ends before the policy takes over was never there. Neither was the picture of the ground.
+    A fault that ends before the policy takes over has no effect, nor does a picture of the ground.
     """
     from_the_start = fault.phase is None and not fault.at_s and fault.for_s is None
     return fault.phase == "offboard" or (from_the_start and fault.kind != "stuck")

@@ -1,4 +1,4 @@
-"""When faults act: pure functions of simulated time and of the phases a flight has gone through."""
+"""Schedule of faults: pure functions of simulated time and of past flight phases."""
 
 from __future__ import annotations
 
@@ -9,21 +9,20 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.faults.model import Fault
 
 FOREVER_US = 1 << 62
-"""End of what has none [µs]."""
+"""End of a fault without an end [µs]."""
 
 
 def window_us(fault: Fault, entered_us: Mapping[str, int]) -> tuple[int, int] | None:
-    """Return begin and end, excluded, of a fault [µs since the start of the episode].
+    """Return start and end, excluded, of a fault [µs since the start of the episode].
 
-    `entered_us` is when each phase of the flight began for the first time; None: the phase of the
-    fault has not begun.
+    `entered_us` is the first start of each flight phase. Returns None before the fault's phase.
     """
     origin_us = 0 if fault.phase is None else entered_us.get(fault.phase)
     if origin_us is None:
         return None
     begin_us = origin_us + round(fault.at_s * US_PER_S)
     if fault.part == "firmware":
-        return begin_us, begin_us + TICK_US  # Simulated time stands still with it.
+        return begin_us, begin_us + TICK_US  # Suspends simulated time too.
     if fault.for_s is None:
         return begin_us, FOREVER_US
     return begin_us, begin_us + max(1, round(fault.for_s * US_PER_S))
@@ -32,15 +31,15 @@ def window_us(fault: Fault, entered_us: Mapping[str, int]) -> tuple[int, int] | 
 def active(
     faults: Sequence[Fault], time_us: int, entered_us: Mapping[str, int]
 ) -> dict[int, tuple[int, int]]:
-    """Return begin and end of the faults that act at a time, by index; see `window_us`."""
+    """Return start and end of the faults active at a time, by index; see `window_us`."""
     windows = ((i, window_us(fault, entered_us)) for i, fault in enumerate(faults))
     return {i: at for i, at in windows if at is not None and at[0] <= time_us < at[1]}
 
 
 def next_change_us(faults: Sequence[Fault], time_us: int, entered_us: Mapping[str, int]) -> int:
-    """Return when the next fault begins or ends after a time, `FOREVER_US` for never [µs].
+    """Return the next start or end of a fault after a time, `FOREVER_US` for never [µs].
 
-    A phase that has not begun is not known to begin.
+    Phases that have not begun are ignored.
     """
     edges = (
         edge
@@ -53,7 +52,7 @@ def next_change_us(faults: Sequence[Fault], time_us: int, entered_us: Mapping[st
 
 
 def gust_share(elapsed_s: float, duration_s: float) -> float:
-    """Return how much of a discrete gust blows, 0 to 1, so long after its begin [s].
+    """Return the strength of a discrete gust, 0 to 1, at a time after its start [s].
 
     (1 - cos(2 pi t / T)) / 2: up to its peak and down again (MIL-F-8785C, 3.7.1.3, discrete gusts).
     """

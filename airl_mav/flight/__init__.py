@@ -1,1 +1,1 @@
-"""Flights: what was flown, how it ended, how well it went."""
+"""Flights: trajectories, verdicts and quality."""

@@ -1,4 +1,4 @@
-"""Where a flight's energy went: staying up, moving, manoeuvring, and the onboard computer."""
+"""Energy of a flight by use: hover, motion, manoeuvres and onboard computer."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from airl_mav.vehicle.power import PowerModel, level_power_w, power_model_of
 
 @dataclass(frozen=True)
 class EnergySplit:
-    """The energy of a part of a flight [J]; the airframe's three parts add up to all of it."""
+    """Energy of a part of a flight [J]; the airframe's three parts add up to its total."""
 
     time_s: float
     hover_j: float
-    """Staying up: a hover at the mass of this flight."""
+    """Energy of a hover at the mass of this flight."""
     motion_j: float
-    """What steady level flight in calm air at the flight's speed takes more than a hover. Below 0
-    where moving saves power: a rotor in forward flight needs less than one in a hover."""
+    """Energy of steady level flight in calm air at the flight's speed, minus a hover. Negative if
+    moving saves power: a rotor needs less power in forward flight than in a hover."""
     manoeuvre_j: float
-    """All the rest: accelerating and braking, climbing and sinking, the wind."""
+    """Remaining energy: acceleration, braking, climb, descent and wind."""
     computer_j: float
 
     @property
@@ -41,9 +41,9 @@ def split_energy(
 ) -> EnergySplit:
     """Split the energy between two simulated times [µs] by the vehicle's power model.
 
-    The recording holds the whole power, integrated at every tick, and the speed at 50 Hz. So the
-    hover is exact. What the horizontal speed adds is integrated over the samples (trapezoid). The
-    manoeuvres are what is left. A 50 Hz recording cannot give them by itself.
+    The recording contains the total power, integrated at every tick, and the speed at 50 Hz. Hover
+    energy is therefore exact. The additional energy of horizontal motion is integrated over the
+    samples (trapezoid). Manoeuvres are the rest: a 50 Hz recording cannot resolve them.
     """
     part = path.between(start_us, end_us)
     time_s = max(0.0, (end_us - start_us) / US_PER_S)

@@ -1,4 +1,4 @@
-"""The referee: when an episode ends, and how it is judged."""
+"""Referee: ends an episode and returns its verdict."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from airl_mav.core.fields import quantity
 from airl_mav.core.goals import Goal, goal_distance_m
 
 GOAL_RADIUS_M = 3.0
-"""Default goal radius [m]: that of the paper's code, seen from above."""
+"""Default goal radius [m], from the paper's code; horizontal distance."""
 
 TIME_LIMIT_S = 120.0
-"""Default longest flight from the start of navigation [s]. The paper's code counts 750 steps; its
-slowest policies took 48 s on average."""
+"""Default maximum flight time from the start of navigation [s]. The paper's code counts 750 steps;
+its slowest policies took 48 s on average."""
 
 GoalRadius = Annotated[
     float,
@@ -32,7 +32,7 @@ TimeLimit = Annotated[
 
 
 class Outcome(str, Enum):
-    """How an episode ended."""
+    """Result of an episode."""
 
     SUCCESS = "success"
     COLLISION = "collision"
@@ -43,72 +43,72 @@ class Outcome(str, Enum):
 
 @dataclass(frozen=True)
 class Task:
-    """What a flight has to do."""
+    """Task of a flight."""
 
     goal: Goal
-    """North, east [m], and down where it has a height."""
+    """North, east [m], and down for a goal with a height."""
     goal_radius_m: float
-    """The goal is reached closer than this: seen from above, if it has no height [m]."""
+    """Goal radius [m]: horizontal distance for a goal without a height."""
     time_limit_s: float
-    """Longest time from the start of navigation [s]."""
+    """Maximum time from the start of navigation [s]."""
 
 
 class TruthSample(NamedTuple):
-    """What the referee sees of the true state."""
+    """True state for the referee."""
 
     time_us: int
     """Simulated time [µs]."""
     position: tuple[float, float, float]
     """NED [m]."""
     collision: str | None
-    """What was hit, None so far; latched by the plant."""
+    """Name of the hit object, None before a collision; latched by the plant."""
     battery_remaining: float
-    """Charge left, 1 to 0."""
+    """Remaining charge, 1 to 0."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How and when an episode ended."""
+    """Result of an episode, its reason and time."""
 
     outcome: Outcome
     reason: str
     time_us: int
-    """Simulated time of the sample that decided [µs]."""
+    """Simulated time of the deciding sample [µs]."""
 
 
 class Referee:
     """Judges one episode from its true samples. Pure: no clock, no randomness.
 
-    The tests, in this order (that of the paper's code, with its missing battery test): goal,
-    collision, battery, time limit. The goal and the time limit count from the start of navigation.
-    A collision or an empty battery ends the take-off too. The first verdict stands.
+    Tests in order, as in the paper's code, which lacks the battery test: goal, collision, battery,
+    time limit. The goal and the time limit count from the start of navigation. A collision or an
+    empty battery also ends the take-off. The first verdict is final.
     """
 
     def __init__(self, task: Task) -> None:
-        """Take the task. Raises ValueError when no flight could fulfil it."""
+        """Take the task. Raises ValueError for an impossible task."""
         if not task.goal_radius_m > 0.0:
             raise ValueError(f"goal_radius_m={task.goal_radius_m}: must be > 0")
         if not task.time_limit_s > 0.0:
             raise ValueError(f"time_limit_s={task.time_limit_s}: must be > 0")
         self.task = task
         self.navigation_us: int | None = None
-        """When navigation began [µs]; None during the take-off."""
+        """Start of navigation [µs]; None during the take-off."""
         self.verdict: Verdict | None = None
 
     def start_navigation(self, time_us: int) -> None:
-        """Say that take-off is over and the policy flies. Raises ValueError when said twice."""
+        """Start navigation: the policy takes over. Raises ValueError on a second call."""
         if self.navigation_us is not None:
             raise ValueError(f"navigation already began at {self.navigation_us} µs")
         self.navigation_us = time_us
 
     def abort(self, time_us: int, reason: str) -> Verdict:
-        """End the episode for a reason outside the flight: a crash, Ctrl-C, a lost process."""
+        """End the episode for an external reason: a crash, Ctrl-C, a lost process."""
         if self.verdict is None:
             self.verdict = Verdict(Outcome.ABORTED, reason, time_us)
         return self.verdict
 
     def observe(self, sample: TruthSample) -> Verdict | None:
-        """Take the next sample; return the verdict once there is one."""
+        """Process the next sample; return the verdict, or None before it."""
         if self.verdict is None:
             found = self._judge(sample)
             if found is not None:
@@ -116,7 +116,7 @@ class Referee:
         return self.verdict
 
     def _judge(self, sample: TruthSample) -> tuple[Outcome, str] | None:
-        """Return outcome and reason of this sample, if it decides."""
+        """Return outcome and reason of this sample, or None."""
         task = self.task
         flying = self.navigation_us is not None and sample.time_us >= self.navigation_us
         if flying:

@@ -1,7 +1,7 @@
 """Paired comparison of two runs on the same seeds, with 95 % intervals and numbers of pairs.
 
-Pairing by seed removes the spread that the arenas add. Two runs that differ little show it after
-far fewer flights than two runs of different seeds.
+Pairing by seed removes the variation between arenas. A small difference becomes visible after far
+fewer flights than with different seeds.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from airl_mav.flight.record import EpisodeRecord
 Floats = NDArray[np.float64]
 
 Pair = tuple[EpisodeRecord, EpisodeRecord]
-"""One seed: the flight of the reference, then the other one."""
+"""Flights of one seed: reference, other."""
 
 TANGO_PRECISION = 1e-12
-"""Accuracy to which the ends of Tango's interval are found, by bisection."""
+"""Precision of the ends of Tango's interval, found by bisection."""
 
 SAME_RATIO = 1e-12
-"""Pairs whose ratios differ by no more than this differ by rounding alone."""
+"""Maximum difference between ratios that is attributed to rounding."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Which of both reached the goal, counted over seeds: McNemar's table."""
+    """Goals reached by each of both runs, counted over seeds: McNemar's table."""
 
     both: int
     only_reference: int
@@ -47,23 +47,23 @@ class Agreement:
 
 @dataclass(frozen=True)
 class Change:
-    """A figure of two runs on the same seeds. None where there is nothing to work it out from."""
+    """Figure of two runs on the same seeds. None without data."""
 
     reference: float | None
     other: float | None
     difference: statistics.Estimate
     """Other minus reference; its n is the number of pairs behind all three figures."""
     median: statistics.Estimate | None = None
-    """Median over the pairs of the difference of each one [%]. One long flight moves a mean, but
-    not a median. None for the success rate."""
+    """Median over the pairs of each pair's difference [%]. One long flight moves a mean, but not a
+    median. None for the success rate."""
 
 
 @dataclass(frozen=True)
 class PairedComparison:
-    """A run against a reference, over pairs of flights with the same seed.
+    """Comparison of a run with a reference, over pairs of flights with the same seed.
 
     The difference of a mean is `100 (other - reference) / reference` percent, over the common
-    successes. That of the success rate is in percentage points, over all pairs.
+    successes. The difference of the success rate is in percentage points, over all pairs.
     """
 
     agreement: Agreement
@@ -72,19 +72,19 @@ class PairedComparison:
     flight_time_s: Change
     distance_m: Change
     energy_j: Change
-    """Of the vehicle, without its computer."""
+    """Energy of the vehicle, without its computer."""
     computer_energy_j: Change
     total_energy_j: Change
-    """Vehicle and computer together."""
+    """Energy of vehicle and computer together."""
 
 
 def pair_by_seed(
     reference: Sequence[EpisodeRecord], other: Sequence[EpisodeRecord]
 ) -> tuple[Pair, ...]:
-    """Return the flights of the seeds that both runs hold, in the order of the reference.
+    """Return the flights of the seeds that both runs contain, in the order of the reference.
 
-    An invalid flight was no test of the policy: its seed makes no pair. Raises ValueError if a run
-    holds a seed twice.
+    An invalid flight is no test of the policy: its seed makes no pair. Raises ValueError if a run
+    contains a seed twice.
     """
     first, second = _by_seed(reference), _by_seed(other)
     return tuple((first[seed], second[seed]) for seed in first if seed in second)
@@ -99,7 +99,7 @@ def _by_seed(episodes: Sequence[EpisodeRecord]) -> dict[int, EpisodeRecord]:
 
 
 def count_agreement(pairs: Sequence[Pair]) -> Agreement:
-    """Count which of both reached the goal."""
+    """Count the goals reached by each of both runs."""
     reached = [tuple(flight.outcome is Outcome.SUCCESS for flight in pair) for pair in pairs]
     return Agreement(
         both=reached.count((True, True)),
@@ -110,7 +110,7 @@ def count_agreement(pairs: Sequence[Pair]) -> Agreement:
 
 
 def common_successes(pairs: Sequence[Pair]) -> tuple[tuple[Quality, Quality], ...]:
-    """Return the quality of the pairs of which both reached the goal."""
+    """Return the quality of the pairs in which both flights reached the goal."""
     return tuple(
         (first.quality, second.quality)
         for first, second in pairs
@@ -123,11 +123,12 @@ def common_successes(pairs: Sequence[Pair]) -> tuple[tuple[Quality, Quality], ..
 def tango(gained: int, lost: int, n: int) -> statistics.Estimate:
     """Return the difference of two paired proportions with Tango's 95 % score interval.
 
-    The differences that McNemar's test, generalised to them, does not reject (T. Tango, Equivalence
-    test and confidence interval for the difference in proportions for the paired-sample design,
-    Statistics in Medicine 17, 1998, 891-908). It keeps its coverage where few pairs differ, and has
-    a width where none does. Of n pairs, in those `gained` only the other succeeded, in those `lost`
-    only the reference. The difference is other minus reference, as a fraction, -1 to 1.
+    The interval contains the differences that McNemar's test, generalised to them, does not reject
+    (T. Tango, Equivalence test and confidence interval for the difference in proportions for the
+    paired-sample design, Statistics in Medicine 17, 1998, 891-908). It keeps its coverage if few
+    pairs differ, and has a width if no pair differs. Of n pairs, `gained` are successes of the
+    other alone, `lost` of the reference alone. The difference is other minus reference, as a
+    fraction, -1 to 1.
     """
     if min(gained, lost) < 0 or gained + lost > n:
         raise ValueError(f"gained={gained}, lost={lost}, n={n}: must be >= 0 and fit")
@@ -156,7 +157,7 @@ def _score(d: float, gained: int, lost: int, n: int) -> float:
     away = gained - lost - n * d
     if away == 0.0:
         return 0.0
-    # Probability of a loss, the likeliest with a difference d: the greater root.
+    # Probability of a loss, maximum likelihood at difference d: the larger root.
     a, b, c = 2.0 * n, (2.0 * n - gained + lost) * d - gained - lost, -lost * d * (1.0 - d)
     q = (math.sqrt(max(0.0, b * b - 4.0 * a * c)) - b) / (2.0 * a)
     variance = n * (2.0 * q + d * (1.0 - d))
@@ -164,10 +165,10 @@ def _score(d: float, gained: int, lost: int, n: int) -> float:
 
 
 def relative_difference(reference: ArrayLike, other: ArrayLike) -> statistics.Estimate:
-    """Return by how many percent the mean of paired values differs, with a bootstrap 95 % interval.
+    """Return the relative difference of paired means [%], with a bootstrap 95 % interval.
 
-    Whole pairs (n,) are drawn (BCa, seeded). One pair has no interval. Pairs of one ratio have one
-    of width zero. Raises ValueError unless all values of the reference are > 0.
+    Resamples whole pairs (n,) (BCa, seeded). One pair has no interval. Pairs of equal ratio have an
+    interval of width zero. Raises ValueError unless all values of the reference are > 0.
     """
     first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
     if first.ndim != 1 or first.shape != second.shape:
@@ -206,7 +207,7 @@ def compare_pairs(
 def _known_by_both(
     good: Sequence[tuple[Quality, Quality]], name: str
 ) -> tuple[list[float], list[float]]:
-    """Return a measure of the pairs of which both flights have it."""
+    """Return a measure of the pairs in which both flights have it."""
     values = [(getattr(first, name), getattr(second, name)) for first, second in good]
     both = [pair for pair in values if None not in pair]
     return [first for first, _ in both], [second for _, second in both]
@@ -226,9 +227,9 @@ def _compare_rates(agreement: Agreement) -> Change:
 
 
 def compare_means(reference: ArrayLike, other: ArrayLike) -> Change:
-    """Return how the means of paired values (n,) differ [%], and the median over the pairs.
+    """Return the difference of the means of paired values (n,) [%], and the median over the pairs.
 
-    There is no difference where a value of the reference is 0, as of a computer of no watts.
+    The difference is undefined if a reference value is 0, as for a computer of 0 W.
     """
     first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
     if not first.size:

@@ -1,4 +1,4 @@
-"""Quality of flight of one episode: time, distance, energy, smoothness, deadlines."""
+"""Flight quality of one episode: time, distance, energy, smoothness, deadlines."""
 
 from __future__ import annotations
 
@@ -19,45 +19,45 @@ from airl_mav.latency.stamps import SETPOINT
 
 @dataclass(frozen=True)
 class Leg:
-    """A part of a flight."""
+    """Part of a flight."""
 
     time_s: float
     distance_m: float
     """Path length in three dimensions [m]."""
     energy_j: float | None
-    """Electrical energy of the vehicle, without its computer [J]; None: nobody measured it."""
+    """Electrical energy of the vehicle, without its computer [J]; None: not measured."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """The measures of one episode. All but `takeoff` count from the start of navigation."""
+    """Measures of one episode. All but `takeoff` count from the start of navigation."""
 
     flight_time_s: float
     distance_m: float
     """Path length in three dimensions [m]."""
     energy_j: float | None
-    """Electrical energy of the vehicle, without its computer [J]; None: nobody measured it."""
+    """Electrical energy of the vehicle, without its computer [J]; None: not measured."""
     computer_energy_j: float
     """Energy of the onboard computer: its watts times the flight time; 0 on the ground [J]."""
     mean_speed_m_s: float
     max_speed_m_s: float
     takeoff: Leg
     endurance_s: float | None = None
-    """How long the pack as charged at the start lasts at the mean power of this flight, with its
-    computer [s]; None where no power flowed, and in older records."""
+    """Endurance of the pack's initial charge at this flight's mean power, with its computer [s];
+    None without power, and in older records."""
     range_m: float | None = None
-    """How far that is at the flight's mean speed [m]."""
+    """Range at the endurance and the flight's mean speed [m]."""
     missions_per_charge: float | None = None
-    """How many such flights that is."""
+    """Number of such flights per charge."""
     deadline_misses: float | None = None
     """Share of decisions that took effect later than the hold time after their frame was exposed,
-    or never (`latency.stages`), 0 to 1. None of this and the following where there is nothing
-    to work it out from, and in older records."""
+    or never (`latency.stages`), 0 to 1. This and the following: None without data and in older
+    records."""
     jerk_rms_m_s3: float | None = None
-    """Of the flown velocity, at the bandwidth of `flight.smoothness` [m/s³]."""
+    """RMS jerk of the flown velocity, at the bandwidth of `flight.smoothness` [m/s³]."""
     jerk_peak_m_s3: float | None = None
     command_jerk_rms_m_s3: float | None = None
-    """Of the commanded velocity, at the same bandwidth [m/s³]."""
+    """RMS jerk of the commanded velocity, at the same bandwidth [m/s³]."""
     command_jerk_peak_m_s3: float | None = None
     command_step_m_s: float | None = None
     """Mean step of the commanded velocity at a switch of action [m/s]."""
@@ -93,9 +93,9 @@ def measure_quality(
 ) -> Quality:
     """Measure an episode from its start to the verdict.
 
-    `pack_j` is what the pack holds at the start (`Battery.energy_j`) [J]; `decisions` are the
-    columns of the decision log, as in `latency.npz`. Each None if not known. Actions held for 0 s
-    have no deadline.
+    `pack_j` is the initial energy of the pack (`Battery.energy_j`) [J]; `decisions` are the columns
+    of the decision log, as in `latency.npz`. None for unknown values. Actions held for 0 s have no
+    deadline.
     """
     if ended_us < navigation_us:
         raise ValueError(f"ended_us={ended_us} lies before navigation_us={navigation_us}")

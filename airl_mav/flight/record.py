@@ -1,4 +1,4 @@
-"""What was flown on what, and the record of one episode: one JSON line of `episodes.jsonl`."""
+"""Setup of a flight, and the record of one episode: one JSON line of `episodes.jsonl`."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from airl_mav.flight.quality import Quality
 from airl_mav.latency.injection import Injection
 
 BUILT_IN = "built-in"
-"""The firmware of all levels but one."""
+"""Firmware of all levels but one."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """One part of a rehearsal: the vehicle, the arena, the policy, the computer."""
+    """Part of a rehearsal: vehicle, arena, policy or computer."""
 
     name: str
     description: str = ""
@@ -31,59 +31,60 @@ class Part:
 
 @dataclass(frozen=True)
 class Setup:
-    """The parts of a rehearsal, in words."""
+    """Parts of a rehearsal, as text."""
 
     level: Level
-    """Rung of the fidelity ladder."""
+    """Fidelity level."""
     vehicle: Part
     arena: Part
     policy: Part
     computer: Part
     computer_watts: float
-    """What the computer draws from the aircraft's pack [W]; 0 of one that stays on the ground."""
+    """Power that the computer draws from the aircraft's pack [W]; 0 for a computer on the
+    ground."""
     injection: Injection
-    """The decision latency t2: measured, injected or estimated."""
+    """Decision latency t2: measured, injected or estimated."""
     speed: float | None
-    """Simulated seconds per wall second; None where time is not paced (lockstep)."""
+    """Simulated seconds per wall second; None without pacing (lockstep)."""
     between_commands: str
-    """What the vehicle does between commands: `persist`, `hover-after 60 ms`."""
+    """Behaviour between commands: `persist`, `hover-after 60 ms`."""
     firmware: str = BUILT_IN
-    """What flew: the built-in autopilot, or the name of real firmware."""
+    """Built-in autopilot, or the name of real firmware."""
     computer_on_ground: bool = False
-    """The computer is ground equipment: the aircraft carries and feeds none."""
+    """True if the computer is ground equipment: the aircraft carries and powers none."""
     conditions: str = ""
-    """Wind, load, spread, noise, charge and renderer, where not the defaults: `wind.east_m_s 4`."""
+    """Non-default wind, load, spread, noise, charge and renderer: `wind.east_m_s 4`."""
 
 
 SCHEMA = 1
 """Version of the line's schema; docs/run-folder.md describes it."""
 
 NO_ARENA = ""
-"""The arena of a flight outside of all arenas."""
+"""Arena name of a flight outside of all arenas."""
 
 
 @dataclass(frozen=True)
 class FaultActed:
-    """A fault that has acted in a flight."""
+    """Fault that acted in a flight."""
 
     fault: str
-    """In words (docs/how-to/faults.md)."""
+    """Fault specification as text (docs/how-to/faults.md)."""
     from_us: int
-    """Simulated time at which it began [µs]."""
+    """Simulated start time [µs]."""
     to_us: int
-    """Simulated time at which it ended, or the record does [µs]."""
+    """Simulated end time [µs], or the record's end."""
 
 
 @dataclass(frozen=True)
 class EpisodeRecord:
-    """What is kept of an episode beside its raw arrays."""
+    """Record of an episode, without its raw arrays."""
 
     index: int
-    """Number of the episode in its run, from 0; names its arrays and its tlog."""
+    """Index of the episode in its run, from 0; names its arrays and its tlog."""
     seed: int
     """Seed of the episode: sensors, wind, latencies."""
     arena: str
-    """`NO_ARENA`: what stood where it flew is not known."""
+    """Arena name; `NO_ARENA`: unknown."""
     arena_seed: int
     outcome: Outcome
     reason: str
@@ -94,47 +95,47 @@ class EpisodeRecord:
     started_us: int
     """Simulated time of the reset [µs]: moving obstacles count from here, see `tours_s`."""
     navigation_us: int | None
-    """Simulated time at which the policy took over [µs]; None when it never did."""
+    """Simulated time at which the policy took over [µs]; None without navigation."""
     ended_us: int
     """Simulated time of the verdict [µs]."""
     wall_s: float | None
-    """Wall time from reset to verdict [s]; None where time is not paced (lockstep)."""
+    """Wall time from reset to verdict [s]; None without pacing (lockstep)."""
     slipped_us: int
-    """Simulated time given up because the host could not keep pace [µs]."""
+    """Simulated time skipped because the host could not keep up [µs]."""
     battery_remaining: float | None
-    """Charge left at the end, 1 to 0."""
+    """Remaining charge at the end, 1 to 0."""
     quality: Quality | None
-    """None when navigation never began."""
+    """Flight quality; None without navigation."""
     notes: tuple[str, ...] = ()
-    """What else happened: failsafes, watchdog trips."""
+    """Other events: failsafes, watchdog trips."""
     invalid: tuple[str, ...] = ()
-    """Why the flight is no test of the policy (`flight.validity`): the host disturbed it in every
-    attempt. Empty: it is one."""
+    """Reasons why the flight is no test of the policy (`flight.validity`): the host disturbed every
+    attempt. Empty: valid."""
     companion_use: ProcessUse | None = None
-    """What the companion process took of its machine for the flight, from arming to the ground;
-    None where it is no process of its own (gym, lockstep), and in older records."""
+    """Resources used by the companion process, from arming to the ground; None without a
+    separate process (gym, lockstep), and in older records."""
     faults: tuple[FaultActed, ...] = ()
-    """What failed, as asked for or as a client injected it, in the order of its beginning."""
+    """Requested or injected faults, in order of their start."""
     zone: int | None = None
-    """Curriculum zone that the goal was drawn in; None: the whole arena."""
+    """Curriculum zone of the goal; None: the whole arena."""
     tours_s: float = 0.0
-    """When, after the reset, moving obstacles are where the seed's tours begin [s]; 0 in older
-    records, whose obstacles began them at the reset."""
+    """Time after the reset at which moving obstacles start their tours [s]; 0 in older records,
+    whose obstacles started at the reset."""
     sha256: dict[str, str] | None = None
-    """Fingerprints by lane, and of the whole `flight`; None where flights are never the same."""
+    """Hashes by lane, and of the whole `flight`; None if flights are not reproducible."""
     schema: int = SCHEMA
 
     @property
     def zero_us(self) -> int:
-        """Start of navigation, or of the episode where navigation never began [µs]."""
+        """Start of navigation, or of the episode without navigation [µs]."""
         return self.started_us if self.navigation_us is None else self.navigation_us
 
     def navigates(self, time_us: int) -> bool:
-        """Return whether the vehicle navigates at a time [µs]."""
+        """Return True if the vehicle navigates at a time [µs]."""
         return self.navigation_us is not None and (self.navigation_us <= time_us < self.ended_us)
 
     def fault_spans_s(self) -> list[tuple[float, float]]:
-        """Return from when to when each fault acted [s], as time counts from `zero_us`."""
+        """Return start and end of each fault [s], relative to `zero_us`."""
         return [
             ((each.from_us - self.zero_us) / US_PER_S, (each.to_us - self.zero_us) / US_PER_S)
             for each in self.faults
@@ -146,15 +147,15 @@ class EpisodeRecord:
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any], source: object) -> EpisodeRecord:
-        """Return the record that an object holds. Raises UsageError, with the source, for none."""
+        """Return the record of a parsed line. Raises UsageError, with the source, if invalid."""
         return typed(_ADAPTER, data, source)
 
 
 def run_sha256(episodes: Sequence[EpisodeRecord]) -> str | None:
-    """Return the fingerprint of a run: equal when all its flights are equal, bit by bit.
+    """Return the hash of a run: equal for runs whose flights are all bit-identical.
 
-    It is the SHA-256, hexadecimal, of the flights' own fingerprints in the order of their index,
-    each a line with its newline; None when there is none of a flight.
+    SHA-256, hexadecimal, of the flights' hashes in the order of their index, each a line with its
+    newline; None if a flight has no hash.
     """
     lines = []
     for record in sorted(episodes, key=lambda record: record.index):

@@ -1,7 +1,7 @@
-"""What a policy has to reach, and whether its flights show that it does.
+"""Requirements of a policy, and their test on flights.
 
-A requirement is decided on the 95 % interval of its figure, never on the figure alone. It is met
-where the whole interval fulfils it, not met where none of it does, and undecided between.
+A requirement is decided on the 95 % interval of its figure, never on the figure alone. It is met if
+the whole interval fulfils it, not met if no part does, and undecided between.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from airl_mav.flight.sequential import Decision, RateTest
 from airl_mav.flight.statistics import Aggregate, Estimate, wilson
 
 MOST_FLIGHTS = 1_000_000
-"""A decision that would take more flights than this is called out of reach."""
+"""Maximum number of flights for a decision; beyond, it is out of reach."""
 
 
 class Measure(NamedTuple):
-    """A figure that can be required."""
+    """Figure that can be required."""
 
     title: str
     unit: str
     per_unit: float
-    """The unit in what the figures are kept in: 0.01 for percent, 1000 for kJ."""
+    """Factor from this unit to the stored unit: 0.01 for percent, 1000 for kJ."""
     attribute: str
-    """Of `Aggregate` and of `PairedComparison`."""
+    """Attribute of `Aggregate` and of `PairedComparison`."""
     gap_unit: str | None = "%"
-    """None: no gap of it can be required."""
+    """Unit of a required gap; None: a gap is not supported."""
 
 
 MEASURES: dict[str, Measure] = {
@@ -44,7 +44,7 @@ MEASURES: dict[str, Measure] = {
     "jerk": Measure("jerk, flown, RMS", "m/s3", 1.0, "jerk_rms_m_s3", None),
     "command_step": Measure("step of the command", "m/s", 1.0, "command_step_m_s", None),
 }
-"""By the word that a requirement names them by."""
+"""Measures by their name in a requirement."""
 
 ACCEPTED = (
     f"MEASURE [gap] >= or <= NUMBER [UNIT], with MEASURE one of {', '.join(MEASURES)}: as"
@@ -59,34 +59,34 @@ _REQUIREMENT = re.compile(
 
 @dataclass(frozen=True)
 class Requirement:
-    """A bound on a figure of a run, or on its difference from a reference."""
+    """Bound on a figure of a run, or on its difference from a reference."""
 
     measure: str
     """Key of `MEASURES`."""
     gap: bool
-    """Whether the difference from the reference is bounded, and not the figure itself."""
+    """True to bound the difference from the reference, False for the figure itself."""
     sense: Literal[">=", "<="]
     limit: float
-    """In `unit`."""
+    """Limit in `unit`."""
 
     @property
     def unit(self) -> str:
-        """Unit of the limit; a gap is in percent, that of a rate in percentage points."""
+        """Unit of the limit: for a gap percent, for a rate's gap percentage points."""
         measure = MEASURES[self.measure]
         return (measure.gap_unit or "") if self.gap else measure.unit
 
     def __str__(self) -> str:
-        """Return the requirement as it is written."""
+        """Return the requirement in its text format."""
         gap = " gap" if self.gap else ""
         return f"{self.measure}{gap} {self.sense} {self.limit:g} {self.unit}"
 
     @property
     def least_rate(self) -> bool:
-        """Whether it is a least success rate: what can be tested as flights come in."""
+        """True for a minimum success rate, which allows a sequential test."""
         return (self.measure, self.gap, self.sense) == ("success", False, ">=")
 
     def test(self) -> RateTest:
-        """Return the test of a least success rate. Raises FieldError for one of 100 %."""
+        """Return the test of a minimum success rate. Raises FieldError for 100 %."""
         if self.limit >= 100.0:
             raise FieldError(
                 "require", str(self), "a success rate below 100 %: no number of flights shows it"
@@ -94,20 +94,20 @@ class Requirement:
         return RateTest(0.01 * self.limit)
 
     def fulfilled_by(self, value: float) -> bool:
-        """Return whether a value, in `unit`, keeps within the bound."""
+        """Return True if a value, in `unit`, keeps within the bound."""
         return value >= self.limit if self.sense == ">=" else value <= self.limit
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A requirement, and what the flights say of it."""
+    """Requirement with its decision."""
 
     requirement: Requirement
     decision: Decision
     estimate: Estimate
-    """The figure in the requirement's unit."""
+    """Figure in the requirement's unit."""
     more_flights: int | None = None
-    """How many more would decide it if the figure stayed; None where decided, or out of reach."""
+    """Additional flights for a decision at the same figure; None if decided or out of reach."""
 
     def sentence(self) -> str:
         """Return the finding as one line."""
@@ -128,7 +128,7 @@ class Finding:
 
 
 def parse_requirement(text: str) -> Requirement:
-    """Read `success >= 95 %` or `flight_time gap <= 10 %`; FieldError if it is no requirement."""
+    """Read `success >= 95 %` or `flight_time gap <= 10 %`. Raises FieldError if invalid."""
     found = _REQUIREMENT.fullmatch(text)
     if found is None or found["measure"] not in MEASURES:
         raise FieldError("require", text, ACCEPTED)
@@ -168,10 +168,10 @@ def find(requirement: Requirement, quality: Aggregate, against: PairedComparison
 
 
 def settle(finding: Finding, reached: Sequence[bool]) -> Finding:
-    """Return a finding as it is where flights were added until a least success rate was decided.
+    """Return a finding for flights added until a minimum success rate was decided.
 
-    The interval would be wrong more often than it says: it was looked at again and again. `reached`
-    are the flights in the order of their seeds. Findings of other requirements stay.
+    Repeated looks make the interval's error exceed its nominal 5 %. `reached` are the flights in
+    the order of their seeds. Findings of other requirements stay.
     """
     if not finding.requirement.least_rate:
         return finding
@@ -184,7 +184,7 @@ def settle(finding: Finding, reached: Sequence[bool]) -> Finding:
 
 
 def decide(requirement: Requirement, estimate: Estimate) -> Decision:
-    """Return what an estimate, in the requirement's unit, says of it."""
+    """Return the decision of an estimate in the requirement's unit."""
     if estimate.low is None or estimate.high is None:
         return Decision.UNDECIDED
     kept = {requirement.fulfilled_by(end) for end in (estimate.low, estimate.high)}
@@ -203,9 +203,9 @@ def _more_flights(
     estimate: Estimate,
     project: Callable[[float, int], Estimate] | None,
 ) -> int | None:
-    """Return how many more flights of the same figure would decide; None: out of reach.
+    """Return the additional flights for a decision at the same figure; None: out of reach.
 
-    Unless `project` gives the estimate of n flights, the interval shrinks with the root of n.
+    `project` gives the estimate of n flights; without it, the interval shrinks with the root of n.
     """
     value, low, high = estimate.value, estimate.low, estimate.high
     if value is None:

@@ -1,10 +1,10 @@
-"""Is a success rate at least a threshold? A test that is looked at as flights come in.
+"""Sequential test of a minimum success rate, evaluated while flights come in.
 
-Looking at an ordinary interval again and again, and stopping when it has decided, makes false
-verdicts as often as one looks. A group-sequential test shares the error out over looks that are
-planned beforehand (Lan & DeMets, Biometrika 70, 1983; Jennison & Turnbull, Group Sequential Methods
-with Applications to Clinical Trials, 2000, chapters 7 and 12). Flights are counted, so the error is
-worked out exactly, by binomial sums, not by a normal approximation.
+Repeated evaluation of an ordinary interval, with a stop at its decision, increases the error. A
+group-sequential test distributes the error over planned interim analyses, the looks (Lan & DeMets,
+Biometrika 70, 1983; Jennison & Turnbull, Group Sequential Methods with Applications to Clinical
+Trials, 2000, chapters 7 and 12). Flights are counted, so the error is exact, from binomial sums
+instead of a normal approximation.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ import numpy as np
 import scipy
 
 ALPHA = 0.05
-"""Greatest probability of a false verdict over all looks. Half of it for "meets" where the rate is
-too low, half of it for "does not meet" where it is not, as a 95 % interval shares it out."""
+"""Maximum probability of a false verdict over all looks. Half of it is for "meets" with a low rate,
+half for "does not meet" with a sufficient rate, as in a 95 % interval."""
 
 LOOKS = (
     *(20, 40, 60, 80),
     *(scale * step for scale in (10, 100, 1000) for step in (10, 15, 20, 30, 40, 50, 70)),
     100_000,
 )
-"""Numbers of flights after which it is looked whether they decide."""
+"""Numbers of flights after which the test is evaluated."""
 
 HALF_SPENT = 100
-"""Number of flights by which half of the error is spent: such as a decision may well take.
-`benchmarks/bench_verdict.py` compares the flights that this and other ways of spending it take."""
+"""Number of flights that spends half of the error: a typical length of a decision.
+`benchmarks/bench_verdict.py` compares the flights needed with this and other spending functions."""
 
 
 class Decision(str, Enum):
-    """What is known of a requirement."""
+    """Decision on a requirement."""
 
     MET = "meets"
     NOT_MET = "does not meet"
@@ -42,26 +42,26 @@ class Decision(str, Enum):
 
 
 def error_spent(flights: int) -> float:
-    """Return how much error either side may have made by so many flights.
+    """Return the cumulative error allowed on either side after a number of flights.
 
-    It grows for ever and never reaches half of `ALPHA`. How many flights there are at most need not
-    be known beforehand.
+    It always grows and never reaches half of `ALPHA`. The maximum number of flights need not be
+    known beforehand.
     """
     return 0.5 * ALPHA * flights / (flights + HALF_SPENT)
 
 
 @dataclass(frozen=True)
 class Look:
-    """What decides after so many flights."""
+    """Decision bounds after a number of flights."""
 
     flights: int
     few: int
-    """So many failures, or fewer, show that the threshold is met; -1: none can."""
+    """Maximum number of failures for "meets"; -1: impossible."""
     many: int
-    """So many failures, or more, show that it is not."""
+    """Minimum number of failures for "does not meet"."""
 
     def decide(self, failures: int) -> Decision:
-        """Return what failures among the flights show."""
+        """Return the decision for a number of failures."""
         if failures <= self.few:
             return Decision.MET
         return Decision.NOT_MET if failures >= self.many else Decision.UNDECIDED
@@ -72,11 +72,11 @@ def plan_looks(
     looks: Sequence[int] = LOOKS,
     spent: Callable[[int], float] = error_spent,
 ) -> Iterator[Look]:
-    """Give the looks of a test, one after the other.
+    """Yield the looks of a test in order.
 
-    Both errors are greatest at the threshold itself. There, what campaigns that are still undecided
-    have come to is carried from look to look as a distribution of their failures. As many of its
-    outermost counts decide as `spent` permits. That is the error of either side by so many flights.
+    Both errors are at their maximum at the threshold. There, the distribution of failures among
+    undecided campaigns is carried from look to look. At each look, the outermost counts within the
+    allowance `spent` decide. Their probability is the error of either side.
     """
     undecided, fewest, before = np.ones(1), 0, 0
     error_few = error_many = 0.0
@@ -91,7 +91,7 @@ def plan_looks(
         kept = undecided.size - n_many
         error_few += float(undecided[:n_few].sum())
         error_many += float(undecided[kept:].sum())
-        # The fewest failures that are possible are none, or one more than decided before.
+        # The minimum possible count of failures is 0, or one more than decided before.
         yield Look(flights, fewest + n_few - 1, fewest + kept)
         undecided, fewest = undecided[n_few:kept], fewest + n_few
 
@@ -103,10 +103,10 @@ def _planned(threshold: float, looks: int) -> tuple[Look, ...]:
 
 @dataclass(frozen=True)
 class RateTest:
-    """Is a success rate at least a threshold, or below it? Looked at after each of `LOOKS`."""
+    """Test of a success rate against a threshold, evaluated after each of `LOOKS`."""
 
     threshold: float
-    """Between 0 and 1, both excluded."""
+    """Threshold between 0 and 1, both excluded."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for a threshold that no number of flights can show."""
@@ -114,7 +114,7 @@ class RateTest:
             raise ValueError(f"threshold={self.threshold}: must be > 0 and < 1")
 
     def decide(self, reached: Sequence[bool]) -> Decision:
-        """Return what the first look that decides has shown; later flights do not change it."""
+        """Return the decision of the first deciding look; later flights do not change it."""
         done = sum(look <= len(reached) for look in LOOKS)
         for look in _planned(self.threshold, done):
             decision = look.decide(look.flights - sum(reached[: look.flights]))
@@ -123,7 +123,7 @@ class RateTest:
         return Decision.UNDECIDED
 
     def flights_needed(self, rate: float, flown: int = 0) -> int | None:
-        """Return after how many flights a rate would decide; None: after none of `LOOKS`."""
+        """Return the number of flights at which a rate would decide; None: not within `LOOKS`."""
         for look in plan_looks(self.threshold):
             failures = round((1.0 - rate) * look.flights)
             if look.flights > flown and look.decide(failures) is not Decision.UNDECIDED:

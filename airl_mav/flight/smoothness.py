@@ -1,10 +1,10 @@
-"""How smoothly a vehicle is commanded and flies: jerk, and the steps of the command.
+"""Smoothness of command and flight: jerk, and the steps of the command.
 
-Jerk is the second derivative of velocity. Of a sampled velocity it depends on the bandwidth that is
-looked at. The jerk of a commanded velocity, which jumps, is nothing but its steps seen through
-that bandwidth. A step of 1 m/s gives a peak of exp(-1/2) / (sqrt(2 pi) SIGMA_S^2) = 345 m/s³. So
-both are taken alike: sampled at 50 Hz, and differentiated twice with a Gaussian that passes half
-the power at `BANDWIDTH_HZ`.
+Jerk is the second derivative of velocity. For a sampled velocity it depends on the bandwidth. The
+jerk of a commanded velocity consists of its steps, filtered to that bandwidth. A step of 1 m/s
+gives a peak of exp(-1/2) / (sqrt(2 pi) SIGMA_S^2) = 345 m/s³. Both velocities are therefore
+processed alike: sampled at 50 Hz, and differentiated twice with a Gaussian that passes half the
+power at `BANDWIDTH_HZ`.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from airl_mav.latency.stamps import NO_STAMP, SETPOINT
 SAMPLE_S = SAMPLE_US / US_PER_S
 
 BANDWIDTH_HZ = 5.0
-"""Faster motion counts for less than half of its power [Hz]. Well above a multicopter's velocity
-loop (about 1 Hz), well below the 25 Hz that samples at 50 Hz can show."""
+"""Half-power bandwidth [Hz]. Well above a multicopter's velocity loop (about 1 Hz), well below the
+25 Hz Nyquist frequency of 50 Hz samples."""
 
 SIGMA_S = math.sqrt(math.log(2.0)) / (2.0 * math.pi * BANDWIDTH_HZ)
 """Standard deviation of the Gaussian [s]: its gain is exp(-2 (pi SIGMA_S f)^2)."""
 
 REACH = math.ceil(5.0 * SIGMA_S / SAMPLE_S)
-"""Samples to each side that a value of the jerk rests on; the first and last ones have none."""
+"""Samples to each side that a jerk value uses; the first and last ones have no jerk."""
 
 
 def _second_derivative() -> NDArray[np.float64]:
-    """Return the second derivative of the Gaussian, sampled, to convolve velocities with."""
+    """Return the sampled second derivative of the Gaussian, as a convolution kernel."""
     t = np.arange(-REACH, REACH + 1) * SAMPLE_S
     gauss = np.exp(-0.5 * (t / SIGMA_S) ** 2)
     kernel = (t**2 / SIGMA_S**4 - 1.0 / SIGMA_S**2) * gauss / gauss.sum()
-    kernel -= kernel.mean()  # A constant velocity has no jerk at all.
+    kernel -= kernel.mean()  # A constant velocity has zero jerk.
     return np.asarray(kernel, np.float64)
 
 
@@ -67,8 +67,8 @@ def jerk_of(velocity: NDArray[np.float64]) -> Jerk | None:
 def sample_times(trajectory: Trajectory, start_us: int, end_us: int) -> NDArray[np.int64]:
     """Return the times (n,) [µs] of an even 50 Hz grid between two times.
 
-    It begins at a recorded sample, so that where the recording is even, and all but that of real
-    firmware is, nothing is interpolated.
+    The grid begins at a recorded sample. Evenly sampled recordings, all except real firmware's, are
+    therefore not interpolated.
     """
     inside = trajectory.time_us[(trajectory.time_us >= start_us) & (trajectory.time_us <= end_us)]
     if not inside.size:
@@ -85,12 +85,12 @@ def flown_velocity(trajectory: Trajectory, times_us: NDArray[np.int64]) -> NDArr
 def commanded_velocity(
     trajectory: Trajectory, decisions: Mapping[str, NDArray[Any]], times_us: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the velocity (n, 3) NED [m/s] that was commanded at increasing times (n,) [µs].
+    """Return the commanded velocity (n, 3) NED [m/s] at increasing times (n,) [µs].
 
-    A command holds from its sending to the next one's. Before the first one the vehicle is told to
-    stand still. Commands are in the heading frame: they turn with the vehicle's true heading. Stops
-    that the watchdog makes between commands (`hover_after_s`) are not in it. `decisions` has the
-    columns `sent_us` and `setpoint` of `latency.npz`.
+    A command holds from its sending to the next one's. Before the first one, the command is zero.
+    Commands are in the heading frame: they turn with the vehicle's true heading. Watchdog stops
+    between commands (`hover_after_s`) are not included. `decisions` has the columns `sent_us` and
+    `setpoint` of `latency.npz`.
     """
     sent_us, setpoints = _sent(decisions)
     commands = np.vstack([np.zeros(3), setpoints])
@@ -100,11 +100,10 @@ def commanded_velocity(
 
 
 def command_steps(decisions: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
-    """Return by how much the commanded velocity jumps at each switch of action (k - 1,) [m/s].
+    """Return the change of the commanded velocity at each switch of action (k - 1,) [m/s].
 
-    The length of the difference between a command and the one before it, of k that were sent. Both
-    are in the heading frame of the moment of the switch. So the length is that of the step in the
-    world.
+    The length of the difference between successive commands of k sent. Both use the heading frame
+    at the switch, so the length is equal in the world frame.
     """
     _, setpoints = _sent(decisions)
     steps: NDArray[np.float64] = np.linalg.norm(np.diff(setpoints, axis=0), axis=1)
@@ -114,7 +113,7 @@ def command_steps(decisions: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
 def _sent(
     decisions: Mapping[str, NDArray[Any]],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return times (k,) [µs] and velocities (k, 3) [m/s] of the commands that were sent."""
+    """Return times (k,) [µs] and velocities (k, 3) [m/s] of the sent commands."""
     if "sent_us" not in decisions or SETPOINT not in decisions:
         return np.zeros(0, np.int64), np.zeros((0, 3))
     sent = decisions["sent_us"] != NO_STAMP

@@ -1,4 +1,4 @@
-"""Quality of flight over many episodes: means and rates, each with its interval and its n."""
+"""Flight quality over many episodes: means and rates, each with its interval and its n."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from airl_mav.flight.record import EpisodeRecord
 
 CONFIDENCE = 0.95
 QUANTILE = 1.959963984540054
-"""Of the normal distribution, for a two-sided 95 % interval: `scipy.special.ndtri(0.975)`."""
+"""Quantile of the normal distribution, for a two-sided 95 % interval:
+`scipy.special.ndtri(0.975)`."""
 NORMAL = NormalDist()
 RESAMPLES = 2000
 BOOTSTRAP_SEED = 20_210_409
-"""The same episodes always get the same interval."""
+"""Fixed seed: the same episodes always give the same interval."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure with its 95 % interval; None where there is nothing to work it out from."""
+    """Figure with its 95 % interval; None without data."""
 
     value: float | None
     low: float | None
@@ -34,7 +35,7 @@ class Estimate:
     """Number of episodes behind the figure."""
 
     def scaled(self, factor: float) -> Estimate:
-        """Return the same in another unit."""
+        """Return the estimate in another unit."""
         value, low, high = (
             None if each is None else factor * each for each in (self.value, self.low, self.high)
         )
@@ -42,28 +43,27 @@ class Estimate:
 
 
 MEANS = ("flight_time_s", "distance_m", "energy_j", "computer_energy_j", "total_energy_j")
-"""Measures of a flight's quality whose means two runs are compared by."""
+"""Measures of flight quality whose means are compared between two runs."""
 
 PACK_MEASURES = ("endurance_s", "range_m", "missions_per_charge")
-"""Measures that older runs were recorded without."""
+"""Measures absent from older runs."""
 
 SMOOTHNESS = ("jerk_rms_m_s3", "command_step_m_s")
-"""The same of these."""
+"""Smoothness measures, absent from older runs."""
 
 OF_ALL_FLIGHTS = ("deadline_misses",)
-"""Measures of quality whose means are over all valid flights. A late decision counts most where it
-made a flight fail."""
+"""Measures averaged over all valid flights: late decisions matter most in failed flights."""
 
 AVERAGED = (*MEANS, "mean_speed_m_s", *PACK_MEASURES, *SMOOTHNESS)
-"""Measures of a flight's quality that have a mean and a median."""
+"""Measures of flight quality with a mean and a median."""
 
 NO_ESTIMATE = Estimate(None, None, None, 0)
-"""Nothing to work a figure out from."""
+"""Estimate without data."""
 
 
 @dataclass(frozen=True)
 class Aggregate:
-    """A run in figures. Times, distances and energies are means over the successful episodes."""
+    """Figures of a run. Times, distances and energies are means over the successful episodes."""
 
     success_rate: Estimate
     """Fraction, 0 to 1, over all valid episodes: an aborted one did not reach its goal."""
@@ -72,12 +72,12 @@ class Aggregate:
     energy_j: Estimate
     computer_energy_j: Estimate
     total_energy_j: Estimate
-    """Vehicle and computer together."""
+    """Energy of vehicle and computer together."""
     mean_speed_m_s: Estimate
     outcomes: dict[Outcome, int]
     """Number of episodes by outcome, aborted ones included."""
     endurance_s: Estimate = NO_ESTIMATE
-    """None of this and the following in runs that were recorded without."""
+    """Endurance [s]; this and the following lack data in older runs."""
     range_m: Estimate = NO_ESTIMATE
     missions_per_charge: Estimate = NO_ESTIMATE
     jerk_rms_m_s3: Estimate = NO_ESTIMATE
@@ -89,7 +89,7 @@ class Aggregate:
 def wilson(successes: int, n: int) -> Estimate:
     """Return a rate with Wilson's 95 % score interval (Wilson, JASA 22, 1927).
 
-    In closed form, without scipy's module of statistics: it is asked while flights are flown.
+    In closed form, without scipy.stats, because it runs between flights.
     """
     if n == 0:
         return NO_ESTIMATE
@@ -105,7 +105,7 @@ def wilson(successes: int, n: int) -> Estimate:
 def bootstrap_mean(values: ArrayLike) -> Estimate:
     """Return the mean of values (n,) with a bootstrap 95 % interval (BCa, seeded).
 
-    One value has no interval. Equal values have one of width zero.
+    One value has no interval. Equal values have an interval of width zero.
     """
     data = np.asarray(values, np.float64)
     if not data.size:
@@ -124,9 +124,9 @@ def bootstrap_interval(
     """Return the seeded 95 % bootstrap interval of a function of means.
 
     Bias-corrected and accelerated: Efron & Tibshirani, An Introduction to the Bootstrap, 1993,
-    section 14.3. The same figures as `scipy.stats.bootstrap`, whose import takes two seconds of
-    processor time. It takes memory proportional to n instead of its square. The samples are paired
-    and not all equal, each (n,), n >= 2; `statistic` takes the means (k,) of each.
+    section 14.3. Equal to `scipy.stats.bootstrap`, whose import takes two seconds of processor
+    time, with memory proportional to n instead of its square. The samples are paired and not all
+    equal, each (n,), n >= 2; `statistic` takes the means (k,) of each.
     """
     n = samples[0].size
     draws = np.random.default_rng(BOOTSTRAP_SEED).integers(0, n, (RESAMPLES, n))
@@ -148,17 +148,17 @@ def bootstrap_interval(
 
 
 def median_of(values: ArrayLike) -> Estimate:
-    """Return the median of values (n,) with a 95 % interval that supposes nothing of their spread.
+    """Return the median of values (n,) with a distribution-free 95 % interval.
 
     The interval ends at two of the values. The number of values below the true median is binomial
     (Conover, Practical Nonparametric Statistics, 3rd ed., 1999, section 3.2). Fewer than six values
-    have none.
+    have no interval.
     """
     data = np.sort(np.asarray(values, np.float64))
     n = data.size
     if not n:
         return NO_ESTIMATE
-    # The greatest number of values that may be left out on either side.
+    # Maximum number of values that may be left out on either side.
     out = _binomial_quantile(0.5 * (1.0 - CONFIDENCE), n) - 1
     middle = float(np.median(data))
     if out < 0:
@@ -167,7 +167,7 @@ def median_of(values: ArrayLike) -> Estimate:
 
 
 def _binomial_quantile(probability: float, n: int) -> int:
-    """Return the least number of heads in n tosses of a coin whose cumulated share reaches it."""
+    """Return the minimum number of heads in n coin tosses with this cumulative probability."""
     heads = np.arange(n)
     steps = np.log(n - heads) - np.log1p(heads)
     logarithms = np.concatenate([[0.0], np.cumsum(steps)]) - n * math.log(2.0)
@@ -175,12 +175,12 @@ def _binomial_quantile(probability: float, n: int) -> int:
 
 
 def reached_goals(episodes: Sequence[EpisodeRecord]) -> list[bool]:
-    """Return whether each valid flight reached its goal: an aborted one did not."""
+    """Return True for each valid flight that reached its goal; an aborted one did not."""
     return [e.outcome is Outcome.SUCCESS for e in episodes if not e.invalid]
 
 
 def aggregate(episodes: Sequence[EpisodeRecord]) -> Aggregate:
-    """Work out a run's figures, over its valid episodes."""
+    """Return a run's figures, over its valid episodes."""
     outcomes = dict.fromkeys(Outcome, 0)
     for episode in episodes:
         outcomes[episode.outcome] += 1

@@ -1,4 +1,4 @@
-"""The true path of one episode, sampled at 50 Hz from the plant."""
+"""True path of one episode, sampled at 50 Hz from the plant."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SAMPLE_US = 20_000
-"""Time between samples [µs]: 50 Hz."""
+"""Sampling period [µs]: 50 Hz."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,8 @@ class Trajectory:
     velocity: NDArray[np.float64]  # (n, 3) NED [m/s]
     quaternion: NDArray[np.float64]  # (n, 4) [w, x, y, z] body -> world
     power_w: NDArray[np.float64]  # (n,) electrical power of the vehicle, without its computer
-    """Mean over the time since the sample before, so that power times time adds up to the energy
-    that was integrated at the full tick rate; NaN where nobody measured it."""
+    """Mean since the previous sample, so that power times time equals the energy integrated at the
+    full tick rate; NaN without a measurement."""
 
     def __post_init__(self) -> None:
         """Check shapes and order. Raises ValueError."""
@@ -47,8 +47,8 @@ class Trajectory:
     def between(self, start_us: int, end_us: int) -> Trajectory:
         """Return the part from `start_us` to `end_us` [µs], its ends interpolated.
 
-        Samples beyond the recording are not made up: the part ends where the recording does. It
-        is empty when the two do not overlap.
+        The part is limited to the recording: it ends at the recording's end, and is empty without
+        an overlap.
         """
         if not len(self):
             return self
@@ -69,7 +69,7 @@ class Trajectory:
 
         quaternion = linear(self._continuous_quaternion())
         quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-        # Power is a mean over the step that ends at a sample. The step a time falls in has it.
+        # Power is a mean over the step that ends at a sample; a time inside a step uses its power.
         return Trajectory(
             times, linear(self.position), linear(self.velocity), quaternion, self.power_w[before]
         )
@@ -87,21 +87,21 @@ class Trajectory:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Trajectory:
-        """Build from arrays by field name. Raises KeyError or ValueError when they do not fit."""
+        """Build from arrays by field name. Raises KeyError or ValueError if invalid."""
         return cls(**{field.name: arrays[field.name] for field in fields(cls)})
 
 
 def pose_at(
     path: Trajectory, time_us: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return position (3,), velocity (3,) and quaternion (4,), the nearest there is to a time."""
+    """Return position (3,), velocity (3,), quaternion (4,) at a time, limited to the recording."""
     time = min(max(time_us, int(path.time_us[0])), int(path.time_us[-1]))
     at = path.between(time, time)
     return at.position[0], at.velocity[0], at.quaternion[0]
 
 
 class TrajectoryRecorder:
-    """Collects the true state of every tick and keeps it at 50 Hz."""
+    """Collects the true state of every tick and samples it at 50 Hz."""
 
     def __init__(self) -> None:
         self._times: list[int] = []
@@ -111,13 +111,13 @@ class TrajectoryRecorder:
         self._last_us: int | None = None
         self._kept_us = 0
         self._energy_uj = 0.0
-        """Since the last sample: power [W] times microseconds."""
+        """Power [W] times microseconds since the last sample."""
         self._power_w = 0.0
 
     def extend(
         self, times_us: Sequence[int], powers_w: Sequence[float], states: NDArray[np.float64]
     ) -> list[int]:
-        """Take n ticks with states (n, >= 10); return which of them were sampled."""
+        """Add n ticks with states (n, >= 10); return the indices of the sampled ticks."""
         kept, last_us, power_w = [], self._last_us, self._power_w
         for k, (time_us, power_w) in enumerate(zip(times_us, powers_w, strict=True)):
             if last_us is not None:
@@ -134,10 +134,10 @@ class TrajectoryRecorder:
         return kept
 
     def keep(self, state: NDArray[np.float64]) -> None:
-        """Sample the newest tick, as at the last moment of an episode.
+        """Sample the newest tick, as at the end of an episode.
 
         `state` (10,) is position NED [m], velocity NED [m/s] and quaternion [w, x, y, z] body ->
-        world. It is not copied: it must not change afterwards.
+        world. It is not copied: do not change it afterwards.
         """
         time_us = self._last_us
         if time_us is None:
@@ -150,7 +150,7 @@ class TrajectoryRecorder:
         self._kept_us, self._energy_uj = time_us, 0.0
 
     def trajectory(self) -> Trajectory:
-        """Return what was recorded so far."""
+        """Return the recorded trajectory."""
         rows = np.concatenate([np.zeros((0, 10)), *self._states])
         return Trajectory(
             np.array(self._times, np.int64),

@@ -1,8 +1,8 @@
-"""Was a flight a test of the policy, or of a host that could not keep up with it?
+"""Validity of a flight: a test of the policy, or disturbed by the host.
 
-Flights that live by the wall clock share a machine with everything else that runs there. Where it
-was too busy, or somebody else commanded the vehicle, what was flown says nothing of the policy. It
-is flown again, and never counted in silence. The rules are one table, of shares and simulated time.
+Flights paced by the wall clock share a machine with other programs. An overloaded host or another
+client's commands invalidate a flight. Invalid flights are repeated, and never counted silently. The
+rules are one table, of shares and simulated time.
 """
 
 from __future__ import annotations
@@ -18,42 +18,41 @@ from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.latency.stamps import NO_STAMP
 
 BY_HAND = "latency or compensation was changed by hand"
-"""Why a flight is no test of its scenario that somebody has changed while it flew."""
+"""Invalidity reason after a manual change in flight."""
 
 LATE_FRAMES = 3.0
-"""A frame older than so many camera periods when it is decided on, or a decision that comes so much
-later than the end of the hold time before it, was late. With a host that keeps pace it is one
-period and the transport."""
+"""Delay limit in camera periods, for a frame's age at its decision, and for a decision's start
+after the previous hold time. With a fast host the delay is one period plus transport."""
 
 
 @dataclass(frozen=True)
 class HostFigures:
-    """What the host did to a flight. None where there is nothing to work it out from."""
+    """Disturbance of a flight by the host. None without data."""
 
     given_up: float
-    """Simulated time given up, as a share of the flight."""
+    """Skipped simulated time, as a share of the flight."""
     tick_lateness_ms: float | None
-    """99th percentile of how late ticks began [simulated ms]."""
+    """99th percentile of the ticks' start delay [simulated ms]."""
     speed: float | None
-    """Simulated seconds per wall second, as a share of those asked for."""
+    """Simulated seconds per wall second, as a share of the requested speed."""
     stale_frames: float | None
-    """Share of decisions on a frame that was older than `LATE_FRAMES` camera periods."""
+    """Share of decisions on a frame older than `LATE_FRAMES` camera periods."""
     late_decisions: float | None
     """Share of decisions that began more than `LATE_FRAMES` camera periods after the hold time."""
 
 
 class Rule(NamedTuple):
-    """A bound that a flight must keep to be valid."""
+    """Bound that a flight must keep to be valid."""
 
     figure: str
     """Field of `HostFigures`."""
     limit: float
     least: bool
-    """Whether the limit is a least value, not a greatest."""
+    """True for a minimum, False for a maximum."""
     scale: float
-    """From the figure to the unit of the text."""
+    """Factor from the figure to the unit of the text."""
     text: str
-    """What is wrong, with places for the figure and for the limit."""
+    """Problem description, with placeholders for the figure and the limit."""
 
 
 RULES = (
@@ -77,8 +76,8 @@ RULES = (
         "{:.0f} % of decisions were paced too late (limit {:g} %)",
     ),
 )
-"""What a host must keep to. Ticks are 4 ms apart and camera frames mostly 33 ms. A decision moves a
-vehicle at 4 m/s by 0.16 m in 40 ms, a tenth of what a hold time of 0.5 s does."""
+"""Validity rules. Ticks are 4 ms apart and camera frames mostly 33 ms. A decision moves a vehicle
+at 4 m/s by 0.16 m in 40 ms, a tenth of its effect in a hold time of 0.5 s."""
 
 
 def host_figures(
@@ -92,13 +91,12 @@ def host_figures(
     frame_period_us: int,
     excused: Sequence[tuple[int, int]] = (),
 ) -> HostFigures:
-    """Work out what the host did to a flight, in simulated time.
+    """Return the disturbance of a flight by the host, in simulated time.
 
-    `flight_us` is from the reset to the verdict, without the time given up in it, `slipped_us`;
-    `wall_s` the wall time of the same, None if it was not paced. `lateness_us` (n,) is how late
-    each tick began. `decisions` has stamps by column, as in `latency.npz`. `excused` are the times
-    in which decisions may be late for what was asked for. These are faults of the camera, a link or
-    a process, or images that take long to draw.
+    `flight_us` is the time from the reset to the verdict, without skipped time, `slipped_us`;
+    `wall_s` is the wall time, None without pacing. `lateness_us` (n,) is the start delay of each
+    tick. `decisions` has stamps by column, as in `latency.npz`. `excused` are intervals in which
+    requested faults or slow images may delay decisions: faults of the camera, a link or a process.
     """
     kept = None
     if wall_s and speed:
@@ -119,7 +117,7 @@ def host_figures(
 
 
 def host_faults(figures: HostFigures, strangers: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return why a flight is no test of its policy; `strangers` commanded the vehicle."""
+    """Return the reasons why a flight is invalid; `strangers` are other commanding clients."""
     faults = []
     for rule in RULES:
         value = getattr(figures, rule.figure)
@@ -148,7 +146,7 @@ def _share_beyond(
     limit_us: float,
     excused: Sequence[tuple[int, int]],
 ) -> float | None:
-    """Return the share of intervals longer than a limit, excused times aside; None: none."""
+    """Return the share of intervals over a limit, without excused times; None: no interval."""
     if start not in stamps or end not in stamps:
         return None
     first, last = stamps[start], stamps[end]

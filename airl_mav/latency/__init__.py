@@ -1,1 +1,1 @@
-"""How late a decision is: stamps, stages, percentiles, and latencies to inject."""
+"""Decision latency: stamps, stages, percentiles, and injection."""

@@ -1,9 +1,9 @@
-"""What per-decision percentiles leave out: a slow decision also keeps the next ones from beginning.
+"""Corrections of per-decision percentiles: a slow decision also delays the next ones.
 
 The loop is closed: the next decision begins after the last one ends. A stall of two seconds is one
-sample of a thousand, though the vehicle flew blind for two seconds ("coordinated omission", Gil
-Tene). Two views put the time back: Tene's correction for an expected interval, as HdrHistogram's
-`copyCorrectedForCoordinatedOmission` has it, and the age of the flown command, weighted by time.
+sample of a thousand, although the vehicle flew blind for two seconds ("coordinated omission", Gil
+Tene). Two corrections: Tene's for an expected interval, as in HdrHistogram's
+`copyCorrectedForCoordinatedOmission`, and the age of the flown command, weighted by time.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from airl_mav.latency.percentiles import MIN_SAMPLES
 
 
 def corrected(samples_us: ArrayLike, expected_us: int) -> NDArray[np.int64]:
-    """Return latencies [µs] with those of the decisions that a slow one kept from beginning.
+    """Return latencies [µs] with added samples for decisions that a slow one delayed.
 
-    Each longer than the interval is followed by copies of less and less, down to one interval.
+    Each latency longer than the interval is followed by copies, each shorter by one interval, down
+    to one interval.
     """
     if expected_us <= 0:
         raise ValueError(f"expected_us={expected_us}: must be > 0")
@@ -34,21 +35,21 @@ def corrected(samples_us: ArrayLike, expected_us: int) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class CommandAges:
-    """How old the flown command was over a flight: it ages evenly from one command to the next."""
+    """Age of the flown command over a flight, increasing with time between commands."""
 
     youngest_us: NDArray[np.int64]
-    """(n,) age of each command as it took effect [µs]."""
+    """(n,) age of each command at its effect [µs]."""
     oldest_us: NDArray[np.int64]
-    """(n,) its age as the next one took over [µs]."""
+    """(n,) age of each command at its replacement [µs]."""
 
     @property
     def time_us(self) -> int:
-        """Time that all commands were flown [µs]."""
+        """Total time of all commands [µs]."""
         return int((self.oldest_us - self.youngest_us).sum())
 
     @property
     def mean(self) -> float | None:
-        """Mean age at a random moment [µs]; None when nothing was flown."""
+        """Mean age at a random time [µs]; None without commands."""
         if not self.time_us:
             return None
         a, b = self.youngest_us.astype(np.float64), self.oldest_us.astype(np.float64)
@@ -61,19 +62,19 @@ class CommandAges:
         return self.quantile(p / 100.0)
 
     def quantile(self, share: float) -> float:
-        """Return the age [µs] not exceeded for a share (0..1) of the time; time must have passed.
+        """Return the age [µs] not exceeded for a share (0..1) of the time; requires commands.
 
-        The ages of a command are uniform from its youngest to its oldest. So the distribution is a
-        sum of ramps. Between two neighbouring ends it is a straight line.
+        A command's age is uniform from its youngest to its oldest. The distribution is therefore a
+        sum of ramps, and linear between two neighbouring ends.
         """
         ends = np.sort(np.concatenate([self.youngest_us, self.oldest_us]))
-        # Commands that are being aged just above each end.
+        # Number of commands active just above each end.
         active = np.searchsorted(np.sort(self.youngest_us), ends, "right") - np.searchsorted(
             np.sort(self.oldest_us), ends, "right"
         )
         time = np.concatenate([[0], np.cumsum(active[:-1] * np.diff(ends))])
         wanted = share * time[-1]
-        # Of several ends at the same time the first: ages between them were never flown.
+        # First of several ends at the same time: ages between them were never flown.
         k = int(np.searchsorted(time, wanted, "left"))
         if k == 0:
             return float(ends[np.flatnonzero(time == 0)[-1]])
@@ -83,9 +84,9 @@ class CommandAges:
 def command_ages(
     exposed_us: ArrayLike, flown_us: ArrayLike, flight: ArrayLike | None = None
 ) -> CommandAges:
-    """Return how old the commands of flights were while they were flown.
+    """Return the ages of the commands while they were flown.
 
-    The last command of a flight is left out: nothing says how long it was flown.
+    The last command of a flight is left out, because its end is unknown.
     """
     exposed, flown = np.asarray(exposed_us, np.int64), np.asarray(flown_us, np.int64)
     flights = np.zeros(exposed.size, np.int64) if flight is None else np.asarray(flight, np.int64)
@@ -96,10 +97,10 @@ def command_ages(
 
 
 def ages_in_closed_loop(latency_us: ArrayLike, hold_us: int) -> CommandAges:
-    """Return the ages in a loop of which only the latencies [µs], in their order, and t3 are known.
+    """Return the ages in a loop from ordered latencies [µs] and t3 alone.
 
-    A command is `latency` old as it takes effect, and `latency + hold + next latency` as the next
-    one takes over.
+    A command's age is `latency` at its effect, and `latency + hold + next latency` at its
+    replacement.
     """
     latency = np.asarray(latency_us, np.int64)
     return CommandAges(latency[:-1], latency[:-1] + hold_us + latency[1:])

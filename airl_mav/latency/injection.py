@@ -1,4 +1,4 @@
-"""Which decision latency a rehearsal flies with, and how the report must call it."""
+"""Selection of a rehearsal's decision latency, and its label in reports."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from airl_mav.profiles.computer import ComputerProfile, Latency, Workload
 Origin = Literal["measured", "injected", "estimated"]
 
 ESTIMATE = "estimate"
-"""Name that asks for an estimate from multiply-accumulates instead of a workload."""
+"""Workload name that requests an estimate from multiply-accumulates."""
 
 
 @dataclass(frozen=True)
 class Injection:
-    """The latency t2 of a rehearsal."""
+    """Decision latency t2 of a rehearsal."""
 
     origin: Origin
-    """`measured`: nothing is injected, t2 is what the machine takes."""
+    """Origin of t2; `measured`: nothing is injected, the machine's time counts."""
     label: str
-    """One line for people: as if what was flown."""
+    """Description in one line."""
     source: str = ""
     assumed: str = ""
     latency: Latency | None = None
-    """What to draw from; None injects nothing."""
+    """Distribution to draw from; None injects nothing."""
 
     def sampler(self, rng: np.random.Generator) -> LatencySampler | None:
-        """Return the source of latencies, or None when nothing is injected."""
+        """Return the source of latencies, or None without injection."""
         return None if self.latency is None else build_sampler(self.latency, rng)
 
 
@@ -40,7 +40,7 @@ NOTHING_INJECTED = Injection("measured", "native speed of the machine that flew;
 
 
 def without_timing(chosen: Injection, native_ms: float, level: str) -> Injection:
-    """Return an injection in the words of a level that times nothing; its t2 is `native_ms`."""
+    """Return an injection for an untimed level, where the default t2 is `native_ms`."""
     if chosen.latency is not None:
         return chosen
     label = f"{native_ms:g} ms in every decision, as of a desktop computer"
@@ -55,13 +55,13 @@ def choose_injection(
     policy_sha256: str | None = None,
     macs: int | None = None,
 ) -> Injection:
-    """Choose the latency that a policy flies with on a computer.
+    """Choose the latency of a policy on a computer.
 
-    A workload of its profile: as if the computer ran that network; `estimate` scales the workload
-    nearest in multiply-accumulates (`macs` of one inference). None: what was measured for the very
-    policy of a digest, if anything. Otherwise nothing is injected. Leave the digest out when the
-    policy really runs on that computer. Then nothing is added to what is measured. Raises
-    UsageError if the computer has no such workload, or nothing to estimate from.
+    `workload` selects an entry of the computer's profile; `estimate` scales the workload nearest in
+    multiply-accumulates (`macs` of one inference). None selects the measurement for the policy's
+    digest, if any. Otherwise nothing is injected. Omit the digest if the policy really runs on that
+    computer, so that nothing is added to its own time. Raises UsageError if the computer lacks the
+    workload, or any workload to estimate from.
     """
     if workload is None:
         for name, work in computer.workloads.items():
@@ -113,7 +113,7 @@ def _scaled(work: Workload, factor: float) -> Latency:
 
 
 def moments(latency: Latency) -> str:
-    """Return mean and spread of a latency as text."""
+    """Return mean and standard deviation of a latency as text."""
     if latency.samples_ms is not None:
         samples = np.array(latency.samples_ms)
         return f"{len(samples)} samples, {samples.mean():.3g} ± {samples.std():.2g} ms"

@@ -1,4 +1,4 @@
-"""Percentiles, printed only with enough samples behind them; whether samples come in runs."""
+"""Percentiles with a minimum sample size, and autocorrelation of samples."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 MIN_SAMPLES: Final = {50.0: 1, 90.0: 64, 95.0: 130, 99.0: 662, 99.9: 6636}
-"""Fewest samples for a percentile p: so many that, if the true p-quantile lay above the bound that
-we print, at most one sample over the bound would be a 1 % chance. It is the early-stopping rule of
-MLPerf LoadGen at 99 % confidence."""
+"""Minimum number of samples for a percentile p. If the true p-quantile lay above the printed bound,
+at most one sample over the bound would have a 1 % chance. This is the early-stopping rule of MLPerf
+LoadGen at 99 % confidence."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What a set of durations looks like; times in µs, None where samples are too few."""
+    """Summary of durations; times in µs, None with too few samples."""
 
     n: int
     mean: float | None
@@ -56,8 +56,8 @@ WINDOW = 5.0
 def autocorrelation(samples: ArrayLike, lags: int) -> NDArray[np.float64]:
     """Return the autocorrelation of samples (n,) at lags 0 to `lags` (lags + 1,), each in -1..1.
 
-    The biased estimate (every lag divided by n), whose sums stay finite. Samples without any spread
-    have none: 1 at lag 0, then 0. Raises ValueError unless n > `lags`.
+    The biased estimate (every lag divided by n), whose sums stay finite. For constant samples: 1 at
+    lag 0, then 0. Raises ValueError unless n > `lags`.
     """
     values = np.asarray(samples, np.float64)
     if not 0 <= lags < values.size:
@@ -75,9 +75,9 @@ def autocorrelation(samples: ArrayLike, lags: int) -> NDArray[np.float64]:
 def integrated_time(samples: ArrayLike) -> float:
     """Return the integrated autocorrelation time [decisions], 1 for independent samples.
 
-    1 + 2 (rho_1 + ... + rho_M), with Sokal's window: M is the least that is 5 of these times or
-    more (Sokal 1997, Monte Carlo methods in statistical mechanics, section 3). n >= 2 samples carry
-    as much about the mean as n / time independent ones.
+    1 + 2 (rho_1 + ... + rho_M), with Sokal's window: M is the minimum lag of at least 5 of these
+    times (Sokal 1997, Monte Carlo methods in statistical mechanics, section 3). n >= 2 samples
+    determine the mean as well as n / time independent ones.
     """
     values = np.asarray(samples, np.float64)
     most = values.size // 2

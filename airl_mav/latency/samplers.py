@@ -1,4 +1,4 @@
-"""Draw decision latencies to inject, so that one computer flies as another."""
+"""Samplers of injected decision latencies, to emulate another computer."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.profiles.computer import Latency
 
 LATENCY_STREAM = 2
-"""Second word of the seed of other latencies than an episode's own."""
+"""Second word of the seed of latencies with another `draw`."""
 
 
 class LatencySampler(Protocol):
-    """A source of latencies."""
+    """Source of latencies."""
 
     def sample_us(self) -> int:
         """Return the next latency [µs], >= 0."""
 
 
 class FixedSampler:
-    """Always the same latency."""
+    """Constant latency."""
 
     def __init__(self, latency_us: int) -> None:
         """Take the latency [µs], >= 0."""
@@ -37,7 +37,7 @@ class FixedSampler:
 
 
 class LognormalSampler:
-    """A least latency plus a log-normal; mean and standard deviation are those of the sum."""
+    """Minimum latency plus a log-normal; mean and standard deviation apply to the sum."""
 
     def __init__(
         self, mean_us: float, std_us: float, min_us: float, rng: np.random.Generator
@@ -53,12 +53,12 @@ class LognormalSampler:
 
 
 class TruncatedNormalSampler:
-    """A normal, drawn again while it falls below the least latency."""
+    """Normal distribution, redrawn below the minimum latency."""
 
     def __init__(
         self, mean_us: float, std_us: float, min_us: float, rng: np.random.Generator
     ) -> None:
-        """Take the moments of the uncut normal [µs]; min_us < mean_us, so most draws stand."""
+        """Take the moments of the untruncated normal [µs]; min_us < mean_us keeps redraws rare."""
         self._mean_us, self._std_us, self._min_us = mean_us, std_us, min_us
         self._rng = rng
 
@@ -70,15 +70,15 @@ class TruncatedNormalSampler:
 
 
 class ReplaySampler:
-    """Measured latencies in the order they were measured, round and round, from a random place.
+    """Measured latencies in their order, cyclic, from a random start.
 
-    The order keeps what a histogram loses: slow decisions come in runs (another process, a hot
-    processor). Every sample is equally likely at every decision, and neighbours stay neighbours.
-    It is the circular block bootstrap (Politis & Romano 1992) with one block a flight.
+    The order preserves runs of slow decisions (another process, a hot processor), which a histogram
+    loses. Every sample is equally likely at every decision, and neighbours stay neighbours. This is
+    the circular block bootstrap (Politis & Romano 1992) with one block per flight.
     """
 
     def __init__(self, samples_us: ArrayLike, rng: np.random.Generator) -> None:
-        """Take the measured latencies (n,) [µs], n >= 1, in their order."""
+        """Take the measured latencies (n,) [µs], n >= 1, in order."""
         self._samples_us: NDArray[np.int64] = np.asarray(samples_us, np.int64)
         if not self._samples_us.size:
             raise ValueError("no samples to draw from")
@@ -99,7 +99,7 @@ def lognormal_parameters(mean: float, std: float) -> tuple[float, float]:
 
 
 def latency_generator(seed: int, draw: int = 0) -> np.random.Generator:
-    """Return the generator of an episode's latencies; another `draw` gives other ones."""
+    """Return the generator of an episode's latencies; another `draw` gives other latencies."""
     return np.random.default_rng((seed, LATENCY_STREAM, draw) if draw else seed)
 
 

@@ -1,8 +1,8 @@
-"""Latency sources written as text: what `--latency` takes.
+"""Latency sources as text: values of `--latency`.
 
 `150ms` (fixed), `lognormal:396ms,20ms` and `normal:396ms,20ms` (mean, standard deviation; a third
-number is the least), `COMPUTER/WORKLOAD` (an entry of a computer profile), or a path to a text file
-of measured latencies, one a line in ms, which are replayed in their order.
+number is the minimum), `COMPUTER/WORKLOAD` (an entry of a computer profile), or a path to a text
+file of measured latencies, one per line in ms, replayed in order.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def select_injection(
     policy_sha256: str | None = None,
     macs: int | None = None,
 ) -> Injection:
-    """Choose a flight's latency, by a source as text or a computer, or raise UsageError."""
+    """Choose a flight's latency, by a text source or a computer. Raises UsageError."""
     if source is None:
         return choose_injection(computer, workload, policy_sha256=policy_sha256, macs=macs)
     if workload is not None:
@@ -54,7 +54,7 @@ def select_injection(
 
 
 def parse_latency(text: str, option: str = "--latency") -> Injection:
-    """Return the latency of a source written as text; a UsageError names the option."""
+    """Return the latency of a text source; a UsageError names the option."""
     path = Path(text)
     if path.is_file():
         latency = Latency(distribution="samples", samples_ms=read_samples(path, option))
@@ -73,7 +73,7 @@ def parse_latency(text: str, option: str = "--latency") -> Injection:
 
 
 def longest_ms(latency: Latency) -> float:
-    """Return the longest latency [ms]; that of an endless distribution is its 99.9 % quantile."""
+    """Return the maximum latency [ms], for an unbounded distribution the 99.9 % quantile."""
     if latency.samples_ms is not None:
         return max(latency.samples_ms)
     mean_ms, std_ms = latency.mean_ms or 0.0, latency.std_ms or 0.0
@@ -99,12 +99,12 @@ def _latency(fields: dict[str, object], text: str, option: str) -> Latency:
 
 
 def duration_ms(text: str) -> float | None:
-    """Return a time with its unit, as `150ms` or `10min`, in ms; None when it is none."""
+    """Return a time with its unit, as `150ms` or `10min`, in ms; None if invalid."""
     found = _TIME.fullmatch(text.strip())
     return None if found is None else float(found[1]) * _MS[found[2]]
 
 
 def _milliseconds(text: str) -> float | None:
-    """Return a latency with its unit in ms, infinite beyond the longest; None when it is none."""
+    """Return a latency with its unit in ms, infinite above `LONGEST_MS`; None if invalid."""
     value_ms = duration_ms(text)
     return math.inf if value_ms is not None and value_ms > LONGEST_MS else value_ms

@@ -1,4 +1,4 @@
-"""The stages of a decision: their stamps and durations, and which decisions miss a deadline."""
+"""Stages of a decision: their stamps and durations, and deadline misses."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Samples = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Stage:
-    """One measured interval."""
+    """Measured interval."""
 
     key: str
     title: str
     start: str
-    """Stamp at which it begins."""
+    """Stamp of the start."""
     end: str
-    """Stamp at which it ends."""
+    """Stamp of the end."""
     meaning: str
 
 
@@ -39,19 +39,19 @@ STAGES = (
     ),
     Stage("t3", "t3 hold", "sent_us", "held_until_us", "action applied → next observation"),
 )
-"""t1 to control follow each other and add up to end to end."""
+"""Stages in order; t1 to control add up to end to end."""
 
 PERIOD = Stage("period", "decision period", "sent_us", "sent_us", "from one action to the next")
 
 SETPOINT_TO_MOTOR = Stage(
     "setpoint_to_motor", "setpoint → motor", "sent_us", "motor_us", "link and control together"
 )
-"""What the flight side alone takes: the real-time figure."""
+"""Duration on the flight side: the real-time figure."""
 
 ALL_STAGES = (*STAGES, SETPOINT_TO_MOTOR, PERIOD)
 
 SHOWN_STAGES = (*STAGES, PERIOD)
-"""The rows of a latency table."""
+"""Rows of a latency table."""
 
 
 def stage_durations(
@@ -59,10 +59,10 @@ def stage_durations(
 ) -> dict[str, tuple[NDArray[np.int64], Samples]]:
     """Return the stages of an episode's decisions, by the stage's key.
 
-    Stamps are the decision log's columns plus `accepted_us` and `motor_us`, each (n,) [µs]. Of each
-    stage two arrays (k,): the decisions that have it, and its durations [µs]. A stage lacks the
-    decisions where one of its two stamps is `NO_STAMP`, and is empty where a whole column is
-    missing. A decision period belongs to the decision that ends it.
+    Stamps are the decision log's columns plus `accepted_us` and `motor_us`, each (n,) [µs]. Each
+    stage has two arrays (k,): the indices of its decisions, and the durations [µs]. A stage omits
+    decisions with `NO_STAMP` in either stamp, and is empty without the column. A decision period
+    belongs to the decision that ends it.
     """
     nothing: Samples = np.zeros(0, np.int64)
     found = {}
@@ -106,9 +106,9 @@ def deadline_miss_ratio(latencies: ArrayLike, deadline: float) -> float | None:
 def ages_at_effect(stamps: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
     """Return the age [µs] of each decision's frame when the decision took effect.
 
-    That is the stage `end_to_end`: exposure of the frame to the first motor command that reflects
-    the decision. A decision that never took effect, although a later one of the flight did, is
-    infinitely old. Those after the last one that took effect are left out.
+    Equals the stage `end_to_end`: from the frame's exposure to the first motor command that
+    reflects the decision. A decision without effect before a later effective one has infinite age.
+    Decisions after the last effective one are left out.
     """
     if "capture_us" not in stamps or "motor_us" not in stamps:
         return np.zeros(0)
@@ -127,14 +127,14 @@ FENCE_RANGES = 3.0
 out" (Exploratory Data Analysis, 1977, section 2D)."""
 
 FENCE_SAMPLES = 16
-"""With fewer samples a quartile has at most four on its far side: no fence is drawn."""
+"""Minimum samples for a fence: with fewer, at most four lie beyond a quartile."""
 
 FENCE_SHARE = 0.05
-"""When more lie beyond the fence they are no outliers but a second kind of decision."""
+"""Share beyond the fence above which values are a second kind of decision, not outliers."""
 
 
 def decision_series(stamps: Mapping[str, NDArray[Any]]) -> dict[str, Samples]:
-    """Return the duration [µs] of each decision's stages (n,), `NO_STAMP` where it is unknown."""
+    """Return the duration [µs] of each decision's stages (n,), `NO_STAMP` if unknown."""
     names = {name for stage in STAGES for name in (stage.start, stage.end)}
     n = max((len(stamps[name]) for name in names & stamps.keys()), default=0)
     series: dict[str, Samples] = {}
@@ -146,18 +146,18 @@ def decision_series(stamps: Mapping[str, NDArray[Any]]) -> dict[str, Samples]:
 
 @dataclass(frozen=True)
 class Fence:
-    """Where outliers begin."""
+    """Outlier threshold."""
 
     limit_us: float
-    """A duration above it is an outlier [µs]."""
+    """Maximum duration that is no outlier [µs]."""
     beyond: int
-    """How many lie above it."""
+    """Number of durations above it."""
     n: int
     second_kind: bool
-    """More lie above it than outliers would: nothing is marked."""
+    """True if too many lie above it for outliers: nothing is marked."""
 
     def marks(self, durations: Samples) -> NDArray[np.bool_]:
-        """Return (k,) which of the durations (k,) [µs] are outliers."""
+        """Return (k,) True for outliers among the durations (k,) [µs]."""
         if self.second_kind:
             return np.zeros(len(durations), np.bool_)
         above: NDArray[np.bool_] = durations > self.limit_us

@@ -1,7 +1,7 @@
-"""The decision log: one row of stamps a decision. numpy and the standard library only.
+"""Decision log: one row of stamps per decision. numpy and the standard library only.
 
-Raw integers go into one preallocated block. Everything else is worked out after the flight.
-Recording costs about 0.3 µs on a desktop core.
+Raw integers go into one preallocated block. Everything else is computed after the flight. Recording
+costs about 0.3 µs on a desktop core.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from airl_mav.core.constants import CommandKind
 
 NO_STAMP = -1
-"""Stands for a time that never came: no frame, a setpoint that was not accepted."""
+"""Missing time: no frame, or a setpoint that was not accepted."""
 
 STAMPS = (
     "capture_us",
@@ -26,13 +26,13 @@ STAMPS = (
     "sent_us",
     "held_until_us",
 )
-"""Columns of simulated time [µs], in the order in which they happen."""
+"""Columns of simulated time [µs], in chronological order."""
 
 SETPOINT, ATTITUDE, RATES = "setpoint", "attitude_setpoint", "rates_setpoint"
 SETPOINTS: Mapping[CommandKind, str] = MappingProxyType(
     {"velocity": SETPOINT, "attitude": ATTITUDE, "body_rates": RATES}
 )
-"""Column of the setpoints, by what they command: who looks for velocities finds no others."""
+"""Column of the setpoints by command kind, so that kinds cannot be confused."""
 
 ROW = np.dtype([(name, "<i8") for name in STAMPS] + [("setpoint", "<f4", (4,))])
 """One decision, 64 bytes: the stamps, then the setpoint as the link sends it (float32)."""
@@ -46,7 +46,7 @@ class DecisionLog:
     __slots__ = ("_block", "_bytes", "_count", "_setpoints")
 
     def __init__(self, capacity: int = 4096, *, commands: CommandKind = "velocity") -> None:
-        """Reserve room for `capacity` (>= 1) decisions; it doubles when full."""
+        """Reserve space for `capacity` (>= 1) decisions; it doubles when full."""
         if capacity < 1:
             raise ValueError(f"capacity={capacity}: must be >= 1")
         self._setpoints = SETPOINTS[commands]
@@ -68,9 +68,10 @@ class DecisionLog:
         held_until_us: int,
         setpoint: tuple[float, float, float, float],
     ) -> None:
-        """Append one decision. Times in simulated µs, `NO_STAMP` for one that never came.
+        """Append one decision. Times in simulated µs, `NO_STAMP` if missing.
 
-        The setpoint has the four numbers that the autopilot receives, as `SETPOINTS` names them.
+        The setpoint contains the four numbers that the autopilot receives, as `SETPOINTS` names
+        them.
         """
         offset = self._count * ROW.itemsize
         if offset == len(self._bytes):
@@ -103,10 +104,10 @@ class DecisionLog:
 
 
 def setpoint_column(columns: Container[str]) -> str | None:
-    """Return the name of the column that holds the setpoints of decisions; None: there is none."""
+    """Return the name of the setpoint column; None if missing."""
     return next((name for name in SETPOINTS.values() if name in columns), None)
 
 
 def commanded(columns: Container[str]) -> CommandKind:
-    """Return what the setpoints of decisions command; without any a velocity, as most do."""
+    """Return the kind of the setpoints; velocity if missing."""
     return next((kind for kind, name in SETPOINTS.items() if name in columns), "velocity")

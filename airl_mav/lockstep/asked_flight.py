@@ -1,4 +1,4 @@
-"""A flight in lockstep whose decisions are asked for, one by one."""
+"""Lockstep flight that exchanges observations and actions with an external caller."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ VERDICTS = {
     Outcome.COLLISION: Verdict.COLLISION,
     Outcome.BATTERY: Verdict.BATTERY,
     Outcome.TIMEOUT: Verdict.TIMEOUT,
-    # It is neither a success nor a failure of whoever decides.
+    # Aborted flights count neither as success nor as failure of the policy.
     Outcome.ABORTED: Verdict.FLYING,
 }
 
@@ -39,21 +39,21 @@ IDLE: dict[CommandKind, AnyAction] = {
     "velocity": Action(0.0, 0.0, 0.0),
     "body_rates": BodyRates(0.0, 0.0, 0.0, 0.0),
 }
-"""What a flight that is called off is answered with; it is not sent any more."""
+"""Action returned to the companion of an aborted flight; its setpoint is not sent."""
 
 LEAVING_S = 0.2
-"""A flight that waits for a decision looks so often whether the program ends [wall s]."""
+"""Interval at which a flight waiting for an action checks for program exit [wall s]."""
 
 
 class AskedFlight:
-    """A flight on a thread of its own, which waits for every decision, or for the program's end.
+    """Flight on a separate thread that blocks until it receives an action or the program exits.
 
-    Implements `actions.Policy` for the companion. All other methods are for one other thread; they
-    return while the flight waits, so that its state stands.
+    Implements `actions.Policy` for the companion. Call all other methods from one other thread.
+    They return while the flight is blocked, so its state is constant.
     """
 
     def __init__(self, resolved: ResolvedScenario, seed: int) -> None:
-        """Begin a flight: it takes off, and asks for the first decision."""
+        """Start a flight: take off and request the first action."""
         self._events: SimpleQueue[Observation | FlownEpisode | BaseException] = SimpleQueue()
         self._answers: SimpleQueue[AnyAction] = SimpleQueue()
         self._idle = IDLE[resolved.pilot.commands]
@@ -63,17 +63,17 @@ class AskedFlight:
             0,
             seed,
             patience_s=math.inf,
-            lands=False,  # What it asks then is how the vehicle stands when the time is up.
+            lands=False,  # After a timeout, observations only report the vehicle's state.
             ticked=lambda *seen: self._account.ticked(*seen),
         )
         self._account = _Account(self._flight.arena)
         self._end: FlownEpisode | BaseException | None = None
-        # Not a daemon: MAVSDK is no longer there when those are ended.
+        # Not a daemon thread: MAVSDK is already destroyed when daemon threads end.
         self._thread = Thread(target=self._fly, name="rehearsal")
         self._thread.start()
 
     def act(self, observation: Observation) -> AnyAction:
-        """Ask for a decision, on the companion's thread."""
+        """Request an action, on the companion's thread."""
         self._events.put(observation)
         while main_thread().is_alive():
             with suppress(Empty):
@@ -82,11 +82,11 @@ class AskedFlight:
         return self._idle
 
     def asked(self) -> Observation | FlownEpisode:
-        """Return what the next decision is to be made on, or the flight when it is over.
+        """Return the observation for the next action, or the finished flight.
 
         Raises:
-            UsageError: It cannot be flown.
-            LockstepError: The companion hangs, or broke.
+            UsageError: The scenario cannot be flown.
+            LockstepError: The companion hangs or raised an error.
             FirmwareLostError: Real firmware was lost.
         """
         event = self._events.get()
@@ -97,26 +97,26 @@ class AskedFlight:
         return event
 
     def answer(self, action: AnyAction) -> Observation | FlownEpisode:
-        """Fly a decision until the next one is asked for; see `asked`."""
+        """Apply an action; return the next observation, or the finished flight."""
         self._answers.put(action)
         return self.asked()
 
     def flights(self) -> Flights:
-        """Return how the flight stands, or how it stood at its verdict: arrays (1,)."""
+        """Return the state of the flight, frozen at its verdict: arrays (1,)."""
         return self._account.flights()
 
     def outcome(self) -> Outcome | None:
-        """Return how it has ended; None: it has not."""
+        """Return the outcome; None = not decided yet."""
         return self._account.outcome()
 
     def moment(self, image: NDArray[np.uint8]) -> Moment:
-        """Return what a picture of now shows, with the image that the network sees."""
+        """Return the rendering data of the current time, with the policy's input image."""
         return self._account.moment(image)
 
     def end(self) -> FlownEpisode | None:
-        """Call it off, where it is not over; return the flight when it has ended.
+        """Abort the flight if it is still running; return the finished flight.
 
-        None: it has ended by an error.
+        Returns None if the flight ended with an error.
         """
         if self._end is None:
             self._flight.call_off()
@@ -130,13 +130,13 @@ class AskedFlight:
     def _fly(self) -> None:
         try:
             event: FlownEpisode | BaseException = self._flight.fly()
-        except BaseException as error:  # handed to whoever asks
+        except BaseException as error:  # raised in the caller's thread
             event = error
         self._events.put(event)
 
 
 class _Account:
-    """What a flight has come to, tick by tick; as the batch twin keeps it."""
+    """Metrics of a flight, updated every tick as in the vectorized simulator."""
 
     def __init__(self, arena: Arena) -> None:
         self._arena = arena
@@ -144,12 +144,12 @@ class _Account:
         self._referee: Referee | None = None
         self._hit: str | None = None
         self._newest = np.zeros((), TRUE_TICK)
-        """The newest of them, or that of the verdict."""
+        """True state of the newest tick, or of the verdict."""
         self._distance_m = self._energy_j = 0.0
         self._at_verdict: Flights | None = None
 
     def ticked(self, simulation: Simulation, referee: Referee, hit: str | None) -> None:
-        """Take the true states of the newest ticks."""
+        """Process the true states of the newest ticks."""
         truths, verdict = simulation.truths, referee.verdict
         self._simulation, self._referee, self._hit = simulation, referee, hit
         if referee.navigation_us is None or self._at_verdict is not None:
@@ -165,23 +165,23 @@ class _Account:
             self._at_verdict = self._now()
 
     def flights(self) -> Flights:
-        """Return how it stands, or stood at the verdict."""
+        """Return the state of the flight, frozen at its verdict."""
         return self._at_verdict or self._now()
 
     def outcome(self) -> Outcome | None:
-        """Return how it was judged; None: not yet."""
+        """Return the outcome; None = not decided yet."""
         verdict = None if self._referee is None else self._referee.verdict
         return None if verdict is None else verdict.outcome
 
     def moment(self, image: NDArray[np.uint8]) -> Moment:
-        """Return what a picture of now shows."""
+        """Return the data of a rendered frame at the current time."""
         simulation, _ = self._flown()
         truth, scene_us = simulation.truth, simulation.time_us - simulation.start_us
         yaw = quat_yaw(truth.quaternion)
         return Moment(self._arena, self.flights(), np.array(truth.position), yaw, scene_us, image)
 
     def _flown(self) -> tuple[Simulation, Referee]:
-        assert self._simulation is not None  # noqa: S101 (nobody asks before the first tick)
+        assert self._simulation is not None  # noqa: S101 (set by the first tick)
         assert self._referee is not None  # noqa: S101
         return self._simulation, self._referee
 
@@ -202,7 +202,7 @@ class _Account:
         )
 
     def _touched(self) -> int:
-        """Return what has been hit, as the batch twin numbers it."""
+        """Return the index of the object that was hit, as numbered by the vectorized simulator."""
         room = {None: NOTHING, "floor": FLOOR, "wall": WALL, "ceiling": CEILING}
         if self._hit in room:
             return room[self._hit]

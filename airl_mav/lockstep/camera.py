@@ -1,4 +1,4 @@
-"""The camera's frames in lockstep: held back until the companion may see them."""
+"""Camera transport in lockstep: delays each frame by its transport latency."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from firmware_sim.firmware import FrameServer
 
 
 class UnderWay:
-    """Frames between their exposure and the companion."""
+    """Queue of frames in transit from exposure to the companion."""
 
     def __init__(self, transport_us: int) -> None:
-        """Take the time from a frame's exposure until it lies decoded in the companion [µs]."""
+        """Set the transport latency [µs]: from exposure to the decoded frame in the companion."""
         self.published = threading.Event()
-        """Set with every frame that is sent; whoever waits for one clears it first."""
+        """Set by each sent frame; a waiting thread clears the event first."""
         self._transport_us = transport_us
         self._frames: deque[Frame] = deque()
 
     def send(self, frame: Frame) -> None:
-        """Send a frame on its way."""
+        """Queue a frame for delivery."""
         frames, arrived_us = self._frames, frame.capture_time_us - self._transport_us
         while len(frames) > 1 and frames[1].capture_time_us <= arrived_us:
-            frames.popleft()  # A newer one has arrived: nobody can see it any more.
+            frames.popleft()  # A newer frame has arrived: this one can no longer be read.
         frames.append(frame)
         if not self.published.is_set():
             self.published.set()
 
     def arrived(self, now_us: int) -> Frame | None:
-        """Take out what has arrived by `now_us` [µs]; return the newest, None if nothing has."""
+        """Remove all frames that arrived by `now_us` [µs]; return the newest or None."""
         newest = None
         while (next_us := self.next_us) is not None and next_us <= now_us:
             newest = self._frames.popleft()
@@ -41,43 +41,43 @@ class UnderWay:
 
     @property
     def next_us(self) -> int | None:
-        """When the next one arrives [µs]; None: none is under way."""
+        """Arrival time of the next frame [µs]; None = no frame is in transit."""
         return self._frames[0].capture_time_us + self._transport_us if self._frames else None
 
     @property
     def awaited(self) -> bool:
-        """Whether the companion waits for the next exposure."""
+        """True if the companion waits for the next exposure."""
         return not self.published.is_set()
 
     def clear(self) -> None:
-        """Forget all frames."""
+        """Discard all frames."""
         self._frames.clear()
 
 
 class MemoryCamera:
-    """Both ends of the camera: `firmware.FrameServer` and, by `latest`, `camera.FrameSource`."""
+    """In-process camera: `firmware.FrameServer` and, with `latest`, `camera.FrameSource`."""
 
     endpoint = "memory"
 
     def __init__(self, transport_us: int) -> None:
-        """Take the time from a frame's exposure until it lies decoded in the companion [µs]."""
+        """Set the transport latency [µs]: from exposure to the decoded frame in the companion."""
         self.clock: Clock | None = None
-        """The companion's."""
+        """Clock of the companion; None = not connected yet."""
         self._under_way = UnderWay(transport_us)
         self.publish = self._under_way.send
         self._newest: ReceivedFrame | None = None
 
     @property
     def awaited(self) -> bool:
-        """Whether the companion waits for the next exposure."""
+        """True if the companion waits for the next exposure."""
         return self._under_way.awaited
 
     def close(self) -> None:
-        """Forget all frames."""
+        """Discard all frames."""
         self._under_way.clear()
 
     def latest(self) -> ReceivedFrame | None:
-        """Return the newest frame that has arrived, without waiting; None before the first."""
+        """Return the newest frame that has arrived, without blocking; None before the first."""
         now_us = 0 if self.clock is None else self.clock.time_us()
         arrived = self._under_way.arrived(now_us)
         if arrived is not None:
@@ -85,9 +85,9 @@ class MemoryCamera:
         return self._newest
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a frame that is not the one already seen; see `companion.camera.FrameSource`.
+        """Wait for a frame with another sequence number; see `companion.camera.FrameSource`.
 
-        Here the time-out counts in simulated time.
+        The timeout is in simulated time.
         """
         clock, under_way = self.clock, self._under_way
         if clock is None:
@@ -107,14 +107,13 @@ class MemoryCamera:
 
 
 class TokenCamera:
-    """The camera of a companion in another process. Implements `firmware.FrameServer`.
+    """Camera of a companion in another process. Implements `firmware.FrameServer`.
 
-    Only the newest frame that has arrived when a turn begins is sent: the companion could not see
-    any other.
+    Each turn sends only the newest frame that has arrived, as the companion cannot read older ones.
     """
 
     def __init__(self, server: FrameServer, transport_us: int) -> None:
-        """Take where the frames go, and the time from a frame's exposure until it arrives [µs]."""
+        """Set the frame server and the transport latency from exposure to arrival [µs]."""
         self.under_way = UnderWay(transport_us)
         self.endpoint = server.endpoint
         self._server = server
@@ -122,29 +121,29 @@ class TokenCamera:
 
     @property
     def awaited(self) -> bool:
-        """Whether the companion waits for the next exposure."""
+        """True if the companion waits for the next exposure."""
         return self.under_way.awaited
 
     def publish(self, frame: Frame) -> None:
-        """Send a frame on its way, in simulated time."""
+        """Queue a frame for delivery, in simulated time."""
         self.under_way.send(frame)
 
     def arrive(self, now_us: int) -> bool:
-        """Take in what has arrived by `now_us` [µs]; return whether that is anything."""
+        """Receive all frames that arrived by `now_us` [µs]; return True if there was one."""
         arrived = self.under_way.arrived(now_us)
         self._newest = arrived or self._newest
         return arrived is not None
 
     @property
     def sequence(self) -> int:
-        """Sequence of the newest frame that has arrived."""
+        """Sequence number of the newest arrived frame."""
         return NO_FRAME if self._newest is None else self._newest.sequence
 
     def send(self) -> None:
-        """Send that frame, by the wall clock; also again, to whoever may have missed it."""
+        """Send the newest arrived frame immediately; a resend covers packet loss."""
         if self._newest is not None:
             self._server.publish(self._newest)
 
     def close(self) -> None:
-        """Forget all frames; the server is its owner's to close."""
+        """Discard all frames; the caller owns and closes the server."""
         self.under_way.clear()

@@ -1,8 +1,8 @@
-"""The conductor: decides what happens next on the one simulated clock.
+"""Scheduler of vehicle and companion on one simulated clock.
 
-It stands where the firmware waits for a tick's time (`firmware_sim.pacing.Pacing`). Up to that
-tick it lets everything happen that is due earlier, in order: the companion's turns, when it wakes,
-and MAVSDK's repetitions of the newest setpoint. Neither the firmware nor the companion knows.
+Runs where the firmware waits for the time of a tick (`firmware_sim.pacing.Pacing`). Before each
+tick it processes all earlier events in order: the companion's turns, at its wake-up times, and
+MAVSDK's repetitions of the newest setpoint. Firmware and companion run unmodified.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from airl_mav.lockstep.vehicle_end import VehicleEnd, acknowledged, command_of
 from firmware_sim.flight_controller import FirmwareLostError
 
 FEED_US = US_PER_S
-"""Telemetry is passed on when a turn begins, and after so long without one: MAVSDK gives a vehicle
-up after 3 s of wall time without a heartbeat [µs]."""
+"""Interval at which telemetry is forwarded between turns [µs]. MAVSDK drops a vehicle after 3 s of
+wall time without a heartbeat."""
 
 SHOWN_US = US_PER_S // 10
-"""The vehicle flies no longer at once where somebody looks on [µs]."""
+"""Maximum simulated time flown in one step when a viewer is connected [µs]."""
 
 SILENCE_US = 3 * US_PER_S
-"""A flight controller that says nothing for longer is no longer heard, as MAVSDK has it [µs]."""
+"""Silence after which the flight controller counts as lost, as in MAVSDK [µs]."""
 
 
 class Conductor:
-    """Conducts one flight. Implements `firmware_sim.pacing.Pacing`."""
+    """Scheduler of one flight. Implements `firmware_sim.pacing.Pacing`."""
 
     epoch_ns = None
     slipped_us = 0
@@ -45,51 +45,51 @@ class Conductor:
         speed: float | None = None,
         clock: SimClock | None = None,
     ) -> None:
-        """Put it between the two.
+        """Connect the vehicle and the companion.
 
         Args:
-            vehicle: The vehicle's end of the companion's link.
-            partner: The companion.
-            digest: Takes the fingerprint of what crosses the link; None: nobody wants it.
-            speed: Greatest number of simulated seconds per wall second; None: as fast as it goes.
-            clock: Simulated time, which it advances; None: its own.
+            vehicle: Vehicle's end of the companion link.
+            partner: Companion.
+            digest: Digest of all traffic on the link; None = not needed.
+            speed: Maximum simulated seconds per wall second; None = unlimited.
+            clock: Simulated clock, advanced here; None = a new one.
         """
         self.clock = clock or SimClock()
         self.ended = False
-        """Whether the companion has ended."""
+        """True after the companion has ended."""
         self._suspended = False
-        """Whether the companion is suspended."""
+        """True while the companion is suspended."""
         self._vehicle = vehicle
         self._partner = partner
         self._digest = digest or FlightDigest()
         self._speed = speed
         self.is_shown = speed is not None
-        """Whether somebody looks on."""
+        """True if a viewer is connected."""
         self.orders_us: Callable[[], float] = lambda: math.inf
-        """Returns when the companion may have an order by the passing of time [µs]."""
+        """Returns the time of the next time-based order to the companion [µs]."""
         self._wall: WallClock | None = None
         self._inbound = Inbound()
         self._turn = Turn(None)
         self._waiting: list[bytes] = []
-        """Telemetry that has not been passed on."""
+        """Telemetry that is not forwarded yet."""
         self._heard_us = self._passed_us = 0
         self._asked: int | None = None
-        """The command whose answer the companion waits for."""
+        """Command whose acknowledgement the companion is waiting for; None = no command."""
         self._answered = threading.Event()
         self._readable: Callable[[int], object] = lambda _time_us: None
 
     def begin(self, at_us: int) -> None:
-        """Give the companion its first turn at simulated `at_us` [µs]."""
+        """Give the companion its first turn at simulated time `at_us` [µs]."""
         if self._vehicle.answers_later:
-            self._vehicle.take()  # What real firmware has sent while it booted is out of date.
+            self._vehicle.take()  # Discard messages that real firmware sent during boot.
         self._turn = Turn(at_us)
 
     def suspend(self) -> None:
-        """Suspend the companion: it has no turns, and MAVSDK repeats nothing."""
+        """Suspend the companion: turns and MAVSDK's setpoint repetitions stop."""
         self._suspended = True
 
     def resume(self) -> None:
-        """Resume it: it has at once the turn that is overdue, and all telemetry since."""
+        """Resume the companion: it gets the overdue turn and all telemetry since at once."""
         if self._suspended:
             self._suspended = False
             self._turn = replace(self._turn, poll=None)
@@ -97,14 +97,14 @@ class Conductor:
 
     @property
     def heard(self) -> bool:
-        """Whether the companion hears the flight controller."""
+        """True if the companion receives the flight controller's messages."""
         return self.clock.time_us() - self._heard_us <= SILENCE_US
 
     # --- firmware_sim.pacing.Pacing
 
     @property
     def quiet_until_us(self) -> float:
-        """When the companion has its next turn [µs]; MAVSDK's repetitions are `arrivals`."""
+        """Time of the companion's next turn [µs]; `arrivals` handles MAVSDK's repetitions."""
         turn = self._turn
         if self._suspended or self._asked is not None or turn.wake_us is None:
             return 0.0
@@ -112,7 +112,7 @@ class Conductor:
             return 0.0
         wake_us, poll = float(turn.wake_us), turn.poll
         if poll is not None and poll.quiet_us is not None and not poll.due(self._waiting):
-            # At most to the tick of the next heartbeat: the vehicle stops flying there.
+            # At most to the tick of the next heartbeat: the vehicle's uninterrupted run ends there.
             checks = poll.quiet_us(self._waiting) / poll.every_us
             wake_us += poll.every_us * (checks if math.isinf(checks) else max(0, int(checks) - 1))
         if self.is_shown:
@@ -121,42 +121,42 @@ class Conductor:
 
     @property
     def arrivals(self) -> Conductor:
-        """Itself: it repeats the setpoint."""
+        """The scheduler, which also repeats setpoints."""
         return self
 
     @property
     def next_us(self) -> float:
-        """When MAVSDK repeats the newest setpoint [µs]; inf = it does not."""
+        """Time of MAVSDK's next setpoint repetition [µs]; inf = never."""
         repeat_us = self._inbound.next_repeat_us
         return math.inf if repeat_us is None else repeat_us
 
     def arrive(self, tick_us: int) -> None:
-        """Deliver the repetitions that are due up to simulated `tick_us` [µs]."""
+        """Deliver all repetitions that are due up to simulated `tick_us` [µs]."""
         while (repeat_us := self._inbound.next_repeat_us) is not None and repeat_us <= tick_us:
             self.clock.sleep_until(repeat_us)
             self._deliver(self._inbound.repeat(repeat_us), self._readable)
 
     def restart(self, tick_us: int) -> None:
-        """Set the clock to `tick_us`."""
+        """Set the clock to simulated `tick_us` [µs]."""
         self.clock.sleep_until(tick_us)
         if self._speed is not None:
             self._wall = WallClock(self._speed)
             self._wall.epoch_ns -= int(tick_us * 1_000 / self._speed)
 
     def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
-        """Let everything happen that is due up to simulated `tick_us`, and return that time [µs].
+        """Process all events up to simulated `tick_us` [µs] and return that time.
 
         Args:
-            tick_us: The next tick's time.
-            sockets: Not used: what the vehicle sends is taken after each tick.
-            readable: Makes the vehicle carry out what has arrived, at a given time.
+            tick_us: Time of the next tick [µs].
+            sockets: Unused: the vehicle's messages are read after each tick.
+            readable: Callback that lets the vehicle process received messages at a given time.
         """
         del sockets
         self._readable = readable
         if self._wall is not None:
             self._wall.sleep_until(tick_us)
         self._pass_over_polls(tick_us)
-        self.clock.sleep_until(tick_us - TICK_US)  # when the newest tick began
+        self.clock.sleep_until(tick_us - TICK_US)  # start of the newest tick
         self._keep(self._vehicle.after_tick(expected=self._asked is not None))
         if self._suspended:
             self.clock.sleep_until(tick_us)
@@ -186,7 +186,7 @@ class Conductor:
         return tick_us
 
     def _pass_over_polls(self, tick_us: int) -> None:
-        """Leave out the checks before the newest tick began: they would fail."""
+        """Skip all polls before the start of the newest tick: their condition is not met there."""
         wake_us, poll = self._turn.wake_us, self._turn.poll
         if wake_us is None or poll is None or poll.quiet_us is None:
             return
@@ -196,7 +196,7 @@ class Conductor:
             self._turn = replace(self._turn, wake_us=wake_us)
 
     def read_by(self, began_us: int) -> int:
-        """Return `began_us`: time stands still while the vehicle reads."""
+        """Return `began_us`: reading takes no simulated time."""
         return began_us
 
     # --- one turn
@@ -230,10 +230,10 @@ class Conductor:
     def _deliver(
         self, frame: bytes, readable: Callable[[int], object], *, of_the_flight: bool = True
     ) -> bool:
-        """Let the vehicle carry out one frame now, and pass its answers on.
+        """Let the vehicle process one frame now, and forward its answers.
 
         Returns:
-            Whether it is a command that is yet to be answered.
+            True if the frame is a command without an acknowledgement yet.
         """
         now_us, vehicle = self.clock.time_us(), self._vehicle
         if of_the_flight:
@@ -241,7 +241,7 @@ class Conductor:
         if vehicle.answers_later and (command := command_of(frame)) is not None:
             self._asked = command
             self._answered.clear()
-        # While it carries out a command it may take in nothing else: that takes simulated time.
+        # A command may block the vehicle's input for some simulated time: request no echo then.
         vehicle.deliver(frame, lambda: readable(now_us), echo=self._asked is None)
         answers = vehicle.take()
         if answers:
@@ -252,7 +252,7 @@ class Conductor:
     # --- telemetry
 
     def _keep(self, frames: Sequence[bytes]) -> None:
-        """Keep what the vehicle has sent."""
+        """Store frames received from the vehicle."""
         if not frames:
             return
         self._heard_us = self.clock.time_us()

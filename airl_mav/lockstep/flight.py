@@ -1,4 +1,4 @@
-"""Episodes in lockstep: everything of one is made here, flown, and thrown away."""
+"""Lockstep episodes: each episode creates, flies and discards its own vehicle and companion."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ from firmware_sim.flight_controller import FirmwareLostError
 from firmware_sim.simulation import Simulation
 from firmware_sim.warm_up import warm_up
 
-if TYPE_CHECKING:  # A flight that nobody watches need not load it.
+if TYPE_CHECKING:  # Not loaded without a viewer.
     from airl_mav.lockstep.watched import Watched
 
 LOADING = "loading"
-"""What is waited for before the first flight."""
+"""Status text before the first flight."""
 
 SHOW_EVERY = 125
-"""The observer sees the true state every so many ticks: twice a simulated second."""
+"""Ticks between two true states sent to the observer: twice per simulated second."""
 
 
 def rehearse(
@@ -57,18 +57,18 @@ def rehearse(
     done: Collection[int] = (),
     view: ViewEnds | None = None,
 ) -> None:
-    """Fly episodes one after the other; each is saved as it ends.
+    """Fly episodes one after the other and save each one when it ends.
 
     Args:
-        scenario: What is flown.
-        folder: Where everything goes.
-        observer: Who looks on.
-        done: Numbers of the episodes that need not be flown.
-        view: Where they are watched; None: nowhere.
+        scenario: Scenario to fly.
+        folder: Run folder for all results.
+        observer: Receiver of progress reports.
+        done: Indices of finished episodes to skip.
+        view: Connection to the viewer; None = no viewer.
 
     Raises:
-        UsageError: The policy cannot use the camera; no arena can be made of a seed.
-        LockstepError: The companion hangs, or broke.
+        UsageError: The policy cannot use the camera, or a seed gives no valid arena.
+        LockstepError: The companion hangs or raised an error.
     """
     observer.waiting(LOADING)
     with heard_compiling(lambda begins: observer.waiting(COMPILING if begins else LOADING)):
@@ -94,26 +94,26 @@ def fly(
     observer: Observer | None = None,
     view: ViewEnds | None = None,
 ) -> FlownEpisode:
-    """Fly one episode; the same scenario, policy and seed give the same flight, bit by bit.
+    """Fly one episode; equal scenario, policy and seed give a bit-identical flight.
 
-    With real firmware they give almost the same one. A flight that loses its firmware is flown
-    again from its seed, with another policy of the same kind and new firmware.
+    Flights of real firmware are only approximately equal. A flight that loses its firmware restarts
+    from its seed, with a new policy of the same kind and new firmware.
 
     Args:
-        resolved: The scenario.
-        policy: What decides, as it begins a flight.
-        index: Number of the episode in its run.
-        seed: Of arena, sensors, wind and latency.
-        tlog: Where its MAVLink log goes; None: no log.
-        log: What real firmware prints goes here; None: to a file in its folder.
-        observer: Who looks on.
-        view: Where it is watched, which may change its pace and, on record, its latency; None:
-            nowhere.
+        resolved: Scenario to fly.
+        policy: Policy, in its initial state.
+        index: Index of the episode in its run.
+        seed: Seed of arena, sensors, wind and latency.
+        tlog: Path of the MAVLink log; None = no log.
+        log: Path for the output of real firmware; None = a file in the firmware's folder.
+        observer: Receiver of progress reports.
+        view: Connection to the viewer, which can change the pace and, on record, the latency; None
+            = no viewer.
 
     Raises:
-        UsageError: The policy cannot use the camera; no arena can be made of the seed; there is no
-            such firmware.
-        LockstepError: The companion hangs, or broke; real firmware was lost too often.
+        UsageError: The policy cannot use the camera, the seed gives no valid arena, or the firmware
+            does not exist.
+        LockstepError: The companion hangs or raised an error, or real firmware was lost too often.
     """
     observer = observer or Observer()
     notes: list[str] = []
@@ -134,7 +134,7 @@ def fly(
 
 
 class Flight:
-    """One flight, from take-off to landing; it is flown once."""
+    """One flight from take-off to landing; call `fly` once."""
 
     def __init__(
         self,
@@ -150,20 +150,20 @@ class Flight:
         lands: bool = True,
         ticked: Callable[[Simulation, Referee, str | None], None] = lambda *_: None,
     ) -> None:
-        """Take what is flown, as `fly` does; nothing is made yet.
+        """Set the parameters of the flight; nothing is started.
 
         Args:
-            resolved: The scenario.
-            policy: What decides, as it begins a flight.
-            index: Number of the episode in its run.
-            seed: Of arena, sensors, wind and latency.
-            observer: Who looks on.
-            notes: What its record is to say beside its own.
-            view: Where it is watched; None: nowhere.
-            patience_s: Longest decision of the policy [s of wall time].
-            lands: Whether the companion lands when the time is up; otherwise it goes on until the
-                flight is called off.
-            ticked: Called after every tick, with what has been hit so far.
+            resolved: Scenario to fly.
+            policy: Policy, in its initial state.
+            index: Index of the episode in its run.
+            seed: Seed of arena, sensors, wind and latency.
+            observer: Receiver of progress reports.
+            notes: Additional notes for the episode's record.
+            view: Connection to the viewer; None = no viewer.
+            patience_s: Maximum duration of a decision of the policy [s of wall time].
+            lands: True = the companion lands at the time limit; False = it continues until the
+                flight is aborted.
+            ticked: Called after every tick, with the first object that was hit.
         """
         self._view = view
         self._watched: Watched | None = None
@@ -177,7 +177,7 @@ class Flight:
         self._observer = observer or Observer()
         self._ticks = 0
         self.arena = resolved.arena_of(seed)
-        """Where it flies."""
+        """Arena of the flight."""
         self._goal = self.arena.goal_point
         self._start: Start = "hover" if resolved.scenario.start == "hover" else "arm"
         self._witnessed = resolved.scenario.firmware == "builtin"
@@ -188,18 +188,18 @@ class Flight:
         self._result: MissionResult | None = None
 
     def call_off(self) -> None:
-        """End it where it is, without a landing, as soon as the policy gives its turn back."""
+        """Abort the flight without landing, as soon as the policy ends its turn."""
         self._called_off = True
         self._stop.set()
         if self._abandon is not None:
             self._abandon.set()
 
     def fly(self, tlog: Path | None = None, log: Path | None = None) -> FlownEpisode:
-        """Fly it; see the function `fly`.
+        """Fly the episode; see the function `fly`.
 
         Raises:
-            UsageError: As `fly`.
-            LockstepError: The companion hangs, or broke.
+            UsageError: See `fly`.
+            LockstepError: The companion hangs or raised an error.
             FirmwareLostError: Real firmware was lost.
         """
         resolved = self._resolved
@@ -215,7 +215,7 @@ class Flight:
                 Stage(
                     transport_us=TRANSPORT_US,
                     digest=self._digest,
-                    # Who watches sets the pace.
+                    # A viewer controls the pace.
                     speed=resolved.speed if self._view is None else None,
                     faults=resolved.scenario.faults,
                     vehicle=vehicle,
@@ -286,7 +286,7 @@ class Flight:
     # --- the conductor's thread
 
     def _look(self, simulation: Simulation) -> None:
-        """Take the true states of the newest ticks."""
+        """Process the true states of the newest ticks."""
         self._judge.look(simulation)
         self._ticked(simulation, self._supervisor.referee, self._judge.hit)
         if self._watched is not None:
@@ -315,7 +315,7 @@ class Flight:
 
     def _flown(self, simulation: Simulation) -> FlownEpisode:
         self._stage.firmware.close_logs()
-        # Nothing broke: where no mission was flown, a fault has kept the companion from beginning.
+        # No mission result and no error: a fault kept the companion from starting.
         result = self._result or MissionResult(self._stage.unheard, (), DecisionLog())
         referee = self._supervisor.referee
         battery = self._judge.battery
@@ -351,7 +351,7 @@ class Flight:
         return FlownEpisode(record, trajectory, latency)
 
     def _fingerprint(self) -> dict[str, str] | None:
-        """Return the fingerprint; None of real firmware, whose threads the host schedules."""
+        """Return the digest; None for real firmware, whose threads are scheduled by the host."""
         if not self._witnessed:
             return None
         return {"flight": self._digest.hexdigest(), **self._digest.lanes()}

@@ -1,4 +1,4 @@
-"""MAVLink frames one behind the other, as the vehicle sends them: whole, version 2."""
+"""Concatenated MAVLink 2 frames, as sent by the vehicle."""
 
 from __future__ import annotations
 
@@ -8,25 +8,24 @@ from firmware_sim.mavlink.codec import layout
 from firmware_sim.mavlink.scheduler import ONBOARD_HZ
 
 _OVERHEAD = 12
-"""Header and checksum of a frame that is not signed [bytes]."""
+"""Header and checksum of an unsigned frame [bytes]."""
 
 _MESSAGE = slice(7, 10)
-"""Where a frame has the number of its message."""
+"""Position of the message id in a frame."""
 
 _SENT_BY = slice(5, 10)
-"""Where it has that, and before it who sent it."""
+"""Position of system id, component id and message id in a frame."""
 
 _PER_INSTANCE = ("DISTANCE_SENSOR",)
-"""Streams of several devices, told apart by a field."""
+"""Streams of several devices, distinguished by a field."""
 
 STATES = frozenset(
     layout(name).id_bytes
     for name, rate_hz in ONBOARD_HZ.items()
     if rate_hz > 1.0 and name not in _PER_INSTANCE
 )
-"""Messages of which only the newest counts: streams of a state, each a replacement of the one
-before, and TIMESYNC, whose answer the vehicle is not sent (`inbound`). Answers, events, texts and
-slow streams, as HEARTBEAT, are not among them."""
+"""Messages that replace older ones: state streams, and TIMESYNC, whose answer is not sent to the
+vehicle (`inbound`). Answers, events, texts and slow streams such as HEARTBEAT are not included."""
 
 
 UNREAD = frozenset(
@@ -36,11 +35,11 @@ UNREAD = frozenset(
         *("POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT", "ESC_INFO", "ESC_STATUS"),
     )
 )
-"""Messages of which the companion never asks MAVSDK."""
+"""Messages that the companion never reads from MAVSDK."""
 
 
 def newest(frames: Sequence[bytes]) -> list[bytes]:
-    """Return the frames that are read: without `UNREAD`, and of each of the `STATES` the newest."""
+    """Return frames without `UNREAD` messages, and only the newest of each of the `STATES`."""
     kept: list[bytes] = []
     replaced: set[bytes] = set()
     for frame in reversed(frames):
@@ -57,7 +56,7 @@ def newest(frames: Sequence[bytes]) -> list[bytes]:
 
 
 def split(frames: bytes) -> Iterator[bytes]:
-    """Yield the frames of a sequence in which none is signed."""
+    """Yield the frames of concatenated unsigned frames."""
     start = 0
     while start + _OVERHEAD <= len(frames):
         end = start + _OVERHEAD + frames[start + 1]
@@ -66,7 +65,7 @@ def split(frames: bytes) -> Iterator[bytes]:
 
 
 def newest_heartbeat(frames: Iterable[bytes]) -> bytes | None:
-    """Return the last HEARTBEAT among frames, None if there is none."""
+    """Return the last HEARTBEAT of some frames, or None."""
     found = None
     for frame in frames:
         if frame[_MESSAGE] == b"\0\0\0":
@@ -75,7 +74,7 @@ def newest_heartbeat(frames: Iterable[bytes]) -> bytes | None:
 
 
 def datagrams(frames: Iterable[bytes], longest: int) -> Iterator[bytes]:
-    """Yield the frames in datagrams of at most `longest` bytes, as few as that makes."""
+    """Pack frames into as few datagrams of at most `longest` bytes as possible."""
     waiting: list[bytes] = []
     length = 0
     for frame in frames:

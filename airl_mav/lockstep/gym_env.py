@@ -1,4 +1,4 @@
-"""`airl/Rehearsal-v0`: a rehearsal in lockstep, decision by decision, in Gymnasium's API."""
+"""`airl/Rehearsal-v0`: a lockstep rehearsal with Gymnasium's API, one step per decision."""
 
 from __future__ import annotations
 
@@ -42,17 +42,16 @@ from firmware_sim.warm_up import warm_up
 
 
 class RehearsalEnv(gym.Env[Encoded, Any]):
-    """One vehicle that flies to its goal as in a rehearsal: `airl/Navigation-v0` for real.
+    """Gymnasium environment that flies one vehicle to its goal through the full flight stack.
 
-    Spaces, actions, rewards and `info` are those of `NavigationEnv`, and so are the keyword
-    arguments. What flies is all of level lockstep: plant, flight controller (PX4 too), MAVLink,
-    MAVSDK and the companion, which asks for its decisions here. `reset` takes off; what follows the
-    last decision of an episode, a landing, is not flown.
+    Spaces, actions, rewards, `info` and keyword arguments are the same as in `NavigationEnv`
+    (`airl/Navigation-v0`). Every flight runs at level lockstep: plant, flight controller (also
+    PX4), MAVLink, MAVSDK and the companion, which gets its actions from `step`. `reset` takes off.
+    The landing after the last step of an episode is not flown.
 
-    A flight that is neither judged a success nor a failure (the companion has ended it, say, by one
-    of its limits) is truncated; its `outcome` is `aborted`. The observation that an episode ends
-    with is what the next decision would be made on; where none is asked for any more, as after a
-    crash, the newest one.
+    A flight without success or failure is truncated with outcome `aborted`, for example when the
+    companion ends it at a limit. The last observation is the input of the next decision. After a
+    crash, which ends all decisions, it is the newest observation.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 2}  # noqa: RUF012
@@ -60,18 +59,18 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
     def __init__(
         self, spec: EnvironmentSpec | None = None, *, render_mode: str | None = None, **knobs: Any
     ) -> None:
-        """Make the environment; nothing is started.
+        """Create the environment; nothing is started.
 
         Args:
-            spec: What it is made of; or
-            render_mode: As of `NavigationEnv`.
-            knobs: the fields of an EnvironmentSpec; and, in either case, those of a Scenario that
-                say what it does not: firmware, real, plant, faults and the others of
-                `spec_scenario.BESIDE`.
+            spec: Specification of the environment; without it, `knobs` contains its fields.
+            render_mode: See `NavigationEnv`.
+            knobs: Fields of an EnvironmentSpec if `spec` is missing, and in both cases Scenario
+                fields that an EnvironmentSpec lacks: firmware, real, plant, faults and the others
+                of `spec_scenario.BESIDE`.
 
         Raises:
-            UsageError: A knob or a profile cannot be used, or it is one of the batch twin alone, or
-                there is no display.
+            UsageError: An option or a profile cannot be used, an option is supported only by the
+                vectorized simulator, or there is no display.
         """
         beside = {name: knobs.pop(name) for name in BESIDE if name in knobs}
         self.environment = bounded(gymnasium_spec(spec, knobs))
@@ -92,7 +91,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         self.observation_space: gym.Space[Any] = observation_space(self._sees)
         self.action_space = action_space(actions)
         self.flown: FlownEpisode | None = None
-        """The newest episode that was flown to its end: record, true path, latencies."""
+        """Newest completed episode: record, true trajectory, latencies."""
         self._flight: AskedFlight | None = None
         self._ending: Any = None
         self._seed = 0
@@ -100,15 +99,16 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Encoded, dict[str, Any]]:
-        """Take off, and return what the first decision is to be made on.
+        """Take off and return the observation for the first decision.
 
         Args:
-            seed: As of `NavigationEnv.reset`.
-            options: As of `NavigationEnv.reset`.
+            seed: See `NavigationEnv.reset`.
+            options: See `NavigationEnv.reset`.
 
         Raises:
-            UsageError: A wrong option or seed, no arena can be made of the seed, no PX4 is there.
-            LockstepError: The companion hangs, or broke.
+            UsageError: An option or the seed is invalid, the seed gives no valid arena, or PX4 is
+                missing.
+            LockstepError: The companion hangs or raised an error.
             gymnasium.error.Error: The seed is negative, or the vehicle has not taken off.
         """
         self._end()
@@ -123,7 +123,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
             resolved = replace(resolved, injection=source_of(self._sources, self._seed))
         flight = AskedFlight(resolved, self._seed)
         self._flight, self._ending = flight, weakref.finalize(self, flight.end)
-        self._ending.atexit = False  # The flight sees to that itself.
+        self._ending.atexit = False  # The flight handles program exit.
         asked = self._heard(flight.asked)
         if isinstance(asked, FlownEpisode):
             raise gym.error.Error(f"seed {self._seed}: it has not taken off: {asked.record.reason}")
@@ -139,9 +139,9 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         """Fly one decision; see Gymnasium's Env.step.
 
         Raises:
-            ResetNeeded: No episode has begun, or it has ended.
-            InvalidAction: The action is none of the set; numbers beyond -1..1 are cut off.
-            LockstepError: The companion hangs, or broke.
+            ResetNeeded: No episode has begun, or the episode has ended.
+            InvalidAction: The action is not in the action set; numbers outside -1..1 are clipped.
+            LockstepError: The companion hangs or raised an error.
             FirmwareLostError: Real firmware was lost; the episode is over.
         """
         flight, spec = self._flight, self.environment.action_spec
@@ -169,11 +169,11 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         return self._seen(), float(reward[0]), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the picture (540, 960, 3) of now with `rgb_array`; a window is shown by itself."""
+        """Return the current frame (540, 960, 3) for `rgb_array`; windows update automatically."""
         return self._pictures.render()
 
     def close(self) -> None:
-        """End the flight, if there is one, and close the window."""
+        """End a running flight and close the window."""
         self._end()
         self._pictures.close()
 
@@ -183,10 +183,10 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         self._flight = self._ending = None
 
     def _heard(self, ask: Callable[[], Observation | FlownEpisode]) -> Observation | FlownEpisode:
-        """Return what the flight asks, or the flight; it is over where that fails, too."""
+        """Return the flight's next observation or its result; end the flight on any error."""
         try:
             return ask()
-        except BaseException:  # Ctrl-C, too: what the flight asks next would be taken for this.
+        except BaseException:  # Ctrl-C, too: the next request would get a stale answer.
             self._end()
             raise
 
@@ -198,7 +198,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
             self._pictures.see(flight.moment(newest_frame(self._sees, self._newest)))
 
     def _seen(self) -> Encoded:
-        """Return the newest observation; whoever takes it may change it."""
+        """Return a copy of the newest observation, which the caller may modify."""
         return {key: array.copy() for key, array in self._newest.items()}
 
     def _info(self, now: Flights) -> dict[str, Any]:

@@ -1,10 +1,9 @@
-"""What of the companion's MAVLink reaches the flight controller in lockstep.
+"""Filter for the companion's MAVLink messages to the flight controller in lockstep.
 
-MAVSDK repeats setpoints at 20 Hz, sends heartbeats and asks for messages by the wall clock, from
-threads of its own. None of that may reach a flight that is to be the same every time. So here a
-setpoint that only repeats the last one is dropped, and repeated in simulated time instead; what
-passes is stamped with simulated time and numbered anew. Nothing is signed here: that is the
-wire's matter (`wire`), and its key stays the one of the start.
+MAVSDK's own threads repeat setpoints at 20 Hz, send heartbeats and request messages, all by wall
+clock. Reproducible flights must not depend on them. Therefore repeated setpoints are dropped, and
+repeated in simulated time instead. All other messages get simulated time stamps and new sequence
+numbers. Signing happens in `wire`, with the key of the start.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from firmware_sim.mavlink.codec import (
 )
 
 REPEAT_US = US_PER_S // 20
-"""MAVSDK repeats the newest setpoint so often [µs] (its offboard plugin: 20 Hz)."""
+"""Interval at which MAVSDK repeats the newest setpoint [µs] (its offboard plugin: 20 Hz)."""
 
 _SETPOINTS = (
     dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED,
@@ -40,13 +39,13 @@ _BY_THE_WALL_CLOCK = (
     dialect.MAVLINK_MSG_ID_SYSTEM_TIME,
 )
 _MAVLINK_2 = b"\xfd"
-"""How a MAVLink 2 frame begins."""
+"""First byte of a MAVLink 2 frame."""
 _MESSAGE = slice(7, 10)
-"""Where a MAVLink 2 frame has the number of its message."""
+"""Position of the message id in a MAVLink 2 frame."""
 _IGNORED = frozenset(number.to_bytes(3, "little") for number in _BY_THE_WALL_CLOCK)
-"""The same numbers as a frame has them: most of what MAVSDK sends need not be decoded."""
+"""The same ids as bytes: most of MAVSDK's frames need no decoding."""
 _TIME_BYTES = 4
-"""Length of the time stamp with which the payload of a setpoint begins."""
+"""Length of the time stamp at the start of a setpoint's payload."""
 _ASKED_BY_THE_WALL_CLOCK = {
     (dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_HOME_POSITION): (
         dialect.MAV_RESULT_DENIED
@@ -55,12 +54,12 @@ _ASKED_BY_THE_WALL_CLOCK = {
         dialect.MAV_RESULT_ACCEPTED
     ),
 }
-"""What MAVSDK asks of its own accord (command, message), and the answer here. HOME_POSITION it
-wants every second until it has it: it comes with its stream. EXTENDED_SYS_STATE it wants at 1 Hz,
-at some moment of its choice: it is streamed at that rate from the start."""
+"""Automatic requests of MAVSDK (command, message), and the answers sent here. MAVSDK requests
+HOME_POSITION every second until it arrives with its stream. It requests EXTENDED_SYS_STATE at 1 Hz
+at an arbitrary time, which is the stream's rate from the start."""
 
 _RATES_AND_REQUESTS = (dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAV_CMD_SET_MESSAGE_INTERVAL)
-"""MAVSDK sends these in any order when it connects: no part of a flight's fingerprint."""
+"""Commands that MAVSDK sends in any order when it connects: excluded from the digest."""
 
 _ENDS_OFFBOARD = (
     dialect.MAV_CMD_DO_SET_MODE,
@@ -72,41 +71,41 @@ _ENDS_OFFBOARD = (
 
 @dataclass(frozen=True)
 class Passed:
-    """What becomes of one frame of the companion."""
+    """Result of filtering one frame of the companion."""
 
     deliver: tuple[bytes, ...] = ()
-    """For the flight controller."""
+    """Frames for the flight controller."""
     of_the_flight: bool = True
-    """Whether it belongs to the flight's fingerprint."""
+    """True if the frames are part of the flight's digest."""
     answer: bytes | None = None
-    """For the companion, in the flight controller's place."""
+    """Answer to the companion on behalf of the flight controller; None = no answer."""
 
 
 NOTHING = Passed()
 
 Encoders: TypeAlias = "dict[tuple[int, int], Encoder]"
-"""By sender: system and component id."""
+"""Encoders by sender: system and component id."""
 
 
 class Inbound:
-    """Sorts the companion's frames. One flight."""
+    """Filter for the companion's frames during one flight."""
 
     def __init__(self) -> None:
         self.next_repeat_us: int | None = None
-        """When the newest setpoint is due again [µs]; None: nothing is repeated."""
+        """Time of the next setpoint repetition [µs]; None = no repetition."""
         self._setpoint: tuple[tuple[int, int], Layout, bytes] | None = None
-        """The newest setpoint: its sender, and its payload behind the time stamp."""
+        """Newest setpoint: sender, layout, and payload after the time stamp."""
         self._counted = 0
-        """Setpoints of the companion that have been delivered."""
+        """Number of the companion's setpoints delivered so far."""
         self._decoder = Decoder(datagrams=True)
         self._numbered: Encoders = {}
         self._aside: Encoders = {}
-        """Numbers apart, for what comes in any order."""
+        """Encoders with separate sequence numbers, for messages in any order."""
         self._own: Encoders = {}
-        """Of the flight controller, for what is answered in its place."""
+        """Encoders of the flight controller, for answers on its behalf."""
 
     def take(self, frame: bytes, now_us: int) -> Passed:
-        """Sort one frame.
+        """Filter one frame.
 
         Args:
             frame: A MAVLink frame of the companion.
@@ -128,12 +127,12 @@ class Inbound:
         return Passed((self._pack(message),))
 
     def renewed(self, setpoints_sent: int, now_us: int) -> bytes | None:
-        """Return the setpoint again when the companion sent the very same once more.
+        """Return the setpoint again if the companion sent an identical one; otherwise None.
 
-        On the wire that cannot be told from MAVSDK's repetition.
+        The frame on the wire does not differ from MAVSDK's repetition.
 
         Args:
-            setpoints_sent: How many it has handed to MAVSDK so far.
+            setpoints_sent: Number of setpoints that the companion has passed to MAVSDK so far.
             now_us: Simulated time [µs].
         """
         again = setpoints_sent > self._counted and self._setpoint is not None
@@ -141,12 +140,12 @@ class Inbound:
         return self.repeat(now_us) if again else None
 
     def resume(self, now_us: int) -> None:
-        """Nothing has been repeated for a while: once at simulated `now_us` [µs], not for all."""
+        """Resume repetitions at simulated `now_us` [µs], without making up for missed ones."""
         if self.next_repeat_us is not None:
             self.next_repeat_us = max(self.next_repeat_us, now_us)
 
     def end(self) -> None:
-        """The companion has gone, and MAVSDK with it: nothing is repeated any more."""
+        """Stop all repetitions: the companion and MAVSDK have ended."""
         self.next_repeat_us = None
 
     def _take_setpoint(self, message: WireMessage, now_us: int) -> Passed:
@@ -166,8 +165,8 @@ class Inbound:
         before: tuple[bytes, ...] = ()
         if _enters_offboard(message):
             if self.next_repeat_us is None and self._setpoint is not None:
-                # Offboard needs a setpoint that is fresh. MAVSDK has just sent one; should it be
-                # the same as in the last offboard flight, it was taken for a repetition.
+                # Offboard mode needs a fresh setpoint. MAVSDK has just sent one. If it equals the
+                # last setpoint of the previous offboard flight, it was dropped as a repetition.
                 before = (self.repeat(now_us),)
         elif message.command in _ENDS_OFFBOARD:
             self.next_repeat_us = None
@@ -176,7 +175,7 @@ class Inbound:
         return Passed((*before, self._pack(message)))
 
     def repeat(self, now_us: int) -> bytes:
-        """Return the newest setpoint as MAVSDK repeats it; call when `next_repeat_us` is due."""
+        """Return the newest setpoint as a repetition; call when `next_repeat_us` is due."""
         assert self._setpoint is not None  # noqa: S101 (there is one whenever it is due)
         self.next_repeat_us = now_us + REPEAT_US
         sender, kind, values = self._setpoint
@@ -197,7 +196,7 @@ class Inbound:
 
 
 def _encoder(encoders: Encoders, sender: tuple[int, int]) -> Encoder:
-    """Return a sender's encoder, made when it is first needed."""
+    """Return a sender's encoder, created on first use."""
     if sender not in encoders:
         encoders[sender] = Encoder(*sender)
     return encoders[sender]

@@ -1,4 +1,4 @@
-"""Who looks at the true state after every tick: fingerprint, collisions, verdict, orders."""
+"""Checks of the true state after every tick: digest, collisions, verdict, orders."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from firmware_sim.simulation import Simulation
 
 
 class Judge:
-    """Follows one flight in truth. All calls on the conductor's thread, or while it waits."""
+    """Observer of one flight's true state. Call on the conductor's thread, or while it waits."""
 
     def __init__(
         self,
@@ -27,16 +27,16 @@ class Judge:
         order: Callable[[Order], None],
         judged: Callable[[Verdict], None] = lambda _: None,
     ) -> None:
-        """Nothing has been flown yet.
+        """Initialize before the flight.
 
         Args:
-            supervisor: Knows when the flight is decided; None: nobody judges.
-            digest: Takes the fingerprint.
-            order: Called with what the companion must be told.
-            judged: Called with the verdict.
+            supervisor: Decides when the flight is over; None = no verdict.
+            digest: Digest to update with the true trajectory.
+            order: Callback for orders to the companion.
+            judged: Callback for the verdict.
         """
         self.battery: float | None = None
-        """What was left of the battery at the verdict."""
+        """Remaining battery at the verdict; None = no verdict yet."""
         self._supervisor = supervisor
         self._digest = digest
         self._order = order
@@ -45,16 +45,16 @@ class Judge:
 
     @property
     def due_us(self) -> float:
-        """When the companion may have an order by the passing of time [µs]; inf = never."""
+        """Time of the next time-based order to the companion [µs]; inf = never."""
         return math.inf if self._supervisor is None else self._supervisor.due_us
 
     @property
     def hit(self) -> str | None:
-        """What has been hit so far."""
+        """First object that was hit; None = no collision."""
         return self._crash.hit
 
     def enter(self, phase: str, time_us: int) -> None:
-        """The companion has entered a phase, at a simulated time [µs]."""
+        """Register that the companion enters a phase, at a simulated time [µs]."""
         if self._supervisor is None or phase != "navigating":
             return
         referee = self._supervisor.referee
@@ -62,12 +62,12 @@ class Judge:
             referee.start_navigation(time_us)
 
     def look(self, simulation: Simulation) -> None:
-        """Take the true states of the newest ticks."""
+        """Process the true states of the newest ticks."""
         self._crash.look(simulation)
         truths, supervisor = simulation.truths, self._supervisor
         self._digest.extend("trajectory", truths.tobytes())
         if supervisor is not None:
-            # Ticks before the last one matter only where one of them may decide the flight.
+            # Earlier ticks are relevant only if the flight may end at any of them.
             first = 0 if self._may_decide(supervisor.referee, truths) else -1
             for time_us, motion, _, charge in truths[first:].tolist():
                 self._see(supervisor, TruthSample(time_us, motion[:3], self._crash.hit, charge))
@@ -82,7 +82,7 @@ class Judge:
             self._order(order)
 
     def _may_decide(self, referee: Referee, truths: Record) -> bool:
-        """Return whether the flight may end before the last of some ticks (n,)."""
+        """Return True if the flight may end before the last of some ticks (n,)."""
         if referee.verdict is not None or len(truths) < 2:
             return False
         last, task, began_us = truths[-1], referee.task, referee.navigation_us
@@ -92,6 +92,6 @@ class Judge:
             return False
         if last["time_us"] - began_us >= task.time_limit_s * US_PER_S:
             return True
-        # Seen from above: of a goal with a height the vehicle is no nearer than that.
+        # Horizontal distance: a lower bound if the goal has a height.
         away = truths["motion"][:, :2] - task.goal[:2]
         return bool((np.hypot(away[:, 0], away[:, 1]) < task.goal_radius_m).any())

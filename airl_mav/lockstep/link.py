@@ -1,4 +1,4 @@
-"""The vehicle, and its end of the companion's link, in lockstep."""
+"""Vehicles for lockstep flights, with their end of the companion's link."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from firmware_sim.mavlink.link import LinkConfig, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 
 BOOT_UNIX_US = 1_767_225_600 * US_PER_S
-"""Calendar time of simulated time 0: 2026-01-01T00:00Z, whenever that is [µs since 1970]."""
+"""Calendar time of simulated time 0: always 2026-01-01T00:00Z [µs since 1970]."""
 
 MAVSDK_HZ = {"EXTENDED_SYS_STATE": 1.0}
-"""Rates that MAVSDK asks for by itself, at a moment that the wall clock decides [Hz]: here they are
-set from the start, and its request changes nothing (`inbound`)."""
+"""Rates that MAVSDK requests automatically, at a wall-clock dependent time [Hz]. They are set from
+the start, so the request has no effect (`inbound`)."""
 
 
 SLOW_EVERY_US = US_PER_S // 10
 """Grid of the slow streams [µs]."""
 
 HEARTBEAT_US = US_PER_S
-"""PX4 sends its heartbeat so often [µs]."""
+"""Heartbeat interval of PX4 [µs]."""
 
 
 def lockstep_link(endpoint: SharedEndpoint) -> LinkConfig:
-    """Return the onboard link for a companion that is conducted.
+    """Return the onboard link configuration for a lockstep companion.
 
-    Answers have sequence numbers of their own: MAVSDK's requests come at any time, and must not
-    change the bytes of the streams. The vehicle flies at once until slow streams are due.
+    Replies have separate sequence numbers: MAVSDK's requests come at any time, and must not change
+    the bytes of the streams. The vehicle flies uninterrupted until slow streams are due.
     """
     link = onboard_link(endpoint)
     rates = {**link.rates_hz, **MAVSDK_HZ}
@@ -47,23 +47,23 @@ def lockstep_link(endpoint: SharedEndpoint) -> LinkConfig:
 
 @dataclass(frozen=True)
 class ConductedVehicle:
-    """What flies under a conductor."""
+    """Vehicle for a lockstep flight."""
 
     stack: FlightStack
     end: VehicleEnd
-    """Its end of the companion's link."""
+    """Vehicle's end of the companion's link."""
     failing: FailingEndpoint | None = None
-    """That link, where it is to fail."""
+    """Link with simulated faults; None = no link faults."""
     heard_after_us: int = 0
-    """Longest time until its first heartbeat after an episode was loaded [µs]."""
+    """Maximum time from loading an episode to the first heartbeat [µs]."""
 
 
 def builtin_vehicle(clock: Clock, faults: Sequence[Fault] = ()) -> ConductedVehicle:
-    """Return the built-in autopilot, whose link is in memory.
+    """Return the built-in autopilot with an in-memory link.
 
     Args:
-        clock: The conductor's.
-        faults: What will fail; those of the link need a place of their own.
+        clock: Clock of the conductor.
+        faults: Faults of the flight; link faults add a `FailingEndpoint`.
     """
     endpoint = MemoryEndpoint()
     failing = None
@@ -77,17 +77,17 @@ def builtin_vehicle(clock: Clock, faults: Sequence[Fault] = ()) -> ConductedVehi
 def real_vehicle(
     aircraft: Aircraft, vehicle: VehicleProfile, log: Path | None = None
 ) -> ConductedVehicle | None:
-    """Return the real firmware that an aircraft is flown by; None: it is the built-in autopilot.
+    """Return the aircraft's real firmware; None for the built-in autopilot.
 
-    Its ports are bound, nothing is started.
+    Binds the ports, starts nothing.
 
     Args:
-        aircraft: What was asked of it.
-        vehicle: What it flies.
-        log: What real firmware prints goes here; None: to a file in its folder.
+        aircraft: Options of the aircraft.
+        vehicle: Vehicle profile.
+        log: Path for the output of real firmware; None = a file in the firmware's folder.
 
     Raises:
-        UsageError: No instance of real firmware is free, or its program is not there.
+        UsageError: No instance of real firmware is free, or its program is missing.
     """
     if aircraft.firmware == "builtin":
         return None

@@ -1,6 +1,6 @@
-"""Vehicle and flight controller on a simulated clock that a companion in another process shares.
+"""Vehicle and flight controller in lockstep with a companion in another process.
 
-`airl-firmware --lockstep`: simulated time waits for that companion.
+`airl-firmware --lockstep`: simulated time waits for the companion.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from firmware_sim.warm_up import warm_up
 
 
 class RemoteStage:
-    """One flight. The sockets stay their owner's, for the next one."""
+    """One flight. The caller owns the sockets and reuses them for the next flight."""
 
     def __init__(
         self,
@@ -46,15 +46,15 @@ class RemoteStage:
         broken_off: Callable[[], bool] = lambda: False,
         say: Callable[[str], None] = lambda _line: None,
     ) -> None:
-        """Put everything together; nothing moves yet.
+        """Connect all parts; nothing is started.
 
         Args:
-            asked: How it flies: transport, turns, pace, who judges.
-            endpoint: Where the companion is, or will be.
-            frames: Where its camera's frames go.
-            stored: The key by which both sign; None: nobody does.
-            broken_off: Asked while the companion is waited for; True gives it up.
-            say: Is told what happens, a line at a time.
+            asked: Options: transport latency, turns, pace, goal.
+            endpoint: Endpoint of the companion, connected or not.
+            frames: Server of the camera's frames.
+            stored: Signing key of both sides; None = no signing.
+            broken_off: Polled while waiting for the companion; True ends the wait.
+            say: Callback for status lines.
         """
         self._asked = asked
         self._say = say
@@ -75,17 +75,17 @@ class RemoteStage:
         self.firmware = Firmware(vehicle.stack, camera, self._conductor, failing=vehicle.failing)
         self._judge = Judge(None, self._digest, order=self._partner.order)
         self.end_us = math.inf
-        """When to end the flight at the latest [µs]."""
+        """Maximum simulated time of the flight [µs]."""
         self._conductor.orders_us = lambda: min(self.end_us, self._judge.due_us)
 
     @property
     def ended(self) -> bool:
-        """Whether the companion has ended, or was given up."""
+        """True if the companion has ended or the wait for it was ended."""
         return self._conductor.ended
 
     @property
     def turns(self) -> int:
-        """Turns that the companion has had."""
+        """Number of the companion's turns so far."""
         return self._partner.turns
 
     @property
@@ -94,11 +94,11 @@ class RemoteStage:
         return self._conductor.clock.time_us()
 
     def load(self, setup: EpisodeSetup, tlog: Path | None) -> Loaded:
-        """Set up the episode; the companion begins a moment later.
+        """Load the episode; the companion starts shortly afterwards.
 
         Args:
-            setup: The episode.
-            tlog: Where its MAVLink log goes; None: no log.
+            setup: Episode to load.
+            tlog: Path of the MAVLink log; None = no log.
         """
         asked = self._asked
         loaded = self.firmware.load(setup, tlog, BOOT_UNIX_US)
@@ -113,17 +113,17 @@ class RemoteStage:
         return loaded
 
     def step(self) -> None:
-        """Fly one tick, with whatever the companion does before it.
+        """Fly one tick, after the companion's turns that are due before.
 
         Raises:
-            LockstepError: The companion is gone, or does not keep to the turns.
+            LockstepError: The companion is lost or violates the protocol.
         """
         self.firmware.step()
 
     def lanes(self) -> dict[str, str]:
-        """Return the fingerprint of the flight by lane; call once, at its end.
+        """Return the flight's digests by part; call once, at the end.
 
-        What the policy saw is not in it: that is the companion's to know.
+        The companion computes the digest of the observations.
         """
         simulation = self.firmware.simulation
         if simulation is not None and simulation.recorder is not None:
@@ -131,7 +131,7 @@ class RemoteStage:
         return {name: lane for name, lane in self._digest.lanes().items() if name != SEEN}
 
     def close(self) -> None:
-        """Let the companion go and forget the flight; the sockets are their owner's to close."""
+        """Release the companion and discard the flight; the caller closes the sockets."""
         self._partner.close()
         self._wire.close()
         self.firmware.close()
@@ -147,16 +147,16 @@ class RemoteStage:
 def fly_vehicle_in_lockstep(
     asked: StandAloneVehicle, stop: threading.Event, listener: Listener | None = None
 ) -> None:
-    """Fly with one companion that passes turns, until it has ended.
+    """Fly with one companion that passes turns, until the companion ends.
 
     Args:
-        asked: What flies, and where.
-        stop: Set from outside to end it.
-        listener: Who is told what happens.
+        asked: Options of the vehicle and its network.
+        stop: Set by the caller to end the flight.
+        listener: Receiver of events.
 
     Raises:
-        UsageError: The input cannot be used, or a port is taken.
-        LockstepError: The companion is gone, or does not keep to the turns.
+        UsageError: The input is invalid, or a port is in use.
+        LockstepError: The companion is lost or violates the protocol.
     """
     listener = listener or Listener()
     check_vehicle(asked)
@@ -196,7 +196,7 @@ def _fly(
 ) -> None:
     """Fly a loaded stage until the companion has ended, or simulated `end_us` [µs].
 
-    Says how it went, and the fingerprint.
+    Prints a summary of the flight and the digests.
     """
     start_us, stopwatch = stage.time_us, WallClock()
     stage.end_us = math.inf if end_us is None else end_us
@@ -204,7 +204,7 @@ def _fly(
         alone = stage.turns == 0
         stage.step()
         if alone:
-            stopwatch = WallClock()  # the wait for the companion is no part of the flight
+            stopwatch = WallClock()  # excludes the wait for the companion
     flown_s = (stage.time_us - start_us) / US_PER_S
     wall_s = max(stopwatch.time_us(), 1) / US_PER_S
     say(

@@ -1,4 +1,4 @@
-"""The scenario that flies an environment of the batch twin in lockstep."""
+"""Conversion of vectorized simulator environments to lockstep scenarios."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BESIDE = (
     "speed",
     "start",
 )
-"""Fields of a `Scenario` that say what an `EnvironmentSpec` does not."""
+"""Fields of a `Scenario` that an `EnvironmentSpec` lacks."""
 
 TWIN_ALONE = (
     "camera",
@@ -38,18 +38,18 @@ TWIN_ALONE = (
     "randomisation.estimation",
     "randomisation.extra_delay_ms",
 )
-"""Fields of an `EnvironmentSpec` that only the batch twin flies by."""
+"""Fields of an `EnvironmentSpec` that only the vectorized simulator supports."""
 
 
 def scenario_of(spec: EnvironmentSpec, beside: Mapping[str, Any]) -> Scenario:
-    """Return the scenario; who decides is left open, and of which of several sources t2 is.
+    """Return the scenario, without a policy; of several t2 sources it uses the first.
 
     Args:
-        spec: The environment.
-        beside: Of the fields `BESIDE` those that are not to be as by default.
+        spec: Specification of the environment.
+        beside: Values of the fields `BESIDE`, without defaults.
 
     Raises:
-        FieldError: A field is of the wrong type or out of range, or only the twin has it.
+        FieldError: A field has a wrong type, is out of range, or needs the vectorized simulator.
     """
     usual = EnvironmentSpec()
     for name in TWIN_ALONE:

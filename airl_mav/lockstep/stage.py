@@ -1,4 +1,4 @@
-"""Vehicle, flight controller, MAVSDK and a companion on one simulated clock, put together."""
+"""Vehicle, flight controller, MAVSDK and companion, connected on one simulated clock."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from firmware_sim.firmware import Firmware
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 HEARD_TIMEOUT_S = 10.0
-"""Longest wait of the companion for the heartbeat that it has been fed [wall s]."""
+"""Companion's timeout for the first heartbeat, which has been fed already [wall s]."""
 
 CUT_TIMEOUT_S = 0.5
-"""MAVSDK's own time-out of a command, before it asks again [wall s]."""
+"""MAVSDK's timeout for a command before it retries [wall s]."""
 
 STOPPED = "stopped"
 
 
 class Stage:
-    """One flight of any companion program. Use as a context manager."""
+    """One flight with any companion program. Use as a context manager."""
 
     def __init__(
         self,
@@ -49,46 +49,46 @@ class Stage:
         vehicle: ConductedVehicle | None = None,
         patience_s: float = PATIENCE_S,
     ) -> None:
-        """Put everything together; nothing moves yet.
+        """Connect all parts; nothing is started.
 
         Args:
-            transport_us: From a frame's exposure until it lies decoded in the companion [µs].
-            digest: Takes the fingerprint of what crosses the link; None: nobody wants it.
-            speed: Greatest number of simulated seconds per wall second; None: as fast as it goes.
-            faults: What the episode's aircraft has of them; only those of the link matter here.
-            vehicle: What flies, released with the stage; None: the built-in autopilot.
-            patience_s: Longest turn of the companion [s of wall time].
+            transport_us: Time from a frame's exposure to the decoded frame in the companion [µs].
+            digest: Digest of all traffic on the link; None = not needed.
+            speed: Maximum simulated seconds per wall second; None = unlimited.
+            faults: Faults of the episode's aircraft; only link faults are used here.
+            vehicle: Vehicle, closed with the stage; None = the built-in autopilot.
+            patience_s: Maximum duration of the companion's turn [s of wall time].
         """
         clock = SimClock()
         self._vehicle = vehicle = vehicle or builtin_vehicle(clock, faults)
         self._partner = ThreadPartner(patience_s)
         self.abandon = threading.Event()
-        """Makes the link break off whatever it waits for."""
+        """Event that aborts all waits of the link."""
         self.conductor = Conductor(vehicle.end, self._partner, digest, speed, clock)
         self.clock = ConductedClock(self.conductor.clock, self._partner.sleep)
-        """The companion's clock, and its watchdog's guard."""
+        """Clock of the companion, also the guard of its watchdog."""
         self.camera = MemoryCamera(transport_us)
-        """The companion's source of frames."""
+        """Frame source of the companion."""
         self.camera.clock = self.clock
         self.firmware = Firmware(
             vehicle.stack, self.camera, self.conductor, failing=vehicle.failing
         )
         self.unheard = ""
-        """Why the companion never began: a fault has kept it from hearing the vehicle."""
+        """Reason if a fault kept the companion from receiving the vehicle; otherwise empty."""
         self.out = ""
-        """The fault after which the companion flies no more, as `companion killed`."""
+        """Fault that ended the companion for good, such as `companion killed`; otherwise empty."""
         self._open = ExitStack()
 
     def __enter__(self) -> Stage:
-        """Make the link."""
-        # In the order of need: the companion's thread ends before its link does.
+        """Create the link."""
+        # Reverse order of closing: the companion's thread ends before its link.
         self._open.enter_context(closing(self.firmware))
         self.link = MavsdkLink(
             *(RAW_URL, self.clock, self.abandon),
             heard=lambda: self.conductor.heard,
             poll=self.clock.poll,
         )
-        """The companion's link; `run` connects it."""
+        """Link of the companion, connected by `run`."""
         self._open.enter_context(closing(self.link))
         self._open.enter_context(closing(self._partner))
         self._partner.attach(self.link)
@@ -100,7 +100,7 @@ class Stage:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """End the companion and release everything."""
+        """End the companion and release all resources."""
         self._open.close()
 
     def run(
@@ -113,26 +113,26 @@ class Stage:
         stop: threading.Event | None = None,
         judged: Callable[[], bool] = lambda: False,
     ) -> Simulation:
-        """Fly until the companion's program has ended.
+        """Fly until the companion's program ends.
 
-        One that a fault has killed, or stopped for good, never ends: without it the flight is over
-        when it is judged, or the motors stop.
+        A program that a fault has killed or stopped for good never ends. The flight then ends at
+        its verdict, or when the motors stop.
 
         Args:
-            setup: The episode.
-            program: What the companion does, on a thread of its own, with `link` connected;
-                simulated time moves only while it sleeps by `clock`.
-            tlog: Where the MAVLink log goes; None: no log.
+            setup: Episode to fly.
+            program: The companion's program. It runs on a separate thread with `link` connected.
+                Simulated time advances only while the program sleeps on `clock`.
+            tlog: Path of the MAVLink log; None = no log.
             begun: Called with the simulated time of the reset [µs].
-            stop: What ends the program early when it is set; None: it is not to be ended so.
-            judged: Asked whether the flight is judged, when nobody flies any more.
+            stop: Event that ends the program early; None = not supported.
+            judged: Polled after the companion has stopped for good; True = there is a verdict.
 
         Returns:
-            The simulation as it stands at the end; closed with the stage.
+            The simulation in its final state; closed with the stage.
 
         Raises:
-            UsageError: The program found that it cannot be flown.
-            LockstepError: The companion hangs, or broke.
+            UsageError: The program rejects its input.
+            LockstepError: The companion hangs or raised an error.
         """
         firmware, conductor = self.firmware, self.conductor
         started_us = firmware.load(setup, tlog, BOOT_UNIX_US).time_us
@@ -157,7 +157,7 @@ class Stage:
         while not conductor.ended and not (self.out and (judged() or self._down())):
             firmware.step()
         if self.out.endswith(STOPPED):
-            # It says what it knows, and flies no more.
+            # The companion reports its results without flying.
             self.abandon.set()
             if stop is not None:
                 stop.set()
@@ -169,9 +169,9 @@ class Stage:
         return firmware.simulation
 
     def _give_up_when_cut(self, faults: FaultTimeline) -> None:
-        """Let MAVSDK give up a command on a link that is cut, as it does by itself elsewhere.
+        """Use MAVSDK's short command timeout while the link is cut, as outside of lockstep.
 
-        On a healthy link the answer is certain, and MAVSDK waits for it however slow the host is.
+        On an intact link an answer is certain, and MAVSDK waits for it even on a slow host.
         """
 
         def changed() -> None:
@@ -181,7 +181,7 @@ class Stage:
         faults.on_change(changed)
 
     def _let_companion_fail(self, faults: FaultTimeline) -> None:
-        """Withhold the companion's turns while it is suspended, and from when it is killed."""
+        """Suspend the companion's turns during its faults, and for good after it is killed."""
 
         def changed() -> None:
             acting = [each.fault for each in faults.acting("companion")]
@@ -197,7 +197,7 @@ class Stage:
         faults.on_change(changed)
 
     def _down(self) -> bool:
-        """Return whether the motors stand."""
+        """Return True if the motors are stopped."""
         simulation = self.firmware.simulation
         return simulation is None or simulation.autopilot.flight.phase < Phase.GROUND
 

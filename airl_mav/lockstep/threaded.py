@@ -1,9 +1,9 @@
-"""The companion in a thread of this process: MAVSDK on raw bytes, and a clock that is conducted.
+"""Companion in a thread of this process, with MAVSDK on raw bytes and a simulated clock.
 
-One of the two threads works at any moment: the conductor's, or the companion's. MAVSDK's own
-threads work always; a barrier tells when they are through. MAVSDK takes in and sends out messages
-one after the other in one queue, so the answer to a PING proves that everything fed before is in
-its getters, and that everything it was told to send before has come out.
+Either the conductor's thread or the companion's thread runs at any moment. MAVSDK's threads run all
+the time; a barrier detects when they are idle. MAVSDK handles incoming and outgoing messages in one
+queue, in order. An answer to a PING therefore proves two things: its getters return all data fed
+before, and all earlier requests have been sent.
 """
 
 from __future__ import annotations
@@ -22,36 +22,35 @@ from companion.mavsdk_link import MavsdkLink
 from firmware_sim.mavlink.codec import Encoder, dialect, layout
 
 FIRST_BARRIER = 0x8000_0000
-"""Sequence number of the first barrier's PING: those of the autopilot's own stream stay below."""
+"""Sequence number of the first barrier's PING, above the autopilot's sequence numbers."""
 
 PATIENCE_S = 60
-"""Longest turn of the companion, by default [s of wall time, while this process runs]."""
+"""Maximum duration of a turn by default [s of wall time, while this process runs]."""
 
 PING_AGAIN_S = 0.1
-"""A barrier's PING is repeated after so long without an answer [wall s]."""
+"""Interval at which an unanswered PING is repeated [wall s]."""
 
 HEARTBEAT_S = 1.0
-"""The newest heartbeat is repeated so often in a long turn [wall s]."""
+"""Interval at which the newest heartbeat is repeated in a long turn [wall s]."""
 
 LONGEST_ANSWER_US = 10 * US_PER_S
-"""Longest time that the answer to a command may take [µs of simulated time]."""
+"""Maximum time until a command is answered [µs of simulated time]."""
 
 _PING: int = dialect.MAVLINK_MSG_ID_PING
 _PING_LAYOUT = layout("PING")
 
 
 class ThreadPartner:
-    """Runs a companion. Implements `turns.Partner`."""
+    """Partner that runs a companion in a thread. Implements `turns.Partner`."""
 
     def __init__(self, patience_s: float = PATIENCE_S) -> None:
-        """Nobody is attached yet; `patience_s` is the longest turn [s of wall time]."""
+        """Set the maximum duration of a turn [s of wall time]; no companion is attached."""
         self._patience_s = patience_s
         self.error: BaseException | None = None
-        """What ended the companion, if it was not its own end."""
-        # Of the standard library's queues the one that never blocks the putter: MAVSDK's thread
-        # must not wait for anybody.
+        """Error that ended the companion; None = still running or completed."""
+        # Only SimpleQueue never blocks in `put`: MAVSDK's thread must not wait for other threads.
         self._inbox: SimpleQueue[bytes | Turn] = SimpleQueue()
-        # A bare lock as a baton: a Semaphore is made of several, and ten times as slow.
+        # A plain lock passes control: a Semaphore consists of several and is ten times slower.
         self._go = threading.Lock()
         self._go.acquire()
         self._abandoned = False
@@ -60,16 +59,16 @@ class ThreadPartner:
         self._heartbeat = b""
         self._barriers = FIRST_BARRIER
         self._fed = True
-        """Whether MAVSDK was fed anything since the newest barrier."""
+        """True if MAVSDK was fed since the newest barrier."""
         self._interrupted = False
-        """Whether the companion, in the middle of its turn, waits for an answer."""
+        """True while the companion waits for an answer in the middle of its turn."""
         self._sent_before = 0
-        """Setpoints sent before its turn began."""
+        """Number of setpoints sent before the current turn."""
         self._encoder = Encoder()
         self._thread: threading.Thread | None = None
 
     def attach(self, link: MavsdkLink) -> None:
-        """Take the link, made with `RAW_URL`, that the companion will use."""
+        """Attach the companion's link, which must be created with `RAW_URL`."""
         self._link = link
         self._feed = link.exchange_raw(self._inbox.put)
 
@@ -81,9 +80,9 @@ class ThreadPartner:
         self._thread.start()
 
     def close(self) -> None:
-        """End the companion wherever it waits for its turn."""
+        """End the companion, wherever it waits for its turn."""
         self._abandoned = True
-        with suppress(RuntimeError):  # it holds the baton already, or has ended
+        with suppress(RuntimeError):  # the companion is running, or has ended
             self._go.release()
         if self._thread is not None:
             self._thread.join(timeout=1.0)
@@ -91,16 +90,16 @@ class ThreadPartner:
     # --- the conductor's thread
 
     def send(self, frames: Sequence[bytes]) -> None:
-        """Feed MAVSDK, of states only the newest: it keeps no other for the companion."""
+        """Feed frames to MAVSDK; of each state only the newest, as MAVSDK keeps no older ones."""
         kept = newest(frames)
         self._heartbeat = newest_heartbeat(kept) or self._heartbeat
         self._fed = True
         self._feed(b"".join(kept))
 
     def turn(self, now_us: int, handle: Handle) -> Turn:
-        """Let the companion work until it sleeps; see `turns.Partner`."""
+        """Let the companion run until it sleeps; see `turns.Partner`."""
         if self._interrupted:
-            self._interrupted = False  # It has its turn still, and its answer now.
+            self._interrupted = False  # The turn continues, and its answer has arrived.
         else:
             if self._fed:
                 self._settle(handle)
@@ -110,13 +109,13 @@ class ThreadPartner:
         if isinstance(turn, threading.Event):
             self._interrupted = True
             return Turn(now_us + LONGEST_ANSWER_US, turn, self._sent_before)
-        # A command is answered before its caller goes on; a setpoint may still be under way.
+        # Commands return after their answer; a setpoint may still be queued in MAVSDK.
         if turn.setpoints_sent != self._sent_before:
             self._settle(handle)
         return turn
 
     def _settle(self, handle: Handle) -> None:
-        """Wait until MAVSDK has taken in and sent out everything so far."""
+        """Wait until MAVSDK has processed all input and sent all output."""
         number, self._fed = self._barriers, False
         self._barriers += 1
         ping = self._encoder.frame(_PING_LAYOUT, _PING_LAYOUT.payload((0, number, 0, 0)))
@@ -125,8 +124,8 @@ class ThreadPartner:
         again_s = 0.0
         while (so_far_s := waited.so_far_s()) < PATIENCE_S:
             if so_far_s >= again_s:
-                # MAVSDK answers no PING of a vehicle that it has only just heard of: ask again
-                # then. A second answer is passed over.
+                # MAVSDK ignores a PING of a newly discovered vehicle: repeat it. Second answers are
+                # ignored.
                 self._feed(ping)
                 again_s = so_far_s + PING_AGAIN_S
             try:
@@ -141,7 +140,7 @@ class ThreadPartner:
         raise LockstepError(f"MAVSDK hangs: no answer to a PING in {PATIENCE_S} s")
 
     def _work(self, handle: Handle) -> Turn | threading.Event:
-        """Wait for the end of the companion's turn, or until it waits for an answer: for what."""
+        """Wait for the end of the turn; return early with an event if an answer is pending."""
         waited = Patience()
         heartbeat_s = HEARTBEAT_S
         while waited.so_far_s() < self._patience_s:
@@ -152,8 +151,8 @@ class ThreadPartner:
                 if (answered := handle(item)) is not None:
                     return answered
             if waited.so_far_s() >= heartbeat_s:
-                # MAVSDK gives a vehicle up after 3 s without a heartbeat, by the wall clock, and
-                # then finds no autopilot to connect to.
+                # MAVSDK drops a vehicle after 3 s of wall time without a heartbeat, and then finds
+                # no autopilot to connect to.
                 self._feed(self._heartbeat)
                 heartbeat_s += HEARTBEAT_S
         raise LockstepError(f"the companion hangs: its turn did not end in {self._patience_s:g} s")
@@ -167,7 +166,7 @@ class ThreadPartner:
     def sleep(
         self, wake_us: int, interrupt: threading.Event | None = None, poll: Poll | None = None
     ) -> None:
-        """Give the turn back until simulated `wake_us` [µs]; see `conducted.Sleep`."""
+        """End the turn until simulated `wake_us` [µs]; see `conducted.Sleep`."""
         self._inbox.put(Turn(wake_us, interrupt, self._setpoints_sent, poll))
         self._await_turn()
 
@@ -182,7 +181,7 @@ class ThreadPartner:
             program()
         except Abandoned:
             return
-        except BaseException as error:  # handed to whoever conducts
+        except BaseException as error:  # raised by the stage
             self.error = error
         self._inbox.put(Turn(None, setpoints_sent=self._setpoints_sent))
 

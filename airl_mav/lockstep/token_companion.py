@@ -1,4 +1,4 @@
-"""The companion of a simulator that waits for it (`airl-companion --lockstep`)."""
+"""Companion for a simulator that waits for it (`airl-companion --lockstep`)."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from companion.signing_proxy import signed
 from companion.token_clock import TokenFrameSource, TokenTurns
 
 ANSWER_TIMEOUT_S = 20.0
-"""MAVSDK repeats a command that has not been answered for so long, four times at most [wall s]:
-never in a flight, also when a process is stopped for a while, but it notices a simulator that is
-gone."""
+"""Timeout after which MAVSDK repeats a command, at most four times [wall s]. Long enough for all
+flights, even if a process is suspended for a while, but MAVSDK notices a lost simulator."""
 
 
 def fly_in_lockstep(
@@ -32,25 +31,24 @@ def fly_in_lockstep(
     waiting: Callable[[], None],
     progress: Callable[[str, int], None],
 ) -> tuple[MissionResult, dict[str, str]]:
-    """Fly one mission; the same simulator and mission give the same flight, bit by bit.
+    """Fly one mission; equal simulator and mission give a bit-identical flight.
 
     Args:
-        asked: How the simulator and the camera are reached, and how long to wait for the
-            simulator, and for each turn.
-        mission: What is flown.
-        stop: Set to end the flight early; the simulator sets it, too.
-        abandon: Set to end it without landing; the simulator sets it, too.
-        waiting: Called once the simulator is waited for.
-        progress: Called with the name of each phase as it begins, and the simulated time [µs].
+        asked: Connection and camera of the simulator, with the timeouts for the simulator and for
+            each turn.
+        mission: Mission to fly.
+        stop: Event that ends the flight early; the simulator sets it, too.
+        abandon: Event that ends the flight without landing; the simulator sets it, too.
+        waiting: Called when the wait for the simulator begins.
+        progress: Called at the start of each phase with its name and the simulated time [µs].
 
     Returns:
-        How it ended, and the fingerprint of what the policy saw.
+        The mission's result, and the digest of the policy's observations.
 
     Raises:
-        UsageError: The connection is none, the key cannot be used, or the policy cannot use the
-            camera.
-        LinkError: No flight controller is heard.
-        Abandoned: The simulator gives no turn any more.
+        UsageError: The connection or the key is invalid, or the policy cannot use the camera.
+        LinkError: No flight controller was found.
+        Abandoned: The simulator does not give turns any longer.
     """
     digest = FlightDigest()
     turns = TokenTurns(stop, abandon, asked.connect_timeout)
@@ -63,12 +61,12 @@ def fly_in_lockstep(
     with (
         closing(open_camera(asked.camera, clock)) as frames,
         signed(asked.connect, asked.signing_key) as url,
-        # Who gives turns is heard, however long the wall clock says that it was silent.
+        # The simulator controls time: ignore silence in wall time.
         closing(MavsdkLink(url, clock, abandon, heard=lambda: True)) as link,
     ):
         waiting()
-        # MAVSDK's own time-out ends the wait for a vehicle that rejects unsigned messages. It also
-        # lets an order to end take effect. A retry is harmless.
+        # MAVSDK's timeout ends the wait for a vehicle that rejects unsigned messages, and lets an
+        # order to end take effect. A retry is harmless.
         link.connect(asked.connect_timeout, stop)
         link.set_timeout(ANSWER_TIMEOUT_S)
         camera = TokenFrameSource(frames, turns, clock)

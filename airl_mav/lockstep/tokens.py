@@ -1,8 +1,8 @@
-"""The companion in another process, maybe in another language: turns pass over its MAVLink link.
+"""Partner for a companion in another process: turns are passed over its MAVLink connection.
 
-The vehicle sends its telemetry, and behind it a STATUSTEXT that gives the turn; the companion sends
-what it has to command, and behind it one that gives the turn back. Until then simulated time
-stands. See docs/reference/lockstep-protocol.md.
+The vehicle sends its telemetry, then a STATUSTEXT that gives the turn. The companion sends its
+commands, then a STATUSTEXT that returns the turn. Simulated time is frozen until then. The
+companion may use any language. See docs/reference/lockstep-protocol.md.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from companion.tokens import Phase, TurnBack, TurnGiven
 from firmware_sim.mavlink.codec import Encoder, dialect
 
 KNOCK_S = 0.1
-"""Before the companion is there, a heartbeat goes out so often [wall s]."""
+"""Heartbeat interval before the companion is connected [wall s]."""
 
 FIRST_REPEAT_S, LAST_REPEAT_S = 0.02, 1.0
-"""The turn is given again after the first, then twice that, up to the last [wall s]."""
+"""Interval of turn repetitions: the first one, doubled each time up to the last one [wall s]."""
 
 SLICE_S = 0.2
-"""Longest wait before anything else is looked at [wall s]."""
+"""Maximum duration of one blocking wait [wall s]."""
 
 _TURN_BACK = re.compile(r"D\d+\b")
 
 
 @dataclass(frozen=True)
 class _Rest:
-    """What the companion waits for."""
+    """Wake-up conditions of the sleeping companion."""
 
     wake_us: int
     event: str
@@ -47,7 +47,7 @@ class _Rest:
 
 
 class TokenPartner:
-    """Passes the turns. One flight. Implements `turns.Partner`."""
+    """Partner that passes turns during one flight. Implements `turns.Partner`."""
 
     def __init__(
         self,
@@ -59,17 +59,16 @@ class TokenPartner:
         broken_off: Callable[[], bool] = lambda: False,
         phase: Callable[[str, int], None] = lambda _phase, _time_us: None,
     ) -> None:
-        """Wait for nobody yet.
+        """Initialize without waiting for the companion.
 
         Args:
-            wire: Where the companion is, or will be.
-            camera: Its frames.
-            turn_us: A companion that does not say when it wants the next turn has it so long
-                after [µs].
-            patience_s: Longest turn of the companion [s of wall time, while this process runs].
-            broken_off: Asked again and again while waiting for the companion; True ends the wait
-                and, for this flight, the companion.
-            phase: Called with each phase that the companion tells, and the simulated time [µs].
+            wire: Socket of the companion, connected or not.
+            camera: Camera of the companion.
+            turn_us: Time until the next turn if the companion does not request one [µs].
+            patience_s: Maximum duration of a turn [s of wall time, while this process runs].
+            broken_off: Polled while waiting for the companion; True ends the wait and, for this
+                flight, the companion.
+            phase: Called with each phase that the companion reports, and the simulated time [µs].
         """
         self._wire = wire
         self._camera = camera
@@ -81,30 +80,30 @@ class TokenPartner:
         self._encoder = Encoder()
         self._heartbeat = b""
         self._heard = False
-        """Whether the companion is there: before, nothing but heartbeats is sent."""
+        """True if the companion is connected; before, only heartbeats are sent."""
         self._backlog: list[bytes] = []
-        """All telemetry before the first turn."""
+        """Telemetry sent before the first turn."""
         self._number = 0
         self._rest: _Rest | None = None
         self._unseen = False
-        """Whether the camera's newest frame has not been sent yet."""
+        """True if the camera's newest frame has not been sent yet."""
         self._early: list[Heard] = []
-        """What came before the first turn."""
+        """Messages received before the first turn."""
         self._phases: set[str] = set()
-        """Told in this turn."""
+        """Phases reported in the current turn."""
 
     @property
     def turns(self) -> int:
-        """Turns given so far."""
+        """Number of turns given so far."""
         return self._number
 
     def order(self, order: Order) -> None:
-        """Tell the companion what to do, in its next turn."""
+        """Send an order to the companion with its next turn."""
         self._order = "land" if order is Order.LAND else "abandon"
         self._ordered.set()
 
     def close(self) -> None:
-        """Tell the companion that nobody conducts it any more."""
+        """Notify the companion that the flight is over."""
         if self._heard:
             self._heard = False
             self._say(TurnGiven(self._number + 1, 0, order="end"))
@@ -112,7 +111,7 @@ class TokenPartner:
     # --- turns.Partner
 
     def send(self, frames: Sequence[bytes]) -> None:
-        """Pass on telemetry, at once if the companion is there."""
+        """Forward telemetry, immediately if the companion is connected."""
         self._heartbeat = newest_heartbeat(frames) or self._heartbeat
         if self._number == 0:
             self._backlog += frames
@@ -120,7 +119,7 @@ class TokenPartner:
             self._wire.send(b"".join(frames))
 
     def turn(self, now_us: int, handle: Handle) -> Turn:
-        """Let the companion work until it sleeps; see `turns.Partner`."""
+        """Let the companion run until it sleeps; see `turns.Partner`."""
         arrived = self._camera.arrive(now_us)
         self._unseen = self._unseen or arrived
         if self._rest is not None and not self._wakes(self._rest, now_us, arrived):
@@ -129,7 +128,7 @@ class TokenPartner:
             return Turn(None)
         over = TurnGiven(self._number, now_us)
         self._number += 1
-        # What is left from before must not fill the socket's buffer.
+        # Drain the socket: earlier messages must not fill its buffer.
         self._hear([*self._early, *self._wire.receive()], over, handle)
         self._early.clear()
         self._phases.clear()
@@ -143,7 +142,7 @@ class TokenPartner:
         self._rest = self._understood(back, now_us)
         return self._asleep(self._rest)
 
-    # --- until when it sleeps
+    # --- wake-up conditions
 
     def _understood(self, back: TurnBack, now_us: int) -> _Rest:
         wake_us = back.wake_us
@@ -153,12 +152,12 @@ class TokenPartner:
             raise LockstepError(
                 f"the companion's {back.text()!r}: accepted: a time after now, {now_us} µs"
             )
-        # It goes back to sleep when it is woken too early.
+        # The companion sleeps again if it is woken too early.
         wake_us = min(wake_us, now_us + LONGEST_REST_US)
         return _Rest(wake_us, back.event, back.setpoints_sent or 0)
 
     def _wakes(self, rest: _Rest, now_us: int, arrived: bool) -> bool:
-        """Return whether that is over now."""
+        """Return True if a wake-up condition is met."""
         if now_us >= rest.wake_us:
             return True
         if rest.event == "frame":
@@ -166,7 +165,7 @@ class TokenPartner:
         return rest.event == "stop" and self._ordered.is_set()
 
     def _asleep(self, rest: _Rest) -> Turn:
-        """Return until when, or what, the conductor may go on without it."""
+        """Return the time or event until which the conductor can continue alone."""
         wake_us, interrupt = rest.wake_us, None
         if rest.event == "frame":
             under_way = self._camera.under_way
@@ -182,7 +181,7 @@ class TokenPartner:
     # --- passing the turn
 
     def _knock(self) -> bool:
-        """Send heartbeats until the companion answers with anything; False: broken off."""
+        """Send heartbeats until the companion answers; False = aborted."""
         while not self._broken_off():
             self._wire.send(self._heartbeat)
             if self._wait(KNOCK_S) and (early := self._wire.receive()):
@@ -193,9 +192,9 @@ class TokenPartner:
         return False
 
     def _exchange(self, given: TurnGiven, handle: Handle) -> TurnBack | None:
-        """Give the turn, again and again, until it comes back; None: broken off."""
+        """Give the turn repeatedly until it is returned; None = aborted."""
         again = False
-        # Counted in repetitions, not read off a clock: a process that was stopped has not waited.
+        # Counted in repetitions, not by a clock: a suspended process has not waited.
         for again_s in _repeats(self._patience_s):
             if again:
                 self._repeat()
@@ -217,20 +216,20 @@ class TokenPartner:
         )
 
     def _repeat(self) -> None:
-        """Send again what goes before the turn."""
+        """Repeat the messages that precede the turn."""
         if self._number == 1:
-            # The companion may have come up while the telemetry was being sent.
+            # The companion may have started during the first transmission.
             self._wire.send(b"".join(self._backlog))
         else:
-            # MAVSDK gives a vehicle up after 3 s without one, by the wall clock.
+            # MAVSDK drops a vehicle after 3 s of wall time without a heartbeat.
             self._wire.send(self._heartbeat)
 
     def _hear(self, heard: list[Heard], given: TurnGiven, handle: Handle) -> TurnBack | None:
-        """Handle what has arrived; return the turn if it is given back.
+        """Handle received messages; return the turn if it is given back.
 
-        Who gives a turn back is the companion: nobody else is heard from then on.
+        The sender that gives a turn back is the companion. All others are ignored from then on.
 
-        Raises LockstepError for words that cannot be understood.
+        Raises LockstepError for a malformed message.
         """
         found = None
         for peer, message in ((each.peer, each.message) for each in heard):
@@ -240,7 +239,7 @@ class TokenPartner:
                     raise LockstepError(f"the companion's {text!r}: accepted: D{given.number}")
                 if back.number == given.number:
                     found = back
-                    if given.number > 0:  # 0: before the first turn there is none to give back
+                    if given.number > 0:  # turn 0: before the first turn
                         self._wire.keep_to(peer)
             elif _TURN_BACK.match(text):
                 raise LockstepError(
@@ -254,7 +253,7 @@ class TokenPartner:
         return found
 
     def _enter(self, phase: Phase, given: TurnGiven) -> None:
-        """Pass on a phase, once however often it is told."""
+        """Report a phase once per turn, even if it is repeated."""
         if phase.number == given.number and phase.name not in self._phases:
             self._phases.add(phase.name)
             self._phase(phase.name, given.time_us)
@@ -267,13 +266,13 @@ class TokenPartner:
         self._wire.send(self._encoder.pack(message))
 
     def _wait(self, seconds: float) -> bool:
-        """Wait until something arrives; return whether it has."""
+        """Wait for a message; return True if there is one."""
         ready, _, _ = select.select([self._wire.socket], [], [], min(seconds, SLICE_S))
         return bool(ready)
 
 
 def _repeats(total_s: float) -> Iterator[float]:
-    """Yield waits that get longer, up to a total [s]."""
+    """Yield increasing wait times, up to a total [s]."""
     wait_s = FIRST_REPEAT_S
     while total_s > 0.0:
         yield min(wait_s, total_s)

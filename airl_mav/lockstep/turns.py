@@ -1,4 +1,4 @@
-"""Turns: simulated time stands while the companion works; then it says until when it sleeps."""
+"""Turns: simulated time is frozen while the companion works, until it reports its wake-up time."""
 
 from __future__ import annotations
 
@@ -11,48 +11,48 @@ from airl_mav.core.constants import US_PER_S
 from companion.conducted import Poll
 
 COMPANION_STARTS_US = US_PER_S // 10
-"""The companion begins so long after the flight controller has booted [µs]."""
+"""Delay from the boot of the flight controller to the start of the companion [µs]."""
 
 
 class LockstepError(Exception):
-    """The companion does not keep to the turns; the message says how."""
+    """Violation of the lockstep protocol by the companion, described in the message."""
 
 
 @dataclass(frozen=True)
 class Turn:
-    """How the companion gave its turn back."""
+    """End of the companion's turn."""
 
     wake_us: int | None
-    """When it wants the next one [µs of simulated time]; None: it has ended."""
+    """Requested time of the next turn [µs of simulated time]; None = the companion has ended."""
     interrupt: threading.Event | None = None
-    """Wakes it earlier when set."""
+    """Event that wakes the companion earlier; None = no event."""
     setpoints_sent: int = 0
-    """Setpoints that it has handed to MAVSDK so far."""
+    """Number of setpoints that the companion has passed to MAVSDK so far."""
     poll: Poll | None = None
-    """Postpones `wake_us`; None: nothing does."""
+    """Condition that postpones `wake_us`; None = no condition."""
 
 
 Handle: TypeAlias = "Callable[[bytes], threading.Event | None]"
-"""Takes a frame of the companion's and answers by `Partner.send`. Where the answer takes simulated
-time, it returns what is set when it has come: the companion, which waits for it inside MAVSDK, is
-to be interrupted until then."""
+"""Handler of a frame from the companion, which answers with `Partner.send`. If the answer takes
+simulated time, the handler returns an event that is set on its arrival. The companion is blocked
+inside MAVSDK, and must be interrupted until then."""
 
 
 class Partner(Protocol):
-    """The companion as the conductor sees it, in a thread or behind a socket."""
+    """Interface between the conductor and a companion, in a thread or behind a socket."""
 
     def send(self, frames: Sequence[bytes]) -> None:
-        """Pass on telemetry, MAVLink frames; the companion has it when its next turn begins."""
+        """Forward telemetry (MAVLink frames); delivered before the companion's next turn begins."""
         ...
 
     def turn(self, now_us: int, handle: Handle) -> Turn:
-        """Let the companion work until it sleeps, while simulated time stands at `now_us` [µs].
+        """Let the companion run until it sleeps; simulated time is constant at `now_us` [µs].
 
         Args:
             now_us: Simulated time [µs].
             handle: Called with every MAVLink frame that the companion sends.
 
         Raises:
-            LockstepError: The turn does not come back.
+            LockstepError: The companion does not return the turn.
         """
         ...

@@ -1,4 +1,4 @@
-"""The vehicle's end of the companion's link: in memory, or real firmware's on a socket."""
+"""Vehicle's end of the companion's link: in memory, or a socket of real firmware."""
 
 from __future__ import annotations
 
@@ -10,96 +10,96 @@ from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 
 SETTLE_EVERY = 5
-"""Ticks between two waits for real firmware. A turn begins with a wait, too. Telemetry is read
-then: it is at most 20 ms old."""
+"""Ticks between two synchronizations with real firmware. Each turn begins with one, too. Telemetry
+is read then and is at most 20 ms old."""
 
 _HEADER = 10
 _COMMANDS = {
     dialect.MAVLINK_MSG_ID_COMMAND_LONG: slice(_HEADER + 28, _HEADER + 30),
     dialect.MAVLINK_MSG_ID_COMMAND_INT: slice(_HEADER + 28, _HEADER + 30),
 }
-"""Where the number of a command lies in its frame: behind seven fields of four bytes."""
+"""Position of a command's number in its frame, after seven fields of four bytes."""
 
 
 class VehicleEnd(Protocol):
-    """What the conductor needs of a vehicle."""
+    """Interface between the conductor and a vehicle."""
 
     answers_later: bool
-    """Whether it answers commands in simulated time, which has to go on meanwhile."""
+    """True if the vehicle needs simulated time to answer commands."""
 
     def deliver(self, frame: bytes, carry_out: Callable[[], object], *, echo: bool) -> None:
-        """Have it take in a frame of the companion's.
+        """Deliver a frame of the companion to the vehicle.
 
         Args:
             frame: A MAVLink frame.
-            carry_out: Makes a vehicle of this process read what has arrived.
-            echo: Whether to return only when it has. That must not be asked while a command is
-                under way: it may take simulated time until it takes in anything else.
+            carry_out: Callback that lets an in-process vehicle process its input.
+            echo: True = return after the vehicle has read the frame. Must be False while a command
+                is pending, as the vehicle may need simulated time until it reads again.
         """
         ...
 
     def take(self) -> list[bytes]:
-        """Return what it has sent since the last call: whole MAVLink frames, oldest first."""
+        """Return all MAVLink frames sent since the last call, oldest first."""
         ...
 
     def after_tick(self, *, expected: bool) -> list[bytes]:
-        """Return the same, once a tick; nobody needs it at once unless an answer is `expected`."""
+        """Return new frames once per tick; they may be delayed unless an answer is `expected`."""
         ...
 
     def settle(self) -> None:
-        """Return when it has done, and sent, all that is due by now."""
+        """Wait until the vehicle has finished all due work and sent its messages."""
         ...
 
 
 class InMemory:
-    """A vehicle of this process, which answers within the tick. Implements `VehicleEnd`."""
+    """Vehicle in this process, which answers within the tick. Implements `VehicleEnd`."""
 
     answers_later = False
 
     def __init__(self, endpoint: MemoryEndpoint) -> None:
-        """Take the vehicle's end."""
+        """Set the vehicle's endpoint."""
         self._endpoint = endpoint
         self.take = endpoint.take
 
     def deliver(self, frame: bytes, carry_out: Callable[[], object], *, echo: bool) -> None:
-        """Have it carry out a frame, at once: there is nothing to wait for."""
+        """Let the vehicle process a frame immediately."""
         del echo
         self._endpoint.inbox.append(frame)
         carry_out()
 
     def after_tick(self, *, expected: bool) -> list[bytes]:
-        """Return what it has sent."""
+        """Return all frames sent since the last call."""
         del expected
         return self.take()
 
     def settle(self) -> None:
-        """Return: it has no threads of its own."""
+        """Do nothing: the vehicle has no threads."""
 
 
 class RealFirmwareEnd:
-    """Real firmware on its own link. Implements `VehicleEnd`."""
+    """Real firmware with its own link. Implements `VehicleEnd`."""
 
     answers_later = True
 
     def __init__(self, link: OnboardLink, settle: Callable[[], None]) -> None:
-        """Take its link, and what waits until it has done all that is due."""
+        """Set the link, and a function that waits until the firmware has finished all due work."""
         self._link = link
         self._settle = settle
         self._ticks = 0
 
     def deliver(self, frame: bytes, carry_out: Callable[[], object], *, echo: bool) -> None:
-        """Send a frame; return when the firmware has taken it in, if `echo`."""
-        del carry_out  # Its own threads do that.
+        """Send a frame; with `echo`, wait until the firmware has read it."""
+        del carry_out  # The firmware's threads process the frame.
         self._link.send(frame)
         if echo:
             self._link.await_echo()
 
     def take(self) -> list[bytes]:
-        """Return what has come."""
+        """Return all received frames."""
         return self._link.take()
 
     def after_tick(self, *, expected: bool) -> list[bytes]:
-        """Return what has come, now and then; the firmware is waited for then."""
+        """Return received frames every `SETTLE_EVERY` ticks, after a synchronization."""
         self._ticks += 1
         if self._ticks % SETTLE_EVERY == 0:
             self._settle()
@@ -108,18 +108,18 @@ class RealFirmwareEnd:
         return self._link.take()
 
     def settle(self) -> None:
-        """Return when it has done all that is due."""
+        """Wait until the firmware has finished all due work."""
         self._settle()
 
 
 def command_of(frame: bytes) -> int | None:
-    """Return the number of the command that a MAVLink 2 frame is; None: it is none."""
+    """Return the command number of a MAVLink 2 frame; None if it is not a command."""
     where = _COMMANDS.get(int.from_bytes(frame[7:10], "little"))
     return None if where is None else int.from_bytes(frame[where], "little")
 
 
 def acknowledged(frame: bytes) -> int | None:
-    """Return the number of the command whose final COMMAND_ACK a MAVLink 2 frame is, or None."""
+    """Return the command number of a final COMMAND_ACK, None for any other MAVLink 2 frame."""
     if int.from_bytes(frame[7:10], "little") != dialect.MAVLINK_MSG_ID_COMMAND_ACK:
         return None
     payload = frame[_HEADER : _HEADER + frame[1]].ljust(3, b"\0")

@@ -1,4 +1,4 @@
-"""A flight in lockstep that is watched: shown, held back, and its latency set by hand."""
+"""Viewer connection of a lockstep flight: display, pace, and manual latency."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from firmware_sim.simulation import Simulation
 
 
 class Watched:
-    """What a view has of one flight, until it is closed.
+    """Connection of one flight to a viewer, until it is closed.
 
-    The companion's calls come on its thread, all others on the conductor's, which waits meanwhile.
+    Call the companion's methods on its thread, all others on the waiting conductor's thread.
     """
 
     def __init__(self, ends: ViewEnds, scenario: ResolvedScenario) -> None:
-        """Connect to a view; it flies in real time until the watchers want it otherwise."""
+        """Connect to a viewer; the pace is real time until a spectator changes it."""
         self._open = ExitStack()
         self._simulation = self._open.enter_context(closing(SimulationTap(ends, scenario)))
         self.companion = self._open.enter_context(closing(CompanionTap(ends, scenario)))
-        """The companion's side."""
+        """Companion's part of the connection."""
         self._pace = self._open.enter_context(closing(Pace(ends, scenario.speed or REAL_TIME)))
 
     def close(self) -> None:
@@ -33,19 +33,19 @@ class Watched:
         self._open.close()
 
     def begin(self, seed: int, arena: Arena, started_us: int) -> None:
-        """Show that an episode begins, at a simulated time [µs]."""
+        """Show the start of an episode, at a simulated time [µs]."""
         self._simulation.begin(seed, arena, started_us)
 
     def frame(self, frame: Frame) -> None:
-        """Show a frame of the camera."""
+        """Show a camera frame."""
         self._simulation.frame(frame)
 
     def tick(self, simulation: Simulation, collision: str | None) -> None:
-        """Show the newest ticks, and wait as the watchers ask for."""
+        """Show the newest ticks, and wait as the pace requires."""
         self._simulation.tick(simulation, collision, self._pace.tick)
         self._pace.tick(simulation.time_us)
 
     def decided(self, decision: Decided) -> None:
-        """Show a decision that was sent."""
+        """Show an executed decision."""
         self.companion.decided(decision)
         self._pace.decided()

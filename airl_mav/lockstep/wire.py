@@ -1,7 +1,6 @@
-"""The companion's socket in lockstep: signed where there is a key, and one companion's alone.
+"""Companion's socket in lockstep: signed if there is a key, and restricted to one companion.
 
-Signatures are of the wire: they carry calendar time, and nothing of them goes further. The flight,
-and its fingerprint, is the same with a key and without.
+Signatures contain calendar time and are not forwarded: the key does not affect the digest.
 """
 
 from __future__ import annotations
@@ -17,25 +16,25 @@ from firmware_sim.mavlink.codec import Decoder, WireMessage, is_signed
 from firmware_sim.mavlink.endpoint import Peer, Sender, UdpEndpoint
 
 LONGEST_DATAGRAM = 1400
-"""Frames of telemetry share a datagram up to this size [bytes]; MAVSDK reads 2048 at a time."""
+"""Maximum size of a telemetry datagram [bytes]; MAVSDK reads 2048 at a time."""
 
 LINK_ID = 0
-"""In the signatures of the vehicle's onboard link, as at level sitl."""
+"""Link id in the signatures of the vehicle's onboard link, as at level sitl."""
 
 TELL_EVERY_US = 10 * US_PER_S
-"""Shortest time between two lines about frames that are turned away [µs of wall time]."""
+"""Minimum interval between two messages about rejected frames [µs of wall time]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """A message, and who sent it."""
+    """Message and its sender."""
 
     peer: Peer
     message: WireMessage
 
 
 class Wire:
-    """Sends to the companion and hears it. One flight; the socket is its owner's to close."""
+    """Connection to the companion during one flight; the caller owns and closes the socket."""
 
     def __init__(
         self,
@@ -44,23 +43,23 @@ class Wire:
         say: Callable[[str], None] = lambda _line: None,
         clock: Clock | None = None,
     ) -> None:
-        """Forget what is left of another flight.
+        """Discard pending input of an earlier flight.
 
         Args:
-            endpoint: Where the companion is, or will be.
-            stored: The key that it has, too; None: nothing is signed or asked for.
-            say: Is told what is turned away, a line at a time.
-            clock: Wall time, for how often that is told.
+            endpoint: Endpoint of the companion, connected or not.
+            stored: Signing key shared with the companion; None = no signing.
+            say: Callback for messages about rejected frames.
+            clock: Wall clock for the interval of these messages.
         """
         socket = endpoint.fileno()
         if socket is None:
             raise ValueError("the endpoint is closed")
         self.socket = socket
-        """To wait on."""
+        """File descriptor to wait on."""
         self.refused = 0
-        """Frames that were unsigned, forged or old."""
+        """Number of unsigned, forged or outdated frames."""
         self.foreign = 0
-        """Datagrams of others than the companion."""
+        """Number of datagrams from senders other than the companion."""
         self._endpoint = endpoint
         self._stored = stored
         self._say = say
@@ -71,12 +70,12 @@ class Wire:
         self._preset = endpoint.towards(None)
         self._learned: tuple[Peer, Sender] | None = None
         self._known = stored is None
-        """Whether anything has come that only a companion can have sent."""
+        """True after a message that only a companion can have sent."""
         self._kept: tuple[Peer] | None = None
         endpoint.receive()
 
     def send(self, frames: bytes) -> None:
-        """Send frames, none of them signed, to the preset remote and to who has spoken."""
+        """Send unsigned frames to the preset remote and the last sender; sign if there is a key."""
         ends = [self._preset, None if self._learned is None else self._learned[1]]
         for datagram in datagrams(self._signed(frames), LONGEST_DATAGRAM):
             for end in ends:
@@ -84,7 +83,7 @@ class Wire:
                     end.send(datagram)
 
     def receive(self) -> list[Heard]:
-        """Return what has arrived and may be taken, oldest first."""
+        """Return all accepted messages, oldest first."""
         heard: list[Heard] = []
         for peer, data in self._endpoint.arrivals():
             if self._kept is not None and peer != self._kept[0]:
@@ -92,7 +91,8 @@ class Wire:
                 continue
             messages = self._decoder.feed(data)
             accepted = self._accepted(messages)
-            # What passes unsigned makes nobody the companion, nor is it sent anything.
+            # Unsigned messages that are accepted do not identify a companion, so no data is sent to
+            # it.
             self._known = self._known or any(map(is_signed, accepted))
             if not accepted or not self._known:
                 continue
@@ -106,11 +106,11 @@ class Wire:
         return heard
 
     def keep_to(self, peer: Peer) -> None:
-        """Hear this one alone from now on: it is the companion."""
+        """Accept only this sender from now on: it is the companion."""
         self._kept = self._kept or (peer,)
 
     def close(self) -> None:
-        """Keep the newest time stamp, and tell the rest."""
+        """Save the newest time stamp, and report the remaining rejections."""
         self._tell_us = None
         self._tell()
         if self._stored is not None:
@@ -134,7 +134,7 @@ class Wire:
         return accepted
 
     def _tell(self) -> None:
-        """Say what was turned away, now and then: a wrong key would look like silence."""
+        """Report rejected frames at intervals; otherwise a wrong key would look like silence."""
         count = self.refused + self.foreign
         if count == self._told:
             return

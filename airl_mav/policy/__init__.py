@@ -1,1 +1,1 @@
-"""What a policy sees and does: observations, actions, policies."""
+"""Inputs, outputs and implementations of policies."""

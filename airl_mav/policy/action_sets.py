@@ -1,12 +1,12 @@
-"""Action sets: from a network's output to a command, in one place.
+"""Action sets: conversion of a network's output to a command.
 
 `arc-25`: five speeds with five yaw rates. `paper-25`: the 25 actions of the paper's text.
-`velocity`: the paper's continuous pair, forward and right speed, the nose following;
-`velocity-fixed-yaw`: the same pair, the nose staying where it is. Those of three dimensions also
-command how fast the vehicle sinks or climbs, where the others hold an altitude: `velocity3d` and
-`velocity3d-fixed-yaw`, as these two with a third number, and `arc3d-75`: `arc-25` climbing, level
-and sinking. `body-rates` commands no velocity: three body rates and a collective thrust. Any other
-is the user's own: a class, made without arguments, whose objects are an `ActionSet`.
+`velocity`: the paper's continuous pair, forward and right speed, the nose turns to the course;
+`velocity-fixed-yaw`: the same pair with a fixed heading. Sets of three dimensions also command the
+vertical speed; the other sets hold an altitude. `velocity3d` and `velocity3d-fixed-yaw` are these
+two with a third number, and `arc3d-75` is `arc-25` climbing, level and sinking. `body-rates`
+commands no velocity: three body rates and a collective thrust. Any other name is a custom set: a
+class, constructed without arguments, whose objects are an `ActionSet`.
 """
 
 from __future__ import annotations
@@ -29,40 +29,40 @@ FIXED_YAW = ("velocity-fixed-yaw", "velocity3d-fixed-yaw")
 VELOCITIES = ("velocity", "velocity3d", *FIXED_YAW)
 CONTINUOUS = (*VELOCITIES, BODY_RATES)
 VERTICAL = ("arc3d-75", "velocity3d", "velocity3d-fixed-yaw")
-"""The sets that command a vertical speed, too."""
+"""Sets that also command a vertical speed."""
 
 DISCRETE = {"arc-25": 25, "paper-25": 25, "arc3d-75": 75}
-"""Numbers of actions."""
+"""Number of actions of each discrete set."""
 
 SHIPPED = ("arc-25", "paper-25", "velocity", "velocity-fixed-yaw", *VERTICAL, BODY_RATES)
 ActionSetName = Annotated[str, plugins.part_name(plugins.ACTION_SETS, SHIPPED)]
 
 PAPER_SPEED_M_S = 5.0
-"""Fastest action of the paper [m/s]."""
+"""Maximum speed of the paper's actions [m/s]."""
 
 ARC_SPEEDS = (0.0, 0.2, 0.4, 0.7, 1.0)
-"""`arc-25`: speeds as shares of the fastest."""
+"""`arc-25`: speeds as shares of the maximum."""
 
 ARC_YAW_RATES_DEG_S = (-72.0, -27.0, 0.0, 27.0, 72.0)
 """`arc-25`: yaw rates [deg/s]."""
 
 CLIMB_SHARES = (-1.0, 0.0, 1.0)
-"""`arc3d-75`: downward speeds as shares of the fastest climb."""
+"""`arc3d-75`: downward speeds as shares of the maximum climb rate."""
 
 PAPER_RIGHT_DEG_S = (108.0, 54.0, 27.0, 13.5, 6.75)
 PAPER_LEFT_DEG_S = (-216.0, -108.0, -54.0, -27.0, -13.5)
 """`paper-25`: yaw rates [deg/s] (Air Learning, appendix B)."""
 
 FOLLOW_GAIN_1_S = 1.2
-"""`velocity`: yaw rate per angle between nose and course [1/s]; the gain of the greedy policy."""
+"""`velocity`: yaw rate per angle between nose and course [1/s]; same as the greedy policy."""
 
 FOLLOW_MAX_RAD_S = math.radians(90.0)
-"""`velocity`: greatest yaw rate [rad/s]."""
+"""`velocity`: maximum yaw rate [rad/s]."""
 
 
 MAX_RATE_DEG_S = 180.0
-"""`body-rates`: greatest rate; PX4 flies up to 220 deg/s about roll and pitch, and 200 deg/s about
-yaw by default (MC_ROLLRATE_MAX, MC_PITCHRATE_MAX, MC_YAWRATE_MAX) [deg/s]."""
+"""`body-rates`: maximum rate [deg/s]; PX4's defaults are 220 deg/s for roll and pitch, and 200
+deg/s for yaw (MC_ROLLRATE_MAX, MC_PITCHRATE_MAX, MC_YAWRATE_MAX)."""
 
 MaxRate = Annotated[
     float, quantity("greatest body rate of the set body-rates", "deg/s", gt=0, le=1800)
@@ -70,7 +70,7 @@ MaxRate = Annotated[
 
 
 class ActionSpec(ProfileModel):
-    """An action set and its fastest speed, or greatest rate."""
+    """An action set and its maximum speed, or maximum rate."""
 
     set: ActionSetName = "arc-25"
     max_speed_m_s: float = quantity(
@@ -80,16 +80,16 @@ class ActionSpec(ProfileModel):
 
     @property
     def commands(self) -> CommandKind:
-        """What an action of the set commands."""
+        """Command kind of the set."""
         return "body_rates" if self.set == BODY_RATES else "velocity"
 
 
 class ActionSet(Protocol):
-    """An action set of the user's."""
+    """Interface of a custom action set."""
 
     @property
     def discrete(self) -> int | None:
-        """Number of discrete actions; None for a continuous set, of two numbers -1..1."""
+        """Number of discrete actions; None for a continuous set of two numbers -1..1."""
 
     def commands(self, actions: NDArray[Any], max_speed_m_s: float) -> NDArray[np.float64]:
         """Return the commands (n, 3) of n actions, as the function `commands` does."""
@@ -103,35 +103,33 @@ def discrete_actions(spec: ActionSpec) -> int | None:
 
 
 def continuous_numbers(spec: ActionSpec) -> int:
-    """Return how many numbers an action of a continuous set has."""
+    """Return the length of an action of a continuous set."""
     if spec.set == BODY_RATES:
         return len(BodyRates._fields)
     return 3 if spec.set in VERTICAL else 2
 
 
 def commands_vertical_speed(spec: ActionSpec) -> bool:
-    """Return whether an action set says how fast to sink or climb; else an altitude is held."""
+    """Return whether an action set commands the vertical speed; otherwise an altitude is held."""
     return spec.set in VERTICAL
 
 
 def command_numbers(spec: ActionSpec) -> int:
-    """Return how many numbers a command of an action set has, as `commands` gives it."""
+    """Return the length of a command from `commands`."""
     return 4 if spec.set in (*VERTICAL, BODY_RATES) else 3
 
 
 def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
     """Return the commands of n actions.
 
-    Discrete actions are (n,) whole numbers from 0 on. Continuous ones are (n, 2): forward and right
-    speed, each -1..1 of the fastest, clipped. Sets of three dimensions are (n, 3). Their third
-    number is the downward speed, of the fastest climb (`actions.fastest_climb`). `body-rates` is
-    (n, 4): roll, pitch and yaw rate, each -1..1 of the maximum, and thrust, -1 for none to 1 for
-    all.
+    Discrete actions are (n,) integers from 0 on. Continuous actions are (n, 2): forward and right
+    speed, each -1..1 of the maximum, clipped. Sets of three dimensions are (n, 3). The third number
+    is the downward speed as a share of `actions.fastest_climb`. `body-rates` is (n, 4): roll, pitch
+    and yaw rate, each -1..1 of the maximum, and thrust, -1 for zero to 1 for full thrust.
 
     The commands are (n, 3): forward and right [m/s] in the heading frame, and yaw rate [rad/s],
-    clockwise positive. Sets of three dimensions have the downward speed [m/s] behind them.
-    `body-rates` has (n, 4), as `actions.BodyRates`. Raises UsageError if a set of the user's
-    returns anything else.
+    clockwise positive. Sets of three dimensions append the downward speed [m/s]. `body-rates`
+    returns (n, 4), as `actions.BodyRates`. Raises UsageError if a custom set returns anything else.
     """
     if spec.set not in SHIPPED:
         return _checked(spec, actions)
@@ -143,21 +141,21 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
         rates = shares[:, :3] * math.radians(spec.max_rate_deg_s)
         return np.concatenate([rates, 0.5 * (1.0 + shares[:, 3:])], axis=1)
     wanted = shares[:, :2] * spec.max_speed_m_s
-    # A vector, not a pair: the corner of the square is no faster than its edges.
+    # Limit the vector's length: a corner of the square is no faster than an edge.
     speed = np.hypot(wanted[:, 0], wanted[:, 1])
     wanted *= np.minimum(1.0, spec.max_speed_m_s / np.maximum(speed, 1e-9))[:, None]
     down = shares[:, 2:] * fastest_climb(spec.max_speed_m_s)
     if spec.set in FIXED_YAW:
         return np.concatenate([wanted, np.zeros((len(wanted), 1)), down], axis=1)
     course = np.arctan2(wanted[:, 1], wanted[:, 0])
-    # A vehicle that hovers has no course to turn to; the turn grows with the speed.
+    # The turn grows with the speed, as the course is undefined in hover.
     turn = np.clip(FOLLOW_GAIN_1_S * course, -FOLLOW_MAX_RAD_S, FOLLOW_MAX_RAD_S)
     turn *= np.minimum(1.0, speed / (0.2 * spec.max_speed_m_s))
     return np.concatenate([wanted, turn[:, None], down], axis=1)
 
 
 def _checked(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the commands of a set of the user's, if they are such. Raises UsageError."""
+    """Return the commands of a custom set. Raises UsageError if shape or values are invalid."""
     asked = np.asarray(_own(spec.set).commands(np.asarray(actions), spec.max_speed_m_s), np.float64)
     wanted = (len(actions), 3)
     if asked.shape != wanted or not np.isfinite(asked).all():
@@ -168,7 +166,7 @@ def _checked(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
 
 @cache
 def _own(name: str) -> ActionSet:
-    """Return an action set of the user's. Raises FieldError."""
+    """Return a custom action set. Raises FieldError."""
     door = plugins.ACTION_SETS
     found = plugins.load_part(door, name, lambda made: callable(getattr(made, "commands", None)))
     try:
@@ -184,7 +182,7 @@ def _own(name: str) -> ActionSet:
 
 
 def command(spec: ActionSpec, action: NDArray[Any]) -> Action | BodyRates:
-    """Return the command of one action, () or (2,); (3,) of a set of three dimensions, or (4,)."""
+    """Return the command of one action, (), (2,), (3,) or (4,) by action set."""
     numbers = commands(spec, np.asarray(action)[None])[0].tolist()
     if spec.set == BODY_RATES:
         return BodyRates(*numbers)
@@ -194,7 +192,7 @@ def command(spec: ActionSpec, action: NDArray[Any]) -> Action | BodyRates:
 
 @cache
 def _table(name: str, max_speed: float) -> NDArray[np.float64]:
-    """Return the commands (k, 3) of a discrete set, of three dimensions (k, 4)."""
+    """Return the commands of a discrete set: (k, 3), or (k, 4) with a vertical speed."""
     if name == "arc3d-75":
         climb = fastest_climb(max_speed)
         return np.array(

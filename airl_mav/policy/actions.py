@@ -1,4 +1,4 @@
-"""What a policy does: it commands a velocity, or an attitude, or body rates, with a thrust."""
+"""Actions of policies: a velocity, or an attitude or body rates with a thrust."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from airl_mav.core.errors import FieldError
 from airl_mav.policy.observation import Observation
 
 DecisionTiming = Literal["sequential", "pipelined"]
-"""When a decision begins: after the hold of the one before, or as soon as that one is ready."""
+"""Start of a decision: after the previous hold time, or as soon as the previous one is ready."""
 
 
 @dataclass(frozen=True)
 class Action:
-    """A velocity command. Where it says nothing of the vertical, the pilot holds an altitude."""
+    """A velocity command. Without a vertical speed the pilot holds an altitude."""
 
     forward_m_s: float
     right_m_s: float
     yaw_rate_rad_s: float
-    """Positive clockwise seen from above."""
+    """Yaw rate, positive clockwise seen from above."""
     down_m_s: float | None = None
-    """Positive downwards; None: the pilot adds the vertical speed that holds the altitude."""
+    """Vertical speed, positive downwards; None = the pilot holds the altitude."""
 
 
 class Attitude(NamedTuple):
-    """An attitude and a collective thrust. Nothing but the policy controls the velocity."""
+    """An attitude and a collective thrust. Only the policy controls the velocity."""
 
     roll_rad: float
-    """Positive: right side down."""
+    """Roll, positive right side down."""
     pitch_rad: float
-    """Positive: nose up."""
+    """Pitch, positive nose up."""
     yaw_rad: float
     """Heading, 0 = north, positive to the east."""
     thrust: float
-    """Collective, 0 to 1 of what the motors can; what hovers is MPC_THR_HOVER of PX4."""
+    """Collective thrust, 0 to 1 of the maximum; PX4 hovers at MPC_THR_HOVER."""
 
     @classmethod
     def accelerating(
@@ -53,11 +53,11 @@ class Attitude(NamedTuple):
         yaw_rad: float,
         hover_thrust: float = 0.5,
     ) -> Attitude:
-        """Return the attitude and thrust of an acceleration, for policies that command those.
+        """Return the attitude and thrust of an acceleration, for policies of accelerations.
 
-        Thrust alone makes the specific force a - g, as in PX4's ControlMath::bodyzToAttitude. Drag
-        is left to the policy. A tilt is not limited. Forward and right are level, along the
-        commanded heading (0 = north, positive to the east); 0 down holds the vertical speed.
+        Thrust alone produces the specific force a - g, as in PX4's ControlMath::bodyzToAttitude.
+        The policy must compensate drag. The tilt is not limited. Forward and right are level, along
+        the commanded heading (0 = north, positive to the east); 0 down holds the vertical speed.
         """
         up_m_s2 = GRAVITY_M_S2 - down_m_s2
         force_m_s2 = math.hypot(forward_m_s2, right_m_s2, up_m_s2)
@@ -67,16 +67,16 @@ class Attitude(NamedTuple):
 
 
 class BodyRates(NamedTuple):
-    """Body rates and a collective thrust (CTBR). Nothing but the policy controls the attitude."""
+    """Body rates and a collective thrust (CTBR). Only the policy controls the attitude."""
 
     roll_rate_rad_s: float
-    """Body FRD, as the two others: about the axis forward, ..."""
+    """Roll rate about the forward axis (body FRD)."""
     pitch_rate_rad_s: float
-    """... to the right, ..."""
+    """Pitch rate about the right axis (body FRD)."""
     yaw_rate_rad_s: float
-    """... and downward."""
+    """Yaw rate about the down axis (body FRD)."""
     thrust: float
-    """As of `Attitude`."""
+    """Collective thrust as in `Attitude`."""
 
 
 AnyAction: TypeAlias = "Action | Attitude | BodyRates"
@@ -88,22 +88,22 @@ KINDS: dict[CommandKind, type[Any]] = {
 }
 
 UPRIGHT_S = 0.15
-"""An attitude, or body rates, persist so long by default, beyond the hold time, before the flight
-controller is to hold the vehicle instead [s]: at 3 rad/s it has turned by 26 degrees."""
+"""Default timeout of an attitude, or of body rates, beyond the hold time [s]. The flight controller
+then holds the vehicle. At 3 rad/s the vehicle has turned by 26 degrees."""
 
 ALTITUDE_P = 0.5
-"""Vertical speed per metre of altitude error [1/s]: slow enough for decisions 1.5 s apart."""
+"""Vertical speed per metre of altitude error [1/s]; stable with decisions 1.5 s apart."""
 
 MAX_VERTICAL_M_S = 1.0
 """Limit of the altitude correction [m/s]."""
 
 CLIMB_SHARE = 0.3
-"""Fastest climb and descent of an action, as a share of the fastest level speed: 1.5 m/s where that
-is 5 m/s, which is what PX4 descends at by default (MPC_Z_VEL_MAX_DN)."""
+"""Maximum climb and descent rate as a share of the maximum level speed: 1.5 m/s at 5 m/s, as in
+PX4's default descent (MPC_Z_VEL_MAX_DN)."""
 
 
 def fastest_climb(speed_m_s: float) -> float:
-    """Return the fastest vertical speed of an action [m/s], of the fastest level one [m/s]."""
+    """Return the maximum vertical speed of an action [m/s] for a maximum level speed [m/s]."""
     return CLIMB_SHARE * speed_m_s
 
 
@@ -120,10 +120,9 @@ def vertical_speeds(altitude_m: float, down_m: NDArray[np.float64]) -> NDArray[n
 
 
 class Policy(Protocol):
-    """Anything that decides.
+    """Interface of a policy.
 
-    What commands no velocity says so: by an attribute `commands`, of its class or its own, which is
-    one of `CommandKind`. Without one it commands a velocity.
+    A class or object attribute `commands` declares the `CommandKind`. The default is velocity.
     """
 
     def act(self, observation: Observation) -> AnyAction:
@@ -131,7 +130,7 @@ class Policy(Protocol):
 
 
 def command_kind(policy: object) -> CommandKind:
-    """Return what a policy, or its class, commands. Raises FieldError if it says anything else."""
+    """Return the command kind of a policy or its class. Raises FieldError if it is unknown."""
     kind = getattr(policy, "commands", "velocity")
     for known in KINDS:
         if kind == known:
@@ -141,7 +140,7 @@ def command_kind(policy: object) -> CommandKind:
 
 @runtime_checkable
 class CameraBound(Protocol):
-    """A policy that not every camera can serve."""
+    """A policy with camera requirements."""
 
     @property
     def name(self) -> str:
@@ -153,19 +152,18 @@ class CameraBound(Protocol):
 
 @runtime_checkable
 class RigBound(CameraBound, Protocol):
-    """One that asks for further cameras, or may."""
+    """A policy that may require additional cameras."""
 
     def refuses_further(self, cameras: Mapping[str, Intrinsics]) -> str | None:
-        """Return why further cameras, by name, cannot serve the policy, or None when they can."""
+        """Return why additional cameras, by name, cannot serve the policy, or None."""
 
 
 def flyable(action: AnyAction, kind: CommandKind, speed_m_s: float) -> AnyAction:
-    """Return an action as it may be sent: a velocity `limited`, a thrust within 0..1.
+    """Return an action within limits: a velocity `limited`, a thrust within 0..1.
 
     Raises:
-        TypeError: It is of another kind.
-        ValueError: An attitude, a body rate or a thrust is no number. Nothing is safe to put in its
-            place.
+        TypeError: The action has another command kind.
+        ValueError: An attitude, a body rate or a thrust is not finite. There is no safe default.
     """
     wanted = KINDS[kind]
     if not isinstance(action, wanted):
@@ -179,9 +177,9 @@ def flyable(action: AnyAction, kind: CommandKind, speed_m_s: float) -> AnyAction
 
 
 def limited(action: Action, speed_m_s: float) -> Action:
-    """Return the action with its speed limited and anything that is not finite made zero.
+    """Return the action with its speed limited and non-finite values set to zero.
 
-    The vertical speed, where it has one, is limited to `fastest_climb` of `speed_m_s`.
+    The vertical speed, if present, is limited to `fastest_climb` of `speed_m_s`.
     """
     numbers = (action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s)
     forward, right, turn = (n if math.isfinite(n) else 0.0 for n in numbers)

@@ -1,7 +1,7 @@
-"""The policy card: what a policy file takes and gives, what made it, and how well it flies.
+"""Policy card: inputs, outputs, training and measured quality of a policy file.
 
-A policy is a folder with `policy.onnx` and `card.json`. The card names the file by its digest, so
-that no card ever speaks for another file.
+A policy is a folder with `policy.onnx` and `card.json`. The card contains the file's SHA-256
+digest, which binds the card to this file.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ SCHEMA = 1
 CARD_FILE = "card.json"
 ONNX_FILE = "policy.onnx"
 TORCH_FILE = "policy.pt2"
-"""The same network as a torch program (`torch.export`): optional."""
+"""Optional copy of the network as a torch program (`torch.export`)."""
 
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Count = Annotated[int, Strict()]
 
 
 class Training(ProfileModel):
-    """What made a policy. A policy from elsewhere may not know."""
+    """Training of a policy; unknown for some external policies."""
 
     arena: str | None = optional("arena profile it was trained in")
     first_arena_seed: Count | None = optional("first seed of the arenas")
@@ -58,7 +58,7 @@ class Measured(Protocol):
 
     @property
     def value(self) -> float | None:
-        """None: nothing to work it out from."""
+        """Estimate; None = no data."""
 
     @property
     def low(self) -> float | None:
@@ -70,7 +70,7 @@ class Measured(Protocol):
 
     @property
     def n(self) -> int:
-        """Flights behind it."""
+        """Number of flights."""
 
 
 class MeasuredQuality(Protocol):
@@ -82,19 +82,19 @@ class MeasuredQuality(Protocol):
 
     @property
     def flight_time_s(self) -> Measured:
-        """This and the following: means over the successful flights."""
+        """Mean over the successful flights, as are the following properties."""
 
     @property
     def distance_m(self) -> Measured:
-        """Flown [m]."""
+        """Flown distance [m]."""
 
     @property
     def energy_j(self) -> Measured:
-        """Of the vehicle, without its computer [J]."""
+        """Energy of the vehicle without its computer [J]."""
 
 
 class MeasuredResult(ProfileModel):
-    """How a policy flew a set of episodes; means over the successful ones."""
+    """Measured quality over a set of episodes; means over the successful ones."""
 
     arena: str = Field(description="arena profile")
     level: Level = Field(description="rung of the fidelity ladder")
@@ -133,7 +133,7 @@ class MeasuredResult(ProfileModel):
 
 
 class PolicyFacts(ProfileModel):
-    """What its maker knows of a policy: everything that the file itself cannot tell."""
+    """Metadata of a policy from its author: all fields that the file does not contain."""
 
     name: str = Field(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$",
@@ -172,7 +172,7 @@ class PolicyFacts(ProfileModel):
 
     @model_validator(mode="after")
     def _random_actions_are_discrete(self) -> PolicyFacts:
-        # A set of the user's is not asked: reading a card runs no code.
+        # Custom sets are not loaded: reading a card runs no code.
         if self.epsilon and self.actions.set in CONTINUOUS:
             raise ValueError(
                 f"epsilon = {self.epsilon:g}: accepted: 0 with the action set {self.actions.set!r}"
@@ -181,7 +181,7 @@ class PolicyFacts(ProfileModel):
 
 
 class Quantisation(ProfileModel):
-    """How a network in 8-bit integers was made from one in floats."""
+    """Conversion of a network from floats to 8-bit integers."""
 
     method: str = Field(description="what was quantised, and how the ranges were found")
     source_sha256: Digest = Field(description=f"SHA-256 digest of the {ONNX_FILE} in floats")
@@ -203,7 +203,7 @@ class Quantisation(ProfileModel):
 
 
 class PolicyCard(PolicyFacts):
-    """All of the card."""
+    """Complete policy card."""
 
     sha256: Digest = Field(description=f"SHA-256 digest of {ONNX_FILE}")
     torch_sha256: Digest | None = optional(f"SHA-256 digest of {TORCH_FILE}, if there is one")
@@ -221,12 +221,12 @@ class PolicyCard(PolicyFacts):
 
 
 def digest(data: bytes) -> str:
-    """Return the SHA-256 of a file's bytes, as a card names it."""
+    """Return the SHA-256 of a file's bytes as in a card."""
     return hashlib.sha256(data).hexdigest()
 
 
 def read_card(folder: Path) -> PolicyCard:
-    """Read the card of a policy, not the policy itself. Raises UsageError."""
+    """Read the card of a policy without the network. Raises UsageError."""
     path = folder / CARD_FILE
     data = read_json(path, SCHEMA, "policy")
     del data["schema"]
@@ -234,12 +234,12 @@ def read_card(folder: Path) -> PolicyCard:
 
 
 def read_model(folder: Path, card: PolicyCard) -> bytes:
-    """Return the bytes of the policy that a card is for. Raises UsageError for another one."""
+    """Return the network of a card. Raises UsageError if the digest differs."""
     return _read_bound(folder / ONNX_FILE, card.sha256)
 
 
 def read_torch_program(folder: Path, card: PolicyCard) -> bytes:
-    """Return the bytes of the card's torch program. Raises UsageError for none or another one."""
+    """Return the torch program of a card. Raises UsageError if missing or the digest differs."""
     if card.torch_sha256 is None:
         raise UsageError(
             f"{folder / TORCH_FILE}: the card names none; export the policy with --with-torch"
@@ -248,10 +248,10 @@ def read_torch_program(folder: Path, card: PolicyCard) -> bytes:
 
 
 def load_card(folder: Path, *, trust: bool = False) -> PolicyCard:
-    """Read the card of a policy and hold the policy against it.
+    """Read the card of a policy and check the policy against it.
 
-    Raises UsageError: see `read_card`; also when the file has another digest, or other inputs and
-    outputs than the card says, or the card names code and there is no trust.
+    Raises UsageError as `read_card`, and if the digest, inputs or outputs of the file differ from
+    the card, or the card names untrusted code.
     """
     card = read_card(folder)
     open_model(folder, card, trust=trust)
@@ -259,9 +259,9 @@ def load_card(folder: Path, *, trust: bool = False) -> PolicyCard:
 
 
 def check_trust(folder: Path, card: PolicyCard, *, trust: bool) -> None:
-    """Raise UsageError for a card that names code, unless its maker is trusted.
+    """Raise UsageError for a card that names code, unless its author is trusted.
 
-    A card that comes with this package names none.
+    Cards of this package name no code.
     """
     named = {"actions.set": card.actions.set} if card.actions.set not in SHIPPED_ACTION_SETS else {}
     if card.observation.layout not in SHIPPED_LAYOUTS:
@@ -277,7 +277,7 @@ def check_trust(folder: Path, card: PolicyCard, *, trust: bool) -> None:
 def open_model(
     folder: Path, card: PolicyCard, threads: int = 1, *, trust: bool = False
 ) -> OnnxRuntime:
-    """Return the policy of a card, ready to infer. Raises UsageError as `load_card` does."""
+    """Return the policy of a card, ready for inference. Raises UsageError as `load_card`."""
     check_trust(folder, card, trust=trust)
     model = read_model(folder, card)
     try:
@@ -289,7 +289,7 @@ def open_model(
 def vehicle_mismatch(
     card: PolicyCard, camera: Camera, further: Mapping[str, Camera] | None = None
 ) -> str | None:
-    """Return why a vehicle's camera, and further ones by name, cannot serve a policy; None: can."""
+    """Return why a vehicle's cameras cannot serve a policy, or None; `further` are by name."""
     seen, others = card.observation, further or {}
     lenses = {name: Intrinsics.of(each) for name, each in others.items()}
     if (reason := further_mismatch(seen, lenses)) is not None:
@@ -304,7 +304,7 @@ def vehicle_mismatch(
             )
     if (reason := camera_mismatch(card.observation, Intrinsics.of(camera))) is not None:
         return reason
-    # What lies between the two would look free, and was not so in training. Colour has no range.
+    # Objects beyond the camera's range would look free, unlike in training. Colour has no range.
     if camera.kind == "depth" and camera.range_m < card.observation.range_m:
         return (
             f"camera with a range of {camera.range_m:g} m; "
@@ -314,7 +314,7 @@ def vehicle_mismatch(
 
 
 def _read_bound(path: Path, sha256: str) -> bytes:
-    """Return a file's bytes if they have the digest. Raises UsageError."""
+    """Return a file's bytes if they match the digest. Raises UsageError."""
     try:
         data = path.read_bytes()
     except OSError as error:

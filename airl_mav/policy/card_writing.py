@@ -1,4 +1,4 @@
-"""Writing policy cards, their pages for people, and copies of policies under another card."""
+"""Writing policy cards, their pages for readers, and copies of policies with a changed card."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from airl_mav.policy.model_card import MARK, MODEL_CARD_FILE, model_card
 
 
 def write_card(folder: Path, card: PolicyCard) -> None:
-    """Write the card beside the policy that it is for. The old card stays until the new is whole.
+    """Write the card into its policy's folder, atomically.
 
-    Its page for people, `README.md`, is written after it, unless somebody else's has that name.
-    Raises UsageError if the folder holds another policy, or none.
+    The generated page `README.md` is written after the card, unless the folder has another page of
+    this name. Raises UsageError if the folder contains another policy, or none.
     """
     read_model(folder, card)
     if card.torch_sha256 is not None:
@@ -38,14 +38,14 @@ def write_card(folder: Path, card: PolicyCard) -> None:
 
 
 def write_model_card(folder: Path, card: PolicyCard) -> None:
-    """Write a card's page for people, unless the folder has one that was not made so."""
+    """Write the page of a card, unless the folder has a page that was not generated."""
     page = folder / MODEL_CARD_FILE
     if not page.exists() or MARK.encode() in page.read_bytes():
         replace_file(page, model_card(card).encode())
 
 
 def add_result(folder: Path, result: MeasuredResult) -> PolicyCard:
-    """Write a result onto a card, in place of that of the same arena, level and latency."""
+    """Write a result to a card; replaces a result with the same arena, level and latency."""
     card = read_card(folder)
     others = [each for each in card.results if _conditions(each) != _conditions(result)]
     results = tuple(sorted([*others, result], key=_conditions))
@@ -61,11 +61,11 @@ def _conditions(result: MeasuredResult) -> tuple[str, str, str]:
 def copy_policy(
     source: Path, out: Path, changes: dict[str, Any], *, trust: bool = False
 ) -> PolicyCard:
-    """Write a policy's network to another folder, its card with changes, and return the card.
+    """Copy a policy to another folder with changes to its card, and return the card.
 
-    Measurements of the source do not apply. The card has no results until it is evaluated. `trust`
-    permits the source's maker to run code on this machine. Raises UsageError if the policy cannot
-    be used, a change is out of range, or `out` is the source or cannot be written.
+    The source's results do not apply: the new card has none until it is evaluated. `trust` permits
+    the source's author to run code on this machine. Raises UsageError if the policy cannot be used,
+    a change is out of range, or `out` is the source or cannot be written.
     """
     card = load_card(source, trust=trust)
     if out.resolve() == source.resolve():

@@ -1,8 +1,8 @@
-"""The classical baseline: turn to the goal, steer away from near returns, slow down.
+"""Classical baseline: turns to the goal, avoids near returns, slows down.
 
-A vector-field histogram over the depth image (after Borenstein and Koren, IEEE Trans. Robotics
-and Automation 7(3), 1991): for each heading in view, how far could the vehicle's width fly? The
-free heading nearest to the goal wins. No memory, no map, no learning.
+A vector-field histogram over the depth image (after Borenstein and Koren, IEEE Trans. Robotics and
+Automation 7(3), 1991): computes the free distance of a strip as wide as the vehicle for each
+heading in view. The free heading nearest to the goal wins. No memory, no map, no learning.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from airl_mav.policy.observation import Observation
 
 @dataclass(frozen=True)
 class GreedySettings:
-    """Tuning of the baseline."""
+    """Settings of the baseline."""
 
     max_speed_m_s: float = 4.0
     max_yaw_rate_rad_s: float = math.radians(90.0)
     brake_m_s2: float = 2.5
-    """Deceleration that the speed limit counts on."""
+    """Deceleration assumed by the speed limit."""
     half_width_m: float = 0.7
     """Half the vehicle's width plus a margin."""
     band_m: float = 0.6
-    """Returns this far above or below the vehicle are in its way."""
+    """Returns within this height above or below the vehicle are obstacles."""
     stop_distance_m: float = 1.3
-    """Closer returns than this are not approached."""
+    """Minimum distance to returns."""
     free_distance_m: float = 10.0
-    """A heading that is free this far is as good as any."""
+    """Free distance at which headings count as equally free."""
     period_s: float = 0.5
-    """Time until the next decision that the speed limit counts on."""
+    """Decision period assumed by the speed limit."""
     turn_gain_1_s: float = 1.2
-    """Yaw rate per angle still to turn. Gain times the true time between decisions must stay well
-    below 2, or the heading oscillates: this one stands decisions 1 s apart."""
+    """Yaw rate per angle error. Gain times the actual decision period must stay well below 2, or
+    the heading oscillates: this gain is stable with decisions 1 s apart."""
     headings: int = 37
     """Number of headings tried across the field of view."""
 
@@ -49,14 +49,14 @@ class GreedyPolicy:
     def __init__(self, settings: GreedySettings | None = None) -> None:
         self._settings = settings or GreedySettings()
         self.side = 1.0
-        """Which way to turn when nothing is free: kept, so as not to dither."""
+        """Turn direction if all headings are blocked, 1 = right; kept to avoid oscillation."""
 
     def act(self, observation: Observation) -> Action:
         """Return the velocity for an observation."""
         s, bearing = self._settings, observation.goal_bearing
         half_fov = 0.5 * observation.intrinsics.horizontal_fov_rad
         if abs(bearing) > half_fov:
-            # The goal is out of view: turn to it on the spot.
+            # The goal is out of view: turn towards it on the spot.
             self.side = math.copysign(1.0, bearing)
             return Action(0.0, 0.0, self._turn(bearing))
         points = near_points(observation, s.band_m)
@@ -64,7 +64,7 @@ class GreedyPolicy:
         headings = np.linspace(-half_fov + margin, half_fov - margin, s.headings)
         clear = np.array([clearance(points, h, s.half_width_m) for h in headings])
         distance = observation.goal_distance
-        # What lies behind the goal does not matter.
+        # Obstacles behind the goal do not matter.
         needed = min(s.free_distance_m, max(distance, s.stop_distance_m))
         lack = np.maximum(0.0, needed - clear) / needed
         cost = np.abs(headings - bearing) + 4.0 * lack
@@ -76,7 +76,7 @@ class GreedyPolicy:
             self.side = math.copysign(1.0, heading)
         speed = self._speed(float(clear[best]), distance)
         turn = self._turn(heading)
-        # The command turns with the nose while it is held: aim so that its mean lies right.
+        # The velocity turns with the nose during the hold: aim so that the mean course is right.
         course = heading - 0.5 * turn * s.period_s
         return Action(speed * math.cos(course), speed * math.sin(course), turn)
 
@@ -85,7 +85,7 @@ class GreedyPolicy:
         return max(-limit, min(limit, self._settings.turn_gain_1_s * angle))
 
     def _speed(self, free_m: float, goal_m: float) -> float:
-        """Return the speed from which the vehicle can stop in time after one more period."""
+        """Return the maximum speed from which the vehicle can stop after another period."""
         s = self._settings
         room = max(0.0, free_m - s.stop_distance_m)
         # v T + v²/2a = room, solved for v
@@ -97,9 +97,9 @@ class GreedyPolicy:
 def near_points(observation: Observation, band_m: float) -> NDArray[np.float64]:
     """Return the returns at flight height as points (n, 2), forward and right of the vehicle [m].
 
-    The image is levelled by the vehicle's roll and pitch, so that neither the floor nor the tilt
-    of acceleration looks like an obstacle. The camera is taken to look along the nose, from the
-    centre of the vehicle.
+    The image is levelled by the vehicle's roll and pitch, so that neither the floor nor the tilt of
+    acceleration looks like an obstacle. The camera is assumed at the vehicle's centre, along the
+    nose.
     """
     k, depth = observation.intrinsics, observation.depth_m
     seen = depth > 0.0
@@ -124,7 +124,7 @@ def near_points(observation: Observation, band_m: float) -> NDArray[np.float64]:
 
 
 def clearance(points: NDArray[np.float64], heading: float, half_width_m: float) -> float:
-    """Return how far a strip of +- half_width_m can go along a heading [rad] before a point [m]."""
+    """Return the free distance [m] of a strip of +- half_width_m along a heading [rad]."""
     c, s = math.cos(heading), math.sin(heading)
     along = c * points[:, 0] + s * points[:, 1]
     across = -s * points[:, 0] + c * points[:, 1]

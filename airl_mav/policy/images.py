@@ -1,6 +1,6 @@
-"""The image that a network sees, made of the camera's: smaller, and of depth as bytes.
+"""Network images from camera images: smaller, and depth as bytes.
 
-With numpy, as the companion does it; `envs.encoding` has the same as compiled loops.
+This is the numpy version of the companion; `envs.encoding` has the same as compiled loops.
 """
 
 from __future__ import annotations
@@ -17,40 +17,40 @@ from airl_mav.policy.scans import NUMPY_SCANNING, Scanning
 
 
 class Bytes(NamedTuple):
-    """How depths become the network's bytes."""
+    """Conversion of depths to the network's bytes."""
 
     table: NDArray[np.uint8]
-    """(65536,) a byte for each value of `nearest_returns`."""
+    """(65536,) byte of each value of `nearest_returns`."""
     far_mm: float = 0.0
-    """Not 0: each of them is 255 (value + 1) / far_mm in single precision, rounded to the nearest
-    and 255 at most, which a compiler turns into vector instructions as it cannot a table."""
+    """Scale of a linear conversion; 0 = use the table. A byte is 255 (value + 1) / far_mm in single
+    precision, rounded to nearest and at most 255. Compilers vectorize this, unlike a table."""
 
 
 class Shrink(NamedTuple):
-    """What makes the network's images of the camera's."""
+    """Conversions from camera images to network images."""
 
     depth: Callable[[NDArray[np.uint16], int, int, Bytes], NDArray[np.uint8]]
-    """From Z16 images (n, h, w), rows, columns and the bytes of depths to the images
-    (n, rows, columns) of those bytes."""
+    """Conversion of Z16 images (n, h, w), with rows, columns and `Bytes`, to byte images
+    (n, rows, columns)."""
     colour: Callable[[NDArray[np.uint8], int, int], NDArray[np.uint8]]
-    """From sRGB or grey images (n, h, w, channels), rows and columns to (n, channels, rows,
-    columns): means of blocks."""
+    """Conversion of sRGB or grey images (n, h, w, channels), with rows and columns, to block means
+    (n, channels, rows, columns)."""
     scanning: Scanning
-    """From depth images to level scans."""
+    """Conversion of depth images to level scans."""
 
 
 def shrink_depth(
     depth_mm: NDArray[np.uint16], rows: int, columns: int, bytes_of: Bytes
 ) -> NDArray[np.uint8]:
-    """Return what numpy makes of depth images; see `Shrink.depth`."""
+    """Return network images of depth images with numpy; see `Shrink.depth`."""
     return bytes_of.table[nearest_returns(depth_mm, rows, columns)]
 
 
 def shrink_colour(image: NDArray[np.uint8], rows: int, columns: int) -> NDArray[np.uint8]:
-    """Return what numpy makes of colour images; see `Shrink.colour`.
+    """Return network images of colour images with numpy; see `Shrink.colour`.
 
-    A pixel is the mean of its block's sRGB numbers, halves rounded up: resampling by area as OpenCV
-    (INTER_AREA) and Pillow (BOX) do it.
+    A pixel is the mean of its block's sRGB numbers, halves rounded up: area resampling as in OpenCV
+    (INTER_AREA) and Pillow (BOX).
     """
     n, height, width, channels = image.shape
     tall, wide = height // rows, width // columns
@@ -64,13 +64,13 @@ def shrink_colour(image: NDArray[np.uint8], rows: int, columns: int) -> NDArray[
 
 
 NUMPY = Shrink(shrink_depth, shrink_colour, NUMPY_SCANNING)
-"""As the companion does it, which has no numba."""
+"""Numpy versions, for the companion without numba."""
 
 
 def nearest_returns(depth_mm: NDArray[np.uint16], rows: int, columns: int) -> NDArray[np.uint16]:
     """Shrink Z16 images (n, h, w) to (n, rows, columns). The nearest return of each block wins.
 
-    Values are one less than in the images, so that "no return" (0) wraps round to the farthest.
+    Values are one less than in the images, so that "no return" (0) wraps around to the maximum.
     """
     image = depth_mm - np.uint16(1)
     vertical, horizontal = depth_mm.shape[1] // rows, depth_mm.shape[2] // columns
@@ -92,7 +92,7 @@ def _depths_m(range_m: float) -> NDArray[np.float64]:
 
 @cache
 def body_bytes(range_m: float) -> Bytes:
-    """Depth in proportion to the range: 0 is at the lens, 255 the range and beyond."""
+    """Return bytes proportional to depth: 0 is at the lens, 255 at the range and beyond."""
     share = np.minimum(_depths_m(range_m) / range_m, 1.0)
     table = np.rint(255.0 * share).astype(np.uint8)
     far_mm = range_m * MM_PER_M
@@ -104,9 +104,9 @@ def body_bytes(range_m: float) -> Bytes:
 
 @cache
 def paper_bytes(range_m: float) -> Bytes:
-    """Air Learning's mapping (airlearning-rl, getScreenDepthVis).
+    """Return Air Learning's mapping (airlearning-rl, getScreenDepthVis).
 
-    255 / max(1 m, depth) cut to a byte, inverted, to the tenth power of the byte's range.
+    255 / max(1 m, depth) truncated to a byte, inverted, to the tenth power of the byte's range.
     """
     byte = (255.0 / np.maximum(1.0, _depths_m(range_m))).astype(np.uint8)
     return Bytes((255.0 * ((255.0 - byte) / 255.0) ** 10).astype(np.uint8))

@@ -1,15 +1,15 @@
-"""Observation layouts: from what the vehicle senses to the arrays that a network takes.
+"""Observation layouts: conversion of observations to the input arrays of a network.
 
 `body` is the default: the camera's image, and goal and velocity in the heading frame. `paper` is
-Air Learning's own input as its code has it: a 154 x 256 image whose top rows draw the bearing of
-the goal, and vectors in the world frame. `scan` is `body` with a level scan, as a planar lidar's,
-in place of the depth image. Earlier frames are carried to where the vehicle is now. All are Dicts
-of the image, `velocity` and `goal`. The image's key is what the camera gives: `depth`, `rgb` or
-`grey`. Images of further cameras follow, under KIND_NAME. Any other layout is a class of the
-user's, made without arguments, whose objects are a `Layout`.
+Air Learning's own input as in its code: a 154 x 256 image whose top rows draw the bearing of the
+goal, and vectors in the world frame. `scan` is `body` with a level scan, as from a planar lidar, in
+place of the depth image. Earlier scans are moved to the vehicle's present position. All are Dicts
+of the image, `velocity` and `goal`. The image's key is the camera's kind: `depth`, `rgb` or `grey`.
+Images of additional cameras follow, under KIND_NAME. Any other layout is a custom class,
+constructed without arguments, whose objects are a `Layout`.
 
-The function that trains is the function that flies: `encode_layout` takes n vehicles at a time,
-and the companion is n = 1.
+Training and flight share one function: `encode_layout` takes n vehicles at a time, and the
+companion is n = 1.
 """
 
 from __future__ import annotations
@@ -41,28 +41,28 @@ from airl_mav.policy.scans import scan_bytes, scans_of
 from airl_mav.profiles.camera_kind import CHANNELS, KINDS
 
 VELOCITY, GOAL = "velocity", "goal"
-"""Keys of the shipped layouts, beside that of the image, which is the camera's kind."""
+"""Keys of the shipped layouts besides the image's key, which is the camera's kind."""
 
 
 def image_key(keys: Iterable[str]) -> str:
-    """Return the key of the image among those of a layout. Raises StopIteration where none is."""
+    """Return the key of the image among a layout's keys. Raises StopIteration without an image."""
     return next(key for key in keys if key in KINDS)
 
 
 IN_FLIGHT = "in_flight"
-"""Key of what else a network is told, where it is."""
+"""Key of the additional inputs, if there are any."""
 
 SPEED_SCALE_M_S = 5.0
-"""`body`: velocities are divided by this, the fastest action of the paper."""
+"""`body`: divisor of velocities, the maximum speed of the paper's actions."""
 
 DISTANCE_SCALE_M = 20.0
-"""`body`: the distance to the goal is divided by this."""
+"""`body`: divisor of the goal distance."""
 
 LEAST_DISTANCE_M = 1e-6
-"""A goal that is nearer has no bearing [m]."""
+"""Minimum distance of a goal with a bearing [m]."""
 
 HEIGHT_SCALE_M = 5.0
-"""How far the goal lies below the vehicle is divided by this, and how high that is."""
+"""Divisor of the goal's distance below the vehicle, and of the vehicle's height."""
 
 STRIP_HALF_WIDTH = 1
 """`paper`: the bar that draws the bearing is three columns wide."""
@@ -84,7 +84,7 @@ def boxes(spec: ObservationSpec) -> dict[str, Box]:
 
 
 def further_boxes(spec: ObservationSpec) -> dict[str, Box]:
-    """Return the images of further cameras, by key, sorted."""
+    """Return the images of additional cameras, by key, sorted."""
     found = {
         key: Box((seen.channels, seen.height_px, seen.width_px), np.uint8, 0, 255)
         for key, seen in zip(spec.further_keys.values(), spec.cameras.values(), strict=True)
@@ -95,30 +95,29 @@ def further_boxes(spec: ObservationSpec) -> dict[str, Box]:
 def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUMPY) -> Encoded:
     """Return the arrays of a layout for n vehicles.
 
-    Its camera must fit (`camera_mismatch`). Every array of `seen` has a leading axis (n,).
+    The camera must fit (`camera_mismatch`). Every array of `seen` has a leading axis (n,).
 
     Returns:
-        The image uint8, the newest frame first: `depth` (n, frames, height, width), "no return"
-        where there was none yet; `rgb` (n, 3 frames, height, width) and `grey` (n, frames, height,
-        width), black where there was none yet. `velocity` (n, 3) and `goal` (n, 3) float32.
-        `scan`: `depth` (n, 1, frames, bearings) of `policy.scans.scan_bytes`, a row for each frame,
-        with as many bearings as the image is wide, and those at either end once more for a camera
-        that sees all round; earlier frames carried to the present place and heading. Else as
-        `body`.
+        Image uint8, the newest frame first: `depth` (n, frames, height, width), missing frames
+        "no return"; `rgb` (n, 3 frames, height, width) and `grey` (n, frames, height, width),
+        missing frames black. `velocity` (n, 3) and `goal` (n, 3) float32.
+        `scan`: `depth` (n, 1, frames, bearings) of `policy.scans.scan_bytes`, a row for each frame.
+        The image width is the number of bearings; an all-round camera repeats some at either end.
+        Earlier frames are moved to the present position and heading. Otherwise as `body`.
         `body`: velocity forward, right, down / 5 m/s; goal as cosine and sine of its bearing and
-        its distance / 20 m; with `goal_height` (n, 4): behind them how far it lies below the
-        vehicle / 5 m, and the distance is the level one. `paper`: velocity NED [m/s]; goal as
-        north, east [m] and distance [m].
-        Where the network is told more, `in_flight` (n, k) float32: forward, right / 5 m/s and yaw
-        rate [rad/s]; latency [s]; age [s]; the setpoint as `InFlight.setpoint` has it; down in
-        body axes FRD; body rates [rad/s]; height above the start / 5 m.
-        Of each further camera its image as in `body`, whichever layout it is: `grey_down`
+        its level distance / 20 m. With `goal_height` goal is (n, 4), the last number being the
+        distance below the vehicle / 5 m. `paper`: velocity NED [m/s]; goal as north, east [m] and
+        distance [m].
+        With additional inputs, `in_flight` (n, k) float32: forward, right / 5 m/s and yaw rate
+        [rad/s]; latency [s]; age [s]; the setpoint as in `InFlight.setpoint`; down in body axes
+        FRD; body rates [rad/s]; height above the start / 5 m.
+        An image of each additional camera as in `body`, for every layout: `grey_down`
         (n, frames, height, width) of a grey camera called down.
 
     Raises:
-        ValueError: The network is told of decisions of which nobody keeps account.
-        UsageError: A layout of the user's gives anything else than it says. Or the network is told
-            how high the goal is, and it has no height; or a further camera shows nothing.
+        ValueError: An additional input is not available.
+        UsageError: A custom layout returns other arrays than declared, the network needs the height
+            of a goal without one, or an additional camera has no image.
     """
     if spec.layout not in SHIPPED:
         return own_arrays(spec, seen)
@@ -149,7 +148,7 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
 
 
 def _below(seen: Observation) -> NDArray[np.float64]:
-    """Return how far the goals of n vehicles lie below them (n,) [m]. Raises UsageError."""
+    """Return distances (n,) [m] of goals below their vehicles. Raises UsageError if unknown."""
     below = seen.goal_down
     if below is None or not np.isfinite(below).all():
         raise UsageError("the network is told how high the goal is, and this goal has no height")
@@ -163,7 +162,7 @@ def _images(spec: ObservationSpec, seen: Observation, shrink: Shrink) -> NDArray
 
 
 def _further(spec: ObservationSpec, seen: Observation, shrink: Shrink) -> Encoded:
-    """Return the network's images of further cameras, by key. Raises UsageError without one."""
+    """Return network images of additional cameras, by key. Raises UsageError if one is missing."""
     encoded: Encoded = {}
     for name, key in sorted(spec.further_keys.items(), key=lambda each: each[1]):
         if name not in seen.further:
@@ -180,7 +179,7 @@ def _stack(
     bytes_of: Bytes,
     shrink: Shrink,
 ) -> NDArray[np.uint8]:
-    """Return what a network sees of a camera's images, the newest first, blank where none are."""
+    """Return the network's image of a camera, the newest frame first, missing frames blank."""
     rows, columns = spec.camera_rows, spec.width_px
     if spec.kind == "depth":
 
@@ -209,12 +208,12 @@ def _scans(spec: ObservationSpec, seen: Observation, shrink: Shrink) -> NDArray[
 
 
 def _told(names: tuple[Told, ...], seen: Observation) -> NDArray[np.float32]:
-    """Return what networks are told of n vehicles and of their decisions (n, k)."""
+    """Return the additional inputs of n vehicles (n, k)."""
     return np.concatenate([_part(name, seen) for name in names], axis=1).astype(np.float32)
 
 
 def _part(name: Told, seen: Observation) -> NDArray[np.float64]:
-    """Return one thing that networks are told of n vehicles (n, k)."""
+    """Return one additional input of n vehicles (n, k)."""
     known, state = seen.in_flight, seen.states[0] if seen.states else None
     if name == "tilt":
         return down_in_body(np.asarray(seen.roll), np.asarray(seen.pitch))
@@ -246,7 +245,7 @@ def newest_frame(spec: ObservationSpec, seen: Mapping[str, NDArray[Any]]) -> NDA
 
 
 def ablated(encoded: Mapping[str, NDArray[Any]], key: str) -> Encoded:
-    """Return the arrays with one input made zero, as the paper's sensor ablation does."""
+    """Return the arrays with one input set to zero, as in the paper's sensor ablation."""
     return {k: np.zeros_like(v) if k == key else v for k, v in encoded.items()}
 
 
@@ -267,20 +266,20 @@ def _bearing_strip(spec: ObservationSpec, seen: Observation) -> NDArray[np.uint8
 
 
 class Layout(Protocol):
-    """A layout of the user's."""
+    """Interface of a custom layout."""
 
     def boxes(self, spec: ObservationSpec) -> Mapping[str, Box]:
-        """Return its arrays by key: `spec.kind` uint8 (channels, height, width), others float32.
+        """Return the arrays by key: `spec.kind` uint8 (channels, height, width), others float32.
 
-        The same of the keys of further cameras (`spec.further_keys`).
+        Images of additional cameras (`spec.further_keys`) have the same format as `spec.kind`.
         """
 
     def encode(self, spec: ObservationSpec, seen: Observation) -> Mapping[str, NDArray[Any]]:
-        """Return those arrays for n vehicles, as `encode_layout` does: of each from its own row."""
+        """Return the arrays for n vehicles, as `encode_layout` does. Rows are independent."""
 
 
 def own_boxes(spec: ObservationSpec) -> dict[str, Box]:
-    """Return the arrays of a layout of the user's by key, sorted, if a network can take them."""
+    """Return the arrays of a custom layout by key, sorted, if a network can take them."""
     found = {key: Box(*box) for key, box in sorted(_own(spec.layout).boxes(spec).items())}
     images = {spec.kind, *spec.further_keys.values()}
     wrong = [
@@ -300,7 +299,7 @@ def own_boxes(spec: ObservationSpec) -> dict[str, Box]:
 
 
 def own_arrays(spec: ObservationSpec, seen: Observation) -> Encoded:
-    """Return what a layout of the user's makes of an observation, if it is what it says."""
+    """Return the arrays of a custom layout for an observation, checked against its boxes."""
     found, wanted = _own(spec.layout).encode(spec, seen), own_boxes(spec)
     encoded = {key: np.asarray(found[key]) for key in wanted if key in found}
     n = len(seen.goal)
@@ -317,7 +316,7 @@ def own_arrays(spec: ObservationSpec, seen: Observation) -> Encoded:
 
 @cache
 def _own(name: str) -> Layout:
-    """Return a layout of the user's. Raises FieldError."""
+    """Return a custom layout. Raises FieldError."""
     door = plugins.LAYOUTS
     methods = ("boxes", "encode")
     found = plugins.load_part(

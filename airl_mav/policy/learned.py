@@ -1,4 +1,4 @@
-"""A learned policy: encode, infer, decide. One rule for the rehearsal and for training."""
+"""Learned policy: encode, infer, decide, in rehearsal and training."""
 
 from __future__ import annotations
 
@@ -40,8 +40,9 @@ from airl_mav.profiles.loading import profiles_dir
 class LearnedPolicy:
     """A network with its card. Implements `actions.Policy`.
 
-    A network with a memory remembers one flight, or n side by side. An object flies them from
-    their first decision to their last, and `with_generator` gives the one for the next flight.
+    A network with memory stores the state of one flight, or of n parallel flights. An object is
+    used from the first to the last decision. `with_generator` returns an object for the next
+    flight.
     """
 
     def __init__(
@@ -52,10 +53,10 @@ class LearnedPolicy:
         rng: np.random.Generator | None = None,
         ablate: str | None = None,
     ) -> None:
-        """Put a policy together; a card with an epsilon needs an `rng`.
+        """Initialize the policy; a card with an epsilon requires an `rng`.
 
-        `ablate` names an input that is made zero, as the paper's sensor ablation does. Raises
-        UsageError if the layout has no such input.
+        `ablate` names an input to set to zero, as in the paper's sensor ablation. Raises UsageError
+        if the layout has no such input.
         """
         if ablate is not None and ablate not in boxes(card.observation):
             known = ", ".join(boxes(card.observation))
@@ -65,9 +66,9 @@ class LearnedPolicy:
         self._rng = rng
         self._ablate = ablate
         self._fitting: tuple[Intrinsics, ...] = ()
-        """The cameras that were found to fit."""
+        """Intrinsics of the cameras that passed the check."""
         self._memory: Memory | None = None
-        """What the network remembers of its flights; None before their first decision."""
+        """Memory of the network; None before the first decision."""
 
     @property
     def name(self) -> str:
@@ -76,11 +77,11 @@ class LearnedPolicy:
 
     @property
     def commands(self) -> CommandKind:
-        """What its actions command."""
+        """Command kind of the actions."""
         return self.card.actions.commands
 
     def with_generator(self, rng: np.random.Generator) -> LearnedPolicy:
-        """Return the same policy at its first decision, with another source of random actions."""
+        """Return the same policy at its first decision, with another random generator."""
         return LearnedPolicy(self.card, self._runtime, rng=rng, ablate=self._ablate)
 
     def refuses(self, camera: Intrinsics) -> str | None:
@@ -88,15 +89,15 @@ class LearnedPolicy:
         return camera_mismatch(self.card.observation, camera)
 
     def refuses_further(self, cameras: Mapping[str, Intrinsics]) -> str | None:
-        """Return why further cameras, by name, cannot serve the policy, or None when they can."""
+        """Return why additional cameras, by name, cannot serve the policy, or None."""
         return further_mismatch(self.card.observation, cameras)
 
     def act(self, observation: Observation) -> Action | BodyRates:
         """Return the action for an observation of one vehicle.
 
         Raises:
-            UsageError: The camera is not one that the policy was trained with.
-            ValueError: The network gives no number.
+            UsageError: The camera differs from the camera in training.
+            ValueError: The network outputs NaN.
         """
         further = observation.further
         looks = (observation.intrinsics, *(each.intrinsics for each in further.values()))
@@ -114,23 +115,23 @@ class LearnedPolicy:
     ) -> NDArray[Any]:
         """Return the actions of n vehicles, as `action_sets.commands` takes them; see `decide`.
 
-        `encoded` are the arrays of the card's layout, each with n rows. Without `rng` the policy's
-        own is used. Raises ValueError as `outputs`, and if an output is not a number.
+        `encoded` are the arrays of the card's layout, each with n rows. The default `rng` is the
+        policy's own generator. Raises ValueError as `outputs`, and if an output is NaN.
         """
         return decide(self.card.actions, self.outputs(encoded), self.card.epsilon, rng or self._rng)
 
     def outputs(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
         """Return a score (n, k) for each discrete action, or the action, of n flights.
 
-        A network with a memory remembers the call as a decision. ValueError: it remembers other
-        flights.
+        A network with memory updates its memory. Raises ValueError if the number of flights
+        changed.
         """
         if self._ablate is not None:
             encoded = ablated(encoded, self._ablate)
         return self._remembering(encoded) if self.card.state else self._runtime.infer(encoded)
 
     def _remembering(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        """Return the outputs of a network with a memory, and remember what it gives."""
+        """Return the outputs of a network with memory, and update the memory."""
         if not isinstance(self._runtime, RecurrentRuntime):
             raise ValueError(f"{type(self._runtime).__name__} runs no network with a memory")
         n = len(next(iter(encoded.values())))
@@ -148,11 +149,11 @@ def decide(
     epsilon: float = 0.0,
     rng: np.random.Generator | None = None,
 ) -> NDArray[Any]:
-    """Turn a network's outputs (n, k) into actions: the best score wins, or chance.
+    """Return the actions of a network's outputs (n, k): the best score, or a random action.
 
-    `epsilon` is the share of random actions of a discrete set. Returns (n,) int64 of a discrete
-    set, (n, 2) float32 of the continuous one. Raises ValueError if an output is not a number, or
-    chance has no `rng`.
+    `epsilon` is the share of random actions of a discrete set. Returns (n,) int64 for a discrete
+    set, (n, k) float32 for a continuous one. Raises ValueError if an output is NaN, or random
+    actions have no `rng`.
     """
     if np.isnan(outputs).any():
         raise ValueError("the network's output is not a number")
@@ -180,10 +181,10 @@ def load_learned(
 ) -> LearnedPolicy:
     """Load a policy from a folder with `policy.onnx` and `card.json`.
 
-    The card is read where none is given. `runtime`, `threads` and `trust` are those of
-    `open_network`, `rng` and `ablate` those of `LearnedPolicy`. An inference is made at once, so
-    that the first decision in the air is no slower than the others. Raises UsageError: card and
-    policy do not fit each other, or the runtime is not installed or not trusted.
+    The default card is read from the folder. `runtime`, `threads` and `trust` are as in
+    `open_network`, `rng` and `ablate` as in `LearnedPolicy`. An inference is run at once, so that
+    the first decision in flight is as fast as the others. Raises UsageError if card and policy do
+    not match, or the runtime is not installed or not trusted.
     """
     card = card or read_card(folder)
     check_trust(folder, card, trust=trust)
@@ -205,10 +206,9 @@ def open_network(
 ) -> RecurrentRuntime:
     """Return the network of a card, ready for its first inference; `torch` takes `policy.pt2`.
 
-    `trust` permits the folder's maker to run code on this machine: `torch.export.load` falls back
-    to unpickling, which runs whatever the file says. An ONNX model is data, and the policies that
-    come with this package are trusted. A card may name code, too. Raises UsageError as
-    `load_learned`.
+    `trust` permits the folder's author to run code on this machine: `torch.export.load` falls back
+    to unpickling, which runs code from the file. An ONNX model is data, and the policies of this
+    package are trusted. A card may name code, too. Raises UsageError as `load_learned`.
     """
     if runtime == "onnx":
         return open_model(folder, card, threads, trust=trust)

@@ -1,7 +1,7 @@
-"""The model card of a policy: its card as a page for people, as model hubs show one.
+"""Model card of a policy: a page as on model hubs.
 
-Markdown with front matter in YAML (`library_name`, `tags`, `model-index`), rendered from
-`card.json` alone and written beside it, so that it says what the card says.
+Markdown with front matter in YAML (`library_name`, `tags`, `model-index`), rendered only from
+`card.json` and written beside it, so that both agree.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from airl_mav.policy.card import MeasuredResult, PolicyCard
 MODEL_CARD_FILE = "README.md"
 
 MARK = "<!-- Written from card.json by airl-mav, and again whenever a result is added to it. -->"
-"""A page without it is somebody's own, and stays as it is."""
+"""Mark of a generated page. Pages without it are never overwritten."""
 
 TASK = "reinforcement-learning"
 ENVIRONMENT = "airl/Navigation-v0"
@@ -26,7 +26,7 @@ QUALITIES = (
     ("distance_m", "distance flown [m]", "{:.1f} m"),
     ("energy_j", "energy drawn [J]", "{:.0f} J"),
 )
-"""Fields of a result, their names, and how a table shows them."""
+"""Fields of a result, their names and table formats."""
 
 
 def model_card(card: PolicyCard) -> str:
@@ -35,7 +35,7 @@ def model_card(card: PolicyCard) -> str:
 
 
 def _front_matter(card: PolicyCard) -> Iterator[str]:
-    """Give the lines that a hub reads. Texts are quoted as JSON, which is YAML too."""
+    """Yield the lines for a hub. Texts are quoted as JSON, which is also YAML."""
     tags = [TASK, "deep-reinforcement-learning", "drones", "onnx", ENVIRONMENT]
     yield from ("---", "library_name: airl-mav", f"pipeline_tag: {TASK}", "tags:")
     for tag in [*tags, card.algorithm] if card.algorithm else tags:
@@ -54,14 +54,14 @@ def _front_matter(card: PolicyCard) -> Iterator[str]:
 
 
 def _page(card: PolicyCard) -> Iterator[str]:
-    """Give the lines that people read."""
+    """Yield the lines for readers."""
     seen, actions, training = card.observation, card.actions, card.training
     yield f"# {card.name}"
     yield ""
     if description := " ".join(card.description.split()).rstrip("."):
         yield from (f"{description[0].upper()}{description[1:]}.", "")
     yield from ("A policy of airl-mav that flies a quadcopter to a goal. In this folder:", "")
-    # One that is told of the goal's height cannot fly where goals have none, as by default.
+    # A network that needs the goal's height cannot fly without one, as in the default arena.
     where = f" --arena {training.arena}" if seen.goal_height and training.arena else ""
     flown = f"airl-sitl --policy .{where}", f"airl evaluate .{where} --episodes 100"
     yield from ("```sh", *flown, "```", "")
@@ -111,7 +111,7 @@ def _page(card: PolicyCard) -> Iterator[str]:
 
 
 def _conditions(result: MeasuredResult) -> str:
-    """Return what a result was flown in, as one line."""
+    """Return the conditions of a result as one line."""
     late = "" if result.latency is None else f", latency {result.latency}"
     last = result.seed + result.episodes - 1
     return f"arena {result.arena}, level {result.level}{late}, seeds {result.seed} to {last}"

@@ -1,7 +1,7 @@
-"""What a policy sees: an image, its own motion and the goal.
+"""Observations of a policy: an image, the vehicle's motion and the goal.
 
-One function for all: `observe` turns frames and the vehicles' telemetry into an Observation, of
-one vehicle in the companion and of n at a time in training.
+`observe` turns frames and telemetry into an Observation, of one vehicle in the companion and of n
+at a time in training.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from airl_mav.core.frames import Vector, ned_to_heading, quats_to_euler
 from airl_mav.core.goals import Goal
 
 Rows = int | slice | Sequence[int] | NDArray[np.int64] | None
-"""Which of n; None: the only one, as that of n = 1."""
+"""Index into n vehicles; None adds a leading axis of n = 1."""
 
 
 @dataclass(frozen=True)
 class Kinematics:
-    """The own state of a vehicle, or of n, as telemetry reports it. Leading axes may be added."""
+    """State of one vehicle, or of n, as reported by telemetry. Leading axes may be added."""
 
     position: Vector  # (..., 3) local NED [m]
     velocity: Vector  # (..., 3) NED [m/s]
     quaternion: Vector  # (..., 4) body FRD -> NED
-    rates: Vector | None = None  # (..., 3) body FRD [rad/s]; None: nobody tells them
+    rates: Vector | None = None  # (..., 3) body FRD [rad/s]; None = not reported
 
     def known(self) -> dict[str, Vector]:
-        """Return position, velocity and quaternion by name: what is always known."""
+        """Return position, velocity and quaternion by name: the fields that are always present."""
         return {
             "position": self.position,
             "velocity": self.velocity,
@@ -41,22 +41,22 @@ class Kinematics:
         }
 
     def rows(self, index: Rows) -> Kinematics:
-        """Return that of vehicle `index` of n, or of several of them."""
+        """Return the state of one or several of n vehicles."""
         rates = None if self.rates is None else self.rates[index]
         return Kinematics(self.position[index], self.velocity[index], self.quaternion[index], rates)
 
 
 @dataclass(frozen=True)
 class InFlight:
-    """What a companion knows of its own decisions, of one or of n."""
+    """Decision state of one companion, or of n."""
 
     latency_s: Vector
-    """(...) latency t2 that is expected of this decision [s]."""
+    """(...) expected latency t2 of this decision [s]."""
     age_s: Vector
-    """(...) how long ago the image was taken [s]."""
+    """(...) age of the image [s]."""
     setpoint: Vector
-    """(..., 4) newest setpoint whole: as `actions.BodyRates`, `actions.Attitude`, or a velocity
-    forward, right, down [m/s] and a yaw rate [rad/s]; zeros before the first."""
+    """(..., 4) newest setpoint: `actions.BodyRates`, `actions.Attitude`, or a velocity forward,
+    right, down [m/s] and a yaw rate [rad/s]; zeros before the first."""
 
     @property
     def command(self) -> Vector:
@@ -65,26 +65,26 @@ class InFlight:
 
     @classmethod
     def of_first_decisions(cls, n: int) -> InFlight:
-        """Return that of n companions which have not decided yet."""
+        """Return the state of n companions before their first decision."""
         return cls(np.zeros(n), np.zeros(n), np.zeros((n, 4)))
 
     def rows(self, index: Rows) -> InFlight:
-        """Return that of companion `index` of n, or of several of them."""
+        """Return the state of one or several of n companions."""
         latency_s, age_s = np.asarray(self.latency_s), np.asarray(self.age_s)
         return InFlight(latency_s[index], age_s[index], self.setpoint[index])
 
 
 @dataclass(frozen=True)
 class View:
-    """What a further camera shows, of one vehicle or with a leading axis of n."""
+    """Image of an additional camera, of one vehicle or with a leading axis of n."""
 
     image: NDArray[Any]
     intrinsics: Intrinsics
     earlier: tuple[NDArray[Any], ...] = ()
-    """Its images of the decisions before, as far as they are kept, the newest first."""
+    """Images of the previous decisions, as far as stored, the newest first."""
 
     def rows(self, index: Rows) -> View:
-        """Return that of vehicle `index` of n, or of several of them."""
+        """Return the view of one or several of n vehicles."""
         earlier = tuple(image[index] for image in self.earlier)
         return View(self.image[index], self.intrinsics, earlier)
 
@@ -100,7 +100,7 @@ class Observation:
     """(..., h, w) depth uint16 along the optical axis [mm], 0 = no return; or colour uint8
     (..., h, w, 3) sRGB, (..., h, w, 1) grey."""
     intrinsics: Intrinsics
-    """Of the camera; its `kind` says what the image's pixels are."""
+    """Intrinsics of the camera; `kind` defines the image's pixels."""
     goal: Vector  # (..., 2) goal relative to the vehicle, forward and right [m]
     velocity: Vector  # (..., 3) heading frame [m/s]
     roll: float | Vector
@@ -110,19 +110,19 @@ class Observation:
     yaw: float | Vector
     """(...) heading [rad], 0 = north, positive to the east."""
     in_flight: InFlight | None = None
-    """None: nobody keeps account of the decisions."""
+    """Decision state; None = not available."""
     earlier: tuple[NDArray[Any], ...] = ()
-    """The images of the decisions before, as far as they are kept, the newest first."""
+    """Images of the previous decisions, as far as stored, the newest first."""
     states: tuple[Kinematics, ...] = ()
-    """Own states: the present one, with attitude and body rates as telemetry has them, and behind
-    it those of `earlier`."""
+    """Vehicle states: the present one, with attitude and body rates from telemetry, then the states
+    of `earlier`."""
     goal_down: Vector | None = None
-    """(...) how far the goal lies below the vehicle [m]; None: it has no height."""
+    """(...) distance of the goal below the vehicle [m]; None = the goal has no height."""
     further: Mapping[str, View] = field(default_factory=dict)
-    """What the vehicle's further cameras show, by name; they look at the same moment."""
+    """Views of additional cameras, by name, at the same time."""
 
     def rows(self, index: Rows) -> Observation:
-        """Return what vehicle `index` of n sees, or several of them."""
+        """Return the observation of one or several of n vehicles."""
         names = ("image", "goal", "velocity", "roll", "pitch", "yaw")
         found: dict[str, Any] = {name: np.asarray(getattr(self, name))[index] for name in names}
         if (told := self.in_flight) is not None:
@@ -138,13 +138,13 @@ class Observation:
     def depth_mm(self) -> NDArray[np.uint16]:
         """Depth (..., h, w) along the optical axis [mm]; 0 = no return.
 
-        Raises UsageError for a colour camera, as the next two do.
+        Raises UsageError for a colour camera, as do the next two properties.
         """
         return depth_only(self.image, self.intrinsics)
 
     @property
     def earlier_mm(self) -> tuple[NDArray[np.uint16], ...]:
-        """Depths (..., h, w) [mm] of the decisions before, as far as they are kept."""
+        """Depths (..., h, w) [mm] of the previous decisions, as far as stored."""
         return tuple(depth_only(image, self.intrinsics) for image in self.earlier)
 
     @property
@@ -164,7 +164,7 @@ class Observation:
 
 
 Earlier = Sequence[tuple[NDArray[Any], Kinematics]]
-"""Images and states of the decisions before, the newest first."""
+"""Images and states of the previous decisions, the newest first."""
 
 
 def encode(frame: Frame, state: Kinematics, goal: Goal) -> Observation:
@@ -174,7 +174,7 @@ def encode(frame: Frame, state: Kinematics, goal: Goal) -> Observation:
 
 
 def views_of(frame: Frame, earlier: Sequence[Mapping[str, NDArray[Any]]] = ()) -> dict[str, View]:
-    """Return the further cameras' views of a frame; `earlier` images are the newest first."""
+    """Return the additional cameras' views of a frame; `earlier` images are the newest first."""
     return {
         name: View(each.image, each.intrinsics, tuple(then[name] for then in earlier))
         for name, each in frame.further.items()
@@ -193,7 +193,7 @@ def observe(
     """Return the observation of one vehicle, or of n.
 
     `goal` is (..., 2) north, east [m], or (..., 3) with down. `earlier` are the images and states
-    of the decisions before, the newest first. `further` are the views of further cameras by name.
+    of the previous decisions, newest first. `further` are views of additional cameras by name.
     """
     roll, pitch, yaw = quats_to_euler(state.quaternion)
     to_goal = np.zeros_like(state.position)

@@ -40,23 +40,23 @@ TOLD: dict[Told, int] = {
     "rates": 3,
     "height": 1,
 }
-"""Numbers of each thing that a network may be told of the decisions, and of the attitude."""
+"""Length of each additional input."""
 
 STRIP_ROWS = 10
 """`paper`: rows on top of the image that draw the bearing of the goal, the last one black."""
 
 SEAM_SHARE = 8
-"""`scan`: so many-th of the bearings of a camera that sees all round are repeated at either end, so
-that a convolution sees what is behind the vehicle in one piece."""
+"""`scan`: divisor for the bearings of an all-round camera that are repeated at either end, so that
+a convolution sees the rear without a gap."""
 
 LEAST_ROWS = 4
-"""Of an image that goes into a network: all but a scan's, which is a row for each frame."""
+"""Minimum rows of a network's image; a scan has one row per frame instead."""
 
 SAME_DEG = 0.1
-"""Two lenses are the same where no place of their images is seen at angles farther apart [deg]."""
+"""Maximum angle between matching lenses at any position of the image [deg]."""
 
 MOST_FRAMES = 8
-"""Most images that a network sees at a time."""
+"""Maximum number of images in an observation."""
 
 Frames = Annotated[
     int,
@@ -110,11 +110,11 @@ Range = Annotated[
 ]
 
 CameraName = Annotated[str, AfterValidator(camera_named)]
-"""Of a further camera."""
+"""Name of an additional camera."""
 
 
 class SeenCamera(ProfileModel):
-    """A further camera, whose image a network takes beside the main one's."""
+    """An additional camera, whose image is an input besides the main camera's."""
 
     height_px: int = quantity(
         "height of the image that the network sees", "px", ge=LEAST_ROWS, le=480
@@ -142,12 +142,12 @@ class SeenCamera(ProfileModel):
 
     @property
     def channels(self) -> int:
-        """Channels of the image that the network sees: those of a frame, for each frame."""
+        """Channels of the network's image, over all frames."""
         return CHANNELS[self.kind] * self.frames
 
 
 class ObservationSpec(ProfileModel):
-    """What a network takes, and the cameras that can provide it."""
+    """Inputs of a network, and the cameras that can provide them."""
 
     layout: LayoutName = Field(default="body", description="which arrays it takes")
     height_px: int = quantity(
@@ -230,17 +230,17 @@ class ObservationSpec(ProfileModel):
 
     @property
     def goal_numbers(self) -> int:
-        """Numbers that a shipped layout says of the goal."""
+        """Length of `goal` in shipped layouts."""
         return 4 if self.goal_height else 3
 
     @property
     def channels(self) -> int:
-        """Channels of the image that the network sees: those of a frame, for each frame."""
+        """Channels of the network's image, over all frames."""
         return 1 if self.layout == "scan" else CHANNELS[self.kind] * self.frames
 
     @property
     def further_keys(self) -> dict[str, str]:
-        """Keys of the further cameras' images, by their names."""
+        """Keys of the additional cameras' images, by camera name."""
         return {name: f"{seen.kind}_{name}" for name, seen in self.cameras.items()}
 
 
@@ -254,9 +254,9 @@ class Box(NamedTuple):
 
 
 def further_mismatch(spec: ObservationSpec, cameras: Mapping[str, Intrinsics]) -> str | None:
-    """Return why further cameras, by name, cannot serve a layout, or None when they can.
+    """Return why additional cameras, by name, cannot serve a layout, or None when they can.
 
-    Those that it does not name may be anything.
+    Cameras that the layout does not name are ignored.
     """
     for name, seen in spec.cameras.items():
         if name not in cameras:
@@ -270,8 +270,8 @@ def further_mismatch(spec: ObservationSpec, cameras: Mapping[str, Intrinsics]) -
 def camera_mismatch(spec: ObservationSpec | SeenCamera, camera: Intrinsics) -> str | None:
     """Return why a camera cannot serve a layout, or None when it can.
 
-    It gives what the network takes, its image is a whole multiple of the network's, projection,
-    field of view and distortion are the same.
+    The camera's kind, projection, field of view and distortion must match. Its image size must be a
+    whole multiple of the network's.
     """
     if camera.kind != spec.kind:
         return f"{camera.kind} camera; accepted: {spec.kind}"
@@ -302,9 +302,9 @@ def camera_mismatch(spec: ObservationSpec | SeenCamera, camera: Intrinsics) -> s
 
 
 def _apart_deg(spec: ObservationSpec | SeenCamera, camera: Intrinsics) -> float:
-    """Return how far apart two lenses see, at most, what they have in one place of the image.
+    """Return the maximum angle between the rays of two lenses at one image position [deg].
 
-    Their fields of view are the same. This is between the middle of the image and its edge [deg].
+    Both have the same field of view. Positions run from the middle of the image to its edge.
     """
     if spec.distortion == camera.distortion:
         return 0.0
@@ -313,5 +313,5 @@ def _apart_deg(spec: ObservationSpec | SeenCamera, camera: Intrinsics) -> float:
     places = np.linspace(0.0, 1.0, 65)
     theirs = undistorted(places * (0.5 * camera.width / camera.focal), camera.distortion)
     apart = np.abs(undistorted(places * rim, spec.distortion) - theirs)
-    # The edge itself may lie beyond the rim of either, by rounding.
+    # Rounding may put the edge beyond the rim of either lens.
     return math.degrees(float(np.max(apart[np.isfinite(apart)])))

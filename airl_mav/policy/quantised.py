@@ -1,4 +1,4 @@
-"""Networks in 8-bit integers: static quantisation of an ONNX model by ONNX Runtime's own tool."""
+"""8-bit integer networks: static quantisation of an ONNX model with ONNX Runtime's tool."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ METHOD = (
     "static, QDQ: activations uint8, weights int8 by channel, ranges by least and greatest value; "
     "the last layer in floats"
 )
-"""What a card says of it."""
+"""Description of the method in a card."""
 
 
 _DENSE = ("Gemm", "MatMul")
@@ -28,15 +28,15 @@ _DENSE = ("Gemm", "MatMul")
 
 
 def quantised(model: bytes, frames: Encoded) -> bytes:
-    """Return a network whose convolutions and dense layers compute in 8-bit integers.
+    """Return a network with convolutions and dense layers in 8-bit integers.
 
-    Inputs and outputs stay what they are. The last dense layer stays in floats. It is small. With
-    integers, scores that lie close together change places. The graph has a pair of QuantizeLinear
-    and DequantizeLinear around each tensor (QDQ). ONNX Runtime fuses them where the processor has
-    integer kernels.
+    Inputs and outputs are unchanged. The last dense layer is small and stays in floats. With
+    integers, close scores would change their order. The graph has a pair of QuantizeLinear and
+    DequantizeLinear around each tensor (QDQ). ONNX Runtime fuses them on processors with integer
+    kernels.
 
-    `model` is an .onnx file with its weights. The ranges are found with the rows of `frames`.
-    Raises UsageError if onnx is not installed or cannot quantise the network.
+    `model` is an .onnx file with its weights. The rows of `frames` calibrate the ranges. Raises
+    UsageError if onnx is not installed or cannot quantise the network.
     """
     try:
         import onnx
@@ -46,7 +46,7 @@ def quantised(model: bytes, frames: Encoded) -> bytes:
         raise UsageError("onnx is not installed; pip install 'airl-mav[profile]'") from None
 
     class Rows(quantization.CalibrationDataReader):  # type: ignore[misc] # untyped
-        """Gives the frames one by one: the least memory, and any number of rows."""
+        """Reader of one frame at a time, for minimum memory."""
 
         def __init__(self) -> None:
             self._rows = _rows(frames)
@@ -71,23 +71,23 @@ def quantised(model: bytes, frames: Encoded) -> bytes:
                 weight_type=quantization.QuantType.QInt8,
                 per_channel=True,
                 # Weights of seven bits. On x86-64 without VNNI, ONNX Runtime adds pairs of products
-                # of 8-bit numbers in 16 bits, which overflow: the network would decide otherwise
-                # there (ONNX Runtime's documentation of quantisation, "Why did I see saturation").
+                # of 8-bit numbers in 16 bits, which overflow and change decisions (ONNX Runtime's
+                # documentation of quantisation, "Why did I see saturation").
                 reduce_range=True,
                 nodes_to_exclude=dense[-1:],
                 calibrate_method=quantization.CalibrationMethod.MinMax,
             )
             data: bytes = onnx.load(written).SerializeToString(deterministic=True)
-        except Exception as error:  # Anything, from an unknown operator to a model that is broken.
+        except Exception as error:  # Any type, from an unknown operator to a broken model.
             raise UsageError(f"the network cannot be quantised: {first_line(error)}") from error
     return data
 
 
 def relative_error(found: NDArray[np.float32], wanted: NDArray[np.float32]) -> float:
-    """Return the root mean square of the differences of outputs (n, k), in shares of their spread.
+    """Return the root mean square error of outputs (n, k), in shares of their spread.
 
-    The spread is the standard deviation of all that is wanted. Outputs that are all the same have
-    none, and any difference of theirs is infinitely large.
+    The spread is the standard deviation of `wanted`. The error is infinite if constant outputs
+    differ.
     """
     away = float(np.sqrt(np.mean((found - wanted) ** 2)))
     spread = float(wanted.std())
@@ -101,7 +101,7 @@ def _rows(frames: Encoded) -> Iterator[Mapping[str, NDArray[Any]]]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the tool's advice on models that were not prepared."""
+    """Silence the tool's warnings about models without preprocessing."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

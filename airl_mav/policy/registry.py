@@ -1,4 +1,4 @@
-"""Policies by name: built in, shipped with a card, any folder with one, or a Python class."""
+"""Registry of policies: built-in, shipped with a card, any folder with one, or a Python class."""
 
 from __future__ import annotations
 
@@ -27,35 +27,35 @@ POLICIES: dict[str, tuple[str, Callable[[float], Policy]]] = {
         lambda hold_s: GreedyPolicy(GreedySettings(period_s=hold_s)),
     ),
 }
-"""Built-in policies: name -> description and a maker that takes the time an action is held [s]."""
+"""Built-in policies: name -> description and factory from the hold time [s]."""
 
 
 @dataclass(frozen=True)
 class PolicyInfo:
-    """What is known of a policy before it is loaded."""
+    """Description of a policy before it is loaded."""
 
     name: str
-    """Short, for people and for the names of folders."""
+    """Short name, also for folders."""
     description: str
     card: PolicyCard | None = None
-    """None: not a learned one."""
+    """Policy card; None = not a learned policy."""
     folder: Path | None = None
-    """Where a learned one lies."""
+    """Folder of a learned policy."""
     program: str | None = None
-    """FILE.py:CLASS or MODULE:CLASS of one that is written in Python."""
+    """FILE.py:CLASS or MODULE:CLASS of a Python policy."""
     asked: CommandKind | None = None
     """Command kind of a policy that another program runs."""
 
     @property
     def sha256(self) -> str | None:
-        """Digest of the policy's file; None for a built-in one."""
+        """Digest of the policy's file; None for a built-in policy."""
         if self.program is not None:
             return digest_of(self.program)
         return None if self.card is None else self.card.sha256
 
     @property
     def commands(self) -> CommandKind:
-        """What it commands. Raises FieldError when a class of the user's says nonsense."""
+        """Command kind. Raises FieldError if a custom class declares an unknown kind."""
         if self.asked is not None:
             return self.asked
         if self.program is not None:
@@ -69,9 +69,9 @@ class PolicyInfo:
 
 
 def camera_refused(policy: PolicyInfo, vehicle: VehicleProfile) -> str | None:
-    """Return why a vehicle's cameras cannot serve a policy, or None when they can, if it is known.
+    """Return why a vehicle's cameras cannot serve a policy, or None if they can, or it is unknown.
 
-    Of a policy that is written in Python, or only asked, nothing is.
+    The requirements of Python policies and of other programs are unknown.
     """
     camera = vehicle.camera
     if policy.asked is not None:
@@ -91,11 +91,10 @@ def policy_names() -> list[str]:
 
 
 def find_policy(name: str, *, trust: bool = False) -> PolicyInfo:
-    """Return what is known of a policy: by name, by its folder's path, or by its Python class.
+    """Return the description of a policy by name, folder path or Python class.
 
-    `trust` permits the maker of its folder to run code on this machine. Raises UsageError if there
-    is no such policy (lists those that exist), its card does not fit it, or names code without
-    trust.
+    `trust` permits the folder's author to run code on this machine. Raises UsageError if there is
+    no such policy (lists the existing ones), its card does not match, or names untrusted code.
     """
     if names_code(name):
         return PolicyInfo(name.rpartition(":")[2], _summary(name), program=name)
@@ -118,12 +117,11 @@ def load_policy(
     ablate: str | None = None,
     trust: bool = False,
 ) -> Policy:
-    """Return a policy, ready to decide, by what is known of it, its name or its folder.
+    """Return a policy, ready to decide, by description, name or folder.
 
-    `hold_s` is how long each of its actions will be held [s]. The keywords are those of
-    `learned.load_learned`; only a learned policy takes another runtime or an ablation. Raises
-    UsageError if there is no such policy (lists those that exist), its card does not fit it, or it
-    cannot be run as asked.
+    `hold_s` is the hold time of each action [s]. The keywords are as in `learned.load_learned`;
+    only a learned policy takes another runtime or an ablation. Raises UsageError if there is no
+    such policy (lists the existing ones), its card does not match, or an option is unsupported.
     """
     known = find_policy(policy, trust=trust) if isinstance(policy, str) else policy
     if known.folder is not None and known.card is not None:
@@ -146,12 +144,12 @@ def load_policy(
 
 
 def _shipped() -> list[str]:
-    """Return the names of the policies that come with the package, sorted."""
+    """Return the names of the shipped policies, sorted."""
     return sorted(path.parent.name for path in (profiles_dir() / "policies").glob(f"*/{CARD_FILE}"))
 
 
 def _folder(name: str) -> Path | None:
-    """Return the folder of a policy; None for one of an installed package. Raises UsageError."""
+    """Return the folder of a policy; None for an installed package's. Raises UsageError."""
     if name in _shipped():
         return profiles_dir() / "policies" / name
     path = Path(name)
@@ -167,10 +165,10 @@ def _folder(name: str) -> Path | None:
 
 
 def _policy_class(name: str) -> Any:
-    """Return a policy's class by FILE.py:CLASS, MODULE:CLASS or its announced name."""
+    """Return a policy's class by FILE.py:CLASS, MODULE:CLASS or entry-point name."""
     return load_part(DOOR, name, lambda made: callable(getattr(made, "act", None)))
 
 
 def _summary(name: str) -> str:
-    """Return the first line of what a policy's class says of itself."""
+    """Return the first line of a policy class's docstring."""
     return (_policy_class(name).__doc__ or "").strip().partition("\n")[0]

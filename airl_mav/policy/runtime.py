@@ -1,9 +1,9 @@
-"""What runs a network: ONNX Runtime, or torch where it is installed.
+"""Inference runtimes: ONNX Runtime, or torch if installed.
 
 Both are imported only when a network is opened: a classical policy needs neither.
 
-A network with a memory takes what it remembers as further inputs, and gives what it will remember
-as further outputs, whose names begin with `next_`. It keeps nothing itself: one runtime serves any
+A network with memory takes its memory as additional inputs, and returns the next memory as
+additional outputs, whose names begin with `next_`. The runtime is stateless: one runtime serves any
 number of flights.
 """
 
@@ -23,19 +23,19 @@ from airl_mav.policy.observation_spec import ObservationSpec
 RuntimeName = Literal["onnx", "torch"]
 
 ACTION = "action"
-"""Name of the output that decides: the only one of a network without memory."""
+"""Name of the action output, the only output of a network without memory."""
 
 NEXT = "next_"
-"""What the name of a memory's output begins with; the rest is the name of its input."""
+"""Prefix of a memory's output; the rest is the name of its input."""
 
 Shapes = Mapping[str, tuple[int, ...]]
-"""What a network remembers: the shape of each array by name, without the leading axis."""
+"""Memory of a network: the shape of each array by name, without the leading axis."""
 
 Memory = dict[str, NDArray[np.float32]]
-"""What the networks of n flights remember: arrays of n rows by name."""
+"""Memory of n flights: arrays of n rows by name."""
 
 _ERRORS_ONLY = 3
-"""ONNX Runtime's severity: warnings about the machine are not for the pilot."""
+"""ONNX Runtime's log severity "error": hides warnings about the machine."""
 
 _ONNX_TYPES: dict[type[np.generic], str] = {
     np.uint8: "tensor(uint8)",
@@ -44,7 +44,7 @@ _ONNX_TYPES: dict[type[np.generic], str] = {
 
 
 class Runtime(Protocol):
-    """A network ready to infer."""
+    """A network ready for inference."""
 
     def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
         """Return the outputs (n, k) for the arrays of a layout, each with n rows."""
@@ -52,16 +52,16 @@ class Runtime(Protocol):
 
 @runtime_checkable
 class RecurrentRuntime(Runtime, Protocol):
-    """One that also runs networks with a memory."""
+    """A runtime that also supports networks with memory."""
 
     def step(
         self, encoded: Mapping[str, NDArray[Any]], memory: Memory
     ) -> tuple[NDArray[np.float32], Memory]:
-        """Return the outputs (n, k) of a network with a memory, and what it will remember."""
+        """Return the outputs (n, k) of a network with memory, and its next memory."""
 
 
 def blank_memory(shapes: Shapes, n: int) -> Memory:
-    """Return what the networks of n flights remember before their first decision: zeros."""
+    """Return the memory of n flights before their first decision: zeros."""
     return {name: np.zeros((n, *shape), np.float32) for name, shape in shapes.items()}
 
 
@@ -81,10 +81,11 @@ class OnnxRuntime:
         threads: int = 1,
         state: Shapes | None = None,
     ) -> None:
-        """Open the bytes of an .onnx file that holds its weights. Small networks need one thread.
+        """Open the bytes of an .onnx file with weights. Small networks need one thread.
 
-        It must take the observation, give the actions, and remember `state` between decisions,
-        None: nothing. Raises ValueError if it is no ONNX, or has other inputs or outputs.
+        The network must take the observation, return the actions, and keep `state` between
+        decisions; None = no memory. Raises ValueError if it is not ONNX, or inputs or outputs
+        differ.
         """
         import onnxruntime
 
@@ -94,7 +95,7 @@ class OnnxRuntime:
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
         options.log_severity_level = _ERRORS_ONLY
-        # A waiting thread must not burn a core that telemetry needs.
+        # A spinning thread must not take a core from telemetry.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
             self._session = onnxruntime.InferenceSession(
@@ -113,7 +114,7 @@ class OnnxRuntime:
     def step(
         self, encoded: Mapping[str, NDArray[Any]], memory: Memory
     ) -> tuple[NDArray[np.float32], Memory]:
-        """Return the outputs (n, k) of a network with a memory, and what it will remember."""
+        """Return the outputs (n, k) of a network with memory, and its next memory."""
         names = [ACTION, *(f"{NEXT}{name}" for name in self._state)]
         found, *after = self._session.run(names, {**encoded, **memory})
         return found, dict(zip(self._state, after, strict=True))
@@ -129,9 +130,9 @@ class TorchRuntime:
         threads: int = 1,
         state: Shapes | None = None,
     ) -> None:
-        """Open the bytes of a .pt2 file; `threads` count for the whole process.
+        """Open the bytes of a .pt2 file; `threads` applies to the whole process.
 
-        It remembers `state` between decisions, None: nothing. Raises ValueError if torch is not
+        `state` is the memory between decisions; None = no memory. Raises ValueError if torch is not
         installed, or cannot load the program.
         """
         try:
@@ -141,7 +142,7 @@ class TorchRuntime:
         torch.set_num_threads(threads)
         try:
             self._module = torch.export.load(io.BytesIO(program)).module()
-        except Exception as error:  # Anything, from a bad archive to an unknown operator.
+        except Exception as error:  # Any type, from a bad archive to an unknown operator.
             raise ValueError(f"not a program that torch loads: {first_line(error)}") from None
         self._torch = torch
         self._keys, self._state = tuple(boxes(observation)), tuple(state or {})
@@ -155,7 +156,7 @@ class TorchRuntime:
     def step(
         self, encoded: Mapping[str, NDArray[Any]], memory: Memory
     ) -> tuple[NDArray[np.float32], Memory]:
-        """Return the outputs (n, k) of a network with a memory, and what it will remember."""
+        """Return the outputs (n, k) of a network with memory, and its next memory."""
         with self._torch.inference_mode():
             tensors = self._tensors(encoded, self._keys) + self._tensors(memory, self._state)
             found, *after = (each.numpy() for each in self._module(*tensors))
@@ -168,7 +169,7 @@ class TorchRuntime:
 def _check_signature(
     session: Any, observation: ObservationSpec, actions: ActionSpec, state: Shapes
 ) -> None:
-    """Raise ValueError unless a session takes and gives what its card says."""
+    """Raise ValueError if a session's inputs or outputs differ from its card."""
     takes = {name: (_ONNX_TYPES[box.dtype], box.shape) for name, box in boxes(observation).items()}
     gives: dict[str, tuple[str, tuple[int, ...]]] = {
         ACTION: (_ONNX_TYPES[np.float32], (outputs_of(actions),))

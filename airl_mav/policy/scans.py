@@ -1,11 +1,11 @@
-"""Level range scans made of depth images, and earlier ones carried to where the vehicle is now.
+"""Level range scans from depth images, with earlier scans moved to the present position.
 
-A scan has a range for each of its bearings: how far from the camera, horizontally, the nearest
-return is of those that are about as high as the camera. It is what a planar lidar on a level
-platform measures, and what MAVLink's OBSTACLE_DISTANCE carries. Earlier scans are carried by the
-vehicle's own motion since: what stands is then where it is in the newest, and the rest has moved.
+A scan has a range for each of its bearings: the horizontal distance from the camera to the nearest
+return at about the camera's height. A planar lidar on a level platform measures the same, and
+MAVLink's OBSTACLE_DISTANCE carries it. Earlier scans are compensated for the vehicle's own motion:
+static objects keep their position in the newest scan, moving ones do not.
 
-With numpy, as the companion does it; `envs.encoding` has the same as compiled loops.
+This is the numpy version of the companion; `envs.encoding` has the same as compiled loops.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from airl_mav.policy.observation import Observation
 Floats = NDArray[np.float64]
 
 BAND_M = 0.9
-"""Returns so much higher or lower than the camera belong to the scan. A row of a coarse image
-(2 degrees) is 0.7 m high at 20 m, so that one at least is inside."""
+"""Maximum height difference between camera and returns of a scan [m]. A row of a coarse image
+(2 degrees) is 0.7 m high at 20 m, so that at least one row is inside."""
 
 NEAREST_M = 0.3
-"""Range of byte 0; the rotors reach farther."""
+"""Range of byte 0 [m]; the rotors extend farther."""
 
 WIDEST_RAD = 1.0
-"""A return that is carried covers no more to either side, however near it comes."""
+"""Maximum half width of a moved return [rad], however near it is."""
 
 
 class Rays(NamedTuple):
-    """Where a camera's pixels look that looks along the nose, in the body frame at a depth of 1."""
+    """Rays of a camera along the nose, in the body frame at a depth of 1."""
 
     forward: Floats
     """(w,) of each column."""
@@ -47,7 +47,7 @@ class Rays(NamedTuple):
     down: Floats
     """(h,) of each row."""
     fov_rad: float
-    """Horizontal field of view, over which the bearings of a scan are spread."""
+    """Horizontal field of view, divided into the bearings of a scan."""
 
 
 class Tilt(NamedTuple):
@@ -60,17 +60,17 @@ class Tilt(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """How n vehicles have moved since an earlier scan."""
+    """Motion of n vehicles since an earlier scan."""
 
     forward_m: Floats
-    """(n,) where it was made: so far ahead of where they are, in the present heading frame."""
+    """(n,) position of the earlier scan in the present heading frame."""
     right_m: Floats
     turned_rad: Floats
-    """(n,) by which their headings have grown, clockwise."""
+    """(n,) change of heading since, clockwise."""
 
 
 class Scanning(NamedTuple):
-    """What makes scans."""
+    """Functions that compute scans."""
 
     level: Callable[[NDArray[np.uint16], Rays, Tilt, int], Floats]
     carried: Callable[[Floats, Moved, float], Floats]
@@ -78,7 +78,7 @@ class Scanning(NamedTuple):
 
 @cache
 def rays_of(camera: Intrinsics) -> Rays:
-    """Return where the pixels of a camera look: of a pinhole or a cylinder. Raises UsageError."""
+    """Return the rays of a pinhole or cylindrical camera. Raises UsageError for a fisheye."""
     if camera.projection == "fisheye":
         raise UsageError("a fisheye gives no level scan; accepted: a pinhole or a cylinder")
     columns: Floats = (np.arange(camera.width, dtype=np.float64) - camera.cx) / camera.focal
@@ -96,8 +96,8 @@ def tilt_of(roll: Floats, pitch: Floats) -> Tilt:
 def level_scan(depth_mm: NDArray[np.uint16], rays: Rays, tilt: Tilt, bearings: int) -> Floats:
     """Return the nearest horizontal ranges (n, bearings) [m] at about the height of the cameras.
 
-    `depth_mm` are (n, h, w) images, 0 = no return. Bearings go from the left edge of the field of
-    view to the right; infinite: nothing is there.
+    `depth_mm` are (n, h, w) images, 0 = no return. Bearings run from the left edge of the field of
+    view to the right. Infinite = no return.
     """
     sr, cr, sp, cp = (np.asarray(each)[:, None, None] for each in tilt)
     depth = depth_mm / MM_PER_M
@@ -120,9 +120,9 @@ def level_scan(depth_mm: NDArray[np.uint16], rays: Rays, tilt: Tilt, bearings: i
 
 
 def carried(scans: Floats, moved: Moved, fov_rad: float) -> Floats:
-    """Return earlier scans (n, bearings) as if nothing but the vehicles had moved.
+    """Return earlier scans (n, bearings) compensated for the vehicles' motion.
 
-    Ranges [m] are infinite where nothing is. A return keeps its angular width. Hidden places stay
+    Ranges [m] are infinite without a return. A return keeps its width. Occluded places stay
     unknown.
     """
     bearings = scans.shape[1]
@@ -135,7 +135,7 @@ def carried(scans: Floats, moved: Moved, fov_rad: float) -> Floats:
     now = np.sqrt(ahead * ahead + right * right)
     half = np.minimum(0.5 * step * ranges / np.maximum(now, NEAREST_M), WIDEST_RAD)
     angle = np.arctan2(right, ahead) + 0.5 * fov_rad
-    # Of the bearings, those whose middle it covers, and the one that its own middle is in.
+    # Bearings with their middle inside the return, and the bearing of the return's own middle.
     middle = np.floor(angle / step).astype(np.int64)
     first = np.minimum(np.ceil((angle - half) / step - 0.5).astype(np.int64), middle)
     last = np.maximum(np.floor((angle + half) / step - 0.5).astype(np.int64), middle)
@@ -151,13 +151,13 @@ def carried(scans: Floats, moved: Moved, fov_rad: float) -> Floats:
 
 
 NUMPY_SCANNING = Scanning(level_scan, carried)
-"""As the companion does it, which has no numba."""
+"""Numpy versions, for the companion without numba."""
 
 
 def scans_of(
     seen: Observation, frames: int, bearings: int, make: Scanning = NUMPY_SCANNING
 ) -> Floats:
-    """Return scans (n, frames, bearings) of n vehicles from here, the newest first [m]."""
+    """Return scans (n, frames, bearings) [m] of n vehicles in the present pose, newest first."""
     rays, now = rays_of(seen.intrinsics), seen.states[0]
     scans = np.full((len(seen.goal), frames, bearings), np.inf)
     images = (seen.depth_mm, *seen.earlier_mm)[:frames]
@@ -173,21 +173,21 @@ def scans_of(
 
 
 def goes_round(fov_rad: float) -> bool:
-    """Return whether a field of view [rad] ends where it begins."""
+    """Return whether a field of view [rad] is a full circle."""
     return fov_rad > 2.0 * math.pi - 1e-6
 
 
 def scan_bytes(scans: Floats, range_m: float) -> NDArray[np.uint8]:
-    """Return scans as a network takes them: logarithms of ranges, from NEAREST_M to `range_m`.
+    """Return scans as bytes for a network: logarithms of ranges, from NEAREST_M to `range_m`.
 
-    A step is 1.7 % of the range where `range_m` is 20 m, so that what is near is seen to move
-    sooner. 255: nothing, or farther.
+    A step is 1.7 % of the range if `range_m` is 20 m, so that the motion of near objects shows
+    sooner. 255 = no return, or farther.
     """
     return np.searchsorted(_edges(range_m), scans, side="right").astype(np.uint8)
 
 
 @cache
 def _edges(range_m: float) -> Floats:
-    """Return the ranges (255,) [m] from which on each byte but 0 stands."""
+    """Return the lower range limits (255,) [m] of all bytes but 0."""
     share = (np.arange(1, 256, dtype=np.float64) - 0.5) / 255.0
     return np.asarray(NEAREST_M * (range_m / NEAREST_M) ** share, np.float64)

@@ -1,8 +1,8 @@
 """Randomly initialised networks of the paper's template, written as ONNX without torch.
 
 L convolutions of F filters (3x3, stride 1, same padding), joined with velocity and goal, L dense
-layers of F units, a score for each action (Krishnan et al., Air Learning, 2021). How long an
-inference takes depends on the layers' sizes, not on what was learned.
+layers of F units, a score for each action (Krishnan et al., Air Learning, 2021). The inference time
+depends on the layers' sizes, not on the weights.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from airl_mav.policy.runtime import ACTION, outputs_of
 
 OPSET = 18
 IR_VERSION = 10
-"""ONNX's file format: what ONNX Runtime reads since 1.18."""
+"""ONNX file format, supported since ONNX Runtime 1.18."""
 
 KERNEL = 3
 VECTOR_INPUTS = 6
-"""Velocity and goal; one more where the network is told how high the goal is."""
+"""Length of velocity and goal; one more with the goal's height."""
 GREATEST_BYTES = 1_900_000_000
-"""An .onnx file with its weights inside stays below 2 GiB (a limit of its encoding)."""
+"""Maximum size of an .onnx file with weights, below the encoding's limit of 2 GiB."""
 
 
 class Size(NamedTuple):
-    """What a network takes."""
+    """Size of a network."""
 
     parameters: int
     macs: int
@@ -51,7 +51,7 @@ def template_size(
     channels: int = 1,
     vector_inputs: int = VECTOR_INPUTS,
 ) -> Size:
-    """Return the size of a network of the template; `channels` are those of its image."""
+    """Return the size of a network of the template; `channels` is the number of image channels."""
     pixels = height_px * width_px
     weights, biases, macs = 0, 0, 0
     for _ in range(layers):
@@ -68,10 +68,10 @@ def template_size(
 def write_template(
     folder: Path, layers: int, filters: int, facts: PolicyFacts, rng: np.random.Generator
 ) -> PolicyCard:
-    """Write a random network of the template and its card to a folder that exists.
+    """Write a random network of the template and its card to an existing folder.
 
-    It has `layers` >= 1 convolutions of so many filters, and as many dense layers. Raises
-    UsageError if it is too large for one .onnx file.
+    The network has `layers` >= 1 convolutions of `filters` filters, and as many dense layers.
+    Raises UsageError if it is too large for one .onnx file.
     """
     spec, outputs = facts.observation, outputs_of(facts.actions)
     shape, vectors = spec.image_shape, _vector_inputs(spec)
@@ -107,7 +107,7 @@ def build_template(
 ) -> bytes:
     """Return a random network of the template as the bytes of an .onnx file.
 
-    Weights are He's (normal, variance 2 / inputs), so that signals neither die out nor grow.
+    Weights are He-initialized (normal, variance 2 / inputs), so that signals keep their scale.
     """
     # Imported late: only the [profile] and [train] extras install it.
     import onnx

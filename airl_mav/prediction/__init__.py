@@ -1,1 +1,1 @@
-"""What a decision will act on: the vehicle's state and its camera's image, carried forward."""
+"""Prediction: the vehicle's state and camera image at the time when a decision takes effect."""

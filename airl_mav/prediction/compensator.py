@@ -1,16 +1,16 @@
-"""Compensation of decision latency: what a decision sees is what it will act on.
+"""Compensation of decision latency: predicts observations at the time of effect.
 
-A decision that takes t2 acts on a vehicle that has flown on meanwhile. But what it flies on is
-known: the setpoints that were sent. So the state is carried forward by the vehicle's response to
-them, to the moment at which the decision is expected to act. And the depth images are reprojected
-to where the camera will be then. The policy need not have been trained for it.
+A decision that takes t2 acts on a vehicle that has moved in the meantime. The setpoints executed in
+the meantime are known. Therefore the vehicle's response to them predicts the state at the time when
+the decision takes effect. The depth images are reprojected to the camera's predicted pose. The
+policy needs no training for it.
 
-Vehicles answer velocity setpoints by a first-order model in closed form (`Response`): after a dead
-time the velocity approaches the setpoint with one time constant, the yaw rate with another. A
+Vehicles respond to velocity setpoints by a first-order model in closed form (`Response`): after a
+dead time the velocity approaches the setpoint with one time constant, the yaw rate with another. A
 setpoint in the heading frame turns with the nose, as PX4 turns it at every repetition. These are
 not the plant's equations: `scripts/fit-response` fits them to flown steps alone.
 
-The same code in the companion (n = 1) and in the batch twin (n at a time); numpy alone.
+The companion (n = 1) and the vectorized simulator (n at a time) share this code; numpy alone.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 
 
 class Motion(NamedTuple):
-    """How n vehicles move."""
+    """Motion of n vehicles."""
 
     position: Array  # (n, 3) NED [m]
     velocity: Array  # (n, 3) NED [m/s]
@@ -49,9 +49,9 @@ def flown_on(motion: Motion, command: Array, response: Response, seconds: Array)
 
     With the heading turning at the rate w from psi on, the horizontal velocity v as a complex
     number (north + i east) follows T v' = c exp(i (psi + w t)) - v, whose solution is A exp(i w t)
-    + (v0 - A) exp(-t / T) with A = c exp(i psi) / (1 + i w T). While the turn itself still builds
-    up, psi is that of the turn it ends in. The setpoint is forward, right, down [m/s], yaw rate
-    [rad/s]. The response's dead time is left to the caller.
+    + (v0 - A) exp(-t / T) with A = c exp(i psi) / (1 + i w T). While the turn builds up, psi is the
+    heading extrapolated back from the final turn. The setpoint is forward, right, down [m/s], yaw
+    rate [rad/s]. The caller handles the response's dead time.
     """
     turn, lag, turn_lag = command[:, 3], response.velocity_time_s, response.yaw_rate_time_s
     fading, turn_fading = np.exp(-seconds / lag), np.exp(-seconds / turn_lag)
@@ -75,10 +75,10 @@ def flown_on(motion: Motion, command: Array, response: Response, seconds: Array)
 
 
 def leaning(motion: Motion, command: Array, response: Response) -> tuple[Array, Array]:
-    """Return the roll and pitch (n,) [rad] with which the vehicles fly on a setpoint (n, 4).
+    """Return the roll and pitch (n,) [rad] of vehicles that fly a setpoint (n, 4).
 
-    The thrust carries the weight and gives the acceleration and what the drag takes, so that it is
-    along the sum of the three.
+    The thrust carries the weight, accelerates the vehicle and balances the drag, so it lies along
+    the sum of the three.
     """
     course = np.exp(-1j * motion.heading)
     velocity = (motion.velocity[:, 0] + 1j * motion.velocity[:, 1]) * course
@@ -89,17 +89,16 @@ def leaning(motion: Motion, command: Array, response: Response) -> tuple[Array, 
 
 
 LINK_US = round(4.0 * US_PER_MS)
-"""A setpoint is taken to be in effect so long after it was sent [µs]: a tick of the flight
-controller."""
+"""Time from sending a setpoint to its effect [µs]: a tick of the flight controller."""
 
 REMEMBERED = 4
-"""Images that are kept by default; more do not fly better (docs/results.md)."""
+"""Default number of stored images; more do not fly better (docs/results.md)."""
 
 NEVER_US = np.iinfo(np.int64).max
 
 
 class Compensator:
-    """Carries forward what n companions see."""
+    """Predicts the observations of n companions."""
 
     def __init__(
         self,
@@ -111,9 +110,9 @@ class Compensator:
     ) -> None:
         """Prepare n companions of one vehicle, whose camera has these intrinsics.
 
-        So many images are `remembered`: the newest, and those that fill what it did not see. Raises
-        FieldError if the vehicle's profile does not say how it answers setpoints, or the camera
-        gives no depth.
+        `remembered` images are stored: the newest, and older ones that fill its unseen parts.
+        Raises FieldError if the vehicle's profile lacks a setpoint response, or the camera gives no
+        depth.
         """
         if intrinsics.kind != "depth":
             raise FieldError(
@@ -130,27 +129,27 @@ class Compensator:
                 " identifies it",
             )
         self.intrinsics = intrinsics
-        """Of the images that are carried forward."""
+        """Intrinsics of the predicted images."""
         self._response = vehicle.response
         self._dead_us = round(self._response.dead_time_s * US_PER_S)
         self._mount = _Mount(vehicle.camera)
         self._reprojector = Reprojector(vehicle.camera, intrinsics)
         self.memory = DecisionMemory(n)
-        """The setpoints and latencies so far."""
+        """Setpoints and latencies so far."""
         shape = (intrinsics.height, intrinsics.width)
         self._depth_mm = np.zeros((n, remembered, *shape), np.uint16)
         self._position = np.zeros((n, remembered, 3))
         self._axes = np.zeros((n, remembered, 3, 3))
         self._kept = np.zeros(n, np.int64)
-        """Images that each one has; the newest come first."""
-        # Pipelined, one is sent with every frame at most, and many before the first is answered.
+        """Number of stored images per companion; the newest come first."""
+        # Pipelined, at most one is sent per frame, and many before the first takes effect.
         room = (LINK_US + self._dead_us) // vehicle.camera.period_us + 3
         self._setpoint = np.zeros((n, room, 4))
-        """The newest comes first: forward, right, down [m/s], yaw rate [rad/s]."""
+        """Setpoints, newest first: forward, right, down [m/s], yaw rate [rad/s]."""
         self._answered_us = np.zeros((n, room), np.int64)
-        """When the vehicle begins to answer each."""
+        """Start of the vehicle's response to each [µs]."""
         self._stopped_us = np.full(n, NEVER_US, np.int64)
-        """When the newest one expires, and the vehicle is told to hover."""
+        """Expiry of the newest setpoint, after which the vehicle hovers [µs]."""
 
     def begin(self, i: int) -> None:
         """Begin a flight of companion i, in a hover."""
@@ -159,11 +158,11 @@ class Compensator:
         self._setpoint[i], self._answered_us[i], self._stopped_us[i] = 0.0, 0, NEVER_US
 
     def forget(self, i: int) -> None:
-        """Forget the images of companion i: what comes next does not follow on them."""
+        """Discard the images of companion i before a discontinuity."""
         self._kept[i] = 0
 
     def held(self) -> Mapping[str, Any]:
-        """Return by name all arrays that change, for checkpoints."""
+        """Return all mutable arrays by name, for checkpoints."""
         return {
             "depth_mm": self._depth_mm,
             "position": self._position,
@@ -182,11 +181,11 @@ class Compensator:
         now_us: NDArray[np.int64],
         state: Kinematics,
     ) -> tuple[NDArray[np.uint16], Kinematics]:
-        """Return images and motion of the vehicles at the time when their decisions will act.
+        """Return images and motion of the vehicles at the time when their decisions take effect.
 
-        Call it once a decision: the images are kept. Only the rows `who` (k,) decide. `depth_mm`
-        (n, h, w) are the newest images, 0 = no return. They were taken `age_us` (n,) ago. The
-        decisions begin at `now_us` (n,).
+        Call once per decision: the images are stored. Only the rows `who` (k,) decide. `depth_mm`
+        (n, h, w) are the newest images, 0 = no return, taken `age_us` (n,) ago. The decisions begin
+        at `now_us` (n,).
         """
         roll, pitch, heading = quats_to_euler(state.quaternion)
         now = Motion(state.position, state.velocity, heading, self._heading_rate(now_us))
@@ -196,7 +195,7 @@ class Compensator:
         image = depth_mm.copy()
         for i in who.tolist():
             age_s = age_us[i] / US_PER_S
-            # The tilt is taken to be the same as then: it changes little once a setpoint is flown.
+            # Assumes an unchanged tilt: it changes little once a setpoint is flown.
             taken = quat_from_euler(
                 float(roll[i]), float(pitch[i]), float(heading[i] - now.heading_rate[i] * age_s)
             )
@@ -220,10 +219,10 @@ class Compensator:
         sent_us: NDArray[np.int64],
         stopped_us: NDArray[np.int64] | None = None,
     ) -> None:
-        """Take the setpoints (k, 4) forward, right, down [m/s], yaw rate [rad/s] that were sent.
+        """Store the sent setpoints (k, 4) forward, right, down [m/s], yaw rate [rad/s].
 
-        The decisions took `t2_us` (k,); `stopped_us` (k,) is when a stop replaces each if no other
-        has come, None: never.
+        The decisions took `t2_us` (k,); `stopped_us` (k,) is the time at which a stop replaces each
+        without a newer one, None: never.
         """
         self.memory.decided(who, command, t2_us)
         for array in (self._setpoint, self._answered_us):
@@ -235,7 +234,7 @@ class Compensator:
         )
 
     def _heading_rate(self, now_us: NDArray[np.int64]) -> Vector:
-        """Return the rates (n,) [rad/s] at which the vehicles turn, by their setpoints alone."""
+        """Return the turn rates (n,) [rad/s] of the vehicles, by their setpoints alone."""
         turns, begins_us = self._setpoint[:, ::-1, 3].T, self._answered_us.T[::-1]
         ends_us = np.minimum(np.vstack([begins_us[1:], now_us]), now_us)
         answered_s = np.maximum(ends_us - begins_us, 0) / US_PER_S
@@ -246,10 +245,10 @@ class Compensator:
         return rate
 
     def _carried(self, motion: Motion, now_us: NDArray[np.int64]) -> tuple[Motion, Vector]:
-        """Return how the vehicles will move, and the setpoints (n, 4) that will be in effect."""
+        """Return the predicted motion, and the setpoints (n, 4) that will be in effect."""
         acts_us = now_us + self.memory.latency.expected_us() + LINK_US
         flown = [*self._setpoint.swapaxes(0, 1)[::-1], np.zeros_like(self._setpoint[:, 0])]
-        # Each lasts until the next is answered, none begins before now or lasts longer than asked.
+        # Each lasts until the next takes effect, limited to the time from now to the effect.
         marks_us = np.vstack([now_us, self._answered_us.T[-2::-1], self._stopped_us, acts_us])
         marks_us = np.minimum(np.maximum.accumulate(marks_us), acts_us)
         seconds = np.diff(marks_us, axis=0) / US_PER_S
@@ -262,7 +261,7 @@ class Compensator:
     def _keep(
         self, i: int, depth_mm: NDArray[np.uint16], position: Vector, quaternion: Vector
     ) -> None:
-        """Keep an image of companion i, and where it was taken."""
+        """Store an image of companion i, and its pose."""
         for array in (self._depth_mm, self._position, self._axes):
             array[i, 1:] = array[i, :-1]
         pose = self._mount.pose(position, quaternion)
@@ -271,7 +270,7 @@ class Compensator:
 
 
 class _Mount:
-    """Place of a camera on its vehicle."""
+    """Camera mount on its vehicle."""
 
     def __init__(self, camera: Camera) -> None:
         self._offset = np.array([camera.forward_m, camera.right_m, -camera.up_m])
@@ -279,6 +278,6 @@ class _Mount:
         self._turn = quat_to_matrix(quat_from_euler(0.0, float(pitch), float(yaw)))
 
     def pose(self, position: Vector, quaternion: Vector) -> CameraPose:
-        """Return the pose of the camera of a vehicle at NED [m], body -> NED."""
+        """Return the camera pose of a vehicle at NED [m], body -> NED."""
         axes = quat_to_matrix(quaternion)
         return CameraPose(position + axes @ self._offset, axes @ self._turn)

@@ -13,12 +13,12 @@ from airl_mav.policy.observation import InFlight
 
 
 class DecisionMemory:
-    """The decisions of n companions."""
+    """Decisions of n companions."""
 
     def __init__(self, n: int) -> None:
         """Take the number of companions."""
         self.latency = ExpectedLatency(n)
-        """What t2 to expect."""
+        """Expected t2."""
         self.newest = np.zeros((n, 4))
         """(n, 4) newest setpoints, as `InFlight.setpoint`."""
 
@@ -30,12 +30,12 @@ class DecisionMemory:
     def decided(
         self, who: NDArray[np.intp], setpoint: NDArray[np.float64], t2_us: NDArray[np.int64]
     ) -> None:
-        """Take the setpoints (k, 4) that the companions in `who` (k,) sent, and their t2 [µs]."""
+        """Store the setpoints (k, 4) that the companions in `who` (k,) sent, and their t2 [µs]."""
         self.latency.measure(who, t2_us)
         self.newest[who] = setpoint
 
     def in_flight(self, age_us: NDArray[np.int64]) -> InFlight:
-        """Return what policies may be told; `age_us` (n,) is how old the images are."""
+        """Return the inputs for policies; `age_us` (n,) is the age of the images."""
         return InFlight(
             self.latency.expected_us() / US_PER_S,
             age_us / US_PER_S,
@@ -43,7 +43,7 @@ class DecisionMemory:
         )
 
     def held(self) -> Mapping[str, Any]:
-        """Return by name all arrays that change, for checkpoints."""
+        """Return all mutable arrays by name, for checkpoints."""
         return {
             "newest": self.newest,
             "measured_us": self.latency.measured_us,
@@ -52,15 +52,15 @@ class DecisionMemory:
 
 
 REMEMBERED = 32
-"""So many of the newest decisions count."""
+"""Number of recent decisions that count."""
 
 
 class ExpectedLatency:
-    """The expected t2 of n companions: the mean of the newest that each has measured.
+    """Expected t2 of n companions: the mean of each companion's recent measurements.
 
-    Before the first decision nothing is expected. The vehicle hovers then, and a still vehicle is
-    where it was, however late. The mean flies better than a high quantile (docs/results.md). The
-    vehicle is on average where it was thought to be.
+    Zero before the first decision, when the vehicle hovers and latency has no effect. The mean
+    flies better than a high quantile (docs/results.md), because the predicted position is then
+    correct on average.
     """
 
     def __init__(self, n: int) -> None:
@@ -71,16 +71,16 @@ class ExpectedLatency:
         """(n,) decisions measured."""
 
     def begin(self, i: int) -> None:
-        """Forget what companion i has measured."""
+        """Reset the measurements of companion i."""
         self.count[i] = 0
 
     def measure(self, who: NDArray[np.intp], t2_us: NDArray[np.int64]) -> None:
-        """Take what a decision of each companion in `who` (k,) took [µs] (k,)."""
+        """Store the decision times [µs] (k,) of the companions in `who` (k,)."""
         self.measured_us[who, self.count[who] % REMEMBERED] = t2_us
         self.count[who] += 1
 
     def expected_us(self) -> NDArray[np.int64]:
-        """Return t2 (n,) [µs] that is expected of the next decision of each."""
+        """Return the expected t2 (n,) [µs] of each next decision."""
         known = np.minimum(self.count, REMEMBERED)
         counted = np.arange(REMEMBERED) < known[:, None]
         total = np.where(counted, self.measured_us, 0).sum(axis=1)

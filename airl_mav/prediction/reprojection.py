@@ -1,10 +1,9 @@
-"""A depth image as it would be from elsewhere, made of the newest images.
+"""Reprojection of a depth image to another pose, from the newest images.
 
-Every pixel with a return is a point. Points are carried into the other camera, and the nearest of
-those that fall on a pixel is seen there. What the newest image saw decides; where it saw nothing of
-a pixel (beyond its edges, behind something) older images do. Where no image did, level ground at
-the height of the take-off is assumed, and above the horizon that nothing is there. What moves is
-taken to stand still.
+Every pixel with a return is a point. Points are transformed into the other camera, and each pixel
+shows its nearest point. The newest image has priority; older images fill pixels that it did not see
+(beyond its edges, occluded). Remaining pixels show level ground at the take-off height, and nothing
+above the horizon. Moving objects are assumed to be static.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from airl_mav.camera.rays import fisheye_places, fisheye_rays
 from airl_mav.profiles.camera import Camera
 
 LEAST_DEPTH_M = 0.05
-"""Points closer to the image plane, or a cylinder's axis, are left out [m]: they have no pixel."""
+"""Minimum depth [m]: points closer to the image plane, or a cylinder's axis, have no pixel."""
 
 _RANK = 1 << 16
-"""Older images rank behind all depths of newer ones."""
+"""Rank step: older images rank behind all depths of newer ones."""
 
 _UNSEEN = np.uint32(0xFFFFFFFF)
 
@@ -34,14 +33,14 @@ Floats = NDArray[np.float32]
 
 
 class CameraPose(NamedTuple):
-    """Where a camera is, and how it looks."""
+    """Position and orientation of a camera."""
 
     position: NDArray[np.float64]  # (3,) NED [m]
     axes: NDArray[np.float64]  # (3, 3) columns: forward (optical axis), right, down, in NED
 
 
 class Sight(NamedTuple):
-    """A depth image and where it was taken."""
+    """Depth image and its camera pose."""
 
     depth_mm: Image  # (h, w), 0 = no return
     pose: CameraPose
@@ -66,9 +65,9 @@ class Reprojector:
         if k.projection != "fisheye":
             rays[2] = v[:, None]
         self._rays = rays.reshape(3, -1)
-        """(3, h w) what each pixel looks along at a depth of 1: forward, right, down."""
+        """(3, h w) viewing direction of each pixel at a depth of 1: forward, right, down."""
         self._sees = self._rays.any(axis=0)
-        """(h w) whether a pixel looks anywhere: not outside of a fisheye's circle."""
+        """(h w) True if a pixel has a direction: inside a fisheye's circle."""
 
     def image(self, sights: Sequence[Sight], pose: CameraPose) -> Image:
         """Return the depth image (h, w) [mm] from a pose. The newest sight is first."""
@@ -78,7 +77,7 @@ class Reprojector:
             pixels, depth_mm = self._carried(sight, pose)
             np.minimum.at(nearest, pixels, depth_mm + np.uint32(rank * _RANK))
         out = (nearest & np.uint32(MAX_MM)).astype(np.uint16)
-        # What lies beyond the range was seen to be empty.
+        # Points beyond the range were observed as empty.
         out[out == MAX_MM] = 0
         unseen = nearest == _UNSEEN
         out[unseen] = self._ground_mm(pose)[unseen]
@@ -87,7 +86,7 @@ class Reprojector:
     def _carried(
         self, sight: Sight, pose: CameraPose
     ) -> tuple[NDArray[np.intp], NDArray[np.uint32]]:
-        """Return the pixels that the points of an image fall on, and their depths there [mm]."""
+        """Return the pixels hit by the points of an image, and their depths [mm]."""
         k = self._k
         turn = (pose.axes.T @ sight.pose.axes).astype(np.float32)
         shift = (pose.axes.T @ (sight.pose.position - pose.position)).astype(np.float32)
@@ -112,7 +111,7 @@ class Reprojector:
     def _on_fisheye(
         self, points: Floats, empty: NDArray[np.bool_]
     ) -> tuple[NDArray[np.intp], NDArray[np.uint32]]:
-        """Return as `_carried` what falls on a fisheye of points (3, h w) from the camera."""
+        """Return as `_carried` the fisheye pixels of points (3, h w) from the camera."""
         there = np.sqrt((points * points).sum(axis=0))
         column, row = (np.rint(place) for place in fisheye_places(self._k, points))
         kept = self._sees & (there > LEAST_DEPTH_M)
@@ -126,7 +125,7 @@ class Reprojector:
         kept: NDArray[np.bool_],
         empty: NDArray[np.bool_],
     ) -> tuple[NDArray[np.intp], NDArray[np.uint32]]:
-        """Return the pixels that points fall on, of those that are kept, and their depths [mm]."""
+        """Return the pixels hit by points, filtered by `kept`, and their depths [mm]."""
         k = self._k
         kept &= (column >= 0) & (column < k.width) & (row >= 0) & (row < k.height)
         column, row, there, empty = column[kept], row[kept], there[kept], empty[kept]
@@ -136,11 +135,11 @@ class Reprojector:
         return pixels, carried_mm
 
     def _bearing_column(self, forward: Floats, right: Floats) -> Floats:
-        """Return the columns (h w) of a cylinder on which points fall; their turns do not count."""
+        """Return the cylinder columns (h w) of points, modulo full turns."""
         k = self._k
         turn = np.float32(2.0 * math.pi * k.focal)
         column = np.arctan2(right, forward) * np.float32(k.focal) + np.float32(k.cx)
-        # What is half a pixel left of the first column, on the seam, is in the last one.
+        # A point half a pixel left of the first column, on the seam, maps to the last one.
         column -= turn * np.floor((column + np.float32(0.5)) / turn)
         found: Floats = np.rint(column)
         return found

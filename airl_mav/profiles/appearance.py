@@ -1,6 +1,6 @@
-"""What an arena looks like to a colour camera: materials, textures, sun, sky, fog.
+"""Appearance of an arena for colour cameras: materials, textures, sun, sky, fog.
 
-Every pair of numbers is [least, greatest], drawn uniformly for each seed. Colours are sRGB, 0-255.
+Every pair of numbers is [minimum, maximum], drawn uniformly for each seed. Colours are sRGB, 0-255.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ WALL_COLOUR = "wall_colour"
 
 
 class Material(ProfileModel):
-    """A material: two albedos, the texture that mixes them or an image, and how it reflects."""
+    """A material: two albedos, a texture that mixes them or an image, and a reflection model."""
 
     albedo: Colour = quantity(
         "reflectance, as an sRGB colour, where the pattern is 0: mortar, shade between leaves; with"
@@ -105,7 +105,7 @@ MATERIALS: dict[str, Material] = {
     ),
     "glass": Material(albedo=(250, 253, 250), surface="glass"),
 }
-"""Materials that every arena can name."""
+"""Materials available in every arena."""
 
 
 def _materials(*default: str) -> Any:
@@ -119,7 +119,7 @@ def _materials(*default: str) -> Any:
 
 
 def _brightness(least: float, greatest: float) -> Any:
-    """Declare by how much the albedo of a kind of surface differs."""
+    """Declare the brightness range of a kind of surface."""
     return quantity(
         "factor of the albedo, drawn for each surface; albedos end at 1",
         "1",
@@ -128,7 +128,7 @@ def _brightness(least: float, greatest: float) -> Any:
 
 
 def _tint(default: float) -> Any:
-    """Declare by how much the colour of a kind of surface differs."""
+    """Declare the colour variation of a kind of surface."""
     return quantity(
         "each colour channel's albedo is changed by a factor between 1 - tint and 1 + tint, drawn"
         " for each surface",
@@ -143,7 +143,7 @@ Brightness = Annotated[tuple[float, float], Each(0, 4, ascending=True)]
 
 
 class Surfaces(ProfileModel):
-    """The four walls together: the materials of one kind of surface."""
+    """Materials of one kind of surface: the four walls together."""
 
     materials: Materials = _materials(WALL_COLOUR)
     brightness: Brightness = _brightness(1.0, 1.0)
@@ -151,13 +151,13 @@ class Surfaces(ProfileModel):
 
 
 class Floor(Surfaces):
-    """The floor."""
+    """Materials of the floor."""
 
     materials: Materials = _materials("gravel")
 
 
 class Standing(Surfaces):
-    """Each obstacle that stands still."""
+    """Materials of each static obstacle."""
 
     materials: Materials = _materials("brick", "concrete", "foliage", "plaster")
     brightness: Brightness = _brightness(0.8, 1.2)
@@ -165,7 +165,7 @@ class Standing(Surfaces):
 
 
 class Moving(Surfaces):
-    """Each obstacle that moves."""
+    """Materials of each moving obstacle."""
 
     materials: Materials = _materials("orange")
 
@@ -189,9 +189,9 @@ class Sun(ProfileModel):
 
 
 class Sky(ProfileModel):
-    """The sky without clouds: its radiance goes from horizon to zenith with the sine of elevation.
+    """The clear sky: radiance varies from horizon to zenith with the sine of elevation.
 
-    It lights surfaces without shadows, by the share of the sky that their tilt lets them see.
+    It lights surfaces without shadows, by the share of the sky visible at their tilt.
     """
 
     irradiance: Annotated[tuple[float, float], Each(0, 10, ascending=True)] = quantity(
@@ -204,7 +204,7 @@ class Sky(ProfileModel):
 
 
 class Fog(ProfileModel):
-    """Fog of one density, which takes on the colour of the horizon."""
+    """Fog of uniform density in the colour of the horizon."""
 
     extinction_1_m: Annotated[tuple[float, float], Each(0, 2, ascending=True)] = quantity(
         "extinction coefficient of Beer-Lambert's law; 3 over it is the meteorological optical"
@@ -222,14 +222,14 @@ class Fog(ProfileModel):
 
     @property
     def drawn(self) -> bool:
-        """Whether any seed may have fog."""
+        """True if any seed may have fog."""
         return self.share > 0.0 and self.extinction_1_m[1] > 0.0
 
 
 class Appearance(ProfileModel):
-    """What a colour camera sees. It has random streams of its own: the geometry knows none of it.
+    """Appearance for colour cameras, from separate random streams: geometry is independent of it.
 
-    Depth images know none of it either, but for glass, which depth passes through.
+    Depth images are also independent of it, except for glass, which depth passes through.
     """
 
     period: int = quantity(
@@ -265,26 +265,26 @@ class Appearance(ProfileModel):
 
     @property
     def known_materials(self) -> tuple[str, ...]:
-        """The names of all materials: shipped ones, the walls', the arena's own."""
+        """Names of all materials: shipped, the walls', and custom ones."""
         return (*MATERIALS, WALL_COLOUR, *self.materials)
 
     @property
     def images(self) -> tuple[ImageFile, ...]:
-        """The pictures of its own materials, each once, in the order of their names."""
+        """Images of the custom materials, without duplicates, ordered by material name."""
         named = sorted(self.materials.items())
         return tuple(dict.fromkeys(m.image for _, m in named if m.image is not None))
 
     def may_have(self, surface: SurfaceName, more: Iterable[str] = ()) -> bool:
-        """Return whether an obstacle, or a part of one in `more` materials, may be so."""
+        """Return whether an obstacle, or a part of `more` materials, may have a kind of surface."""
         kinds = (*self.static.materials, *self.moving.materials, *more)
         return any(self.material(name, (0, 0, 0)).surface == surface for name in kinds)
 
     def material(self, name: str, wall_colour: tuple[int, int, int]) -> Material:
-        """Return a material by name; one of the arena's own goes before a shipped one."""
+        """Return a material by name; a custom material overrides a shipped one."""
         if name == WALL_COLOUR:
             return Material(albedo=wall_colour)
         return self.materials[name] if name in self.materials else MATERIALS[name]
 
 
 DEFAULT = Appearance()
-"""That of an arena whose profile says nothing of it."""
+"""Appearance of an arena whose profile does not define one."""

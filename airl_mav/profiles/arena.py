@@ -1,4 +1,4 @@
-"""The arena specification: the knobs of the environment generator."""
+"""Arena specification: the parameters of the environment generator."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from airl_mav.profiles.terrain import Terrain, check_terrain
 ShapeName = Literal["box", "cylinder", "sphere"]
 SHAPES: tuple[ShapeName, ...] = get_args(ShapeName)
 OBSTACLES = "obstacles"
-"""The generator that is shipped: `arena.generate`."""
+"""The built-in generator: `arena.generate`."""
 GeneratorName = Annotated[str, part_name(GENERATORS, (OBSTACLES,))]
 Option = bool | int | float | str | list[int | float | str]
 
 ASSET_NAME = re.compile("[a-z]+(-[a-z]+)*")
-"""What things of the user's may be called: what is hit is called after it."""
+"""Valid names of custom assets, used in collision reports."""
 
 SPHERE_OFFSET = 0.5
-"""A sphere's centre is at most this share of its radius off the flight altitude."""
+"""Maximum offset of a sphere's centre from the flight altitude, as a share of its radius."""
 
 
 class Size(ProfileModel):
-    """The floor rectangle and the walls on its edges."""
+    """The floor rectangle and the walls at its edges."""
 
     north_m: float = quantity("length of the floor, south to north", "m", ge=5, le=500, default=50)
     east_m: float = quantity("width of the floor, west to east", "m", ge=5, le=500, default=50)
@@ -49,7 +49,7 @@ class Size(ProfileModel):
 
 
 class Start(ProfileModel):
-    """Where the vehicle takes off, heading north."""
+    """Take-off position; the vehicle heads north."""
 
     north_m: float = quantity("distance from the south wall", "m", ge=0.5, le=499.5, default=3)
     east_m: float = quantity("distance from the west wall", "m", ge=0.5, le=499.5, default=25)
@@ -63,7 +63,7 @@ class Start(ProfileModel):
 
 
 class Goal(ProfileModel):
-    """The goal: drawn anew with every seed, or fixed by `north_m` and `east_m`."""
+    """The goal: drawn for each seed, or fixed by `north_m` and `east_m`."""
 
     north_m: float | None = quantity(
         "fixed goal: north of the start; left out: drawn", "m", ge=-500, le=500, default=None
@@ -88,7 +88,7 @@ class Goal(ProfileModel):
     @field_validator("height_m", mode="before")
     @classmethod
     def _one_height(cls, value: object) -> object:
-        """Take one number for both ends of the range."""
+        """Convert a single number to a range."""
         one = isinstance(value, int | float) and not isinstance(value, bool)
         return (value, value) if one else value
 
@@ -101,14 +101,14 @@ class Goal(ProfileModel):
 
     @property
     def fixed(self) -> tuple[float, float] | None:
-        """North and east [m] from the start, or None when the goal is drawn."""
+        """North and east [m] from the start; None = the goal is drawn."""
         if self.north_m is None or self.east_m is None:
             return None
         return self.north_m, self.east_m
 
 
 class StaticObstacles(ProfileModel):
-    """Obstacles that stand still. Ranges are [least, greatest], drawn uniformly, one by one."""
+    """Static obstacles. Ranges are [minimum, maximum], drawn uniformly, one by one."""
 
     count: Annotated[tuple[int, int], Each(0, 200, ascending=True)] = quantity(
         "how many", "1", default=(0, 0)
@@ -150,7 +150,7 @@ class MovingObstacles(StaticObstacles):
 
 
 class ArenaSpec(ProfileModel):
-    """Knobs of an arena; defaults are the paper's where it has them (arXiv 1906.00421).
+    """Parameters of an arena; defaults are the paper's where available (arXiv 1906.00421).
 
     A bounding box is the rectangle around an obstacle's footprint, its sides along north and east.
     """
@@ -215,7 +215,7 @@ class ArenaSpec(ProfileModel):
 
     @model_serializer(mode="wrap")
     def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out pairs that say nothing, as `later_field` does with what stands alone."""
+        """Omit pairs of fields at their defaults, as `later_field` omits single fields."""
         data: dict[str, Any] = dump(self)
         silent: list[str] = []
         if self.generator == OBSTACLES and not self.options:
@@ -223,16 +223,16 @@ class ArenaSpec(ProfileModel):
         if not self.assets and self.asset_scale == (1.0, 1.0):
             silent += ["assets", "asset_scale"]
         for name in silent:
-            data.pop(name, None)  # gone already where what is as by default is left out
+            data.pop(name, None)  # may already be omitted as a default
         return data
 
     @property
     def has_assets(self) -> bool:
-        """Whether anything that stands may be made of parts."""
+        """True if static obstacles may be assets."""
         return not set(self.static.shapes) <= set(SHAPES)
 
     def asset(self, name: str) -> Asset | None:
-        """Return what stands under a name of `static.shapes`; None: it is a shape."""
+        """Return the asset of a name in `static.shapes`, or None for a shape."""
         return self.assets.get(name) or ASSETS.get(name)
 
     @model_validator(mode="after")
@@ -260,7 +260,7 @@ class ArenaSpec(ProfileModel):
 
     @property
     def _most_m(self) -> tuple[float, str]:
-        """How high what stands on the ground may be [m], and why."""
+        """Maximum height of obstacles on the ground [m], and the reason."""
         walls = self.size.height_m
         if not self.terrain.drawn:
             return walls, "size.height_m, the walls"
@@ -354,7 +354,7 @@ class ArenaSpec(ProfileModel):
         )
 
     def _check_behind_gates(self) -> None:
-        """Refuse gates that leave no room for the goal behind the last of them."""
+        """Reject gates that leave no room for the goal behind the last one."""
         last, free = self.gates.last_m, self.goal.clearance_m
         fixed = self.goal.fixed
         if fixed is not None:

@@ -1,4 +1,4 @@
-"""Files that an arena's profile names, with their digests: meshes and images of textures."""
+"""Files named in an arena's profile, with their digests: meshes and texture images."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel
 
 MOST_TRIANGLES = 200_000
-"""Of one mesh."""
+"""Maximum triangles of a mesh."""
 
 GREATEST_M = 50.0
-"""Greatest distance of a corner from its asset's place, along each axis [m]."""
+"""Maximum distance of a corner from its asset's position, along each axis [m]."""
 
 MOST_BYTES = 1 << 27
-"""Of one file."""
+"""Maximum size of a file."""
 
 CONTENT = {"content": True}
-"""Context of a serialisation that says what things are, and not where they lie."""
+"""Context of a serialisation of content without file paths."""
 
 
 class CheckedFile(ProfileModel):
-    """A file beside a profile that must be what it was when the profile was made."""
+    """A file beside a profile, verified by its digest."""
 
     file: str = Field(min_length=1, description="a path from the profile's folder")
     sha256: str = Field(description="SHA-256 of that file, hexadecimal")
@@ -47,7 +47,7 @@ class CheckedFile(ProfileModel):
     def _without_place(
         self, dump: SerializerFunctionWrapHandler, info: SerializationInfo
     ) -> dict[str, Any]:
-        """Leave out where the file lies where only content counts: its digest tells that."""
+        """Omit the path if only content counts: the digest identifies the file."""
         data: dict[str, Any] = dump(self)
         if info.context == CONTENT:
             del data["file"]
@@ -55,7 +55,7 @@ class CheckedFile(ProfileModel):
 
 
 class MeshFile(CheckedFile):
-    """Triangles that cameras see in place of the parts, which stay what is hit."""
+    """Triangles that cameras render in place of the parts; collisions use the parts."""
 
     file: str = Field(
         min_length=1,
@@ -65,7 +65,7 @@ class MeshFile(CheckedFile):
 
 
 def read_checked(named: CheckedFile) -> bytes:
-    """Return the bytes of a file. Raises UsageError where it is gone, or another one."""
+    """Return the bytes of a file. Raises UsageError if missing or the digest differs."""
     path = Path(named.file)
     try:
         if path.exists() and not path.is_file():
@@ -86,11 +86,11 @@ def read_checked(named: CheckedFile) -> bytes:
 
 
 MOST_IMAGES = 16
-"""Of one arena."""
+"""Maximum images of an arena."""
 
 
 class ImageFile(CheckedFile):
-    """A picture that repeats on a surface."""
+    """An image that repeats on a surface."""
 
     file: str = Field(
         min_length=1,

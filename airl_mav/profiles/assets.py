@@ -1,8 +1,7 @@
-"""Things that are made of parts: trees, lamp posts, fences, the frame of a window.
+"""Assets made of parts: trees, lamp posts, fences, window frames.
 
-A part is a box, a cylinder or a sphere, as every other obstacle is, so that cameras, contacts,
-planners and renderers need to know nothing of what it belongs to. Sizes of shipped assets are of
-common things of their kind, in round numbers.
+A part is a box, a cylinder or a sphere like every other obstacle, so that cameras, contacts,
+planners and renderers treat it as one. Shipped assets have common sizes in round numbers.
 """
 
 from __future__ import annotations
@@ -16,11 +15,11 @@ from airl_mav.core.fields import ProfileModel, later_field, optional, quantity
 from airl_mav.profiles.asset_files import MeshFile
 
 MOST_PARTS = 128
-"""Parts of one asset: every ray and every contact looks at each."""
+"""Maximum parts of an asset: every ray and every contact checks each part."""
 
 
 class _Placed(ProfileModel):
-    """Where a part is, seen from the place of the asset on the floor."""
+    """Position of a part relative to the asset's position on the floor."""
 
     forward_m: float = quantity(
         "of its middle, ahead of the asset's place", "m", ge=-10, le=10, default=0
@@ -37,7 +36,7 @@ class _Placed(ProfileModel):
 
     @property
     def yaw_rad(self) -> float:
-        """Heading in the asset [rad]; 0 of what is round."""
+        """Heading in the asset [rad]; 0 for round parts."""
         return 0.0
 
 
@@ -54,7 +53,7 @@ class BoxPart(_Placed):
 
     @property
     def half_size_m(self) -> tuple[float, float, float]:
-        """Half extents along its own axes [m], as `Obstacles.half_size`."""
+        """Half extents along the box's axes [m], as `Obstacles.half_size`."""
         return 0.5 * self.length_m, 0.5 * self.width_m, 0.5 * self.height_m
 
     @property
@@ -72,7 +71,7 @@ class CylinderPart(_Placed):
 
     @property
     def half_size_m(self) -> tuple[float, float, float]:
-        """Radius twice and half its height [m], as `Obstacles.half_size`."""
+        """Radius twice and half the height [m], as `Obstacles.half_size`."""
         return self.radius_m, self.radius_m, 0.5 * self.height_m
 
 
@@ -92,7 +91,7 @@ Part = Annotated[BoxPart | CylinderPart | SpherePart, Field(discriminator="shape
 
 
 class Asset(ProfileModel):
-    """One thing, made of parts that keep their places in it."""
+    """An asset of parts at fixed relative positions."""
 
     parts: Annotated[tuple[Part, ...], Field(min_length=1, max_length=MOST_PARTS)] = Field(
         description="boxes, cylinders and spheres, each with its shape, place and size"
@@ -104,7 +103,7 @@ class Asset(ProfileModel):
 
     @property
     def top_m(self) -> float:
-        """Height of its highest point above the floor [m]."""
+        """Height of the highest point above the floor [m]."""
         return max(part.bottom_m + 2.0 * part.half_size_m[2] for part in self.parts)
 
 
@@ -212,5 +211,5 @@ ASSETS: dict[str, Asset] = {
         )
     ),
 }
-"""Assets that every arena can name. They stand across their forward axis; `wire` has three wires
-between two poles, and the opening of `window-frame`, 1.8 m each way, is as high as drones fly."""
+"""Assets available in every arena. They extend across their forward axis; `wire` has three wires
+between two poles, and the opening of `window-frame`, 1.8 m each way, is at flight height."""

@@ -1,4 +1,4 @@
-"""The camera of a vehicle profile: its image, its mount, and how depth is matched."""
+"""Camera of a vehicle profile: image, mount and depth matching."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from airl_mav.profiles.distortion import MOST_COEFFICIENT, UNDISTORTED, Distorti
 from airl_mav.profiles.imaging import Imaging
 
 LEAST_ROWS = 6
-"""Of an image that is no cylinder's."""
+"""Minimum rows of an image, except with a cylindrical projection."""
 
 Coefficients = Annotated[Distortion, Each(-MOST_COEFFICIENT, MOST_COEFFICIENT)]
-"""Of a fisheye."""
+"""Distortion coefficients of a fisheye."""
 
 
 class Stereo(ProfileModel):
-    """How a depth camera matches the images of two imagers; see `camera.stereo`."""
+    """Stereo matching of a depth camera with two imagers; see `camera.stereo`."""
 
     baseline_m: float = quantity("distance between the imagers", "m", ge=0.01, le=1)
     focal_px: float = quantity(
@@ -37,7 +37,7 @@ class Stereo(ProfileModel):
 
 
 class Ranging(ProfileModel):
-    """How a lidar or another sensor of ranges measures them; see `camera.noise`."""
+    """Errors of a lidar or another range sensor; see `camera.noise`."""
 
     noise_m: float = quantity("noise of a range, sd", "m", ge=0, le=5, default=0.0)
     noise_share: float = quantity(
@@ -54,7 +54,7 @@ class Ranging(ProfileModel):
 
 
 class Camera(ProfileModel):
-    """A camera: the main one looks ahead or all round, further ones wherever they are mounted."""
+    """A camera: the main one looks ahead or all round, additional ones in any direction."""
 
     kind: CameraKind = later_field(
         "depth",
@@ -159,14 +159,14 @@ def check_matched(field: str, camera: Camera) -> None:
 
 
 def check_rows(field: str, camera: Camera) -> None:
-    """Raise FieldError, naming the field, for an image that is too low for its projection."""
+    """Raise FieldError, naming the field, for an image with too few rows for its projection."""
     if camera.height_px < LEAST_ROWS and camera.projection != "cylindrical":
         accepted = f"value >= {LEAST_ROWS} px with projection {camera.projection!r}"
         raise FieldError(field, camera.height_px, accepted)
 
 
 def _check_imaging(imaging: Imaging, camera: Camera) -> None:
-    """Raise FieldError for what a camera's kind or rate cannot have."""
+    """Raise FieldError for settings that the camera's kind or rate does not support."""
     if imaging.bayer and camera.kind != "rgb":
         accepted = f"false with a camera of kind {camera.kind!r}"
         raise FieldError("camera.imaging.bayer", True, accepted)
@@ -178,15 +178,15 @@ def _check_imaging(imaging: Imaging, camera: Camera) -> None:
             raise FieldError(f"camera.imaging.{name}", value, accepted)
 
 
-# --- cameras beside the main one: by name, all triggered with it
+# --- additional cameras: by name, all triggered with the main one
 
 MOST: Final = 32
-"""Further cameras of a vehicle, at most: the largest images of all of them fit into one frame."""
+"""Maximum additional cameras: their largest images fit into one frame."""
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,23}")
 
 _SAY_WHICH = ("model", "name")
-"""No names: a file's table that has them replaces that of its base (`loading`)."""
+"""Reserved names: a table with these fields replaces the table of its base (`loading`)."""
 
 ACCEPTED_NAME: Final = (
     "a name of a-z, 0-9 and _ that begins with a letter, 24 characters at most, but for"
@@ -195,19 +195,19 @@ ACCEPTED_NAME: Final = (
 
 
 def is_camera_name(name: str) -> bool:
-    """Return whether a further camera may be called so."""
+    """Return whether a name is valid for an additional camera."""
     return _NAME.fullmatch(name) is not None and name not in _SAY_WHICH
 
 
 def camera_named(name: str) -> str:
-    """Return a further camera's name. Raises ValueError for one that none can have."""
+    """Return an additional camera's name. Raises ValueError for an invalid name."""
     if not is_camera_name(name):
         raise ValueError(f"{name!r}: accepted: {ACCEPTED_NAME}")
     return name
 
 
 def _each_by_itself(value: Any) -> Any:
-    """Raise FieldError that names the camera, where its fields contradict each other."""
+    """Validate each camera. Raises FieldError naming a camera with contradictory fields."""
     if not isinstance(value, Mapping):
         return value
     if len(value) > MOST:
@@ -223,16 +223,16 @@ def _each_by_itself(value: Any) -> Any:
             field = re.sub(r"^camera\b", f"cameras.{name}", error.field)
             raise FieldError(field, error.value, error.accepted, error.problem) from None
         except ValidationError:
-            pass  # The vehicle's own validation says where.
+            pass  # The vehicle's own validation reports the field.
     return value
 
 
 FurtherCameras = Annotated[dict[str, Camera], BeforeValidator(_each_by_itself)]
-"""By name."""
+"""Additional cameras by name."""
 
 
 def with_the_rate(data: Any) -> Any:
-    """Return the data of a vehicle profile, its further cameras with the main one's rate."""
+    """Return the data of a vehicle profile, with the main camera's rate in additional cameras."""
     if not isinstance(data, Mapping):
         return data
     main, further = data.get("camera"), data.get("cameras")
@@ -247,7 +247,7 @@ def with_the_rate(data: Any) -> Any:
 
 
 def check_rates(main: Camera, further: Mapping[str, Camera]) -> None:
-    """Raise FieldError for a further camera that is not triggered with the main one."""
+    """Raise FieldError for an additional camera with another rate than the main one."""
     for name, camera in further.items():
         if camera.rate_hz != main.rate_hz:
             raise FieldError(

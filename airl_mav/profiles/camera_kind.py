@@ -11,35 +11,35 @@ CameraKind = Literal["depth", "rgb", "grey"]
 (h, w, 1), luma of the sRGB numbers."""
 
 Renderer = Literal["raycast", "mitsuba"]
-"""What draws images: the ray caster, or Mitsuba's path tracer, its reference for colour."""
+"""Renderer of images: the ray caster, or Mitsuba's path tracer as the reference for colour."""
 
 SLOW: Final[frozenset[Renderer]] = frozenset({"mitsuba"})
-"""Renderers that take longer for an image than a tick has."""
+"""Renderers that need longer than a tick for an image."""
 
 KINDS: Final[tuple[CameraKind, ...]] = get_args(CameraKind)
 
 CHANNELS: Final[dict[CameraKind, int]] = {"depth": 1, "rgb": 3, "grey": 1}
-"""Channels of the image that a network is given."""
+"""Channels of a network's image."""
 
 
 def shape_of(kind: CameraKind, height: int, width: int) -> tuple[int, ...]:
-    """Return the shape of a camera's image: (h, w) of depth, (h, w, channels) of colour."""
+    """Return the shape of a camera's image: (h, w) for depth, (h, w, channels) for colour."""
     return (height, width) if kind == "depth" else (height, width, CHANNELS[kind])
 
 
 Projection = Literal["pinhole", "cylindrical", "fisheye"]
-"""How directions fall on the image; `camera.intrinsics.Intrinsics` has the formulas."""
+"""Projection of directions to the image; `camera.intrinsics.Intrinsics` has the formulas."""
 
 PROJECTIONS: tuple[Projection, ...] = get_args(Projection)
 
 PINHOLE_BELOW_DEG, CYLINDER_MOST_DEG, FISHEYE_MOST_DEG = 170.0, 360.0, 190.0
-"""Horizontal field of view that a pinhole stays below, and that the others may have [deg].
+"""Limit of a pinhole's horizontal field of view, exclusive, and of the others, inclusive [deg].
 
-A fisheye sees nothing that is farther from its optical axis than half of it, in any direction."""
+A fisheye sees up to half its field of view from the optical axis, in any direction."""
 
 
 def check_fov(field: str, projection: Projection, horizontal_fov_deg: float) -> None:
-    """Raise FieldError, of this name, for a field of view [deg] that a projection cannot have."""
+    """Raise FieldError, naming the field, for a field of view [deg] beyond a projection's limit."""
     beyond = {
         "pinhole": horizontal_fov_deg >= PINHOLE_BELOW_DEG,
         "cylindrical": horizontal_fov_deg > CYLINDER_MOST_DEG,

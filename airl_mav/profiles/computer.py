@@ -1,6 +1,6 @@
-"""The computer profile: what an onboard computer costs, draws, and how late it decides.
+"""Computer profile: price, power and decision latency of an onboard computer.
 
-A computer has latencies per workload (a network on a runtime), never one number.
+Latencies are given per workload (a network on a runtime), never as a single number.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from airl_mav.core.files import replace_file
 from airl_mav.profiles.loading import load_profile, profiles_dir
 
 LONGEST_MS = 60_000.0
-"""A decision slower than a minute flies nothing: taken for a mistake in the file [ms]."""
+"""Maximum latency [ms]; a decision slower than a minute is assumed to be a mistake in the file."""
 
 Distribution = Literal["fixed", "lognormal", "normal-truncated", "samples"]
 
 
 class Network(ProfileModel):
-    """The network that was timed."""
+    """The network of a latency measurement."""
 
     layers: int | None = quantity(
         "convolution layers of the paper's template (and as many dense ones)",
@@ -53,10 +53,9 @@ class Network(ProfileModel):
 class Latency(ProfileModel):
     """The distribution of t2: inference start -> action ready.
 
-    `fixed`: always `mean_ms`. `lognormal`: `min_ms` plus a log-normal, with `mean_ms` and `std_ms`
-    those of the sum. `normal-truncated`: a normal of `mean_ms` and `std_ms`, cut off below
-    `min_ms` (so its own mean lies a little higher). `samples`: measured values, replayed in their
-    order.
+    `fixed`: always `mean_ms`. `lognormal`: `min_ms` plus a log-normal; `mean_ms` and `std_ms` apply
+    to the sum. `normal-truncated`: a normal of `mean_ms` and `std_ms`, truncated below `min_ms` (so
+    the resulting mean is slightly higher). `samples`: measured values, replayed in order.
     """
 
     distribution: Distribution
@@ -96,7 +95,7 @@ class Latency(ProfileModel):
 
 
 class Measured(ProfileModel):
-    """How a workload was timed, in a profile that was written to be passed on."""
+    """Measurement conditions of a workload in a shared profile."""
 
     date_utc: str = Field(description="when")
     machine: str = Field(description="operating system, architecture and Python")
@@ -111,16 +110,16 @@ class Measured(ProfileModel):
 
 
 def samples_digest(samples_ms: Sequence[float]) -> str:
-    """Return the SHA-256 of samples [ms], as `Measured.samples_sha256` has it."""
+    """Return the SHA-256 of samples [ms], as in `Measured.samples_sha256`."""
     return hashlib.sha256("".join(f"{each:.3f}\n" for each in samples_ms).encode()).hexdigest()
 
 
 Origin = Literal["measured", "published"]
-"""Samples of a machine, or moments that somebody has published."""
+"""Measured samples, or published moments."""
 
 
 class Workload(ProfileModel):
-    """One network on one runtime, as this computer ran it."""
+    """Latency of one network on one runtime on this computer."""
 
     network: Network
     policy_sha256: str | None = optional(
@@ -146,7 +145,7 @@ class Workload(ProfileModel):
 
     @property
     def origin(self) -> Origin:
-        """Where the latency comes from."""
+        """Origin of the latency."""
         return "measured" if self.latency.distribution == "samples" else "published"
 
 
@@ -174,19 +173,19 @@ class ComputerProfile(ProfileModel):
 
     @property
     def onboard_watts(self) -> float:
-        """What the computer draws from the aircraft's pack [W]."""
+        """Power drawn from the aircraft's battery [W]."""
         return 0.0 if self.ground_equipment else self.watts
 
     @property
     def onboard_mass_kg(self) -> float:
-        """What the computer adds to the aircraft's mass [kg]."""
+        """Mass added to the aircraft [kg]."""
         return 0.0 if self.ground_equipment else self.mass_g / G_PER_KG
 
 
 def load_computer(name: str) -> ComputerProfile:
-    """Load a computer profile, shipped or by path, with its sample files read in.
+    """Load a computer profile, shipped or by path, including its sample files.
 
-    Raises UsageError: see `load_profile`; also when a sample file is missing or holds anything but
+    Raises UsageError as `load_profile`, and if a sample file is missing or contains anything but
     latencies in (0, 60000] ms.
     """
     profile = load_profile("computers", name, ComputerProfile)
@@ -199,7 +198,7 @@ def load_computer(name: str) -> ComputerProfile:
 
 
 def _with_samples(latency: Latency, folder: Path) -> Latency:
-    """Replace `samples_file`, relative to `folder`, by the values that it holds."""
+    """Replace `samples_file`, relative to `folder`, by its values."""
     if latency.samples_file is None:
         return latency
     samples = read_samples(folder / latency.samples_file, "samples_file")
@@ -207,10 +206,10 @@ def _with_samples(latency: Latency, folder: Path) -> Latency:
 
 
 def read_samples(path: Path, option: str) -> tuple[float, ...]:
-    """Read a text file of measured latencies in their order: one a line in ms, # for remarks.
+    """Read a text file of measured latencies in order: one per line in ms, # for comments.
 
-    `option` names the file in messages. Raises UsageError if it cannot be read, is empty, or holds
-    anything but latencies in (0, 60000] ms.
+    `option` names the file in messages. Raises UsageError if the file cannot be read, is empty, or
+    contains anything but latencies in (0, 60000] ms.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -221,18 +220,18 @@ def read_samples(path: Path, option: str) -> tuple[float, ...]:
         raise UsageError(f"{path}: {error}; accepted: one latency a line, ms") from None
     if not values.size:
         raise UsageError(f"{path}: no samples; accepted: one latency a line, ms")
-    # Negated, so that a NaN counts as outside.
+    # Negated, so that NaN counts as outside.
     outside = values[~((values > 0) & (values <= LONGEST_MS))]
     if outside.size:
         raise UsageError(f"{path}: {outside[0]:g}: accepted: 0 < value <= {LONGEST_MS:g} ms")
     return tuple(float(value) for value in values)
 
 
-# --- what was measured, written into a profile
+# --- writing measurements to a profile
 
 
 def existing_profile(path: Path, cpu: str) -> ComputerProfile | None:
-    """Return the profile in a .toml file, None without one. Raises UsageError for another CPU's."""
+    """Return the profile in a .toml file, None without one. Raises UsageError for another CPU."""
     if not path.exists():
         return None
     profile = load_profile("computers", str(path), ComputerProfile)
@@ -244,17 +243,17 @@ def existing_profile(path: Path, cpu: str) -> ComputerProfile | None:
 
 
 def write_samples(path: Path, samples_ms: Sequence[float], remarks: Sequence[str]) -> None:
-    """Write measured latencies in their order, one a line in ms, with remarks above them."""
+    """Write measured latencies in order, one per line in ms, with comments above them."""
     lines = [f"# {remark}" for remark in remarks] + [f"{value:.3f}" for value in samples_ms]
     replace_file(path, "".join(f"{line}\n" for line in lines).encode())
 
 
 def write_profile(path: Path, profile: ComputerProfile) -> None:
-    """Write a profile as TOML; the old file stays until the new one is whole."""
+    """Write a profile as TOML, atomically."""
     plain = profile.model_dump(mode="json", exclude_none=True)
     replace_file(path, tomli_w.dumps(plain, multiline_strings=False).encode())
 
 
 def with_workload(profile: ComputerProfile, name: str, workload: Workload) -> ComputerProfile:
-    """Return the profile with a workload added, in place of one of the same name."""
+    """Return the profile with a workload added or replaced."""
     return profile.model_copy(update={"workloads": {**profile.workloads, name: workload}})

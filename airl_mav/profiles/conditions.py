@@ -1,6 +1,6 @@
-"""What an aircraft flies with and in: its load, its spread, its sensors' noise, the wind.
+"""Flight conditions: wind, payload, domain randomization and sensor noise.
 
-Tables of scenarios; those of training environments are the same.
+The tables are used by scenarios and training environments.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class WindSettings(ProfileModel):
 
 
 class Payload(ProfileModel):
-    """A point of mass, placed from the middle of the rotors; none by default."""
+    """A point mass relative to the middle of the rotors; none by default."""
 
     mass_g: float = quantity("mass of the payload", "g", ge=0, le=100_000, default=0.0)
     forward_m: float = quantity("ahead of the middle", "m", ge=-2, le=2, default=0.0)
@@ -43,9 +43,9 @@ class Payload(ProfileModel):
 
 
 class Spread(ProfileModel):
-    """How far an aircraft may be from its profile, drawn with every episode; 0 is not at all.
+    """Domain randomization of the aircraft, drawn for every episode; 0 = as in the profile.
 
-    The flight controller goes on counting on the profile.
+    The flight controller still assumes the profile's values.
     """
 
     mass: float = quantity("mass and inertia, +- this share", "1", ge=0, le=0.9, default=0.0)
@@ -57,7 +57,7 @@ class Spread(ProfileModel):
 
 
 class SensorNoise(ProfileModel):
-    """Sensors that are worse than the profile's, or better."""
+    """Scale of sensor noise relative to the profile."""
 
     navigation_noise: float = quantity(
         "noise, bias and drift of IMU, GPS, barometer and magnetometer, times this; where the"

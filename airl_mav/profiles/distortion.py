@@ -1,14 +1,14 @@
-"""The coefficients of a fisheye: at which angle off the axis a place of the image is seen.
+"""Distortion coefficients of a fisheye: conversion between image radius and angle off the axis.
 
 The model of Kannala and Brandt ("A generic camera model and calibration method for conventional,
-wide-angle, and fish-eye lenses", 2006) as OpenCV's `fisheye` and ROS's `equidistant` have it: what
-is seen at an angle theta [rad] from the optical axis falls at the way r = focal theta_d from its
-place in the image, with
+wide-angle, and fish-eye lenses", 2006) as in OpenCV's `fisheye` and ROS's `equidistant`: a ray at
+an angle theta [rad] from the optical axis is at the distance r = focal theta_d from the axis in the
+image, with
 
     theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8).
 
-With all coefficients 0 it is the equidistant lens, r = focal theta. A lens sees as far as theta_d
-increases, to 95 degrees at most.
+With all coefficients 0 the lens is equidistant, r = focal theta. The maximum angle is where theta_d
+stops increasing, and at most 95 degrees.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ Distortion = tuple[float, float, float, float]
 """k1, k2, k3, k4."""
 
 UNDISTORTED: Final[Distortion] = (0.0, 0.0, 0.0, 0.0)
-"""An equidistant lens."""
+"""Coefficients of an equidistant lens."""
 
 MOST_OFF_RAD: Final = math.radians(0.5 * FISHEYE_MOST_DEG)
-"""What is farther from the optical axis falls on no pixel of any lens [rad]."""
+"""Maximum angle from the optical axis for any lens [rad]."""
 
 _MOST_STEPS: Final = 100
-"""Bisection alone comes to rounding in fewer."""
+"""Iteration limit, enough for bisection alone to converge."""
 
 _ROUNDING: Final = 1e-12
-"""Share of theta_d by which rounding may move the rim of a lens."""
+"""Rounding tolerance of the rim of a lens, as a share of theta_d."""
 
 MOST_COEFFICIENT: Final = 100.0
-"""Greatest amount of a coefficient; those of real lenses are below 10."""
+"""Maximum magnitude of a coefficient; real lenses are below 10."""
 
 Angle = TypeVar("Angle", float, NDArray[Any])
 
 
 def distorted(theta: Angle, k: Distortion) -> Angle:
-    """Return theta_d [rad] of angles from the optical axis [rad]; kernels compile it, too."""
+    """Return theta_d [rad] of angles from the optical axis [rad]; also compiled in kernels."""
     square = theta * theta
     part = k[1] + square * (k[2] + square * k[3])
     found: Angle = theta * (1.0 + square * (k[0] + square * part))
@@ -63,16 +63,16 @@ def steepness(theta: Angle, k: Distortion) -> Angle:
 
 @lru_cache(maxsize=256)
 def sees_to(k: Distortion) -> float:
-    """Return the angle from the optical axis [rad] to which theta_d increases; at most 95 deg."""
+    """Return the off-axis angle [rad] up to which theta_d increases; at most 95 degrees."""
     by_square = [1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[2], 9.0 * k[3]]
     turns = _crossings(by_square, MOST_OFF_RAD * MOST_OFF_RAD)
     return math.sqrt(turns[0]) if turns else MOST_OFF_RAD
 
 
 def undistorted(theta_d: NDArray[Any], k: Distortion) -> NDArray[np.float64]:
-    """Return the angles from the optical axis [rad] that fall at theta_d >= 0, to rounding.
+    """Return the angles from the optical axis [rad] of theta_d >= 0, to rounding.
 
-    Newton's method, kept between bounds that close in; infinity where no angle falls that far out.
+    Newton's method within shrinking bounds; infinite if theta_d is beyond the lens's rim.
     """
     aim = np.asarray(theta_d, np.float64)
     if k == UNDISTORTED:
@@ -97,7 +97,7 @@ def undistorted(theta_d: NDArray[Any], k: Distortion) -> NDArray[np.float64]:
 def check_distortion(
     field: str, projection: Projection, horizontal_fov_deg: float, k: Distortion
 ) -> None:
-    """Raise FieldError, of this name, for coefficients that a camera cannot have."""
+    """Raise FieldError, naming the field, for invalid coefficients."""
     if k == UNDISTORTED:
         return
     shown = [float(each) for each in k]
@@ -116,9 +116,9 @@ def check_distortion(
 
 
 def _crossings(polynomial: list[float], end: float) -> list[float]:
-    """Return where a polynomial, lowest power first, changes its sign between 0 and an end.
+    """Return the sign changes of a polynomial, lowest power first, between 0 and an end.
 
-    Between two places where its derivative changes its own it does so once at most.
+    There is at most one between two sign changes of the derivative.
     """
     if len(polynomial) == 1:
         return []

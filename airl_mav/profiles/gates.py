@@ -1,4 +1,4 @@
-"""Gates in an arena's profile: walls with openings that are on the way to the goal."""
+"""Gates in an arena's profile: walls with openings between start and goal."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from typing import Annotated
 from airl_mav.core.fields import Each, ProfileModel, quantity
 
 GATE = "gate"
-"""What a wall with an opening is called where it is hit."""
+"""Name of a wall with an opening in collision reports."""
 
 EDGE_M = 0.1
-"""Least wall on each side of an opening, below and above it [m]."""
+"""Minimum wall on each side of an opening, below and above it [m]."""
 
 
 class Gates(ProfileModel):
     """Walls from the west to the east wall, each with an opening, between the start and the goal.
 
-    They stand one behind the other, and are as high as the walls of the arena. Ranges are [least,
-    greatest], drawn uniformly, one by one.
+    They stand one behind the other, and are as high as the walls of the arena. Ranges are
+    [minimum, maximum], drawn uniformly, one by one.
     """
 
     count: Annotated[tuple[int, int], Each(0, 20, ascending=True)] = quantity(
@@ -45,7 +45,7 @@ class Gates(ProfileModel):
 
     @property
     def last_m(self) -> float:
-        """Farthest from the start that the north side of one may be [m]; 0: there is none."""
+        """Maximum distance from the start to the north side of a gate [m]; 0 = no gates."""
         if self.count[1] == 0:
             return 0.0
         behind = (self.count[1] - 1) * self.spacing_m[1]
@@ -55,7 +55,7 @@ class Gates(ProfileModel):
 def check_gates(
     gates: Gates, *, west_m: float, east_m: float, height_m: float, free_m: float
 ) -> None:
-    """Raise ValueError for gates that no arena of a size can have.
+    """Raise ValueError for gates that do not fit an arena's size.
 
     `west_m` and `east_m` are from the start to the walls of `height_m`; `free_m` is free around the
     start.

@@ -1,4 +1,4 @@
-"""How a colour camera's image is formed: exposure, lens, sensor, and what compresses it."""
+"""Image formation of a colour camera: exposure, lens, sensor and compression."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from airl_mav.core.fields import ProfileModel, optional, quantity, switch
 
 
 class AutoExposure(ProfileModel):
-    """A gain that follows how bright the image is; see `camera.imaging`."""
+    """A gain that follows the brightness of the image; see `camera.imaging`."""
 
     target: float = quantity(
         "mean light of the image that it aims at; 1 is white", "1", ge=0.01, le=0.9, default=0.18
@@ -28,7 +28,7 @@ class AutoExposure(ProfileModel):
 
 
 class Imaging(ProfileModel):
-    """What lies between the light and the numbers of a pixel; all of it is off by default."""
+    """Image formation from light to pixel values; every effect is off by default."""
 
     exposure_ms: float = quantity(
         "exposure time, in which motion blurs the image; the frame's stamp is its middle. No longer"

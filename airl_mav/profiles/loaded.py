@@ -1,4 +1,4 @@
-"""The aircraft as it takes off: the vehicle of the profile with its computer and its payload."""
+"""Take-off configuration: a profile's vehicle with computer and payload."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from airl_mav.profiles.vehicle import CORNERS, VehicleProfile, load_vehicle
 def loaded(
     vehicle: VehicleProfile, computer: ComputerProfile | None, payload: Payload
 ) -> VehicleProfile:
-    """Return a vehicle with what it carries; with nothing to carry, the vehicle itself.
+    """Return a vehicle with its load; without a load, the vehicle itself.
 
-    Computer and payload are points of mass. The computer is in the middle of the rotors. Ground
-    equipment does not fly along. Mass, centre of mass and inertia about it follow (parallel axes).
-    Collision body, drag and camera stay where they were against the centre of mass. Products of
-    inertia are left out. So is the height of the centre of mass below the rotors, on which no force
-    here acts. Raises FieldError if the rotors do not carry it with a margin, or not so far off
-    their middle.
+    Computer and payload are point masses. The computer is in the middle of the rotors. Ground
+    equipment adds no mass. Mass, centre of mass and inertia about it follow (parallel axes).
+    Collision body, drag and camera keep their position relative to the centre of mass. Products of
+    inertia and the height of the centre of mass below the rotors are ignored: no modelled force
+    depends on the height. Raises FieldError if the rotors do not carry the mass with a margin, or
+    the offset of the centre of mass.
     """
     board_kg = 0.0 if computer is None else computer.onboard_mass_kg
     load_kg = payload.mass_g / G_PER_KG
@@ -32,7 +32,7 @@ def loaded(
         if load_kg:
             raise FieldError("payload.mass_g", payload.mass_g, problem=problem)
         raise FieldError("computer", f"{G_PER_KG * board_kg:g} g", problem=problem)
-    # Mass [kg], and where it is: forward, right, down of the middle of the rotors [m].
+    # Mass [kg] and position: forward, right, down of the middle of the rotors [m].
     points = (
         (body.mass_kg, body.com_forward_m, body.com_right_m, 0.0),
         (board_kg, 0.0, 0.0, 0.0),
@@ -71,7 +71,7 @@ def equipped(
 
 
 def check_spread(vehicle: VehicleProfile, spread: Spread, table: str = "spread") -> None:
-    """Raise FieldError, naming the table, for a spread whose heaviest and weakest cannot hover."""
+    """Raise FieldError, naming the table, if the worst case of a spread cannot hover."""
     heaviest_kg = vehicle.body.mass_kg * (1.0 + spread.mass)
     if (problem := vehicle.too_heavy(heaviest_kg, 1.0 - spread.thrust)) is not None:
         name = "mass" if spread.mass > spread.thrust else "thrust"
@@ -82,10 +82,10 @@ def check_spread(vehicle: VehicleProfile, spread: Spread, table: str = "spread")
 def _check_balance(
     vehicle: VehicleProfile, payload: Payload, mass_kg: float, forward_m: float, right_m: float
 ) -> None:
-    """Raise FieldError for a centre of mass that the rotors cannot hover around.
+    """Raise FieldError if the rotors cannot hover around a centre of mass.
 
-    Without torque a rotor carries a quarter of the weight, more or less by how far the centre of
-    mass has moved towards it, in shares of the arms.
+    Without torque a rotor carries a quarter of the weight, plus or minus the displacement of the
+    centre of mass towards the rotor, in shares of the arms.
     """
     rotor = vehicle.rotor
     ahead, aside = forward_m / rotor.arm_forward_m, right_m / rotor.arm_right_m

@@ -1,4 +1,4 @@
-"""Find and read profile files; a wrong one gets one clear line."""
+"""Lookup and parsing of profile files, with one-line errors."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ _SINGULAR: dict[Kind, str] = {
 Model = TypeVar("Model", bound=BaseModel)
 
 MOST_BYTES = 1 << 20
-"""Size of a profile file; the largest that is shipped has 3 kB."""
+"""Maximum size of a profile file; the largest shipped one has 3 kB."""
 
 MOST_BASES = 10
-"""Profiles that lie below a profile, one under the other."""
+"""Maximum depth of a chain of base profiles."""
 
 
 @cache
 def profiles_dir() -> Path:
-    """Return the folder of the shipped profiles: inside the wheel, or of the source checkout."""
+    """Return the folder of the shipped profiles: inside the wheel, or in the source checkout."""
     package = Path(__file__).resolve().parent.parent
     shipped = package / "_profiles"
     return shipped if shipped.is_dir() else package.parent / "profiles"
@@ -60,9 +60,9 @@ def describe_profile(kind: Kind, name: str) -> str:
 def load_profile(kind: Kind, name: str, model: type[Model]) -> Model:
     """Load a shipped profile by name, or any file by path (recognised by its .toml suffix).
 
-    A file with `base = "NAME"` is that profile, or that path, with what the file says put over it.
-    Raises UsageError if the profile does not exist (lists those that do), is no TOML, or has a
-    field that is missing, unknown, of the wrong type or out of range.
+    A file with `base = "NAME"` overrides fields of that profile or path. Raises UsageError if the
+    profile does not exist (lists the existing ones), is not TOML, or has a field that is missing,
+    unknown, of the wrong type or out of range.
     """
     path = _path(kind, name)
     data = _read(kind, path, ())
@@ -76,12 +76,12 @@ def load_profile(kind: Kind, name: str, model: type[Model]) -> Model:
 
 
 def profile_digest(profile: BaseModel) -> str:
-    """Return the SHA-256 of a profile's content, hexadecimal: its name does not tell a change."""
+    """Return the SHA-256 of a profile's content, hexadecimal; detects changes under a name."""
     return hashlib.sha256(profile.model_dump_json(context=CONTENT).encode()).hexdigest()
 
 
 def _path(kind: Kind, name: str) -> Path:
-    """Return the file of a profile. Raises UsageError when there is none."""
+    """Return the file of a profile. Raises UsageError if missing."""
     path = Path(name) if name.endswith(".toml") else profiles_dir() / kind / f"{name}.toml"
     if not path.is_file():
         known = ", ".join(list_profiles(kind))
@@ -92,7 +92,7 @@ def _path(kind: Kind, name: str) -> Path:
 
 
 def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
-    """Return what a file says, on top of its bases. `above`: the files that led here."""
+    """Return the content of a file merged with its bases. `above`: the files that led here."""
     if path in above:
         raise UsageError(f"{above[0]}: base: leads back to {path}")
     if len(above) > MOST_BASES:
@@ -111,7 +111,7 @@ def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Return what a TOML file holds. Raises UsageError."""
+    """Return the content of a TOML file. Raises UsageError."""
     try:
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)
@@ -124,7 +124,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         too_deep = deeper_than(found, DEEPEST)
     except RecursionError:
         too_deep = True
-    except ValueError as error:  # Also numbers of thousands of digits, and no UTF-8.
+    except ValueError as error:  # Includes numbers of thousands of digits and invalid UTF-8.
         raise UsageError(f"{path}: not valid TOML: {error}") from None
     if too_deep:
         raise UsageError(f"{path}: nested too deep: accepted: {DEEPEST} levels")
@@ -132,7 +132,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def _anchor_files(data: dict[str, Any], path: Path) -> None:
-    """Make paths to meshes and images absolute: they are told from their profile's folder."""
+    """Make paths to meshes and images absolute: they are relative to the profile's folder."""
     look = data.get("appearance")
     for owners, field in (
         (data.get("assets"), "mesh"),
@@ -145,7 +145,7 @@ def _anchor_files(data: dict[str, Any], path: Path) -> None:
 
 
 def _check_file(named: CheckedFile, path: Path, table: str) -> None:
-    """Raise UsageError, in the name of the profile, where a file is gone or another one."""
+    """Raise UsageError, naming the profile, if a file is missing or its digest differs."""
     try:
         read_checked(named)
     except UsageError as error:
@@ -153,9 +153,9 @@ def _check_file(named: CheckedFile, path: Path, table: str) -> None:
 
 
 def _name_power_model(data: dict[str, Any], path: Path) -> None:
-    """Say of a nine-coefficient table `power` that it is one: before 0.3 there was no other.
+    """Add the `model` field to a nine-coefficient table `power`, optional before version 0.3.
 
-    Raises UsageError if it has a payload, which is no part of the power model any more.
+    Raises UsageError for a `payload_g`, which is no longer part of the power model.
     """
     power = data.get("power")
     if not isinstance(power, dict) or "b1_vxy" not in power or "model" in power:
@@ -168,13 +168,13 @@ def _name_power_model(data: dict[str, Any], path: Path) -> None:
 
 
 _WHICH = ("model", "name")
-"""The fields of a table that say which: of another model or algorithm, the fields are others."""
+"""Fields that select a table's schema: another model or algorithm has other fields."""
 
 
 def _overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """Return one table put over another, table by table.
+    """Return one table merged over another, table by table.
 
-    A table that is of another `model`, or has another `name`, replaces that of the base.
+    A table with another `model` or `name` replaces the base's table.
     """
     if any(above.get(which, below.get(which)) != below.get(which) for which in _WHICH):
         return above

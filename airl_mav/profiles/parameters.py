@@ -1,12 +1,12 @@
-"""PX4's parameters, from `parameters.csv`: names, types, defaults, ranges, and what is flown here.
+"""PX4 parameters from `parameters.csv`: names, types, defaults, ranges and limits in flight.
 
 The rehearsal's flight controller serves them over MAVLink; training reads its gains from them.
 Source of names, types, units, ranges and defaults: PX4 1.16, its parameter reference; the defaults
-are those of its SITL with airframe 10016, as measured. It leaves where the rotors are
-(CA_ROTORn_PX, _PY) to the airframe: here as in vehicles/quad.
+were measured in PX4's SITL with airframe 10016. PX4 leaves the rotor positions (CA_ROTORn_PX, _PY)
+to the airframe: here as in vehicles/quad.
 
-PX4 stores what it is given, also out of range. So does this flight controller; what flies is the
-stored value, held within bounds that the control code can fly (`ParameterSpec.flown`).
+PX4 also stores values out of range, as does this flight controller. The control code uses the
+stored value clamped to safe bounds (`ParameterSpec.flown`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import NamedTuple
 from airl_mav.core.errors import UsageError
 
 OFF = "0|"
-"""In front of a lower flown bound: zero is flown as well, it turns off what the parameter does."""
+"""Prefix of a lower flown bound: zero is also allowed and turns the function off."""
 
 
 class ParameterSpec(NamedTuple):
@@ -29,26 +29,26 @@ class ParameterSpec(NamedTuple):
     name: str
     default: int | float
     low: float
-    """PX4's range; -inf and inf where PX4 has no limit."""
+    """Range in PX4; -inf and inf = no limit."""
     high: float
     unit: str
     flown_low: float
-    """Bounds of what is flown. They may be wider than PX4's range, or narrower."""
+    """Bounds of the value in flight. They may be wider or narrower than PX4's range."""
     flown_high: float
     zero_is_off: bool
-    """Whether zero is flown although it lies below `flown_low`."""
+    """True if zero is used although it is below `flown_low`."""
     meaning: str
-    """What it does here; empty: it is stored and returned, and has no effect."""
+    """Effect in this simulator; empty = stored and returned without effect."""
 
     def flown(self, value: float) -> float:
-        """Return what is flown when `value` is stored."""
+        """Return the value used in flight for a stored `value`."""
         if value == 0.0 and self.zero_is_off:
             return 0.0
         return min(self.flown_high, max(self.flown_low, float(value)))
 
     @property
     def is_used(self) -> bool:
-        """Whether it has an effect here."""
+        """True if the parameter has an effect in this simulator."""
         return bool(self.meaning)
 
 
@@ -76,7 +76,7 @@ def _read(path: Path) -> tuple[ParameterSpec, ...]:
 
 
 SPECS = _read(Path(__file__).with_suffix(".csv"))
-"""In ascending order of the names."""
+"""Parameters in ascending order of the names."""
 
 SPEC_BY_NAME: Mapping[str, ParameterSpec] = {spec.name: spec for spec in SPECS}
 
@@ -103,7 +103,7 @@ def parameter_values(overrides: Mapping[str, int | float]) -> dict[str, int | fl
 
 
 def flown_values(overrides: Mapping[str, int | float]) -> dict[str, float]:
-    """Return what is flown of `parameter_values`; raises as it does."""
+    """Return the values in flight of `parameter_values`; raises as it does."""
     stored = parameter_values(overrides)
     flown = {name: SPEC_BY_NAME[name].flown(stored[name]) for name in overrides}
     return _FLOWN_DEFAULTS | flown

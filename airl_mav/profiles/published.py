@@ -1,4 +1,4 @@
-"""Published results of others, as they print them: shown beside our own figures."""
+"""Published results of other projects, shown beside our figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rooms in an arena's profile: walls inside of it, with doors between rooms."""
+"""Rooms in an arena's profile: interior walls with doors between rooms."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import Annotated
 from airl_mav.core.fields import Each, ProfileModel, quantity
 
 ROOM_WALL = "room-wall"
-"""What a wall between rooms, and what is above its doors, is called where it is hit."""
+"""Name of a wall between rooms, and of its lintels, in collision reports."""
 
 EDGE_M = 0.1
-"""Least wall on each side of a door [m]."""
+"""Minimum wall on each side of a door [m]."""
 
 HEADROOM_M = 0.5
-"""Least height of a door, and of a ceiling, above what flies at the flight altitude [m]."""
+"""Minimum height of a door, and of a ceiling, above the flight altitude [m]."""
 
 
 class Rooms(ProfileModel):
-    """Walls that divide the arena into rooms, each of which can be reached through doors.
+    """Walls that divide the arena into rooms; every room is reachable through doors.
 
-    The walls are as high as those of the arena. Ranges are [least, greatest], drawn uniformly.
+    The walls are as high as the arena's. Ranges are [minimum, maximum], drawn uniformly.
     """
 
     count: Annotated[tuple[int, int], Each(0, 100, ascending=True)] = quantity(
@@ -65,12 +65,12 @@ class Rooms(ProfileModel):
 
     @property
     def drawn(self) -> bool:
-        """Whether there are any."""
+        """True if the arena has rooms."""
         return self.count[1] > 0
 
     def slots(self, length_m: float) -> int:
-        """Return how many rooms of the least side fit in a row of a length [m]."""
-        # What fits exactly fits, whatever the last bit of the division.
+        """Return the number of rooms of the minimum side in a row of a length [m]."""
+        # The tolerance accepts exact fits in spite of rounding.
         return max(0, math.floor((length_m + self.thickness_m) / self._step_m + 1e-9))
 
     @property
@@ -81,7 +81,7 @@ class Rooms(ProfileModel):
 def check_rooms(
     rooms: Rooms, *, north_m: float, east_m: float, height_m: float, flight_altitude_m: float
 ) -> None:
-    """Raise ValueError for rooms that no arena of a size can have.
+    """Raise ValueError for rooms that do not fit an arena's size.
 
     The floor is `north_m` x `east_m`; a vehicle must fit through doors at the flight altitude.
     """
@@ -121,7 +121,7 @@ def _check_doors(rooms: Rooms, height_m: float, flight_altitude_m: float) -> Non
 
 
 def _most(rooms: Rooms, longer_m: float, shorter_m: float) -> tuple[int, str]:
-    """Return how many rooms always fit into a floor, and where."""
+    """Return the number of rooms that always fit into a floor, and their arrangement."""
     along = rooms.slots(longer_m)
     if rooms.corridor_width_m is None:
         return along * rooms.slots(shorter_m), "side by side"

@@ -1,4 +1,4 @@
-"""The sensors of a vehicle profile, but its camera: inertial, magnetic, pressure, GPS, and more."""
+"""Sensors of a vehicle profile except the camera: inertial, magnetic, pressure, GPS, and more."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ class Gps(ProfileModel):
 
 
 class Vision(ProfileModel):
-    """Visual-inertial odometry, or a motion capture system: the pose in a frame of its own.
+    """Visual-inertial odometry, or a motion capture system: the pose in a local frame.
 
-    The frame is the vehicle's at the start. What drifts does so with the way and with time, for
-    good. Nothing is seen a second time.
+    The frame is the vehicle's at the start. Drift accumulates with distance and with time. There is
+    no loop closure.
     """
 
     rate_hz: float = quantity("poses a second", "Hz", ge=5, le=250)
@@ -67,7 +67,7 @@ class Vision(ProfileModel):
 class Rangefinder(ProfileModel):
     """A distance sensor that looks straight down in body axes: one ray.
 
-    It tells a range outside its limits, and none at all, as invalid (a quality of 0).
+    Ranges outside the limits, and missing returns, are reported as invalid (a quality of 0).
     """
 
     rate_hz: float = quantity("ranges a second", "Hz", ge=1, le=100)
@@ -88,10 +88,10 @@ class Rangefinder(ProfileModel):
 
 
 class OpticalFlow(ProfileModel):
-    """A camera that looks straight down in body axes, and tells how the ground moves in its image.
+    """A camera that looks straight down in body axes and reports the optical flow of the ground.
 
-    Out of its limits, and where nothing is below, it tells a quality of 0. It has no gyro: the
-    flight controller takes its own.
+    Outside its limits, and without ground below, it reports a quality of 0. It has no gyro: the
+    flight controller uses its own gyro.
     """
 
     rate_hz: float = quantity("measurements a second", "Hz", ge=5, le=125)

@@ -8,23 +8,23 @@ from typing import Annotated
 from airl_mav.core.fields import Each, ProfileModel, quantity
 
 LEAST_RELIEF_M = 0.2
-"""Least height of the highest hill [m]."""
+"""Minimum height of the highest hill [m]."""
 
 MOST_CELLS = 16_384
-"""Cells of the ground's grid: two triangles each."""
+"""Maximum cells of the ground's grid: two triangles each."""
 
 FINEST_M = 0.25
-"""Least side of a cell [m]."""
+"""Minimum side of a cell [m]."""
 
 CELLS_A_HILL = 12
 """Cells across a hill, where the floor is small enough."""
 
 LEAST_CELLS_A_HILL = 5
-"""Cells across a hill, at least."""
+"""Minimum cells across a hill."""
 
 
 class Terrain(ProfileModel):
-    """Hills on the floor. The ground is nowhere below it."""
+    """Hills on the floor. The ground is never below the floor."""
 
     relief_m: Annotated[tuple[float, float], Each(0, 50, ascending=True)] = quantity(
         "height of the highest hill above the floor, drawn from [least, greatest]; [0, 0]: there"
@@ -43,7 +43,7 @@ class Terrain(ProfileModel):
 
     @property
     def drawn(self) -> bool:
-        """Whether there are hills."""
+        """True if the arena has hills."""
         return self.relief_m[1] > 0.0
 
     def pitch_m(self, north_m: float, east_m: float) -> float:
@@ -60,13 +60,13 @@ def check_terrain(
     height_m: float,
     start_m: tuple[float, float],
 ) -> None:
-    """Raise ValueError for hills that no arena of a size can have.
+    """Raise ValueError for hills that do not fit an arena's size.
 
-    The floor is `north_m` x `east_m`; `start_m` is from the south and from the west wall to the
-    start.
+    The floor is `north_m` x `east_m`; `start_m` is the start's distance from the south and the west
+    wall.
     """
     least, greatest = terrain.relief_m
-    # Nothing stands on a hill that is as high as the walls.
+    # Obstacles need some height between the highest hill and the top of the walls.
     if least < LEAST_RELIEF_M or greatest > height_m - LEAST_RELIEF_M:
         raise ValueError(
             f"terrain.relief_m = {list(terrain.relief_m)}: accepted: {LEAST_RELIEF_M:g} <= value <="
@@ -80,7 +80,7 @@ def check_terrain(
             f"of {north_m:g} x {east_m:g} m (the ground has {MOST_CELLS} cells at most, "
             f"{LEAST_CELLS_A_HILL} across a hill)"
         )
-    # Where hills have risen to their height: a scale beyond what is level.
+    # Hills reach their full height one scale beyond the level area.
     south, west = start_m
     farthest = math.hypot(max(south, north_m - south), max(west, east_m - west))
     most = farthest - terrain.scale_m

@@ -1,4 +1,4 @@
-"""The vehicle profile: airframe, rotors, drag, battery, power model, sensors, parameters."""
+"""Vehicle profile: airframe, rotors, drag, battery, power model, sensors, parameters."""
 
 from __future__ import annotations
 
@@ -41,20 +41,20 @@ class Body(ProfileModel):
 
 
 THRUST_MARGIN = 0.3
-"""Share of the weight that the rotors must give beyond it: less leaves nothing to steer with."""
+"""Minimum thrust margin as a share of the weight; a smaller margin leaves no control authority."""
 
 Corner = Literal["front right", "rear left", "front left", "rear right"]
-"""Where a motor sits. Front right and rear left turn counter-clockwise seen from above."""
+"""Position of a motor. Front right and rear left turn counter-clockwise seen from above."""
 
 CORNERS: tuple[Corner, ...] = ("front right", "rear left", "front left", "rear right")
-"""The project's order of motors, which is PX4's for a quad X."""
+"""Order of motors in this project, the same as PX4's for a quad X."""
 
 COUNTER_CLOCKWISE: tuple[Corner, ...] = ("front right", "rear left")
-"""Those whose rotor turns that way, seen from above."""
+"""Motors with a rotor that turns counter-clockwise, seen from above."""
 
 
 class Rotor(ProfileModel):
-    """One of four equal rotors in PX4 quad-X order: front right, rear left, front left, rear right.
+    """Four equal rotors in PX4 quad-X order: front right, rear left, front left, rear right.
 
     Front right and rear left turn counter-clockwise seen from above (PX4's CA_ROTORn_KM > 0).
     """
@@ -77,7 +77,7 @@ class Rotor(ProfileModel):
     speed_max_rad_s: float = quantity("rotor speed at full command", "rad/s", gt=10, le=20000)
 
     def px4_geometry(self) -> dict[str, float]:
-        """Return where the rotors sit and how they turn, as PX4's parameters CA_ROTORn_*."""
+        """Return rotor positions and directions as PX4's parameters CA_ROTORn_*."""
         values = {}
         for i, corner in enumerate(CORNERS):
             forward = 1.0 if corner.startswith("front") else -1.0
@@ -90,7 +90,7 @@ class Rotor(ProfileModel):
 
 
 class Drag(ProfileModel):
-    """Aerodynamic drag of the body, against the air: F = -(linear v + quadratic |v| v)."""
+    """Aerodynamic drag of the body relative to the air: F = -(linear v + quadratic |v| v)."""
 
     linear_n_s_m: float = quantity("linear (rotor) drag", "N/(m/s)", ge=0, le=10)
     quadratic_n_s2_m2: float = quantity("quadratic (body) drag", "N/(m/s)²", ge=0, le=10)
@@ -107,17 +107,17 @@ class Battery(ProfileModel):
     resistance_ohm: float = quantity("internal resistance of the pack", "ohm", ge=0, le=1)
 
     def energy_j(self, charge: float) -> float:
-        """Return what a pack at a state of charge 0..1 holds [J].
+        """Return the energy of a pack at a state of charge 0..1 [J].
 
-        Charge times the mean open-circuit voltage on the way to empty. Its own resistance takes a
-        part of it: the current times the resistance over the voltage, 1 to 2 % for a quad in hover.
+        Charge times the mean open-circuit voltage until empty. The internal resistance dissipates a
+        part: the current times the resistance over the voltage, 1 to 2 % for a quad in hover.
         """
         mean_v = self.cell_empty_v + 0.5 * charge * (self.cell_full_v - self.cell_empty_v)
         return charge * self.capacity_mah * C_PER_MAH * self.cells * mean_v
 
 
 class Momentum(ProfileModel):
-    """Power by momentum theory, from the rotor's own data; `vehicle.power` has the formula."""
+    """Power by momentum theory, from rotor data; `vehicle.power` has the formula."""
 
     model: Literal["momentum"] = Field(description="momentum theory")
     propeller_diameter_m: float = quantity("diameter of a propeller", "m", gt=0.01, le=5)
@@ -140,7 +140,7 @@ class Regression(ProfileModel):
 
     P = b1 |vxy| + b2 |axy| + b3 |vxy||axy| + b4 |vz| + b5 |az| + b6 |vz||az| + b7 m + b8 vxy.w + b9
 
-    It is of the aircraft that it was fitted to: neither mass nor rotors of another change it. The
+    The model is valid for the fitted aircraft only: it is independent of mass and rotors. The
     bandwidth of the accelerations that Tseng et al. fitted is not published.
     """
 
@@ -160,10 +160,10 @@ class Regression(ProfileModel):
 
 
 class Estimation(ProfileModel):
-    """The flight controller's estimation error in flight, as environments imitate it.
+    """Estimation error of the flight controller in flight, as modelled by environments.
 
-    Each axis is a first-order Gauss-Markov process: standard deviation and correlation time.
-    Fitted by `scripts/fit-estimation-error`, which prints this table.
+    Each axis is a first-order Gauss-Markov process: standard deviation and correlation time. Fitted
+    by `scripts/fit-estimation-error`, which prints this table.
     """
 
     position_horizontal_m: float = quantity("sd of north and east", "m", ge=0, le=100)
@@ -181,10 +181,10 @@ class Estimation(ProfileModel):
 
 
 class Response(ProfileModel):
-    """How the vehicle answers velocity setpoints, seen from outside: a first-order model.
+    """First-order model of the vehicle's response to velocity setpoints.
 
-    Identified from flown steps by `scripts/fit-response`, which prints this table. Compensation of
-    decision latency predicts the vehicle's motion with it.
+    Identified from flown steps by `scripts/fit-response`, which prints this table. Latency
+    compensation uses it to predict the vehicle's motion.
     """
 
     dead_time_s: float = quantity(
@@ -197,16 +197,16 @@ class Response(ProfileModel):
     )
 
 
-# Strict, or true and "0.5" would pass; a whole number passes for a float.
+# Strict, or true and "0.5" would pass; an integer passes for a float.
 ParameterTable = dict[str, Annotated[float, Strict()]]
 
 
-# Whole numbers stay whole: real firmware has parameters of both types.
+# Integers stay integers: real firmware has parameters of both types.
 TypedParameterTable = dict[str, Annotated[int, Strict()] | Annotated[float, Strict()]]
 
 
 class RealFirmware(ProfileModel):
-    """What real firmware must be set to, to fly this vehicle."""
+    """Settings required in real firmware to fly this vehicle."""
 
     motors: tuple[Corner, Corner, Corner, Corner] = Field(
         description="which motor hangs on each of the firmware's outputs 1 to 4"
@@ -224,20 +224,20 @@ class RealFirmware(ProfileModel):
 
 
 class Px4(RealFirmware):
-    """What PX4 needs; rotor geometry and thrust curve follow from the vehicle itself."""
+    """Settings for PX4; rotor geometry and thrust curve follow from the vehicle."""
 
     airframe: int = quantity("SYS_AUTOSTART, airframe of PX4's simulator", "1", ge=1, le=99_999)
 
 
 class ArduPilot(RealFirmware):
-    """What ArduCopter needs."""
+    """Settings for ArduCopter."""
 
     frame_class: int = quantity("FRAME_CLASS, 1 = quad", "1", ge=1, le=1)
     frame_type: int = quantity("FRAME_TYPE, 1 = X", "1", ge=0, le=20)
 
 
 class VehicleProfile(ProfileModel):
-    """Everything about the aircraft that is not its companion computer."""
+    """Complete description of the aircraft except the companion computer."""
 
     description: str = Field(description="one line for people")
     source: str = Field(description="where the numbers come from")
@@ -284,7 +284,7 @@ class VehicleProfile(ProfileModel):
         return self
 
     def too_heavy(self, mass_kg: float, thrust_share: float = 1.0) -> str | None:
-        """Return why the rotors, at a share of their thrust, do not carry a mass with a margin."""
+        """Return why rotors at a share of thrust cannot carry a mass with a margin, or None."""
         needed_n = (1.0 + THRUST_MARGIN) * mass_kg * GRAVITY_M_S2
         thrust_n = thrust_share * self.thrust_n
         if thrust_n >= needed_n:
@@ -297,26 +297,26 @@ class VehicleProfile(ProfileModel):
 
     @property
     def compensable(self) -> bool:
-        """Whether what its camera sees can be carried forward: its response is known, and depth."""
+        """True if latency compensation is supported: known response and a depth camera."""
         return self.response is not None and self.camera.kind == "depth"
 
     @property
     def uses_gps(self) -> bool:
-        """Whether its flight controller knows by GPS where on the globe it is."""
+        """True if the flight controller gets its global position from GPS."""
         return self.sensors.gps.fitted and self.parameters.get("EKF2_GPS_CTRL", 1) != 0
 
     @property
     def told_origin(self) -> Geodetic | None:
-        """Where a rehearsal tells it that it is, as it has no GPS; None = it knows by itself."""
+        """Global origin that a rehearsal sets for a vehicle without GPS; None = GPS provides it."""
         return None if self.uses_gps else HOME
 
     @property
     def thrust_n(self) -> float:
-        """Greatest thrust of all rotors [N]: more than the weight, by `THRUST_MARGIN`."""
+        """Maximum thrust of all rotors [N]; at least `THRUST_MARGIN` above the weight."""
         return len(CORNERS) * self.rotor.thrust_max_n
 
     def autopilot_parameters(self) -> dict[str, float]:
-        """Return the built-in autopilot's parameters: its rotors' places, and `parameters`."""
+        """Return the built-in autopilot's parameters: its rotor positions, and `parameters`."""
         known = {spec.name for spec in SPECS}
         places = {n: v for n, v in self.rotor.px4_geometry().items() if n in known}
         return {**places, **self.parameters}

@@ -1,1 +1,1 @@
-"""Profiling: how long this computer takes for a policy's decisions, as a computer profile."""
+"""Profiling: this computer's decision latency for a policy, as a computer profile."""

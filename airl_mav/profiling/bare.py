@@ -22,7 +22,7 @@ from airl_mav.profiling.policy_under_test import PolicyUnderTest
 from airl_mav.profiling.request import ProfileRequest
 
 OBSERVATIONS = 64
-"""Different observations, in turn, so that they do not stay in the caches."""
+"""Number of different observations, used in turn to avoid cache hits."""
 
 GOAL = 20.0, 5.0
 """North, east [m]."""
@@ -31,11 +31,11 @@ OBSERVATION_STREAM, ACTION_STREAM = 11, 12
 """Second words of the seed."""
 
 COLD_DECISIONS = 20
-"""Decisions by which a flight's length is planned."""
+"""Number of decisions used to plan a flight's duration."""
 
 
 class BareLoop:
-    """Decisions without a flight: what the pilot does between its two stamps of t2."""
+    """Decisions without a flight: the pilot's work between its two stamps of t2."""
 
     def __init__(self, request: ProfileRequest, policy: PolicyUnderTest) -> None:
         """Open the network. Raises UsageError if it cannot be run."""
@@ -45,14 +45,14 @@ class BareLoop:
             policy.folder, policy.card, request.runtime, request.threads, trust=request.trust
         )
         self.load_us = self.clock.time_us() - start_us
-        """Opening the network [µs]."""
+        """Load time of the network [µs]."""
         rng = np.random.default_rng((request.seed, ACTION_STREAM))
         self._policy = LearnedPolicy(policy.card, network, rng=rng)
         self._max_speed_m_s = policy.card.actions.max_speed_m_s
         self._observations = itertools.cycle(random_observations(request, policy))
 
     def decide(self) -> tuple[int, int]:
-        """Make a decision; return when it began and when it ended [µs]."""
+        """Make a decision; return its start and end [µs]."""
         frame, state = next(self._observations)
         start_us = self.clock.time_us()
         action = self._policy.act(encode(frame, state, GOAL))
@@ -88,7 +88,7 @@ def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recor
 
 
 def cold_start(request: ProfileRequest, policy: PolicyUnderTest) -> tuple[int, int, int]:
-    """Return how long opening, the first and a typical later decision take [µs]."""
+    """Return the durations of loading, the first and a typical later decision [µs]."""
     loop = BareLoop(request, policy)
     stamps = [loop.decide() for _ in range(COLD_DECISIONS)]
     first_us, *later_us = (end_us - start_us for start_us, end_us in stamps)
@@ -98,7 +98,7 @@ def cold_start(request: ProfileRequest, policy: PolicyUnderTest) -> tuple[int, i
 def random_observations(
     request: ProfileRequest, policy: PolicyUnderTest
 ) -> list[tuple[Frame, Kinematics]]:
-    """Return images of noise, as large as the camera's, and states of a level vehicle."""
+    """Return noise images, as large as the camera's, and states of a level vehicle."""
     spec, lens = policy.card.observation, policy.camera
     if camera_mismatch(spec, lens) is not None:
         lens = _lens_for(spec)
@@ -124,7 +124,7 @@ def random_observations(
 
 
 def _lens_for(seen: ObservationSpec | SeenCamera) -> Intrinsics:
-    """Return a camera whose images are as large as the network's."""
+    """Return a camera whose images match the network's input size."""
     fov = math.radians(seen.horizontal_fov_deg)
     size = seen.width_px, seen.camera_rows
     return Intrinsics.from_fov(*size, fov, seen.projection, seen.kind, seen.distortion)

@@ -1,4 +1,4 @@
-"""Level hil: the companion on this computer, against a simulator that runs elsewhere."""
+"""Level hil: the companion on this computer, against a simulator on another one."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ GOAL = 9_000.0, 0.0
 """North, east of the start [m]: out of reach."""
 
 GROUND_EXCHANGES = 100
-"""TIMESYNC exchanges before the flight, and as many after it."""
+"""Number of TIMESYNC exchanges before the flight, and again after it."""
 
 GROUND_INTERVAL_S = 0.005
-"""From one of them to the next [s]: out of step with the simulator's tick soon enough."""
+"""Interval between them [s], out of step with the simulator's tick."""
 
 FLIGHT_INTERVAL_S = 0.1
-"""From one exchange in flight to the next [s]. Each takes 0.3 ms of processor time on a desktop
-core, and one or two decisions of a hundred coincide with one."""
+"""Interval between exchanges in flight [s]. Each takes 0.3 ms of processor time on a desktop core,
+and one or two decisions of a hundred coincide with one."""
 
 
 @dataclass(frozen=True)
 class TimedMission:
-    """A mission, and the exchanges with the simulator's clock."""
+    """Mission, and the exchanges with the simulator's clock."""
 
     result: MissionResult
     before: Exchanges
@@ -56,7 +56,7 @@ class TimedMission:
 
 
 class DecisionLimit:
-    """A policy that ends the flight after so many decisions. Implements `actions.Policy`."""
+    """Policy that ends the flight after a number of decisions. Implements `actions.Policy`."""
 
     def __init__(self, policy: Policy, limit: int, stop: threading.Event, bar: Bar) -> None:
         self._policy, self._limit = policy, limit
@@ -65,7 +65,7 @@ class DecisionLimit:
 
     def act(self, observation: Observation) -> AnyAction:
         """Return the policy's action."""
-        # Stopped before the decision, not after: the pilot drops the one that it is stopped in.
+        # Stopped before the decision, because the pilot drops a decision interrupted by a stop.
         if self._count == self._limit:
             self._stop.set()
         else:
@@ -163,7 +163,7 @@ def _fly(
 def relate_stamps(mission: TimedMission, warm_up: int) -> tuple[Stamps, str, tuple[str, ...]]:
     """Convert the frames' exposure to this computer's clock, if the clocks can be related.
 
-    Return columns after the warm-up, with `exchange_*` columns of one row per exchange in flight;
+    Returns columns after the warm-up, with `exchange_*` columns of one row per exchange in flight;
     the stamp from which command age counts; remarks. `capture_us` is the exposure by this
     computer's clock, within `capture_uncertainty_us`, `capture_simulator_us` by the simulator's.
     """
@@ -181,7 +181,7 @@ def relate_stamps(mission: TimedMission, warm_up: int) -> tuple[Stamps, str, tup
     try:
         relation = relate(mission.before, during, mission.after)
         captured_us = np.rint(relation.own_time(exposed_us)).astype(np.int64)
-        # One more for rounding.
+        # Plus one for rounding.
         within_us = np.ceil(relation.uncertainty_at(captured_us)).astype(np.int64) + 1
         if (early := int(np.count_nonzero(captured_us - within_us > stamps["decoded_us"]))) > 0:
             raise ClockError(
@@ -227,15 +227,15 @@ AUTOPILOT_COMPONENT = 1
 """MAV_COMP_ID_AUTOPILOT1: other components of the vehicle may answer too, by other clocks."""
 
 LAST_ANSWER_S = 0.2
-"""Wait for the last answer of a series [s]."""
+"""Wait time for the last answer of a series [s]."""
 
 
 class TimesyncLink(MavsdkLink):
-    """A link that also exchanges TIMESYNC with the flight controller."""
+    """Link that also exchanges TIMESYNC with the flight controller."""
 
     _system_id: int
     _pending: set[int]
-    """Times at which the unanswered requests were sent [µs]."""
+    """Send times of unanswered requests [µs]."""
     _answered: list[tuple[int, int, int]]
 
     def connect(self, timeout_s: float, stop: threading.Event | None = None) -> None:
@@ -257,12 +257,12 @@ class TimesyncLink(MavsdkLink):
         self._clock.sleep_until(self._clock.time_us() + int(LAST_ANSWER_S * US_PER_S), stop)
 
     def exchanging(self, interval_s: float) -> AbstractContextManager[None]:
-        """Send requests at an interval [s] from a thread, for as long as the context lasts."""
+        """Return a context that sends requests at an interval [s] from a thread."""
         return every(int(interval_s * US_PER_S), self._ask, self._clock, "timesync")
 
     def take_exchanges(self) -> Exchanges:
         """Return the answered requests since the last call, in the order of the answers."""
-        # Another answer may arrive meanwhile: it stays.
+        # Keeps answers that arrive during the copy.
         taken = self._answered[:]
         del self._answered[: len(taken)]
         columns = np.array(taken, np.int64).reshape(-1, 3)
@@ -276,14 +276,14 @@ class TimesyncLink(MavsdkLink):
             self._pending.discard(sent_us)
 
     def _hear(self, message: Any, _: object) -> None:
-        """Take an answer; called from a thread of MAVSDK's."""
+        """Process an answer; called from a MAVSDK thread."""
         received_us = self._clock.time_us()
         sender = message.system_id, message.component_id
         if sender != (self._system_id, AUTOPILOT_COMPONENT):
             return
         fields = json.loads(message.fields_json)
         remote_ns, sent_us = fields["tc1"], fields["ts1"] // NS_PER_US
-        # Requests of the flight controller have no tc1; a second answer is of no use.
+        # Requests of the flight controller have no tc1; ignore duplicate answers.
         if remote_ns == 0 or sent_us not in self._pending:
             return
         self._pending.discard(sent_us)

@@ -1,4 +1,4 @@
-"""What was measured: the stamps of every decision, a computer profile, and their files."""
+"""Measurement: stamps of every decision, a computer profile, and their files."""
 
 from __future__ import annotations
 
@@ -35,38 +35,38 @@ from airl_mav.profiling.request import ProfileRequest
 from airl_mav.profiling.soak import Soak
 
 SCHEMA = 1
-"""Version of the facts beside the samples."""
+"""Version of the facts file."""
 
 ROUND_TRIP = "mavlink_round_trip"
 """Key of the TIMESYNC exchanges in flight."""
 
 PAGE_NEEDS = frozenset({"jinja2", "matplotlib"})
-"""What draws the page of a soak; the [sim] extra has it."""
+"""Packages that draw the page of a soak, included in the [sim] extra."""
 
 T1_UNCERTAINTY = "t1_uncertainty"
-"""Key of the greatest error of each decision's t1."""
+"""Key of the maximum error of each decision's t1."""
 
 Stamps = dict[str, NDArray[np.int64]]
 
 
 class ProfilingError(RuntimeError):
-    """The measurement broke off: a process or the link was lost, or the flight ended too early."""
+    """The measurement failed: a process or the link was lost, or the flight ended too early."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """The stamps of the decisions after the warm-up, and how they were taken."""
+    """Stamps of the decisions after the warm-up, and their method."""
 
     flights: tuple[Stamps, ...]
-    """Stamps [µs] by column, one row a decision, of each flight; at level bare of the one run."""
+    """Stamps [µs] by column, one row per decision, of each flight; at level bare of the one run."""
     exposure: str | None
-    """Stamp from which the age of a command counts; None: no command was flown."""
+    """Stamp from which command age counts; None: no command was flown."""
     load_us: int
-    """Opening the network [µs]."""
+    """Load time of the network [µs]."""
     first_us: int
-    """The very first decision [µs]."""
+    """Duration of the very first decision [µs]."""
     remarks: tuple[str, ...] = ()
-    """How it was measured, and what was not."""
+    """Remarks on the method and on missing figures."""
 
     @cached_property
     def stages(self) -> dict[str, Samples]:
@@ -81,7 +81,7 @@ class Recording:
 
     @cached_property
     def columns(self) -> Stamps:
-        """The stamps of all flights, one after the other."""
+        """Stamps of all flights, concatenated."""
         return {
             name: np.concatenate([flight[name] for flight in self.flights])
             for name in self.flights[0]
@@ -89,12 +89,12 @@ class Recording:
 
     @property
     def flight_numbers(self) -> NDArray[np.int64]:
-        """Number of the flight of each decision."""
+        """Flight number of each decision."""
         rows = [len(flight["infer_start_us"]) for flight in self.flights]
         return np.repeat(np.arange(len(rows), dtype=np.int64), rows)
 
     def command_ages(self, hold_s: float) -> CommandAges:
-        """Return the age of the flown command, with a hold of `hold_s` [s] if not flown."""
+        """Return the ages of the flown command, with a hold of `hold_s` [s] if not flown."""
         if self.exposure is None:
             return ages_in_closed_loop(self.stages["t2"], round(hold_s * US_PER_S))
         columns = self.columns
@@ -103,24 +103,24 @@ class Recording:
 
 @dataclass(frozen=True)
 class DrawnPower:
-    """What the computer draws, as far as its own sensors tell."""
+    """Power consumption of the computer, from its built-in sensors."""
 
     source: str
-    """What told it, or why nothing did."""
+    """Power source, or the reason why power is not available."""
     idle_w: float | None = None
-    """Mean before anything was measured [W]."""
+    """Mean before the measurement [W]."""
     busy_w: float | None = None
-    """Mean while the decisions were measured [W]."""
+    """Mean during the decisions [W]."""
 
     def __str__(self) -> str:
-        """Return what was measured, in words; why nothing was."""
+        """Return the measured power as text, or the reason why it is missing."""
         idle, busy = (f"{w:.2f} W" for w in (self.idle_w or 0.0, self.busy_w or 0.0))
         return self.source if self.busy_w is None else f"{idle} idle, {busy} busy, {self.source}"
 
 
 @dataclass(frozen=True)
 class ComputerMeasurement:
-    """How long a computer takes for a policy's decisions."""
+    """Measured decision latency of a computer for a policy."""
 
     request: ProfileRequest
     card: PolicyCard
@@ -129,36 +129,35 @@ class ComputerMeasurement:
     workload: str
     """Name of the workload in the profile."""
     profile: ComputerProfile
-    """The computer with this workload, whose samples are inline, and those that were measured
-    before."""
+    """Computer profile with this workload, whose samples are inline, and earlier workloads."""
     machine: dict[str, Any]
     """Processor, cores, memory, operating system and Python."""
     before: MachineState
     after: MachineState
     power: DrawnPower
     soak: Soak | None = None
-    """What happened in the soak, if one was asked for."""
+    """Result of the soak, if requested."""
     files: tuple[Path, ...] = ()
-    """Profile, samples, stamps and facts, if they were written, and those of the soak."""
+    """Paths of written files: profile, samples, stamps, facts and soak."""
 
     @property
     def stages(self) -> dict[str, Samples]:
-        """Durations [µs] of each stage, by its key; empty where it was not measured."""
+        """Durations [µs] of each stage, by its key; empty without a measurement."""
         return self.recording.stages
 
     @property
     def t2_us(self) -> Samples:
-        """Durations of the decisions [µs], in their order."""
+        """Durations of the decisions [µs], in order."""
         return self.stages["t2"]
 
     @property
     def network(self) -> Network:
-        """The network that was timed, and what ran it."""
+        """Timed network and its runtime."""
         return self.profile.workloads[self.workload].network
 
 
 def save(measured: ComputerMeasurement, path: Path) -> tuple[Path, ...]:
-    """Write samples, stamps, facts and finally the profile at `path`; return all four paths."""
+    """Write samples, stamps, facts and finally the profile at `path`; return all paths."""
     recording, profile = measured.recording, measured.profile
     stem = f"{measured.computer}.{measured.workload}"
     samples, arrays, facts = (path.with_name(stem + end) for end in (".txt", ".npz", ".json"))
@@ -181,7 +180,7 @@ def save(measured: ComputerMeasurement, path: Path) -> tuple[Path, ...]:
 
 
 def share(measured: ComputerMeasurement, path: Path) -> Path:
-    """Write computer, workload, samples and provenance as one file that other machines can fly."""
+    """Write computer, workload, samples and provenance as one portable file."""
     workload = measured.profile.workloads[measured.workload]
     samples_ms = tuple(round(each, 3) for each in workload.latency.samples_ms or ())
     machine, soaked = measured.machine, measured.soak
@@ -205,7 +204,7 @@ def share(measured: ComputerMeasurement, path: Path) -> Path:
 
 
 def _save_soak(measured: ComputerMeasurement, soaked: Soak, series: Path) -> tuple[Path, ...]:
-    """Write the series of a soak and, where it can be drawn, its page; return both."""
+    """Write the series of a soak and, with the packages installed, its page; return both."""
     save_arrays(series, soaked.series)
     if not PAGE_NEEDS.issubset(name for name in PAGE_NEEDS if find_spec(name)):
         return (series,)

@@ -1,4 +1,4 @@
-"""The policy whose decisions are timed: a known one, or a random network."""
+"""Policy whose decisions are timed: an existing one, or a random network."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ RUNTIME_PACKAGES = {"onnx": ("ONNX Runtime", "onnxruntime"), "torch": ("torch", 
 
 @dataclass(frozen=True)
 class PolicyUnderTest:
-    """A learned policy, and a vehicle whose camera fits it."""
+    """Learned policy, and a vehicle whose camera fits the policy."""
 
     name: str
-    """Name of a shipped policy, or path of its folder: what `Scenario.policy` takes."""
+    """Name of a built-in policy, or path of its folder, as in `Scenario.policy`."""
     folder: Path
-    """Where policy.onnx and card.json lie."""
+    """Folder of policy.onnx and card.json."""
     card: PolicyCard
     network: Network
-    """The network, as a computer profile describes it."""
+    """Network description for the computer profile."""
     vehicle: str
     """Name or path of the vehicle profile."""
     camera: Intrinsics
@@ -49,7 +49,7 @@ class PolicyUnderTest:
 
 @contextmanager
 def open_policy(request: ProfileRequest) -> Iterator[PolicyUnderTest]:
-    """Open the policy under test; a random network's files last as long as the context."""
+    """Open the policy under test; a random network's files exist only in the context."""
     if request.policy is not None and request.network is not None:
         raise FieldError("network", request.network, "either a policy or a network, not both")
     names = [request.vehicle] if request.vehicle else sorted(list_profiles("vehicles"), key=len)
@@ -86,7 +86,7 @@ def open_policy(request: ProfileRequest) -> Iterator[PolicyUnderTest]:
 
 
 def _vehicle_for(card: PolicyCard, vehicles: dict[str, VehicleProfile]) -> str:
-    """Return the first vehicle whose camera fits a policy. Raises FieldError if none does."""
+    """Return the first vehicle whose camera fits a policy. Raises FieldError without one."""
     for name, vehicle in vehicles.items():
         reason = vehicle_mismatch(card, vehicle.camera, vehicle.cameras)
         if reason is None:
@@ -123,7 +123,7 @@ def _write_random_network(
         except FieldError as error:
             raise FieldError("image", request.image, problem=error.line(sign=" = ")) from None
         tried.append((vehicle, spec, camera_mismatch(spec, Intrinsics.of(camera))))
-    # At level bare the observations are made up: any camera will do.
+    # At level bare the observations are synthetic: any camera will do.
     vehicle, spec, mismatch = next((each for each in tried if each[2] is None), tried[0])
     if mismatch is not None and request.level != "bare":
         problem = f"vehicle {vehicle}: {mismatch} (or level bare)"

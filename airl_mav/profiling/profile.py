@@ -1,4 +1,4 @@
-"""How long does this computer take for a policy's decisions?"""
+"""Measurement of this computer's decision latency for a policy."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ BUSY_SHARE = 0.25
 """Load average over one minute, per usable core, above which a machine is not idle."""
 
 IDLE_US = 3 * US_PER_S
-"""How long the power of a machine that only waits is looked at."""
+"""Duration of the idle power measurement."""
 
 WATTS_REMARK = "watts: "
-"""How the source of a profile begins to say that nobody gave the watts."""
+"""Prefix of the profile's source text for watts without a user value."""
 
 UNKNOWN = {"watts": f"{WATTS_REMARK}not measured", "price_usd": "price: not known"}
-"""What the source of a profile says of a field that was not given."""
+"""Source texts for missing fields."""
 
 
 def profile(
@@ -73,7 +73,7 @@ def profile(
     machine = describe_machine()
     computer = request.on or _file_name(str(machine["cpu"]))
     cpu = f"{machine['cores']} x {machine['cpu']}"
-    # Before anything is measured: a file that must not be changed is better found now.
+    # Before measuring: an unchangeable file is reported early.
     path = None if out is None else out / f"{computer}.toml"
     held = None if path is None else existing_profile(path, cpu)
     with open_policy(request) as policy:
@@ -101,7 +101,7 @@ def profile(
         raise measurement.ProfilingError(
             f"a decision took {longest_ms:.0f} ms; accepted: {LONGEST_MS:g} ms"
         )
-    # A clock of whole µs may give 0 for what is faster.
+    # A clock of whole µs may return 0 for shorter durations.
     samples_ms = (np.maximum(t2_us, 1) / US_PER_MS).tolist()
     workload = Workload(
         network=network,
@@ -130,7 +130,7 @@ def profile(
 
 
 def _measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> measurement.Recording:
-    """Measure at the level that was asked for. Imported late: only sitl needs the simulator."""
+    """Measure at the requested level. Imports late: only sitl needs the simulator."""
     if request.level == "bare":
         from airl_mav.profiling.bare import measure
     elif request.level == "hil":
@@ -141,12 +141,12 @@ def _measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> meas
         return measure(request, policy, bar)
     except measurement.ProfilingError:
         raise
-    except RuntimeError as error:  # of what runs the network
+    except RuntimeError as error:  # Raised by the runtime
         raise measurement.ProfilingError(str(error)) from error
 
 
 def _idle_power(source: PowerSource) -> float | None:
-    """Return the mean power of a machine that only waits [W]."""
+    """Return the mean power of an idle machine [W]."""
     clock = WallClock()
     meter = PowerMeter(source, clock)
     clock.sleep_until(IDLE_US)
@@ -159,9 +159,9 @@ def _soak(
     source: PowerSource | None,
     progress: Progress,
 ) -> Soak:
-    """Go on deciding, without a pause, for as long as was asked for; Ctrl-C ends it early."""
+    """Repeat decisions without a pause for the requested time; Ctrl-C ends the soak early."""
     seconds = request.soak_s
-    assert seconds is not None  # noqa: S101 (it was asked for)
+    assert seconds is not None  # noqa: S101 (the soak was requested)
     loop = BareLoop(request, policy)
     meter = None if source is None else PowerMeter(source, loop.clock)
 
@@ -189,7 +189,7 @@ def _soak(
 
 
 def busy_remark(before: MachineState, cores: int) -> str | None:
-    """Return a warning if other programs used the processor at the start, None if not."""
+    """Return a warning if other programs used the processor at the start, else None."""
     if before.load is None or before.load[0] <= BUSY_SHARE * cores:
         return None
     return (
@@ -206,9 +206,9 @@ def _computer(
     date: str,
     power: measurement.DrawnPower,
 ) -> ComputerProfile:
-    """Return the computer as its file has it, with the request's watts and price.
+    """Return the computer's profile with the request's watts and price.
 
-    Otherwise the watts are measured, except at level sitl, where the simulator draws power too.
+    Missing watts are measured, except at level sitl, where the simulator draws power too.
     """
     given = {"watts": request.watts, "price_usd": request.price_usd}
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
@@ -224,7 +224,7 @@ def _computer(
             source="; ".join((f"airl profile, {date}", *said.values())),
             **{"watts": 0.0, "price_usd": 0.0, **changes},
         )
-    # What was said of a figure goes with the figure.
+    # The source text of a figure is replaced with the figure.
     replaced = tuple(UNKNOWN[name].partition(" ")[0] for name in changes)
     parts = [part for part in held.source.split("; ") if not part.startswith(replaced)]
     parts += [said[name] for name in changes if name in said]
@@ -239,6 +239,6 @@ def _workload_name(request: ProfileRequest, policy: str) -> str:
 
 
 def _file_name(cpu: str) -> str:
-    """Return a processor's name as the name of a file."""
+    """Return a processor's name as a file name."""
     plain = re.sub(r"\((?:r|tm|c)\)", "", cpu.lower())
     return re.sub(r"[^a-z0-9]+", "-", plain).strip("-")[:48].strip("-") or "computer"

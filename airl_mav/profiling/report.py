@@ -1,4 +1,4 @@
-"""The report of a measurement on the terminal: machine, stages, age of the command, verdict."""
+"""Terminal report of a measurement: machine, stages, command age, verdict."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ PAPER_COMPUTER, PAPER_WORKLOAD = "ras-pi-4", "template-5x32"
 """The paper's gap: its onboard computer with its smallest policy."""
 
 NO_GAP, SMALL_GAP = 0.01, 0.1
-"""t2 as a share of the decision period below which it adds no gap, or a small one."""
+"""Maximum t2 as a share of the decision period for no gap, and for a small gap."""
 
 
 def print_measurement(measured: ComputerMeasurement, console: Console) -> None:
-    """Print everything, and what was written."""
+    """Print all results and the written files."""
     print_table(_machine_table(measured), console, wrap=True)
     print_table(_stage_table(measured), console)
     print_table(_time_table(measured), console)
@@ -145,7 +145,7 @@ def _percentile(value_us: float | None, n: int) -> str:
 
 
 def _ms(value_us: float | None) -> str:
-    """Return a time in ms with three figures or more, "-" for none."""
+    """Return a time in ms with three figures or more, "-" for None."""
     if value_us is None:
         return "-"
     value = value_us / US_PER_MS
@@ -153,10 +153,10 @@ def _ms(value_us: float | None) -> str:
 
 
 def correlation_line(t2_us: Samples) -> str:
-    """Return whether slow decisions come in runs, as a sentence."""
+    """Return a sentence on the autocorrelation of decision times."""
     lags = [lag for lag in LAGS if lag < t2_us.size]
     rho = autocorrelation(t2_us, lags[-1])
-    # The autocorrelation of independent samples keeps below this in 95 %.
+    # The autocorrelation of independent samples stays below this in 95 %.
     bound, time = 1.96 / np.sqrt(t2_us.size), integrated_time(t2_us)
     values = ", ".join(f"{rho[lag]:+.2f} at {lag}" for lag in lags)
     runs = float(np.abs(rho[1:4]).max()) > bound
@@ -172,7 +172,7 @@ def correlation_line(t2_us: Samples) -> str:
 
 
 def verdict(card: PolicyCard, t2_us: Samples) -> str:
-    """Return whether this computer adds a gap for a policy, as a sentence."""
+    """Return a sentence on the gap that this computer adds for a policy."""
     s = summarize(t2_us)
     period_us = card.hold_s * US_PER_S
     high, name = (s.max, "greatest") if s.p99 is None else (s.p99, "p99")

@@ -1,4 +1,4 @@
-"""What `profile` can be asked for: meaning, unit, range and default of each field."""
+"""Request of `profile`: meaning, unit, range and default of each field."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from airl_mav.scenario.stand_alone import CompanionAddresses
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 
 FLOWN_SPEED_M_S = 0.1
-"""Speed limit in flight: far below what a goal or a wall could be reached with."""
+"""Speed limit in flight: too slow to reach a goal or a wall."""
 
 SHORTEST_SOAK_MS, LONGEST_SOAK_MS = 10e3, 24 * 3600e3
 
@@ -25,7 +25,7 @@ ProfileLevel = Literal["bare", "sitl", "hil"]
 
 
 class ProfileRequest(CompanionAddresses, Inference):
-    """What is measured, and how."""
+    """Subject and method of a measurement."""
 
     policy: str | None = Field(
         default=None,
@@ -128,13 +128,13 @@ class ProfileRequest(CompanionAddresses, Inference):
 
     @property
     def soak_s(self) -> float | None:
-        """How long the soak lasts [s]; None: there is none."""
+        """Duration of the soak [s]; None: no soak."""
         given_ms = None if self.soak is None else duration_ms(self.soak)
         return None if given_ms is None else given_ms * US_PER_MS / US_PER_S
 
     @property
     def flown_as(self) -> dict[str, Any]:
-        """How the policy is flown at levels sitl and hil, as fields of a scenario."""
+        """Scenario fields for the flight at levels sitl and hil."""
         shared = {*Inference.model_fields, "hold_s", "seed"}
         limits = {"goal_radius_m": 0.5, "max_speed_m_s": FLOWN_SPEED_M_S}
         return {**self.model_dump(include=shared), **limits}

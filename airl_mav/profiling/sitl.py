@@ -26,30 +26,30 @@ from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
 
 LONGEST_FLIGHT_S = 300.0
-"""Well within a battery, and at walking pace far from every wall."""
+"""Maximum flight time: well within a battery, and at walking pace far from every wall."""
 
 MARGIN = 1.1
-"""A flight's time limit over the time that its decisions are expected to take."""
+"""Ratio of a flight's time limit to the expected time of its decisions."""
 
 COLUMNS = (*STAMPS, "accepted_us", "motor_us")
 
 
 class DecisionEstimate(LiveObserver):
-    """Counts the decisions of a flight by the time since navigation began."""
+    """Estimates the number of decisions of a flight from the navigation time."""
 
     def __init__(self, bar: Bar, period_s: float, before: int) -> None:
-        """Begin with the decisions of earlier flights; one more is made every period."""
+        """Start from the decisions of earlier flights; one more is made every period."""
         super().__init__(Progress(), Path(), (), 1)
         self._decisions, self._period_us, self._before = bar, period_s * US_PER_S, before
         self._navigating_us: int | None = None
 
     def phase(self, phase: str, time_us: int) -> None:
-        """Take the time at which navigation begins."""
+        """Store the start time of navigation."""
         if phase == "navigating":
             self._navigating_us = time_us
 
     def state(self, state: State, started_us: int) -> None:  # noqa: ARG002 (an Observer's names)
-        """Show how many decisions there must be by now."""
+        """Show the estimated number of decisions."""
         if self._navigating_us is not None:
             flown = max(0, state.time_us - self._navigating_us) // self._period_us
             self._decisions.update(completed=self._before + flown)
@@ -57,7 +57,7 @@ class DecisionEstimate(LiveObserver):
 
 def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recording:
     """Fly until there are enough decisions; arguments as `bare.measure`."""
-    # Before the network is opened for anything else.
+    # Before the network is opened elsewhere.
     load_us, first_us, later_us = cold_start(request, policy)
     scenario = resolve(
         Scenario(
@@ -94,7 +94,7 @@ def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recor
 def _flights(
     request: ProfileRequest, scenario: ResolvedScenario, period_s: float, bar: Bar
 ) -> Iterator[Stamps]:
-    """Give the stamps of flight after flight, without warm-up, until there are enough."""
+    """Yield the stamps of each flight, without warm-up, until there are enough."""
     count = number = 0
     while (missing := request.decisions - count) > 0:
         wanted = request.warm_up + missing

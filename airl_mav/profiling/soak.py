@@ -1,4 +1,4 @@
-"""Thermal soak: deciding without a pause for minutes, until the computer is as warm as it gets."""
+"""Thermal soak: decisions without a pause until the temperature is steady."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from airl_mav.latency.percentiles import percentile, summarize
 from airl_mav.latency.stages import Samples
 
 ROW_US = US_PER_S
-"""The series has a row for each second."""
+"""Interval of the series."""
 
 WINDOW_US = 60 * US_PER_S
-"""The last minute is compared with the first; in a soak of less than two, its halves."""
+"""Window of the comparison: the last minute with the first; below two minutes, the halves."""
 
 FREQUENCY_DROP = 0.05
-"""A processor whose mean frequency falls by more than this share has dropped it. Less is what a
-governor does from second to second."""
+"""Relative drop of mean frequency that counts as throttling. A governor varies less from second to
+second."""
 
 
 class Reading(NamedTuple):
-    """What the machine says of itself at a moment; None: nothing."""
+    """Machine state at one moment; None: not available."""
 
     frequency_mhz: float | None
     """Mean of the cores."""
@@ -39,29 +39,29 @@ class Reading(NamedTuple):
 
 @dataclass(frozen=True)
 class Soak:
-    """What happened to a computer that went on deciding."""
+    """Result of a thermal soak."""
 
     asked_s: float
     interrupted: bool
     series: dict[str, NDArray[np.float64]]
-    """A row for each second: `time_s` (its end, since the beginning), `n` decisions, their
-    `p50_ms` and `max_ms`, `frequency_mhz`, `temperature_c`, `power_w`; NaN where not told."""
+    """Rows of one second: `time_s` (end, since the start), `n` decisions, their `p50_ms` and
+    `max_ms`, `frequency_mhz`, `temperature_c`, `power_w`; NaN if not available."""
     window_s: float
-    """How long the first and the last part are [s]."""
+    """Duration of the first and of the last part [s]."""
     first_us: Samples
-    """t2 of the decisions of the first part, in their order."""
+    """t2 of the first part's decisions, in order."""
     last_us: Samples
-    """Those of the last part."""
+    """t2 of the last part's decisions, in order."""
     throttled: bool | None
-    """Whether the system says that it slowed the processor down; None: it does not tell."""
+    """True if the system reported throttling; None: not available."""
 
     @property
     def duration_s(self) -> float:
-        """How long it lasted [s]."""
+        """Duration of the soak [s]."""
         return float(self.series["time_s"][-1])
 
     def ends(self, name: str) -> tuple[float, float] | None:
-        """Return the mean of a column over the first and over the last part; None: not told."""
+        """Return the mean of a column over the first and the last part; None: not available."""
         column, time_s = self.series[name], self.series["time_s"]
         first, last = max(self.window_s, time_s[0]), self.duration_s - self.window_s
         parts = time_s <= first, time_s > last
@@ -72,7 +72,7 @@ class Soak:
 
     @property
     def frequency_dropped(self) -> bool | None:
-        """Whether the processor is slower at the end; None where the system does not tell."""
+        """True if the processor is slower at the end; None: not available."""
         ends = self.ends("frequency_mhz")
         return None if ends is None else ends[1] < (1.0 - FREQUENCY_DROP) * ends[0]
 
@@ -91,7 +91,7 @@ class Soak:
         }
 
     def sentence(self) -> str:
-        """Return how the last part differs from the first, in one line."""
+        """Return the difference between the first and the last part, in one line."""
         part = "minute" if self.window_s == WINDOW_US / US_PER_S else f"{self.window_s:.0f} s"
         moved = [
             f"{name} {_change(percentile(self.first_us, p), percentile(self.last_us, p))}"
@@ -134,9 +134,9 @@ def soak(
 ) -> Soak:
     """Repeat decisions until `stop`, and read the machine's state every second.
 
-    `decide` returns a decision's start and end by the clock [µs]. `read` reads the machine, never
-    while a decision is timed, `state` its state before and after. `progress` gets the elapsed
-    seconds, each row.
+    `decide` returns a decision's start and end by the clock [µs]. `read` reads the machine between
+    decisions, `state` the machine's state before and after. `progress` gets the elapsed seconds,
+    each row.
     """
     before, begun_us = state(), clock.time_us()
     end_us = begun_us + round(duration_s * US_PER_S)

@@ -1,4 +1,4 @@
-"""The page of a soak: latency, frequency, temperature, power over time. Needs the [sim] extra."""
+"""Page of a soak: latency, frequency, temperature, power over time. Needs the [sim] extra."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ AXES = (
     ("temperature_c", "temperature", "°C"),
     ("power_w", "power", "W"),
 )
-"""Columns of the series below the latency: those that the machine tells."""
+"""Columns of machine readings, drawn below the latency."""
 
 LONG_TAIL = 5.0
-"""Times the median that the longest latency must be for a logarithmic axis."""
+"""Ratio of maximum latency to median above which the axis is logarithmic."""
 
 
 def write_soak_page(

@@ -1,1 +1,1 @@
-"""Vehicle and computer profiles from what a flight has recorded."""
+"""Refit: vehicle and computer profiles estimated from a recorded flight."""

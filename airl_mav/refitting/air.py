@@ -3,24 +3,24 @@
 With the drag D per mass, k = D / m, and the wind w, the air brakes a velocity v by k (v - w). The
 rotors push along the body's axis only. Both fits are linear in k and k w.
 
-The vehicle's log holds the acceleration that is felt, along the body's x and y axes:
+The vehicle's log contains the specific force along the body's x and y axes:
 
     a = -k R' (v - w) + b + c (w_y, -w_x)
 
-R' turns from NED to the body's axes. b is the accelerometer's bias, with a normal prior. Several
-headings tell it from the wind. w_x and w_y are the rates of roll and pitch. Rotors above the centre
-of mass feel their wind. A sample that is a mean is turned by them. (PX4's own estimator tells
-drag from wind so: EKF2_DRAG_CTRL.)
+R' rotates from NED to the body's axes. b is the accelerometer's bias, with a normal prior. Several
+headings separate the bias from the wind. w_x and w_y are the rates of roll and pitch. c covers the
+airflow at rotors above the centre of mass, and the rotation during an averaged sample. (PX4's
+estimator separates drag from wind in this way: EKF2_DRAG_CTRL.)
 
-Telemetry has no accelerometer. There the lean of the vehicle accelerates it.
+Telemetry has no accelerometer. There the lean of the vehicle gives the acceleration:
 
     v' = g + f z - k (v - w)
 
 z is the body's up axis, f the thrust per mass, from the vertical part of the equation. The level
-part is averaged over windows of half a second. An error of the attitude looks like wind while the
-heading stays. It is estimated as a bias along the body's axes with a normal prior. That is of the
-profile's accelerometer until the vehicle has manoeuvred, and smaller after. So the interval of the
-wind is wide where the flight is short, or the drag small.
+part is averaged over windows of half a second. An attitude error resembles wind at a constant
+heading. It is estimated as a bias along the body's axes with a normal prior: the profile's
+accelerometer bias until the vehicle has manoeuvred, and a smaller one after. The wind's interval is
+therefore wide for a short flight or a small drag.
 """
 
 from __future__ import annotations
@@ -42,46 +42,46 @@ WINDOW = 13
 """Samples of a window: half a second of telemetry."""
 
 SETTLE_US = 2 * US_PER_S
-"""After so long in navigation an estimator has told tilt and bias apart [µs]."""
+"""Navigation time after which an estimator separates tilt and bias [µs]."""
 
 SETTLED_SHARE = 0.4
-"""What is left of an accelerometer's bias in the attitude then, and along the axis of thrust."""
+"""Share of the accelerometer's bias that then remains in the attitude and along the thrust."""
 
 LEARNT_SHARE = 0.6
-"""What is left of it in what the estimator has corrected until the flight's end. Chosen on the
-first twenty flights of benchmarks/bench_refit.py and 24 of PX4 1.16."""
+"""Share that remains after correction by the estimator's final value. Chosen on the first twenty
+flights of benchmarks/bench_refit.py and 24 of PX4 1.16."""
 
 BY_RATE_M_S = 0.1
-"""How much of a rate the accelerometer may feel as acceleration [m/s² for 1 rad/s]. A thrust of 1 g
-that is turned by a sample's time of 4 ms is 0.04, drag of 0.2 1/s on rotors 10 cm up 0.02."""
+"""Acceleration per rate in the accelerometer [m/s² for 1 rad/s]. A thrust of 1 g turned by a 4 ms
+sample gives 0.04, drag of 0.2 1/s on rotors 10 cm up 0.02."""
 
 OFF_M_S, OFF_S = 0.03, 4.0
-"""An estimator's velocity is off by so much along an axis [m/s], and for so long by about the same
-[s]. That is what PX4 1.16 estimated in twelve simulated flights whose truth is known. The
-accelerometer's equations take it for wind."""
+"""Error of an estimator's velocity along an axis [m/s], and its correlation time [s], as estimated
+by PX4 1.16 in twelve simulated flights with known truth. The accelerometer's equations attribute
+this error to wind."""
 
 SKEW_S = 0.01
-"""By how much attitude and velocity in telemetry may be of different moments [s]."""
+"""Time skew between attitude and velocity in telemetry [s]."""
 
 UNSEEN = 2.0
-"""Errors of an estimator and gusts change slower than a short flight shows. The variance is so many
-times that which the rows show. Chosen on the first twenty flights of benchmarks/bench_refit.py."""
+"""Variance factor for estimator errors and gusts that vary slower than a short flight. Chosen on
+the first twenty flights of benchmarks/bench_refit.py."""
 
 LEAST_ROWS = 4 * WINDOW
 LEAST_FELT = 40
-"""Samples of the accelerometer: two seconds of what PX4 logs by default."""
+"""Minimum samples of the accelerometer: two seconds at PX4's default logging rate."""
 DRAWS = 4000
-"""Of the posterior distribution: wind is a ratio."""
+"""Draws from the posterior distribution: wind is a ratio."""
 
 WIDEST_DRAG, WIDEST_WIND_M_S = 0.2, 1.0
-"""Half widths of intervals, of the drag as a share, from which on nothing is observable."""
+"""Maximum half widths of observable intervals, of the drag as a share."""
 
 ITERATIONS = 4
-"""For the noise of the rows, and for quadratic drag, which needs the wind."""
+"""Iterations for the noise of the rows, and for quadratic drag, which depends on the wind."""
 
 _DRAG, _NORTH, _EAST = 0, 1, 2
 _AIR = 3
-"""Parameters of the air: k, k w north, k w east; biases follow."""
+"""Number of air parameters: k, k w north, k w east; biases follow."""
 
 
 DRAG = FittedQuantity("drag_1_s", "drag per mass", "1/s")
@@ -93,13 +93,13 @@ WIND = (
 
 @dataclass(frozen=True)
 class Air:
-    """What the air did."""
+    """Fitted drag and wind."""
 
     drag_1_s: FittedQuantity
     wind_north_m_s: FittedQuantity
     wind_east_m_s: FittedQuantity
     quadratic_1_m: float
-    """Quadratic drag per mass, as the profile has it."""
+    """Quadratic drag per mass, from the profile."""
 
     @property
     def wind(self) -> tuple[float, float] | None:
@@ -108,7 +108,7 @@ class Air:
         return None if north is None or east is None else (north, east)
 
     def along_thrust(self, velocity: Array, quaternion: Array) -> Array:
-        """Return drag per mass along body down (n,) [m/s²], of NED velocities and attitudes."""
+        """Return drag per mass along body down (n,) [m/s²], for NED velocities and attitudes."""
         north, east = self.wind or (0.0, 0.0)
         against = velocity - np.array([north, east, 0.0])
         linear = self.drag_1_s.value or 0.0
@@ -120,7 +120,7 @@ class Air:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Equations of accelerations: what is left = matrix @ parameters."""
+    """Equations of accelerations: left = matrix @ parameters."""
 
     matrix: Array
     """(n, 2, 3 + others)."""
@@ -129,16 +129,16 @@ class _Rows:
     velocity: Array
     """(n, 3) NED [m/s], for quadratic drag."""
     axes: Array
-    """(n, 2, 3) how a force NED enters the two equations."""
+    """(n, 2, 3) projection of a NED force into the two equations."""
     prior: tuple[float, ...]
-    """Standard deviations of the others: biases [m/s²]; what is felt of rates [m/s], or how early
-    the lean is [s]."""
+    """Standard deviations of the other parameters: biases [m/s²]; rate effect [m/s], or the lead
+    time of the lean [s]."""
     off: float = 0.0
-    """How much slow errors of the velocity weigh as noise of single samples [m²/s²]."""
+    """Weight of slow velocity errors as noise of single samples [m²/s²]."""
 
 
 def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> Air:
-    """Fit drag and wind; the profile gives accelerometer and quadratic drag."""
+    """Fit drag and wind; the profile provides accelerometer and quadratic drag."""
     mass_kg = vehicle.body.mass_kg
     quadratic_1_m = vehicle.drag.quadratic_n_s2_m2 / mass_kg
     known = vehicle.drag.linear_n_s_m / mass_kg
@@ -186,7 +186,8 @@ def _estimate(of: FittedQuantity, value: float, drawn: Array, source: str) -> Fi
 def _felt_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
     """Return the equations of the accelerometer across the body's axis, if logged.
 
-    The raw data are corrected by the estimator's final bias, as its bias changes while it learns.
+    The raw data are corrected by the estimator's final bias, because the bias changes during
+    learning.
     """
     log = flown.log
     if log is None:
@@ -212,7 +213,7 @@ def _felt_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
 
 
 def _learnt_bias(log: VehicleLog, start_us: float, end_us: float) -> Array | None:
-    """Return the accelerometer's bias (3,) that the estimator has learnt of a flight [m/s²]."""
+    """Return the accelerometer's bias (3,) learnt by the estimator in a flight [m/s²]."""
     corrected = log.specific_force.between(start_us, end_us)
     if len(corrected) < LEAST_FELT:
         return None
@@ -224,7 +225,7 @@ def _lean_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
     """Return the equations of telemetry: velocity gained in a window against lean and drag.
 
     In oscillating flight, a lean that is early by d looks like a drag of d w², w the angular
-    frequency. So d is estimated, too.
+    frequency. Therefore d is also estimated.
     """
     path = flown.path.between(*flown.airborne_us)
     if len(path) < LEAST_ROWS:
@@ -279,7 +280,7 @@ def _posterior(rows: _Rows, quadratic_1_m: float) -> tuple[Array, Array]:
 
 
 def _quadratic(rows: _Rows, middle: Array, quadratic_1_m: float) -> Array:
-    """Return what quadratic drag does to the rows (n, 2) in the wind found so far [m/s²]."""
+    """Return the effect of quadratic drag on the rows (n, 2) in the current wind [m/s²]."""
     if quadratic_1_m == 0.0 or middle[_DRAG] <= 0.0:
         return np.zeros_like(rows.left)
     wind = np.array([*middle[_NORTH : _EAST + 1] / middle[_DRAG], 0.0])

@@ -1,4 +1,4 @@
-"""The files of a refit: profiles that load as they are, and say what was fitted from what."""
+"""Files of a refit: loadable profiles that document their sources."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from airl_mav.refitting.response import ResponseFit
 from airl_mav.refitting.thrust import Thrust
 
 DIGITS = 4
-"""Significant digits of what is written: no interval is narrower."""
+"""Significant digits of written values: no interval is narrower."""
 
 TUNED = ("MC_", "MPC_")
-"""Parameters that decide how a vehicle flies begin so."""
+"""Name prefixes of parameters that affect flight."""
 
 
 @dataclass(frozen=True)
 class Override:
-    """A field of a profile."""
+    """Modified field of a profile."""
 
     table: str
     key: str
@@ -49,7 +49,7 @@ def overrides_of(
     air: Air,
     logged: Mapping[str, float],
 ) -> tuple[Override, ...]:
-    """Return the parameters in which a flight differs from the vehicle's profile."""
+    """Return the vehicle parameters that differ between a flight and its profile."""
     found: list[Override] = []
     carried_kg = flying.body.mass_kg - profile.body.mass_kg
     mass_kg = flying.body.mass_kg
@@ -81,7 +81,7 @@ def overrides_of(
 
 
 def refitted(profile: VehicleProfile, overrides: Sequence[Override]) -> VehicleProfile:
-    """Return a profile with what a flight says otherwise. Raises FieldError if it cannot fly."""
+    """Return a profile with a flight's overrides. Raises FieldError if it cannot fly."""
     data: dict[str, Any] = profile.model_dump()
     for each in overrides:
         data[each.table] = {**(data[each.table] or {}), each.key: each.value}
@@ -89,7 +89,7 @@ def refitted(profile: VehicleProfile, overrides: Sequence[Override]) -> VehicleP
 
 
 def _parameters(profile: VehicleProfile, logged: Mapping[str, float]) -> list[Override]:
-    """Return the flight controller's gains and limits that differ, except out-of-range values."""
+    """Return the flight controller's changed gains and limits, without out-of-range values."""
     held = parameter_values(profile.parameters)
     remark = "as the flight controller's log has it"
     return [
@@ -119,13 +119,13 @@ VEHICLE_FILE, COMPUTER_FILE, LATENCY_FILE = "vehicle.toml", "computer.toml", "la
 SCENARIO_FILE, REFIT_FILE = "scenario.toml", "refit.json"
 
 WORKLOAD = "flown"
-"""Name of the workload in the computer's profile."""
+"""Workload name in the computer's profile."""
 
 
 def vehicle_toml(
     base: str, description: str, overrides: Sequence[Override], remarks: Sequence[str]
 ) -> str:
-    """Return the profile of a vehicle: its base, and what a flight says otherwise."""
+    """Return a vehicle profile as TOML: its base, and a flight's overrides."""
     path = Path(base)
     named = str(path.absolute()) if base.endswith(".toml") else base
     lines = [f"# {remark}" for remark in remarks]
@@ -167,7 +167,7 @@ def computer_profile(
 
 
 def _network(policy: str, runtime: str, box: BlackBox) -> tuple[Network, str] | None:
-    """Return the network of a policy and its digest; None where it has none, or is not here."""
+    """Return the network of a policy and its digest; None if missing or not installed."""
     try:
         card = find_policy(policy).card
     except UsageError:
@@ -194,7 +194,7 @@ def write_refit(
     samples_ms: Sequence[float],
     remarks: Sequence[str],
 ) -> None:
-    """Write the files of a refit into a new or empty folder, `refit.json`, made of `data`, last."""
+    """Write the files of a refit into a new or empty folder, `refit.json`, from `data`, last."""
     out.mkdir(parents=True, exist_ok=True)
     replace_file(out / VEHICLE_FILE, vehicle.encode())
     scenario: dict[str, Any] = {"vehicle": str((out / VEHICLE_FILE).absolute())}

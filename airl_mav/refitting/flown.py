@@ -1,4 +1,4 @@
-"""What a refit looks at: a recorded flight, the vehicle's log of it, or both."""
+"""Input of a refit: a recorded flight, the vehicle's log, or both."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from airl_mav.vehicle_log.alignment import Alignment, align
 from airl_mav.vehicle_log.ulog import MOTORS, VehicleLog
 
 AIRBORNE_M = 0.8
-"""Higher than this above where it stood, ground and its effect are far [m]."""
+"""Minimum height above the start position without ground effect [m]."""
 
 LOGGED_PATH_US = 40_000
-"""Step of a path that is taken from a log [µs]: the rate of a companion's recording."""
+"""Step of a path from a log [µs]: the rate of a companion's recording."""
 
 OFFBOARD = 14
 """`vehicle_status.nav_state` of PX4's Offboard (NAVIGATION_STATE_OFFBOARD)."""
@@ -29,36 +29,37 @@ OFFBOARD = 14
 
 @dataclass(frozen=True)
 class Flown:
-    """A recorded flight in the companion's time; log times where there is only a log."""
+    """Recorded flight in the companion's time; log times for a log alone."""
 
     path: Trajectory
-    """As telemetry told it, or the log."""
+    """Path from telemetry, or from the log."""
     sent_us: NDArray[np.int64]
-    """(k,) when the setpoints were sent; of a log, when they are first in it [µs]."""
+    """(k,) send times of the setpoints; for a log, their first log times [µs]."""
     setpoints: NDArray[np.float64]
-    """(k, 4) velocity [m/s], yaw rate [rad/s]: forward, right, down; of a log north, east, down."""
+    """(k, 4) velocity [m/s], yaw rate [rad/s]: forward, right, down; for a log north, east,
+    down."""
     navigation_us: int
-    """From when on velocity setpoints steered it [µs]."""
+    """Start of steering by velocity setpoints [µs]."""
     ended_us: int
-    """Until when [µs]."""
+    """End of steering by velocity setpoints [µs]."""
     airborne_us: tuple[int, int]
-    """From when to when it was clear of the ground [µs]."""
+    """Airborne interval, clear of the ground [µs]."""
     log: VehicleLog | None = None
     clocks: Alignment | None = None
-    """How the clocks of the companion and of the log relate; None without both."""
+    """Relation of the companion's and the log's clocks; None without both."""
 
     @property
     def is_logged_only(self) -> bool:
-        """Whether the vehicle's log is all that there is."""
+        """True if only the vehicle's log is available."""
         return self.log is not None and self.clocks is None
 
     @property
     def told_by(self) -> str:
-        """What tells its motion, for people."""
+        """Source of the motion, as text."""
         return "the vehicle's log" if self.is_logged_only else "telemetry"
 
     def logged_us(self, time_us: float) -> float:
-        """Return the log's time of what was told at the flight's time [µs]."""
+        """Return the log time of telemetry received at a flight time [µs]."""
         if self.log is None:
             raise ValueError("there is no log")
         return time_us if self.clocks is None else time_us - self.clocks.told_us
@@ -124,7 +125,7 @@ def flown_by_log(log: VehicleLog) -> Flown:
 
 
 def _logged_path(log: VehicleLog) -> Trajectory:
-    """Return the estimated path at `LOGGED_PATH_US`, between the samples of the log."""
+    """Return the estimated path at `LOGGED_PATH_US`, interpolated between log samples."""
     first_us = max(int(each.time_us[0]) for each in (log.motion, log.attitude))
     last_us = min(int(each.time_us[-1]) for each in (log.motion, log.attitude))
     times_us = np.arange(first_us, last_us, LOGGED_PATH_US)
@@ -138,7 +139,7 @@ def _logged_path(log: VehicleLog) -> Trajectory:
 def _velocity_setpoints(
     log: VehicleLog, start_us: int, end_us: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the longest run of setpoints by velocity alone, as plans hide the response."""
+    """Return the longest run of pure velocity setpoints, because plans hide the response."""
     tracked = log.setpoint.between(start_us, end_us)
     steered = np.isfinite(tracked.values[:, :3]).all(axis=1)
     steered &= log.nav_state.newest(tracked.time_us)[:, 0] == OFFBOARD
@@ -151,7 +152,7 @@ def _velocity_setpoints(
 
 
 def _longest(holds: NDArray[np.bool_]) -> tuple[int, int]:
-    """Return the first and the last index of the longest row that holds; one does."""
+    """Return the first and the last index of the longest true run; requires one."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(np.int8)))
     starts, ends = edges[::2], edges[1::2]
     longest = int(np.argmax(ends - starts))
@@ -159,7 +160,7 @@ def _longest(holds: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def seconds(times_us: NDArray[np.int64], from_us: int) -> NDArray[np.float64]:
-    """Return times (n,) [µs] as seconds since a moment."""
+    """Return times (n,) [µs] as seconds since a start."""
     return np.asarray((times_us - from_us) / US_PER_S, np.float64)
 
 

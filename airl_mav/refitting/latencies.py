@@ -1,4 +1,4 @@
-"""How late decisions were: t1, t2 and the link, as recorded in flight."""
+"""Latency of recorded decisions: t1, t2 and the link."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from airl_mav.refitting.quantity import LEVEL, RESAMPLES, FittedQuantity
 from airl_mav.vehicle_log.alignment import Alignment
 
 LEAST = 5
-"""Decisions below which a mean has no interval."""
+"""Minimum decisions for the interval of a mean."""
 
 T1 = FittedQuantity("t1_ms", "t1, mean", "ms")
 T2 = FittedQuantity("t2_ms", "t2, mean", "ms")
@@ -25,20 +25,20 @@ LINK = FittedQuantity("link_ms", "link, both ways", "ms")
 
 @dataclass(frozen=True)
 class Latencies:
-    """How late the decisions of a flight were."""
+    """Latencies of a flight's decisions."""
 
     t1_ms: FittedQuantity
-    """Mean time from a frame's exposure until it was decoded."""
+    """Mean time from a frame's exposure to its decoding."""
     t2_ms: FittedQuantity
-    """Mean time from the start of an inference until its action was ready."""
+    """Mean time from the start of an inference to its action."""
     link_ms: FittedQuantity
-    """Round trip: setpoint up, telemetry down, and its age."""
+    """Round trip: setpoint up, telemetry down, and the age of telemetry."""
     samples_ms: tuple[float, ...]
-    """t2 of the decisions, in their order."""
+    """t2 of the decisions, in order."""
 
 
 def no_latencies() -> Latencies:
-    """Return what a vehicle's log alone tells of them: nothing."""
+    """Return empty latencies for a vehicle's log alone."""
     why = "a vehicle's log holds no decisions: give the black box"
     return Latencies(T1.without(why), T2.without(why), LINK.without(why), ())
 
@@ -46,11 +46,11 @@ def no_latencies() -> Latencies:
 def fit_latencies(
     stamps: Mapping[str, NDArray[np.int64]], clocks: Alignment | None, rng: np.random.Generator
 ) -> Latencies:
-    """Return the latencies of a flight's decisions; `clocks` is None without a log."""
+    """Return the latencies of a flight's decisions; `clocks` = None without a log."""
     t2_us = stamps["action_ready_us"] - stamps["infer_start_us"]
     stamped = stamps["capture_us"] != NO_STAMP
     t1_us = (stamps["decoded_us"] - stamps["capture_us"])[stamped]
-    # A clock of whole microseconds may give 0 for what is faster.
+    # A clock of whole microseconds may return 0 for shorter durations.
     samples_ms = np.maximum(t2_us, 1) / US_PER_MS
     unstamped = "the camera does not stamp by the companion's clock"
     t1 = _mean(T1, t1_us / US_PER_MS, unstamped, rng)
@@ -61,7 +61,7 @@ def fit_latencies(
 def _mean(
     of: FittedQuantity, values_ms: NDArray[np.float64], none: str, rng: np.random.Generator
 ) -> FittedQuantity:
-    """Return the mean with its interval, wider by how much decisions depend on each other."""
+    """Return the mean with its interval, widened by the autocorrelation of decisions."""
     if len(values_ms) < LEAST:
         why = f"{len(values_ms)} decisions; {LEAST} are needed" if len(values_ms) else none
         return of.without(why)

@@ -1,4 +1,4 @@
-"""An estimate with its 95 % interval, or why a flight does not tell it."""
+"""Estimate with its 95 % interval, or the reason why it is not observable."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ Array = NDArray[np.float64]
 LEVEL = 0.95
 RESAMPLES = 999
 BLOCK_S = 1.0
-"""Residuals nearer than this may depend on each other, and are resampled together [s]."""
+"""Length of resampled blocks: residuals closer in time may be correlated [s]."""
 
 LEAST_BLOCKS = 4
-"""A flight of fewer blocks has no interval."""
+"""Minimum number of blocks for an interval."""
 
 
 @dataclass(frozen=True)
 class FittedQuantity:
-    """One fitted quantity."""
+    """Fitted quantity."""
 
     key: str
     meaning: str
     unit: str
     value: float | None = None
-    """None: not observable in this flight."""
+    """Fitted value; None: not observable in this flight."""
     low: float | None = None
     high: float | None = None
-    """Ends of the 95 % interval."""
+    """Upper end of the 95 % interval; `low` is the lower end."""
     source: str = ""
     unobservable: str = ""
-    """Why it is not known; "" where it is."""
+    """Reason why the quantity is unknown; "" if known."""
     profile: float | None = None
-    """What the profile says, in the same unit; None: nothing."""
+    """Value of the profile, in the same unit; None: missing."""
 
     @property
     def observed(self) -> bool:
-        """Whether the flight tells it."""
+        """True if the flight provides the quantity."""
         return self.value is not None
 
     @property
@@ -52,12 +52,12 @@ class FittedQuantity:
         return 0.5 * (self.high - self.low)
 
     def found(self, ends: Iterable[float], source: str) -> FittedQuantity:
-        """Return it with a value, the low and the high end of its interval, and their source."""
+        """Return the quantity with value, low and high end of the interval, and their source."""
         value, low, high = map(float, ends)
         return replace(self, value=value, low=low, high=high, source=source)
 
     def without(self, why: str) -> FittedQuantity:
-        """Return it as not observable."""
+        """Return the quantity as not observable."""
         return replace(self, value=None, low=None, high=None, source="", unobservable=why)
 
 
@@ -66,7 +66,7 @@ def block_intervals(
 ) -> Array:
     """Return the offsets of 95 % intervals from a least-squares solution, lower and upper (2, k).
 
-    Neighbouring residuals are correlated. So blocks of seconds are resampled. Each resample moves
+    Neighbouring residuals are correlated, so blocks of seconds are resampled. Each resample moves
     the solution by one Gauss-Newton step (one-step bootstrap). Student's t accounts for the few
     blocks. Unobservable parameters have infinite intervals.
     """
@@ -87,7 +87,7 @@ def block_intervals(
 
 
 def mean_interval(values: Array, times_s: Array, rng: np.random.Generator) -> tuple[float, float]:
-    """Return the 95 % interval of the mean of samples (n,) that depend on their neighbours."""
+    """Return the 95 % interval of the mean of correlated samples (n,)."""
     ones = np.ones((len(values), 1))
     ends = block_intervals(-ones, values - values.mean(), times_s, rng)
     return float(values.mean() + ends[0, 0]), float(values.mean() + ends[1, 0])
@@ -98,7 +98,7 @@ def _widened(
     statistic: Callable[[NDArray[np.int64]], Array],
     rng: np.random.Generator,
 ) -> Array:
-    """Return the bootstrap interval of a statistic of blocks, as wide as Student's t makes it."""
+    """Return the bootstrap interval of a statistic of blocks, widened by Student's t."""
     found = bootstrap(
         (blocks,),
         statistic,

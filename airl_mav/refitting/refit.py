@@ -1,4 +1,4 @@
-"""A vehicle and a computer profile from a recorded flight."""
+"""Fit of a vehicle and a computer profile to a recorded flight."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ SCHEMA = 1
 LOG_SUFFIX = ".ulg"
 
 DEFAULT_COMPUTER = "workstation"
-"""Stays on the ground: has no part in the vehicle's mass."""
+"""Computer on the ground, without mass on the vehicle."""
 
 
 @dataclass(frozen=True)
 class Refit:
-    """What a flight says of its vehicle, its computer and the wind."""
+    """Result of a refit: vehicle, computer and wind."""
 
     black_box: Path | None
-    """None: only the vehicle's log tells of the flight."""
+    """Path of the black box; None: only the vehicle's log is available."""
     ulg: Path | None
     base: str
-    """Profile that was refitted: a shipped name, or a path."""
+    """Refitted profile: a built-in name, or a path."""
     known: Known
-    """Which of mass and thrust that profile was believed about."""
+    """Quantity taken from that profile: mass or thrust."""
     vehicle: VehicleProfile
     overrides: tuple[files.Override, ...]
     response: ResponseFit
@@ -54,13 +54,13 @@ class Refit:
     latencies: Latencies
     notes: tuple[str, ...]
     parameters: Mapping[str, float]
-    """Of the flight controller, as its log has them; empty without one."""
+    """Logged parameters of the flight controller; empty without a log."""
     flights: tuple[Refit, ...] = ()
-    """What each tells alone, where several were fitted together."""
+    """Results of the single flights in a joint fit."""
 
     @property
     def estimates(self) -> tuple[FittedQuantity, ...]:
-        """All that was fitted, or was not."""
+        """All fitted or unobservable quantities."""
         response, thrust, air, late = self.response, self.thrust, self.air, self.latencies
         return (
             *(response.dead_time_s, response.velocity_time_s, response.yaw_rate_time_s),
@@ -70,11 +70,11 @@ class Refit:
         )
 
     def estimate(self, key: str) -> FittedQuantity:
-        """Return one of them. Raises KeyError."""
+        """Return an estimate by key. Raises KeyError."""
         return {each.key: each for each in self.estimates}[key]
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as `refit.json` has it."""
+        """Return the refit in the format of `refit.json`."""
         flights = [each._told() for each in self.flights]
         return {
             "schema": SCHEMA,
@@ -86,7 +86,7 @@ class Refit:
         }
 
     def _told(self) -> dict[str, Any]:
-        """Return what a flight tells, or all of them together."""
+        """Return the estimates of one flight, or of the joint fit."""
         wind = self.air.wind
         estimates = {each.key: asdict(each) for each in self.estimates}
         for fields in estimates.values():
@@ -116,7 +116,7 @@ def refit(
         path: Black box, or a vehicle's log (.ulg) alone, which contains nothing about the computer.
         ulg: The vehicle's log of the black box's flight; without it mass, thrust and link stay
             unknown.
-        vehicle: Profile to refit: name or path; None = that of the black box, or `quad`.
+        vehicle: Profile to refit: name or path; None = the black box's vehicle, or `quad`.
         known: Quantity to take from the profile: a flight shows only thrust per mass.
         out: New folder for `vehicle.toml`, `computer.toml`, `latency.txt`, `scenario.toml` and
             `refit.json`; None = no files.
@@ -170,13 +170,13 @@ def refit(
 
 
 def check_out(out: Path | None) -> None:
-    """Refuse a folder that holds something. Raises FieldError."""
+    """Raise FieldError for a non-empty folder."""
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FieldError("out", f"{out}", "a new or empty folder: it holds something else")
 
 
 def _board(name: str) -> tuple[ComputerProfile, tuple[str, ...]]:
-    """Return the computer that flew; where its profile is not on this machine, a note says so."""
+    """Return the computer that flew; without its profile, the default and a note."""
     try:
         return load_computer(name), ()
     except UsageError as error:

@@ -1,6 +1,6 @@
 """Fit of a vehicle's response to setpoints: dead time, time constants of velocity and yaw rate.
 
-The model is that of `prediction.compensator`, driven by the sent setpoints and the flown heading.
+The model of `prediction.compensator`, driven by the sent setpoints and the flown heading.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from airl_mav.refitting.flown import Flown, seconds
 from airl_mav.refitting.quantity import Array, FittedQuantity, block_intervals
 
 STEP_S = 0.004
-"""Of the model [s]: the flight controller's own."""
+"""Time step of the model [s], equal to the flight controller's."""
 
 TELEMETRY_AGE_S = 0.010
-"""Mean age of the newest telemetry, which comes 50 times a second [s]; at most twice that."""
+"""Mean age of the newest telemetry, received 50 times a second [s]; the maximum is twice this."""
 
 DEAD_TIMES_S = (0.05, 0.15, 0.3)
-"""Where searches begin: the cost has more than one valley [s]."""
+"""Initial values of the searches: the cost has several local minima [s]."""
 
 LEAST_CHANGE_M_S, LEAST_CHANGE_RAD_S = 1.0, 0.2
-"""Root mean square change from setpoint to setpoint, below which the answer drowns in noise."""
+"""Minimum RMS change between setpoints; below, noise hides the response."""
 
 DIFFERENCES = (0.02, 0.02, 0.02)
-"""Steps of the numerical derivatives, as shares: the model is piecewise linear in the dead time."""
+"""Relative steps of the numerical derivatives: the model is piecewise linear in the dead time."""
 
 TIMES = {
     "dead_time_s": "dead time",
@@ -44,12 +44,12 @@ TIMES = {
 
 LEAST_DECISIONS = 8
 WIDEST_S, WIDEST_SHARE = 0.05, 0.4
-"""A dead time that is known no better, or a time constant, is not observable."""
+"""Maximum half width of an observable dead time [s], and of a time constant as a share."""
 
 
 @dataclass(frozen=True)
 class ResponseFit:
-    """The answers of a vehicle."""
+    """Response parameters of a vehicle."""
 
     dead_time_s: FittedQuantity
     velocity_time_s: FittedQuantity
@@ -67,26 +67,26 @@ class ResponseFit:
 
 @dataclass(frozen=True)
 class _Driven:
-    """What drives the model, and what it is compared with."""
+    """Inputs and reference data of the model."""
 
     grid_s: Array
     """(m,) steps of the model [s]."""
     commands: Array
-    """(m, 4) setpoint that was the newest to be sent, as in `Flown`."""
+    """(m, 4) newest sent setpoint, as in `Flown`."""
     heading: Array
-    """(m,) that was flown [rad], without jumps."""
+    """(m,) flown heading [rad], unwrapped."""
     times_s: Array
-    """(n,) of the samples [s]."""
+    """(n,) sample times [s]."""
     velocity: Array
     """(n, 2) north, east [m/s]."""
     turned: Array
-    """(n,) heading [rad], without jumps."""
+    """(n,) heading [rad], unwrapped."""
     begun_m_s: tuple[float, float]
 
 
 @dataclass(frozen=True)
 class _Solution:
-    """Of a least-squares problem with k parameters and n residuals."""
+    """Solution of a least-squares problem with k parameters and n residuals."""
 
     x: Array
     """(k,)."""
@@ -122,7 +122,7 @@ def _too_little(flown: Flown) -> str | None:
 
 
 def _changes(flown: Flown) -> Array:
-    """Return the steps of the setpoints (n, 4): against the previous decision, or a log's mean."""
+    """Return the steps of the setpoints (n, 4): from the previous decision, or a log's mean."""
     if flown.is_logged_only:
         return np.asarray(flown.setpoints - flown.setpoints.mean(axis=0))
     return np.diff(flown.setpoints, axis=0)
@@ -162,8 +162,8 @@ def _velocity(
 ) -> tuple[FittedQuantity, FittedQuantity]:
     """Fit dead time and time constant to the velocities north and east together.
 
-    A companion's setpoints are in the heading frame. So the time of the heading, their arrival, is
-    a third parameter. Logged setpoints are in the world frame.
+    A companion's setpoints are in the heading frame, so the heading's time, their arrival, is a
+    third parameter. Logged setpoints are in the world frame.
     """
     grid = driven.grid_s
 
@@ -195,7 +195,7 @@ def _velocity(
 def _link_share(flown: Flown) -> tuple[float, float, str]:
     """Return the round trip's part outside the vehicle [s], 95 % interval and source."""
     if flown.is_logged_only:
-        # A change is first seen in the sample after it: half their distance later, on the mean.
+        # A change appears in the next sample: half a sample period later on average.
         step_s = float(np.median(np.diff(flown.sent_us))) / US_PER_S
         changed = int(np.count_nonzero(np.any(np.diff(flown.setpoints, axis=0), axis=1)))
         unsure_s = QUANTILE * step_s / math.sqrt(12.0 * max(changed, 1))
@@ -226,7 +226,7 @@ def _link_share(flown: Flown) -> tuple[float, float, str]:
 def _yaw_rate(
     driven: _Driven, flown: Flown, known: FittedQuantity, rng: np.random.Generator
 ) -> FittedQuantity:
-    """Fit the time constant of the yaw rate to the heading, with a dead time of its own."""
+    """Fit the time constant of the yaw rate to the heading, with a separate dead time."""
     rms = _rms(_changes(flown)[:, 3:])
     if rms < LEAST_CHANGE_RAD_S:
         why = f"yaw rates change by {rms:.2f} rad/s; {LEAST_CHANGE_RAD_S:g} are needed"
@@ -247,7 +247,7 @@ def _yaw_rate(
 
 
 def _lagged(wanted: NDArray[np.complex128] | Array, lag_s: float, begun: complex) -> Array:
-    """Return what follows a wanted value (m,) with a time constant [s], from `begun` on."""
+    """Return the first-order response to a setpoint (m,) with a time constant [s], from `begun`."""
     left = math.exp(-STEP_S / lag_s)
     start = np.array([begun], np.complex128)
     return np.asarray(lfilter([0.0, 1.0 - left], [1.0, -left], wanted + 0j, zi=start)[0])
@@ -277,7 +277,7 @@ def _with_interval(known: FittedQuantity, value: float, ends: Array, source: str
 
 
 def _known_to(estimate: FittedQuantity, widest: float) -> FittedQuantity:
-    """Return an estimate, or that it is not observable where its interval is too wide."""
+    """Return an estimate, marked as not observable if its interval is too wide."""
     half = estimate.half_width
     if half is not None and half <= widest:
         return estimate

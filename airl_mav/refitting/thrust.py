@@ -1,7 +1,7 @@
 """Thrust per mass, from motor commands and the accelerometer along the body's axis.
 
-The accelerometer measures thrust / m less the drag's part. Motor commands are the share of maximum
-thrust. So their ratio is thrust_max / m. Means over the flight cancel rotor lag and vibration.
+The accelerometer measures thrust / m minus the drag's part. Motor commands are shares of maximum
+thrust, so their ratio is thrust_max / m. Means over the flight cancel rotor lag and vibration.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from airl_mav.refitting.quantity import Array, FittedQuantity, mean_interval
 from airl_mav.vehicle_log.ulog import VehicleLog
 
 Known = Literal["thrust", "mass"]
-"""Which of the two the profile is right about."""
+"""Quantity that the profile has right."""
 
 LEAST_SAMPLES = 20
 WIDEST = 0.15
-"""Half width of the interval of the ratio, as a share, from which on it is not observable."""
+"""Maximum half width of an observable ratio's interval, as a share."""
 
 
 @dataclass(frozen=True)
 class Thrust:
-    """What the rotors had to carry."""
+    """Fitted thrust and mass."""
 
     ratio_m_s2: FittedQuantity
-    """Greatest thrust per mass."""
+    """Maximum thrust per mass."""
     hover: FittedQuantity
-    """Thrust in a hover as a share of the greatest."""
+    """Thrust in a hover as a share of maximum thrust."""
     mass_kg: FittedQuantity
-    """Take-off mass; not observable where the profile is right about the mass."""
+    """Take-off mass; not observable if the profile's mass is taken as known."""
     thrust_max_n: FittedQuantity
-    """Of one rotor; not observable where the profile is right about the thrust."""
+    """Maximum thrust of one rotor; not observable if the profile's thrust is taken as known."""
 
 
 def fit_thrust(
     flown: Flown, vehicle: VehicleProfile, air: Air, known: Known, rng: np.random.Generator
 ) -> Thrust:
-    """Fit maximum thrust per mass, and from it whichever of mass and thrust is not `known`."""
+    """Fit maximum thrust per mass, and from it the quantity other than `known`."""
     ratio = vehicle.thrust_n / vehicle.body.mass_kg
     blank = FittedQuantity("thrust_per_mass_m_s2", "thrust per mass", "m/s²", profile=ratio)
     return thrust_of(_ratio(flown, vehicle, air, blank, rng), vehicle, known)
@@ -89,7 +89,7 @@ def _ratio(
     carried = dragged - felt.values[:, 2]
     shared = np.interp(felt.time_us, motors.time_us, share)
     value = float(carried.mean() / shared.mean())
-    # The ratio's error by its linearisation: that of the mean of what is left over.
+    # Error of the ratio, linearised: the error of the mean residual.
     left = carried - value * shared
     low, high = mean_interval(left, felt.time_us / US_PER_S, rng)
     bias_m_s2 = QUANTILE * SETTLED_SHARE * vehicle.sensors.imu.accel_bias_m_s2
@@ -104,8 +104,8 @@ def _ratio(
 def _shares(commands: Array, log: VehicleLog, vehicle: VehicleProfile) -> Array:
     """Return motor commands (n, 4) as shares of maximum thrust.
 
-    PX4's actuator_motors are thrusts where THR_MDL_FAC describes the motors' curve. Only its
-    outputs are bent (src/lib/mixer_module/functions/FunctionMotors.hpp).
+    PX4's actuator_motors are thrusts if THR_MDL_FAC describes the motors' curve. Only its outputs
+    are curved (src/lib/mixer_module/functions/FunctionMotors.hpp).
     """
     curve = 0.0 if log.parameters.get("THR_MDL_FAC") else vehicle.rotor.thrust_curve
     u = np.clip(commands, 0.0, 1.0)

@@ -1,8 +1,8 @@
-"""A vehicle's profile from several flights' logs together.
+"""Joint fit of a vehicle's profile to several flights' logs.
 
-Each flight is fitted alone. The mean of a random-effects model joins them. There a flight's value
-differs from the vehicle's by its own error. It also differs by a spread that all of them share
-(DerSimonian and Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 7, 1986).
+Each flight is fitted alone, and a random-effects model joins the results. A flight's value differs
+from the vehicle's by the flight's error and by a variance common to all flights (DerSimonian and
+Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 7, 1986).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def refit_together(
         seed: Seed of the intervals' resamples.
 
     Raises:
-        UsageError: A file cannot be read, or is the log of no flight. `FieldError`s name the field.
+        UsageError: A file cannot be read, or contains no flight. `FieldError`s name the field.
     """
     check_out(out)
     for path in logs:
@@ -100,7 +100,7 @@ def refit_together(
 
 
 def pooled(alone: Sequence[FittedQuantity]) -> FittedQuantity:
-    """Return a quantity of a vehicle, by what several flights tell of it."""
+    """Return a vehicle's quantity, pooled from several flights."""
     told = [each for each in alone if each.value is not None and each.half_width]
     if not told:
         return replace(alone[0], unobservable=f"in none of {len(alone)}: {alone[0].unobservable}")

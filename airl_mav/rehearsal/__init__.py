@@ -1,1 +1,1 @@
-"""Runs: the processes of a rehearsal, the order they start in, and what they leave behind."""
+"""Runs: processes of a rehearsal, their start order and their output files."""

@@ -1,8 +1,8 @@
-"""The control channel between the harness and a process it supervises: JSON lines over pipes.
+"""Control channel between the harness and a supervised process: JSON lines over pipes.
 
-Requests go to the child's standard input, events come from its standard output. What the child
-wants to say to people goes to standard error. The end of standard input means that the harness is
-gone: the child ends. Because it is only pipes, the same channel runs through `ssh`.
+Requests go to the child's standard input, events come from its standard output. Messages for people
+go to standard error. The child ends at the end of standard input, which means that the harness has
+ended. The channel uses only pipes, so it also runs through `ssh`.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from airl_mav.view.ends import ViewEnds
 
 
 class _Line(BaseModel):
-    """One message."""
+    """Message of the channel."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     def to_line(self) -> bytes:
-        """Return the wire form."""
+        """Return the message as a line of JSON."""
         return self.model_dump_json().encode() + b"\n"
 
 
@@ -38,34 +38,34 @@ class _Line(BaseModel):
 
 
 class Begin(_Line):
-    """What the process is to be: its first line."""
+    """First line to a process: its configuration."""
 
     type: Literal["begin"] = "begin"
     scenario: ResolvedScenario
     log: str | None = None
     """File for the output of real firmware."""
     view: ViewEnds | None = None
-    """Where the flights are watched; None: nowhere."""
+    """View that shows the flights; None: no view."""
 
 
 # --- rehearsal -> firmware
 
 
 class LoadEpisode(_Line):
-    """Set up a new arena with the vehicle at rest in it; the autopilot boots."""
+    """Request to set up a new arena with the vehicle at rest; the autopilot boots."""
 
     type: Literal["load"] = "load"
     episode: int
     seed: int
-    """Of arena, sensors and wind."""
+    """Seed of arena, sensors and wind."""
     tlog: str | None
-    """Write the MAVLink log here."""
+    """Path of the MAVLink log."""
     record: str
-    """Write the flight's arrays (.npz) here when the episode is finished."""
+    """Path of the flight's arrays (.npz), written when the episode is finished."""
 
 
 class FinishEpisode(_Line):
-    """Stop the episode and save its arrays."""
+    """Request to stop the episode and save its arrays."""
 
     type: Literal["finish"] = "finish"
 
@@ -74,30 +74,30 @@ class FinishEpisode(_Line):
 
 
 class Fly(_Line):
-    """Fly one mission."""
+    """Request to fly one mission."""
 
     type: Literal["fly"] = "fly"
     episode: int
     goal: Goal
-    """North, east [m] from the start."""
+    """Goal: north, east [m] from the start."""
     epoch_ns: int | None
-    """Host monotonic time of simulated time 0 when both share a host; None = start a clock."""
+    """Host monotonic time of simulated time 0 on a shared host; None = start a clock."""
     seed: int
-    """Of the injected latency, and of random actions."""
+    """Seed of the injected latency and of random actions."""
     record: str
-    """Write the decision log (.npz) here."""
+    """Path of the decision log (.npz)."""
 
 
 class Abort(_Line):
-    """End the mission now."""
+    """Request to end the mission now."""
 
     type: Literal["abort"] = "abort"
     land: bool
-    """Stop and land; False after a crash: there is nothing left to land."""
+    """True to stop and land; False after a crash."""
 
 
 class Shutdown(_Line):
-    """End the process."""
+    """Request to end the process."""
 
     type: Literal["shutdown"] = "shutdown"
 
@@ -106,33 +106,33 @@ class Shutdown(_Line):
 
 
 class Compiling(_Line):
-    """The process begins to compile kernels, or ends it: at the first start after an install."""
+    """Event: kernel compilation starts or ends, at the first start after an install."""
 
     type: Literal["compiling"] = "compiling"
     begins: bool
 
 
 class Ready(_Line):
-    """The process can take requests."""
+    """Event: the process accepts requests."""
 
     type: Literal["ready"] = "ready"
 
 
 class Loaded(_Line):
-    """The episode stands: the vehicle waits at the start."""
+    """Event: the episode is loaded, and the vehicle waits at the start."""
 
     type: Literal["loaded"] = "loaded"
     episode: int
     time_us: int
     epoch_ns: int | None
-    """Host monotonic time of simulated time 0; None when time is not paced."""
+    """Host monotonic time of simulated time 0; None without pacing."""
     slipped_us: int
-    """Simulated time given up before, because the host could not keep up."""
+    """Simulated time skipped before the episode because the host could not keep up [µs]."""
     goal: Goal
 
 
 class State(_Line):
-    """The true state, a few times a second."""
+    """Event: the true state, several times a second."""
 
     type: Literal["state"] = "state"
     time_us: int
@@ -145,11 +145,11 @@ class State(_Line):
     armed: bool
     landed: bool
     slipped_us: int
-    """Simulated time given up since the start because the host could not keep up."""
+    """Simulated time skipped since the start because the host could not keep up [µs]."""
 
 
 class Text(_Line):
-    """A STATUSTEXT of the autopilot."""
+    """Event: a STATUSTEXT of the autopilot."""
 
     type: Literal["text"] = "text"
     time_us: int
@@ -158,35 +158,35 @@ class Text(_Line):
 
 
 class LogLost(_Line):
-    """A log of the flight cannot be written any more; the flight goes on."""
+    """Event: a log of the flight cannot be written; the flight continues."""
 
     type: Literal["log_lost"] = "log_lost"
     what: str
-    """Which file, and why."""
+    """File name and cause."""
 
 
 class Due(_Line):
-    """A process's fault begins or ends; a firmware to be killed has saved its arrays."""
+    """Event: a process fault starts or ends; before a kill, the firmware has saved its arrays."""
 
     type: Literal["due"] = "due"
     time_us: int
     fault: str
-    """In words (docs/how-to/faults.md)."""
+    """Fault specification as text (docs/how-to/faults.md)."""
     begins: bool
 
 
 class Saved(_Line):
-    """The episode's arrays are on disk."""
+    """Event: the episode's arrays are on disk."""
 
     type: Literal["saved"] = "saved"
     path: str
-    """Of the arrays."""
+    """Path of the arrays."""
     sha256: dict[str, str] = Field(default_factory=dict)
-    """In lockstep, the fingerprint of the flight by lane; see docs/explanation/lockstep.md."""
+    """In lockstep, hashes of the flight by lane; see docs/explanation/lockstep.md."""
 
 
 class Progress(_Line):
-    """The mission has entered a phase."""
+    """Event: the mission has entered a phase."""
 
     type: Literal["progress"] = "progress"
     phase: str
@@ -194,28 +194,28 @@ class Progress(_Line):
 
 
 class Ended(_Line):
-    """The mission is over."""
+    """Event: the mission is over."""
 
     type: Literal["ended"] = "ended"
     reason: str
     notes: tuple[str, ...] = ()
     path: str
-    """Of the decision log."""
+    """Path of the decision log."""
     by_hand: bool = False
-    """Whether its latency or its compensation was changed by hand."""
+    """True if the user changed latency or compensation during the flight."""
     use: ProcessUse | None = None
-    """What the mission took of the companion's machine; None where it is no process of its own."""
+    """Resources used by the companion; None if it is not a separate process."""
     sha256: dict[str, str] = Field(default_factory=dict)
-    """In lockstep, the fingerprint of what the policy saw; see docs/explanation/lockstep.md."""
+    """In lockstep, hashes of the policy's inputs; see docs/explanation/lockstep.md."""
 
 
 class Failed(_Line):
-    """The process cannot go on and will end."""
+    """Event: the process cannot continue and will end."""
 
     type: Literal["failed"] = "failed"
     message: str
     usage: bool = False
-    """The input cannot be used: to start again would not help."""
+    """True for invalid input: a restart would not help."""
 
 
 Request = Annotated[
@@ -230,13 +230,13 @@ _EVENTS: TypeAdapter[Any] = TypeAdapter(Event)
 
 
 def parse_event(line: bytes) -> Event:
-    """Read one event line. Raises ValueError (pydantic's) for anything else."""
+    """Read one event line. Raises pydantic's ValueError for an invalid line."""
     event: Event = _EVENTS.validate_json(line)
     return event
 
 
 class ChildChannel:
-    """The child's end: requests in through a callback, events out."""
+    """The child's end of the channel: passes requests to a callback and sends events."""
 
     def __init__(self, incoming: BinaryIO, outgoing: BinaryIO) -> None:
         self._incoming = incoming
@@ -245,14 +245,14 @@ class ChildChannel:
 
     @classmethod
     def on_stdio(cls) -> ChildChannel:
-        """Take over standard input and output, so that no library's output garbles the channel."""
+        """Take over standard input and output, so that library output cannot enter the channel."""
         outgoing = os.fdopen(os.dup(1), "wb", buffering=0)
         os.dup2(2, 1)
-        # Unbuffered: the reading thread must hold no lock that the end of the interpreter wants.
+        # Unbuffered: the reader thread must not hold a lock at interpreter shutdown.
         return cls(os.fdopen(os.dup(0), "rb", buffering=0), outgoing)
 
     def send(self, event: _Line) -> None:
-        """Send one event; a harness that is gone is no error here (its end of file is)."""
+        """Send one event; ignore a broken pipe, because the end of input reports it."""
         try:
             with self._lock:
                 self._outgoing.write(event.to_line())
@@ -260,7 +260,7 @@ class ChildChannel:
             return
 
     def begin(self) -> Begin | None:
-        """Wait for the first line, or None when the rehearsal is gone before it."""
+        """Wait for the first line; return None if the harness ends before."""
         line = self._incoming.readline()
         if not line:
             return None
@@ -270,9 +270,9 @@ class ChildChannel:
             raise UsageError(f"not a scenario: {field_error(error)}: {line[:200]!r}") from None
 
     def listen(self, handle: Callable[[Any], None], gone: Callable[[], None]) -> None:
-        """Call `handle` for every request, on a thread; `gone` when the harness is gone.
+        """Call `handle` for every request, on a thread, and `gone` when the harness ends.
 
-        `gone` is also called when `handle` fails: then nobody would hear the end of the harness.
+        Also calls `gone` when `handle` fails, because the thread then stops reading.
         """
 
         def loop() -> None:
@@ -291,7 +291,7 @@ class ChildChannel:
 
 
 def serve(work: Callable[[Begin, ChildChannel], None], lost: type[Exception]) -> int:
-    """Be a child process: take its first line, work, and say why it failed; return its status."""
+    """Run a child process: read its first line, work, report a failure; return the exit status."""
     channel = ChildChannel.on_stdio()
     # The rehearsal decides when to end, also on Ctrl-C: it closes the pipe.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

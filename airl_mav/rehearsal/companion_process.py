@@ -1,4 +1,4 @@
-"""The companion process of a rehearsal: MAVSDK, camera and policy, missions on request."""
+"""Companion process of a rehearsal: MAVSDK, camera and policy fly missions on request."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from companion.mission import check_camera, fly_mission
 from companion.signing_proxy import signed
 from companion.watchdog import ThreadGuard
 
-if TYPE_CHECKING:  # A companion that nobody watches need not load it.
+if TYPE_CHECKING:  # Loaded only for a view.
     from airl_mav.view.taps import CompanionTap
 
 CONNECT_TIMEOUT_S = 30.0
-"""Longest wait for the flight controller [wall s]."""
+"""Connection timeout of the flight controller [wall s]."""
 
 
 class Missions:
-    """Flies missions; link and camera stay open for all of them."""
+    """Flies missions; link and camera stay open between them."""
 
     def __init__(
         self,
@@ -42,7 +42,7 @@ class Missions:
         harness: channel.ChildChannel,
         tap: CompanionTap | None = None,
     ) -> None:
-        """Load the policy, or raise UsageError; nothing is connected yet."""
+        """Load the policy without connecting. Raises UsageError."""
         self._scenario = scenario
         self._tap = tap
         self._harness = harness
@@ -51,7 +51,7 @@ class Missions:
         self._stop, self._abandon = threading.Event(), threading.Event()
 
     def handle(self, request: Any) -> None:
-        """Take a request, on the channel's thread."""
+        """Accept a request, on the channel's thread."""
         if isinstance(request, channel.Abort):
             (self._stop if request.land else self._abandon).set()
             self._stop.set()
@@ -59,15 +59,14 @@ class Missions:
         if isinstance(request, channel.Fly):
             self._stop.clear()
             self._abandon.clear()
-            # Shared for one flight, then left alone. What lasts a while (holding an action, the
-            # watchdog) must not jump when the simulator gives up time. The rehearsal corrects the
-            # stamps afterwards.
+            # Set once per flight: holding an action and the watchdog must not jump when the
+            # simulator skips time. The rehearsal corrects the stamps afterwards.
             if request.epoch_ns is not None:
                 self._clock.epoch_ns = request.epoch_ns
         self._requests.put(request)
 
     def run(self) -> None:
-        """Fly the requested missions until the end; UsageError: the camera does not fit."""
+        """Fly the requested missions until shutdown. Raises UsageError for an unfit camera."""
         aircraft, clock = self._scenario.scenario, self._clock
         camera_port = aircraft.open_ports.camera_port
         use = UseMeter(WallClock())
@@ -129,7 +128,7 @@ class Missions:
 
 
 def fly(begin: channel.Begin, harness: channel.ChildChannel) -> None:
-    """Fly missions on request, until the pipe ends."""
+    """Fly missions on request until the pipe closes."""
     with ExitStack() as held:
         tap: CompanionTap | None = None
         if begin.view is not None:
@@ -137,8 +136,8 @@ def fly(begin: channel.Begin, harness: channel.ChildChannel) -> None:
 
             tap = held.enter_context(closing(CompanionTap(begin.view, begin.scenario)))
         missions = Missions(begin.scenario, harness, tap)
-        # Without its rehearsal a companion has no business in the air, whatever it is doing: its
-        # setpoints end and the flight controller's offboard-loss failsafe takes over.
+        # Without its rehearsal the companion must not fly: its setpoints end and the flight
+        # controller's offboard-loss failsafe takes over.
         harness.listen(missions.handle, lambda: os._exit(EXIT_BROKEN))
         missions.run()
 

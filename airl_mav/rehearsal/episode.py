@@ -1,4 +1,4 @@
-"""One episode of a rehearsal: its plan, its observations, its record."""
+"""Episode of a rehearsal: state during the flight, and its record."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from airl_mav.scenario.resolved import ResolvedScenario
 from companion.interfaces import CAMERA_SILENT, FRAMES_LATE, LINK_LOST, TELEMETRY_FROZEN
 
 SEPARATED = (LINK_LOST, CAMERA_SILENT, TELEMETRY_FROZEN, FRAMES_LATE)
-"""Why a mission ends when both processes live but no longer hear each other. One of them stood
-still for seconds, or the host has too much to do."""
+"""Reasons to end a mission when both processes live but lost contact. A process was blocked for
+seconds, or the host is overloaded."""
 
 DISTURBING = (*PROCESSES, *LINKS, "camera")
-"""Parts without which a companion sees or commands late, or not at all."""
+"""Parts whose faults delay the companion's observations or commands, or cut them off."""
 
 
 @dataclass
 class Episode:
-    """What is known of a running episode."""
+    """State of a running episode."""
 
     index: int
     seed: int
@@ -49,23 +49,23 @@ class Episode:
     faults: ProcessFaults
     notes: list[str]
     wall_us: int | None = None
-    """Wall time from the reset to the verdict."""
+    """Wall time from reset to verdict [µs]."""
     paused_us: int = 0
-    """How long the firmware was suspended in it, as asked for [simulated µs]."""
+    """Time that the firmware was suspended by faults during the episode [simulated µs]."""
     state: State | None = None
     verdict_state: State | None = None
     ended: Ended | None = None
     navigating_us: int | None = None
-    """When navigation began, by the companion's clock, which has given up no time [µs]."""
+    """Start of navigation by the companion's clock, which does not skip time [µs]."""
 
     @property
     def referee(self) -> Referee:
-        """The referee."""
+        """Return the episode's referee."""
         return self.supervisor.referee
 
     @property
     def separated(self) -> str | None:
-        """Why it ended before its verdict, if the processes no longer heard each other."""
+        """Return the end reason if the processes lost contact before the verdict, else None."""
         verdict, ended = self.referee.verdict, self.ended
         if verdict is None or verdict.outcome is not Outcome.ABORTED or ended is None:
             return None
@@ -73,14 +73,14 @@ class Episode:
 
     @property
     def slipped_us(self) -> int:
-        """Simulated time given up so far [µs]."""
+        """Return the simulated time skipped so far [µs]."""
         return 0 if self.state is None else self.state.slipped_us - self.loaded.slipped_us
 
 
 def join_episode(
     episode: Episode, scenario: ResolvedScenario, record_path: Path, decisions_path: Path
 ) -> FlownEpisode:
-    """Join what both processes left of a judged episode; the companion's log may be missing."""
+    """Join both processes' outputs of a judged episode; the companion's log may be missing."""
     arrays = _read(record_path)
     trajectory = Trajectory.from_arrays(part_of(arrays, "trajectory"))
     latency = part_of(arrays, "estimate", keep_prefix=True)
@@ -116,19 +116,19 @@ def join_episode(
 
 
 def _slow_images(scenario: ResolvedScenario) -> bool:
-    """Return whether images take longer than a tick, so that they are late in real time."""
+    """Return True if images take longer than a tick, so that they are delayed in real time."""
     return scenario.scenario.renderer in SLOW
 
 
 def _excused(record: EpisodeRecord, scenario: ResolvedScenario) -> list[tuple[int, int]]:
-    """Return from when to when decisions may be late for what was asked for [µs]."""
+    """Return the intervals in which requested faults excuse late decisions [µs]."""
     if _slow_images(scenario):
         return [(record.started_us, record.ended_us)]
     return [(each.from_us, each.to_us) for each in disturbances(record.faults)]
 
 
 def _told_of_images(stamps: Mapping[str, NDArray[Any]]) -> tuple[str, ...]:
-    """Return how many images were decided on that took long to draw, and how late they were."""
+    """Return a note on the number of path-traced images used and their delay."""
     late, fetched_us = stage_durations(stamps)["t1"]
     if not fetched_us.size:
         return ()
@@ -155,7 +155,7 @@ def _record(
         episode.referee,
         trajectory,
         latency,
-        # What the referee knew in flight was the time given up by its newest state, an older one.
+        # The referee subtracted the skipped time of its newest state in flight, an older value.
         None if began_us is None else int(without_slips(np.array([began_us]), slips)[0]),
         index=episode.index,
         seed=episode.seed,
@@ -180,10 +180,10 @@ def judged_record(
     started_us: int,
     **known: Any,
 ) -> EpisodeRecord:
-    """Return the record of a flight that a referee has watched; one without a verdict is aborted.
+    """Return the record of a refereed flight; without a verdict it is aborted.
 
-    Navigation began, and the episode started, by the clock of the trajectory [µs]. `known` are the
-    fields of `EpisodeRecord` that neither scenario nor referee tells.
+    `navigation_us` and `started_us` use the trajectory's clock [µs]. `known` contains the fields of
+    `EpisodeRecord` that neither scenario nor referee provides.
     """
     verdict = referee.verdict or referee.abort(started_us, "no verdict")
     quality = None
@@ -216,7 +216,7 @@ def judged_record(
 
 
 def faults_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[FaultActed, ...]:
-    """Return the faults that acted in a flight, of what the firmware has recorded of it."""
+    """Return the faults that acted in a flight, from the firmware's arrays."""
     told = part_of(arrays, "faults")
     if not told:
         return ()
@@ -225,17 +225,17 @@ def faults_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[FaultActed, ...]:
 
 
 def disturbing(faults: Iterable[Fault]) -> list[Fault]:
-    """Return the faults of which a companion may decide late, or lose the vehicle."""
+    """Return the faults that can delay a companion's decisions or crash the vehicle."""
     return [fault for fault in faults if fault.part in DISTURBING]
 
 
 def disturbances(acted: Sequence[FaultActed]) -> list[FaultActed]:
-    """Return of what has acted the faults of which a companion may decide late, or be lost."""
+    """Return the acted faults that can delay a companion's decisions or crash the vehicle."""
     return [each for each in acted if disturbing([Fault.model_validate(each.fault)])]
 
 
 COMPANION_STAMPS = tuple(name for name in STAMPS if name != "capture_us")
-"""Stamps by the companion's clock; the exposure of a frame is by the simulator's."""
+"""Stamps by the companion's clock; the frame's exposure uses the simulator's clock."""
 
 
 def join_stamps(
@@ -245,7 +245,7 @@ def join_stamps(
 ) -> dict[str, NDArray[Any]]:
     """Return the decision log with the times at which the autopilot accepted and applied each.
 
-    Slips (k, 2) are the times at which simulated time was given up, and how much [µs].
+    Slips (k, 2) are the times at which simulated time was skipped, and the durations [µs].
     """
     by_simulator = {name: without_slips(decisions[name], slips) for name in COMPANION_STAMPS}
     if not setpoints:
@@ -265,10 +265,10 @@ def join_stamps(
 
 
 def without_slips(times_us: NDArray[np.int64], slips: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return times (n,) of a clock that ran on as the simulator's clock tells them [µs].
+    """Convert times (n,) of the companion's clock to the simulator's clock [µs].
 
-    Both agreed at the start of the episode. Each slip set the simulator's clock back to the tick
-    that was due. What happened while it stood still happened at that tick.
+    Both clocks agreed at the start of the episode. Each slip set the simulator's clock back to the
+    due tick. Times during the slip map to that tick.
     """
     told = times_us.copy()
     given_up_us = 0
@@ -294,8 +294,8 @@ def part_of(
 UNMATCHED = -1
 
 SAME_WITHIN = 1e-5
-"""Setpoints closer than this in every element [m/s, rad, rad/s] are the same: MAVSDK turns degrees
-into radians in float32, which costs the last bits of a yaw."""
+"""Tolerance for equal setpoints, per element [m/s, rad, rad/s]: MAVSDK converts degrees to
+radians in float32, which loses the last bits of a yaw."""
 
 
 def match_setpoints(
@@ -306,11 +306,11 @@ def match_setpoints(
 ) -> NDArray[np.int64]:
     """Match each sent setpoint (n, 4) with the first accepted copy of it.
 
-    MAVSDK sends a setpoint at once, and again at 20 Hz until the next one. A copy counts when it
-    was accepted at or after the sending, before the next one was sent, and carries the same four
-    numbers (NaN, an unused field, equals NaN). When a decision repeats the one before, a resend of
-    that one still under way counts as well. It commands the same. Return the index (n,) into the
-    accepted ones, `UNMATCHED` where there is none.
+    MAVSDK sends a setpoint at once, and again at 20 Hz until the next one. A copy counts if it was
+    accepted at or after the sending, before the next one was sent, and contains the same four
+    numbers (NaN, an unused field, equals NaN). If a decision repeats the previous one, a late
+    resend of the previous setpoint also counts: it commands the same. Return the index (n,) into
+    the accepted setpoints, `UNMATCHED` without a match.
     """
     sent = np.asarray(sent_us, np.int64)
     accepted = np.asarray(accepted_us, np.int64)
@@ -336,7 +336,7 @@ def match_setpoints(
 
 
 def stamps_of(index: ArrayLike, times_us: ArrayLike) -> NDArray[np.int64]:
-    """Look up the time (n,) [µs] of each match in `times_us` (m,); `NO_STAMP` where unmatched."""
+    """Return the time (n,) [µs] of each match in `times_us` (m,); `NO_STAMP` if unmatched."""
     where = np.asarray(index, np.int64)
     stamps = np.full(len(where), NO_STAMP, np.int64)
     matched = where != UNMATCHED

@@ -1,8 +1,7 @@
-"""Saves episodes in batches, in a thread of its own.
+"""Saves episodes in batches, in a separate thread.
 
-Episodes of the levels gym and lockstep end faster than single ones can be saved. Who flies or
-hands out flights must not wait for the disk. The files and what they promise are those of
-`RunFolder.save_episodes`.
+Episodes of the levels gym and lockstep end faster than single ones can be saved. The flying process
+must not wait for the disk. Files and guarantees match `RunFolder.save_episodes`.
 """
 
 from __future__ import annotations
@@ -14,18 +13,18 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 
 INTERVAL_S = 2.0
-"""Time between two saves while the run is small [wall s]."""
+"""Interval between two saves of a small run [wall s]."""
 
 INTERVAL_PER_SAVE = 9.0
-"""Least time between two saves, in multiples of how long the last one took. Adding to an archive
-copies it. Without this, saving would take most of the time of a run of ten thousand flights."""
+"""Minimum interval between two saves, in multiples of the last save's duration. Each save copies
+the archive; without this minimum, saving would dominate a run of ten thousand flights."""
 
 MAX_WAITING = 1000
-"""Most episodes that wait to be saved."""
+"""Maximum number of episodes that wait to be saved."""
 
 
 class EpisodeSaver:
-    """Saves episodes as they come. A context manager: at its end all of them are on the disk."""
+    """Saves episodes as they end. As a context manager, all are on disk at exit."""
 
     def __init__(self, folder: RunFolder) -> None:
         self._folder = folder
@@ -36,12 +35,12 @@ class EpisodeSaver:
         self._thread = threading.Thread(target=self._run, name="episode saver")
 
     def __enter__(self) -> EpisodeSaver:
-        """Start."""
+        """Start the thread."""
         self._thread.start()
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Save the rest. Raises the error of a save that failed, unless one is under way."""
+        """Save the rest. Raises a failed save's error unless another exception is active."""
         with self._changed:
             self._ending = True
             self._changed.notify_all()
@@ -50,7 +49,7 @@ class EpisodeSaver:
             self._raise_error()
 
     def add(self, episode: FlownEpisode) -> None:
-        """Take an episode; blocks while too many wait. Raises the error of a save that failed."""
+        """Add an episode; blocks while the queue is full. Raises the error of a failed save."""
         with self._changed:
             self._changed.wait_for(lambda: len(self._waiting) < MAX_WAITING or self._error)
             self._raise_error()
@@ -69,13 +68,13 @@ class EpisodeSaver:
             while not ending:
                 ending, episodes = self._collect(interval_s)
                 interval_s = max(INTERVAL_S, INTERVAL_PER_SAVE * self._save(episodes))
-        except BaseException as error:  # Raised again where the episodes come from.
+        except BaseException as error:  # Raised again in the caller's thread.
             with self._changed:
                 self._error = error
                 self._changed.notify_all()
 
     def _collect(self, interval_s: float) -> tuple[bool, list[FlownEpisode]]:
-        """Wait for the next save; return whether it is the last one, and its episodes."""
+        """Wait for the next save; return True if it is the last one, and its episodes."""
         with self._changed:
             self._changed.wait_for(
                 lambda: self._ending or len(self._waiting) >= MAX_WAITING, interval_s
@@ -85,7 +84,7 @@ class EpisodeSaver:
             return self._ending, episodes
 
     def _save(self, episodes: list[FlownEpisode]) -> float:
-        """Save; return how long that took [wall s]."""
+        """Save the episodes; return the duration [wall s]."""
         clock = WallClock()
         if episodes:
             self._folder.save_episodes(episodes)

@@ -1,4 +1,4 @@
-"""Episode of a scenario as the firmware loads it."""
+"""Episode of a scenario in the form that the firmware loads."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def episode_setup(resolved: ResolvedScenario, arena: Arena, seed: int) -> Episod
 
 
 def state_of(simulation: Simulation, collision: str | None, slipped_us: int = 0) -> State:
-    """Return the state after the newest tick, with what has been hit and slipped so far."""
+    """Return the state after the newest tick, with collision and skipped time [µs]."""
     truth, flight = simulation.truth, simulation.autopilot.flight
     x, y, z = (float(c) for c in truth.position)
     return State(

@@ -1,4 +1,4 @@
-"""The firmware process of a rehearsal: plant, flight controller and camera, episodes on request."""
+"""Firmware process of a rehearsal: plant, flight controller and camera fly requested episodes."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.simulation import Simulation
 from firmware_sim.warm_up import warm_up
 
-if TYPE_CHECKING:  # A firmware that nobody watches need not load it.
+if TYPE_CHECKING:  # Loaded only for a view.
     from airl_mav.view.taps import SimulationTap
 
 STATE_EVERY_US = 40_000
-"""The rehearsal hears the true state so often: 25 Hz."""
+"""Period of true-state reports to the rehearsal [simulated µs]: 25 Hz."""
 
 
 def build_firmware(
@@ -61,12 +61,12 @@ def build_firmware(
 ) -> Firmware:
     """Bind all ports and return the firmware without an episode.
 
-    Addresses are IPv4; `insecure` allows those that other machines can reach. What real firmware
-    prints goes to `log`, or into a file in its folder. The built-in autopilot keeps the parameters
-    that users set in `parameters_file`, or forgets them. Without `recording` episodes may last for
-    ever. `bind_devices` binds more links of the built-in flight controller, after the others.
-
-    Raises UsageError if a port is taken, an address unusable, or real firmware is not there.
+    Addresses are IPv4; `insecure` allows addresses that other machines can reach. Output of real
+    firmware goes to `log`, or into a file in its folder. The built-in autopilot saves user
+    parameters in `parameters_file`; None = does not save them. Without `recording`, episodes have
+    no maximum length. `bind_devices` binds additional links of the built-in flight controller,
+    after the others. Raises UsageError if a port is taken, an address unusable, or real firmware
+    missing.
     """
     ports = aircraft.open_ports
 
@@ -110,7 +110,7 @@ def build_firmware(
 
 
 class Service:
-    """Flies the episodes that the rehearsal asks for, one at a time."""
+    """Flies the episodes that the rehearsal requests, one at a time."""
 
     def __init__(
         self,
@@ -119,7 +119,7 @@ class Service:
         scenario: ResolvedScenario,
         tap: SimulationTap | None = None,
     ) -> None:
-        """Store the firmware, its listeners, the scenario and the view."""
+        """Store firmware, harness, scenario and view, and register callbacks."""
         self._tap = tap
         if tap is not None:
             firmware.on_frame = tap.frame
@@ -132,19 +132,19 @@ class Service:
         self._reported = 0
         self._crash = CrashDetector()
         self._due: dict[int, Fault] = {}
-        """The faults of processes that the rehearsal was told to carry out, by their number."""
+        """Acting process faults reported to the rehearsal, by number."""
         self._handlers: dict[type, Callable[[Any], None]] = {
             channel.LoadEpisode: self._load,
             channel.FinishEpisode: self._finish,
         }
 
     def run(self, requests: queue.Queue[Any]) -> None:
-        """Fly until the end; UsageError if an episode cannot be made, or FirmwareLostError."""
+        """Fly until shutdown. Raises UsageError for an invalid episode, or FirmwareLostError."""
         while self._handle_all(requests):
             self._firmware.step()
 
     def _handle_all(self, requests: queue.Queue[Any]) -> bool:
-        """Handle what has arrived; False when it is time to end."""
+        """Handle all pending requests; return False on shutdown."""
         with contextlib.suppress(queue.Empty):
             while True:
                 request = requests.get(block=False)
@@ -192,14 +192,14 @@ class Service:
         self._harness.send(state_of(simulation, self._crash.hit, self._firmware.slipped_us))
 
     def _tell_faults(self, timeline: FaultTimeline, now_us: int) -> None:
-        """Tell the faults of processes that begin or end."""
+        """Report process faults that begin or end."""
         acting = {each.number: each.fault for each in timeline.acting(*PROCESSES)}
         if acting.keys() == self._due.keys():
             return
         for number in acting.keys() ^ self._due.keys():
             fault, begins = (acting | self._due)[number], number in acting
             if begins and (fault.part, fault.kind) == ("firmware", "killed"):
-                # What is true is known until then; nobody could ask for it afterwards.
+                # Save the true state now: a killed firmware cannot answer.
                 self._firmware.save(self._record)
             self._harness.send(channel.Due(time_us=now_us, fault=str(fault), begins=begins))
         self._due = acting
@@ -218,7 +218,7 @@ def unix_us() -> int:
 
 
 def fly(begin: channel.Begin, harness: channel.ChildChannel) -> None:
-    """Fly episodes on request, until the pipe ends."""
+    """Fly episodes on request until the pipe closes."""
     requests: queue.Queue[Any] = queue.Queue()
     harness.listen(requests.put, lambda: requests.put(channel.Shutdown()))
     scenario = begin.scenario

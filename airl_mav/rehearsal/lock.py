@@ -1,4 +1,4 @@
-"""A folder that belongs to one run at a time, and to all processes of it."""
+"""Lock that reserves a folder for one run and all its processes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 
 WAIT_S = 20.0
-"""How long the processes of a run that was killed may take to end [wall s]."""
+"""Maximum wait for the processes of a killed run to end [wall s]."""
 
 POLL_S = 0.05
 """Time between two attempts to take the lock [wall s]."""
@@ -21,14 +21,14 @@ POLL_S = 0.05
 
 @contextmanager
 def locked(path: Path, say: Callable[[str], None]) -> Iterator[int]:
-    """Keep a folder, made when there is none, to this process and those that inherit the lock.
+    """Create a folder if needed, and lock it for this process and processes that inherit the lock.
 
-    The lock ends with the last process that has the yielded descriptor. The processes of a killed
-    run are waited for. They hold its ports and may still write.
+    The lock ends with the last process that has the yielded descriptor. Waits for the processes of
+    a killed run, which hold its ports and may still write.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        # The folder itself: a file of its own would have to be cleaned up.
+        # Locks the folder: a lock file would need cleanup.
         descriptor = os.open(path, os.O_RDONLY)
     except OSError as error:
         raise UsageError(f"--out {path}: {error.strerror}") from None
@@ -57,7 +57,7 @@ def _try(descriptor: int) -> bool:
     except BlockingIOError:
         return False
     except OSError:
-        # Some file systems, above all those of a network, have no such locks. Then nothing keeps
-        # two runs out of one folder.
+        # Some file systems, mainly network ones, do not support locks. Nothing then prevents two
+        # runs in one folder.
         return True
     return True

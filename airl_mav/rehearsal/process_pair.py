@@ -1,4 +1,4 @@
-"""Firmware and companion as one: started, listened to, made to fail and ended together."""
+"""Firmware and companion processes: start, events, faults and end."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ MODULES = {
     FIRMWARE: "airl_mav.rehearsal.firmware_process",
     COMPANION: "airl_mav.rehearsal.companion_process",
 }
-"""What each process runs."""
+"""Python module of each process."""
 
 READY_TIMEOUT_S = 180.0
-"""Maximum time until both are ready, without that of compiling kernels [wall s]."""
+"""Maximum time until both are ready, without kernel compilation [wall s]."""
 
 REPLY_TIMEOUT_S = 30.0
-"""Longest wait for an answer of a healthy process [wall s]."""
+"""Reply timeout of a healthy process [wall s]."""
 
 LOOK_S = 0.2
-"""Waits are cut this short, so that Ctrl-C is seen at once on every platform [wall s]."""
+"""Maximum length of one wait, so that Ctrl-C acts at once on every platform [wall s]."""
 
 
 class LostError(Exception):
-    """A process died or hangs, or they lost each other; `what` is one line for the records."""
+    """A process died, hangs or lost contact; `what` is one line for the records."""
 
     def __init__(self, what: str, detail: str = "") -> None:
         super().__init__(what + detail)
@@ -48,7 +48,7 @@ class LostError(Exception):
 
 
 class Child(ChildProcess):
-    """One of our programs; its events and its end arrive in a shared queue."""
+    """One process of the pair; its events and its end arrive in a shared queue."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class Child(ChildProcess):
         keeps: Sequence[int] = (),
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        """Start `python -m module`; `events` gets (name, event), and (name, Exited) in the end."""
+        """Start `python -m module`; `events` gets (name, event), and finally (name, Exited)."""
         super().__init__(
             [sys.executable, "-m", module],
             log,
@@ -70,57 +70,57 @@ class Child(ChildProcess):
         )
         self.name = name
         self.ending = False
-        """Its end is wanted: no surprise when it comes."""
+        """True once its end is expected."""
         self._events = events
         self._reader = threading.Thread(target=self._read, name=f"{name}-events", daemon=True)
         self._reader.start()
 
     def send(self, request: BaseModel) -> None:
-        """Send a request; a dead child's end is reported through the queue."""
+        """Send a request; the queue reports the end of a dead child."""
         if self.stdin is not None:
             with suppress(BrokenPipeError, ValueError):
                 self.stdin.write(request.model_dump_json().encode() + b"\n")
                 self.stdin.flush()
 
     def stop(self) -> None:
-        """End it; see `ChildProcess.stop`. All its events are in the queue then."""
+        """End the process; see `ChildProcess.stop`. All its events are then in the queue."""
         self.ending = True
         super().stop()
         self._reader.join(GRACE_S)
 
     def kill(self) -> None:
-        """End it at once; does not wait."""
+        """End the process at once, without waiting."""
         self.ending = True
         super().kill()
 
     def _read(self) -> None:
         if self.stdout is not None:
             for line in self.stdout:
-                with suppress(ValidationError):  # a line that is not ours: nothing to act on
+                with suppress(ValidationError):  # Not an event line.
                     self._events.put((self.name, parse_event(line)))
             self.stdout.close()
         self._events.put((self.name, self.wait()))
 
 
 class ProcessPair:
-    """Two processes that fly together; after a loss a new pair takes over."""
+    """Two processes that fly together; after a loss a new pair replaces them."""
 
     def __init__(self) -> None:
         self._events: queue.Queue[tuple[str, Event | Exited]] = queue.Queue()
         self._children: dict[str, Child] = {}
         self._scratch = ""
-        """Folder of the companion's temporary files. MAVSDK makes one for each system that it
-        hears, and leaves it behind when its process is killed."""
+        """Folder of the companion's temporary files. MAVSDK creates one folder per system, and
+        leaves it behind when its process is killed."""
         self._clock = WallClock()
         self._suspended: dict[str, tuple[int, int | None]] = {}
-        """Since when each suspended process is, and until when [wall µs]; None: until asked for."""
+        """Start and end of the suspension by process [wall µs]; end None: until `resume`."""
         self._suspended_us: dict[str, int] = {}
-        """How long each was suspended before [wall µs]."""
+        """Duration of earlier suspensions by process [wall µs]."""
 
     def start(
         self, begin: Begin, logs: Path, keeps: Sequence[int], compiling: Callable[[], None]
     ) -> None:
-        """Start both processes and wait until they are ready, or raise UsageError or LostError."""
+        """Start both processes and wait until they are ready. Raises UsageError or LostError."""
         self._scratch = tempfile.mkdtemp(prefix="airl-companion-")
         places = {COMPANION: {"TMPDIR": self._scratch}}
         for name, module in MODULES.items():
@@ -143,13 +143,13 @@ class ProcessPair:
         self.pump(note, READY_TIMEOUT_S, "both processes to be ready", lambda: bool(compiles))
 
     def stop(self) -> None:
-        """End both processes; returns when they are gone."""
+        """End both processes and wait for their exit."""
         try:
-            # The companion first: what it commands last is part of the flight.
+            # Companion first: its last commands are part of the flight.
             for name in (COMPANION, FIRMWARE):
                 self.stop_one(name)
         except BaseException:
-            # A second Ctrl-C: no more patience, but nobody is left behind.
+            # A second Ctrl-C: kill all children without waiting.
             for child in self._children.values():
                 child.kill()
             raise
@@ -158,23 +158,23 @@ class ProcessPair:
                 shutil.rmtree(self._scratch, ignore_errors=True)
 
     def stop_one(self, name: str) -> None:
-        """End one process, if it was started; returns when it is gone."""
+        """End one process, if it was started, and wait for its exit."""
         if name in self._children:
             self._children[name].stop()
 
     def lives(self, name: str) -> bool:
-        """Return whether a process is there and meant to be."""
+        """Return True if the process is expected to run."""
         return not self._children[name].ending
 
     def suspend(self, name: str, for_s: float | None = None) -> None:
-        """Suspend a process, as a computer that hangs, for some wall time or until `resume`."""
+        """Suspend a process, like a hanging computer, for some wall time [s] or until `resume`."""
         now_us = self._clock.time_us()
         until_us = None if for_s is None else now_us + round(for_s * US_PER_S)
         self._children[name].suspend()
         self._suspended[name] = now_us, until_us
 
     def resume(self, name: str) -> None:
-        """Resume a process, if it is suspended."""
+        """Resume a process if it is suspended."""
         if name in self._suspended:
             suspended_us = self.suspended_us(name)
             del self._suspended[name]
@@ -182,25 +182,25 @@ class ProcessPair:
             self._children[name].resume()
 
     def suspended_us(self, name: str) -> int:
-        """Return how long a process has been suspended in all [wall µs]."""
+        """Return the total suspension time of a process [wall µs]."""
         before_us = self._suspended_us.get(name, 0)
         if name not in self._suspended:
             return before_us
         return before_us + self._clock.time_us() - self._suspended[name][0]
 
     def kill(self, name: str) -> None:
-        """End a process at once (SIGKILL), on purpose: its end is no loss."""
+        """Kill a process (SIGKILL) on purpose: its end does not count as a loss."""
         self._suspended.pop(name, None)
         self._children[name].kill()
 
     def send(self, name: str, request: BaseModel) -> None:
-        """Send a request; a dead process's end is found by who waits for the answer."""
+        """Send a request; the wait for the answer reports the end of a dead process."""
         self._children[name].send(request)
 
     def wait_for(
         self, kind: type[Any], look: Callable[[Event], None], timeout_s: float | None = None
     ) -> Any:
-        """Return the next event of a kind; `look` sees those before it. Raises as `pump`."""
+        """Return the next event of a kind; `look` gets the events before it. Raises as `pump`."""
         found: list[Any] = []
 
         def take(_name: str, event: Event) -> bool:
@@ -221,10 +221,11 @@ class ProcessPair:
         what: str,
         paused: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Feed events, with the name of their process, to `take` until it returns True.
+        """Feed events, with their process name, to `take` until it returns True.
 
-        While `paused`, time does not count. Raises UsageError if a process says so, and LostError
-        if one died or failed, or the time [wall s] is over; `what` is waited for, in words.
+        Time does not count while `paused`. Raises UsageError if a process reports one, and
+        LostError if a process died or failed, or after the timeout [wall s]; `what` describes the
+        expected event.
         """
         since = WallClock()
         paused_us = before_us = 0
@@ -247,7 +248,7 @@ class ProcessPair:
                 return
 
     def _look_s(self) -> float:
-        """Let those go on whose time is over; return how long there is nothing to do [wall s]."""
+        """Resume processes whose suspension is over; return the time to the next check [wall s]."""
         now_us, look_us = self._clock.time_us(), round(LOOK_S * US_PER_S)
         for name, (_, until_us) in list(self._suspended.items()):
             if until_us is None:
@@ -279,7 +280,7 @@ KILLED = "killed"
 
 
 class ProcessFaults:
-    """Carries out what is due."""
+    """Executes process faults that are due."""
 
     def __init__(self, pair: ProcessPair, speed: float) -> None:
         """Take the processes, and simulated seconds per wall second."""
@@ -289,27 +290,27 @@ class ProcessFaults:
         self._out: dict[str, str] = {}
 
     def out(self, name: str) -> str | None:
-        """Return what became of a process that flies no more in this episode, as "killed"."""
+        """Return the fault kind that ended a process for this episode, as "killed", or None."""
         return self._out.get(name)
 
     @property
     def reason(self) -> str | None:
-        """Why a flight ends that one of them flies no more, in words; None: both fly."""
+        """Return the reason why a lost process ends the flight; None: both fly."""
         return "; ".join(f"{name} {kind}" for name, kind in self._out.items()) or None
 
     @property
     def paused_us(self) -> int:
-        """How long the firmware was suspended, as asked for [simulated µs]."""
+        """Return the time that the firmware was suspended by faults [simulated µs]."""
         return round((self._pair.suspended_us(FIRMWARE) - self._suspended_before_us) * self._speed)
 
     def carry_out(self, due: Due) -> str | None:
-        """Begin or end a fault; return what was done, for the records, or None."""
+        """Begin or end a fault; return a note for the records, or None."""
         fault = Fault.model_validate(due.fault)
         name, kind, at_s = fault.part, fault.kind, due.time_us / US_PER_S
         if name in self._out:
             return None
         if not due.begins:
-            # The firmware, which is suspended itself, is timed by the wall clock.
+            # The suspended firmware itself is timed by the wall clock.
             if name == COMPANION:
                 self._pair.resume(name)
                 return f"{name} resumed at {at_s:.2f} s"
@@ -324,6 +325,6 @@ class ProcessFaults:
         return f"{name} {kind} at {at_s:.2f} s, as asked for"
 
     def undo(self) -> None:
-        """Let those go on that still stand."""
+        """Resume both processes."""
         for name in (FIRMWARE, COMPANION):
             self._pair.resume(name)

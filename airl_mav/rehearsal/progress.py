@@ -1,4 +1,4 @@
-"""What is seen while a rehearsal flies: a line per episode, and the vehicle's state, live."""
+"""Live display of a rehearsal: a line per episode, and the vehicle's state."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from airl_mav.rehearsal.channel import State, Text
 from airl_mav.rehearsal.tally import Tally
 
 WARNING = 4
-"""MAV_SEVERITY_WARNING: texts of this severity and graver are shown."""
+"""MAV_SEVERITY_WARNING: shows texts of this severity or worse."""
 
 OUTCOME_STYLES = {
     Outcome.SUCCESS: "green",
@@ -25,39 +25,39 @@ OUTCOME_STYLES = {
 
 
 class Observer:
-    """Looks on while episodes are flown, from one thread at a time; by itself it does nothing."""
+    """Base class of observers of episodes; called from one thread at a time, does nothing."""
 
     def waiting(self, what: str) -> None:
-        """Something is being waited for."""
+        """Called when the rehearsal waits for something."""
 
     def episode(self, index: int, seed: int, goal: Goal) -> None:
-        """An episode begins; its goal (north, east) [m]."""
+        """Called when an episode begins; its goal is (north, east) [m]."""
 
     def phase(self, phase: str, time_us: int) -> None:
-        """The companion has entered a phase, at a simulated time [µs]."""
+        """Called when the companion enters a phase, at a simulated time [µs]."""
 
     def state(self, state: State, started_us: int) -> None:
-        """The vehicle's true state, and when the episode began [µs]."""
+        """Called with the vehicle's true state, and the start of the episode [µs]."""
 
     def text(self, text: Text) -> None:
-        """The autopilot said something."""
+        """Called for a text of the autopilot."""
 
     def finished(self, record: EpisodeRecord) -> None:
-        """An episode has been saved."""
+        """Called when an episode has been saved."""
 
     def lost(self, what: str) -> None:
-        """An episode was lost and begins again."""
+        """Called when an episode was lost and begins again."""
 
 
 class LiveObserver(Observer):
-    """Shows a rehearsal as it flies."""
+    """Shows a rehearsal on the terminal."""
 
     def __init__(
         self, progress: Progress, folder: Path, done: tuple[EpisodeRecord, ...], episodes: int
     ) -> None:
-        """Begin with the episodes that a run folder holds, of so many in all."""
+        """Begin with the episodes in a run folder, out of `episodes` in total."""
         self.finished_records: list[EpisodeRecord] = []
-        """Those that have ended while it looked on, in that order."""
+        """Records of episodes finished since the start, in that order."""
         self._progress = progress
         self._tally = Tally(progress, "flights", folder, done, episodes)
         self._flight = ""
@@ -65,7 +65,7 @@ class LiveObserver(Observer):
         self._phase = ""
 
     def waiting(self, what: str) -> None:
-        """Show what is being waited for."""
+        """Show the reason of a wait."""
         self._progress.status(what)
 
     def episode(self, index: int, seed: int, goal: Goal) -> None:
@@ -90,7 +90,7 @@ class LiveObserver(Observer):
         )
 
     def text(self, text: Text) -> None:
-        """Print what the autopilot says, if it is a warning or graver."""
+        """Print an autopilot text of severity warning or worse."""
         if text.severity <= WARNING:
             self._progress.note(f"  autopilot: {text.text}", "yellow")
 
@@ -116,7 +116,7 @@ class LiveObserver(Observer):
         self._tally.add(record)
 
     def lost(self, what: str) -> None:
-        """Print what happened to an episode that begins again."""
+        """Print the loss of an episode that begins again."""
         self._progress.note(f"  {what}", "yellow")
 
     def close(self) -> None:

@@ -1,8 +1,8 @@
-"""A rehearsal: two processes, N seeded episodes, one run folder, whatever happens to the processes.
+"""Rehearsal: two processes, N seeded episodes and one run folder, robust to process failures.
 
-An episode is saved when it has been flown whole. One that lost a process on the way is flown again
-by two new ones, from its seed. So is one that the host disturbed. Nothing of them enters the
-records but a note. What is still invalid after the last attempt is saved as such.
+A complete episode is saved. An episode that lost a process is flown again by two new ones, from its
+seed. So is an episode that the host disturbed. The records contain only a note of such attempts. An
+episode still invalid after the last attempt is saved as invalid.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from airl_mav.view.ends import ViewEnds
 from firmware_sim.external.programs import load_timeout_s
 
 WRAP_UP_S = 90.0
-"""Longest time from the verdict to the companion's report: landing included [simulated s]."""
+"""Maximum time from the verdict to the companion's report, including landing [simulated s]."""
 
 SEPARATED_BY = "firmware and companion lost each other"
 
 
 class RehearsalError(Exception):
-    """The run cannot go on; the message says why."""
+    """Error that ends the run; the message contains the cause."""
 
 
 class Rehearsal:
-    """Flies a scenario. Use as a context manager: whatever happens, both processes end."""
+    """Flies a scenario. As a context manager, it always ends both processes."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class Rehearsal:
         keeps: Sequence[int] = (),
         view: ViewEnds | None = None,
     ) -> None:
-        """Take the scenario; nothing is started yet. The processes inherit the locks in `keeps`."""
+        """Take the scenario without starting it. The processes inherit the locks in `keeps`."""
         self._view = view
         self._scenario = scenario
         self._speed = scenario.speed or 1.0
@@ -72,20 +72,20 @@ class Rehearsal:
         self._dismiss()
 
     def run(self, done: Collection[int] = ()) -> None:
-        """Fly the episodes that are not `done` and save each; RehearsalError: lost too often."""
+        """Fly and save the episodes not in `done`. Raises RehearsalError after repeated losses."""
         for index, seed in enumerate(self._scenario.scenario.seeds):
             if index not in done:
                 self._fly_surely(index, seed)
 
     def _fly_surely(self, index: int, seed: int) -> None:
-        """Fly an episode and save it; when it is lost or invalid, fly it again."""
+        """Fly an episode and save it; repeat it if lost or invalid."""
         flight = f"flight {index:03d}, seed {seed}"
         notes: list[str] = []
         while True:
             try:
                 flown = self._fly(index, seed, notes)
             except LostError as error:
-                # The next attempt is made by two new processes.
+                # The next attempt starts two new processes.
                 self._dismiss()
                 notes.append(f"flown again: {error.what}")
                 if len(notes) == MAX_ATTEMPTS:
@@ -95,7 +95,7 @@ class Rehearsal:
                 self._observer.lost(f"{flight} begins again: {error}")
                 continue
             faults = "; ".join(flown.record.invalid)
-            # What somebody has changed on purpose is not flown again behind their back.
+            # Do not repeat flights that the user changed on purpose.
             by_hand = BY_HAND in flown.record.invalid
             if not faults or by_hand or len(notes) + 1 == MAX_ATTEMPTS:
                 break
@@ -106,9 +106,9 @@ class Rehearsal:
         self._observer.finished(flown.record)
 
     def _present(self) -> ProcessPair:
-        """Return the two processes; started when there are none."""
+        """Return the two processes, and start them if needed."""
         if self._pair is None:
-            # Known before it is started: who is interrupted meanwhile still ends it.
+            # Stored before the start, so that an interrupt still ends it.
             self._pair = pair = ProcessPair()
             self._observer.waiting("starting firmware and companion")
             log = (self._folder.path / FIRMWARE_PRINTS).absolute()
@@ -127,7 +127,7 @@ class Rehearsal:
     # --- one episode
 
     def _left_by(self, index: int) -> tuple[Path, Path]:
-        """Return where firmware and companion leave what they know of an episode."""
+        """Return the paths of the firmware's and the companion's files of an episode."""
         folder = self._folder.path
         return folder / f".episode-{index:03d}.npz", folder / f".decisions-{index:03d}.npz"
 
@@ -136,7 +136,7 @@ class Rehearsal:
             path.unlink(missing_ok=True)
 
     def _fly(self, index: int, seed: int, notes: Sequence[str]) -> FlownEpisode:
-        """Fly an episode. Raises LostError when it is none."""
+        """Fly an episode. Raises LostError if it fails."""
         pair, scenario, folder = self._present(), self._scenario, self._folder
         record_path, decisions_path = self._left_by(index)
         self._clear(index)
@@ -179,8 +179,7 @@ class Rehearsal:
         except LostError as error:
             if not pair.lives(FIRMWARE):
                 raise
-            # The firmware still flies. Whatever is wrong with the companion, its setpoints end
-            # here; see the failsafe through.
+            # The firmware still flies. End the companion and its setpoints, and watch the failsafe.
             faults.undo()
             pair.stop_one(COMPANION)
             seen = self._watch_failsafe(pair, episode)
@@ -199,14 +198,14 @@ class Rehearsal:
         return flown
 
     def _longest_s(self) -> float:
-        """Return the longest time that a flight may take [wall s]."""
+        """Return the maximum duration of a flight [wall s]."""
         asked = self._scenario.scenario
         stands_s = sum(fault.for_s or 0.0 for fault in asked.faults if fault.part == FIRMWARE)
         flown_s = TAKEOFF_LIMIT_S + asked.time_limit_s + WRAP_UP_S
         return (flown_s + stands_s) / self._speed
 
     def _call_back(self, pair: ProcessPair, episode: Episode) -> None:
-        """Let those go on that still stand; a companion that flies no more says what it knows."""
+        """Resume suspended processes; an aborted companion reports its log."""
         episode.faults.undo()
         if episode.ended is None and pair.lives(COMPANION):
             pair.send(COMPANION, channel.Abort(land=False))
@@ -215,11 +214,11 @@ class Rehearsal:
                     lambda _, event: self._follow(pair, episode, event), REPLY_TIMEOUT_S, "its end"
                 )
             except LostError:
-                # It was not to fly any more anyway: what it knows of its decisions is lost.
+                # The companion was to be aborted anyway: its decision log is lost.
                 pair.stop_one(COMPANION)
 
     def _follow(self, pair: ProcessPair, episode: Episode, event: channel.Event) -> bool:
-        """Take one event of a flight; True when the companion has ended it."""
+        """Handle one event of a flight; return True when the companion has ended it."""
         referee = episode.referee
         if isinstance(event, channel.State):
             self._see(pair, episode, event)
@@ -244,13 +243,13 @@ class Rehearsal:
         return False
 
     def _end(self, episode: Episode, reason: str) -> None:
-        """Abort a flight that is not judged yet."""
+        """Abort a flight without a verdict."""
         if episode.referee.verdict is None:
             now_us = episode.state.time_us if episode.state else episode.loaded.time_us
             self._judge(episode, episode.referee.abort(now_us, reason))
 
     def _carry_out(self, episode: Episode, due: channel.Due) -> None:
-        """Stop a process, kill it, or let it go on, as asked for."""
+        """Suspend, kill or resume a process for a due fault."""
         faults = episode.faults
         if (done := faults.carry_out(due)) is not None:
             episode.notes.append(done)
@@ -258,7 +257,7 @@ class Rehearsal:
             self._end(episode, faults.reason)
 
     def _over_alone(self, episode: Episode) -> bool:
-        """Return whether a flight is over whose companion flies no more: judged, or down."""
+        """Return True if a flight without a companion is over: judged, or landed."""
         faults, state = episode.faults, episode.state
         if not faults.out(COMPANION) or faults.reason is None:
             return False
@@ -287,7 +286,7 @@ class Rehearsal:
         self._observer.phase(verdict.outcome.value, verdict.time_us)
 
     def _watch_failsafe(self, pair: ProcessPair, episode: Episode) -> list[str]:
-        """Watch the flight controller without its companion until it is down; return its texts."""
+        """Watch the flight controller without its companion until disarmed; return its texts."""
         self._observer.waiting("companion lost: watching the failsafe land the vehicle")
         said: list[str] = []
 
@@ -307,7 +306,7 @@ class Rehearsal:
         return said
 
     def _look(self, event: channel.Event, notes: list[str]) -> None:
-        """Take an event that nobody waits for; what is to be recorded of it is added to `notes`."""
+        """Handle an event outside a wait; add texts for the record to `notes`."""
         if isinstance(event, channel.Text):
             self._observer.text(event)
         elif isinstance(event, channel.LogLost):

@@ -1,7 +1,7 @@
-"""The folder of a run: a new one, or one that is gone on with. A kill loses no saved episode.
+"""Folder of a new or resumed run. A kill loses no saved episode.
 
 docs/run-folder.md describes every file. An episode is committed by its line in `episodes.jsonl`,
-which is written last. Arrays without a line belong to an episode that never ended.
+which is written last. Arrays without a line belong to an unfinished episode.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ EPISODES_FILE = "episodes.jsonl"
 LATENCY_FILE = "latency.npz"
 TRAJECTORIES_FILE = "trajectories.npz"
 FIRMWARE_PRINTS = "autopilot.log"
-"""What real firmware prints, where it was started for the run."""
+"""Output of real firmware that was started for the run."""
 STAMPS_CRC, PATH_CRC = "latency_crc32", "trajectory_crc32"
-"""Fields of a line: the CRC of the episode's arrays in the two archives."""
+"""Fields of a line: CRC of the episode's arrays in the two archives."""
 LOG_FILES = ("firmware.log", "companion.log", FIRMWARE_PRINTS)
-"""What the processes have to say to people; the first two are empty when all is well."""
+"""Log files of the processes; the first two are empty without problems."""
 
 CAMPAIGN_FILE = "campaign.json"
 
@@ -54,29 +54,29 @@ FOLDER_KINDS = {
     "gap.json": "a verdict, or a gap of an earlier version",
     **dict.fromkeys(("ladder.json", "matrix.json"), "runs of an earlier version"),
 }
-"""What a folder holds, by the first of these files that is found in it."""
+"""Folder contents, by the first of these files in it."""
 
 TICK_LATENESS = "tick_lateness_us"
-"""Name of the array of a paced run that says how late each tick began [µs]."""
+"""Array name of the start delay of each tick in a paced run [µs]."""
 
 
 @dataclass(frozen=True)
 class RunInfo:
-    """What `run.json` holds."""
+    """Contents of `run.json`."""
 
     name: str
     created_utc: str
-    """ISO 8601."""
+    """Creation time, ISO 8601."""
     setup: Setup
     config: dict[str, Any]
     """Every setting of the run, as given."""
     seeds: tuple[int, ...]
-    """Seed of each episode planned, by index."""
+    """Seed of each planned episode, by index."""
     versions: dict[str, str]
-    """Packages by name."""
+    """Package versions by name."""
     machine: dict[str, Any]
     git: dict[str, Any] | None
-    """Commit of the checkout, and whether it was changed; None for an installed wheel."""
+    """Commit of the checkout, and its changed flag; None for an installed wheel."""
     schema: int = SCHEMA
 
 
@@ -85,7 +85,7 @@ _INFO = TypeAdapter(RunInfo)
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A run read back. The mappings are by episode index and may lack episodes."""
+    """Run read from a folder. The mappings are by episode index and may lack episodes."""
 
     path: Path
     info: RunInfo
@@ -96,20 +96,20 @@ class LoadedRun:
 
 @dataclass(frozen=True)
 class FlownEpisode:
-    """One episode, flown."""
+    """Finished episode."""
 
     record: EpisodeRecord
     trajectory: Trajectory
-    """Its true path."""
+    """True path."""
     latency: Mapping[str, NDArray[Any]]
-    """Its raw stamps by column; see docs/run-folder.md."""
+    """Raw stamps by column; see docs/run-folder.md."""
 
 
 class RunFolder:
-    """A run being written."""
+    """Run folder open for writing."""
 
     def __init__(self, path: Path) -> None:
-        """Wrap a folder; use `create` for a new run and `resume` for one that was killed."""
+        """Wrap a folder; use `create` for a new run and `resume` for a killed run."""
         self.path = path
 
     @classmethod
@@ -122,7 +122,7 @@ class RunFolder:
         setup: Setup,
         seeds: Sequence[int] = (),
     ) -> RunFolder:
-        """Make the folder, by default `runs/<UTC time>-<name>`, and write `run.json`."""
+        """Create the folder, by default `runs/<UTC time>-<name>`, and write `run.json`."""
         now = utc_now()
         if out is None:
             path = _fresh_folder(Path("runs"), f"{now:%Y%m%dT%H%M%SZ}-{name}")
@@ -149,7 +149,7 @@ class RunFolder:
 
     @classmethod
     def adopt(cls, path: Path, info: RunInfo) -> RunFolder:
-        """Make the folder of a run that was flown elsewhere, or raise UsageError."""
+        """Create the folder of a run from elsewhere. Raises UsageError."""
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -159,13 +159,13 @@ class RunFolder:
 
     @classmethod
     def resume(cls, path: Path) -> tuple[RunFolder, LoadedRun]:
-        """Open a run that was killed, cut off a half-written line, and say what is there."""
+        """Open a killed run, cut off a half-written line, and return its contents."""
         run = load(path)
         files.cut_torn_line(path / EPISODES_FILE)
         return cls(path), run
 
     def plan_again(self, config: Mapping[str, Any], seeds: Sequence[int]) -> None:
-        """Replace the settings and the seeds that are planned, in `run.json`."""
+        """Replace the settings and the planned seeds in `run.json`."""
         info = replace(load_info(self.path), config=dict(config), seeds=tuple(seeds))
         _write_info(self.path / RUN_FILE, info)
 
@@ -174,7 +174,7 @@ class RunFolder:
         return self.path / f"flight-{index:03d}.tlog"
 
     def forget(self, indices: Collection[int]) -> None:
-        """Take the lines of episodes back; arrays without a line are no episode's."""
+        """Remove the lines of episodes; arrays without a line are ignored."""
         path = self.path / EPISODES_FILE
         kept = [
             line
@@ -184,7 +184,7 @@ class RunFolder:
         files.replace_file(path, b"".join(kept))
 
     def sweep(self) -> None:
-        """Remove what an unfinished episode's processes left, but the logs of a killed firmware."""
+        """Remove files of unfinished episodes, but keep the logs of a killed firmware."""
         for pattern in (".*.npz*", f"{LATENCY_FILE}.partial", f"{TRAJECTORIES_FILE}.partial"):
             for leftover in self.path.glob(pattern):
                 leftover.unlink()
@@ -192,10 +192,10 @@ class RunFolder:
             log.rename(log.with_suffix(""))
 
     def discard(self) -> None:
-        """Take back a run that never began, so that the same folder can be used again."""
+        """Remove a run without flights, so that the same folder can be used again."""
         for name in (RUN_FILE, SCENARIO_FILE, *LOG_FILES):
             (self.path / name).unlink(missing_ok=True)
-        with suppress(OSError):  # Somebody else's files.
+        with suppress(OSError):  # The folder contains other files.
             self.path.rmdir()
 
     def save_episodes(self, episodes: Sequence[FlownEpisode]) -> None:
@@ -213,7 +213,7 @@ class RunFolder:
 
 
 def check_folder(path: Path, wanted: str) -> None:
-    """Raise UsageError if a folder holds something else than the file by which ours is known."""
+    """Raise UsageError if a folder contains something other than the file `wanted`."""
     for file, what in FOLDER_KINDS.items():
         if file == wanted and (path / file).exists():
             return
@@ -224,11 +224,11 @@ def check_folder(path: Path, wanted: str) -> None:
 def open_folder(
     out: Path | None, name: str, scenario: ResolvedScenario
 ) -> tuple[RunFolder, tuple[EpisodeRecord, ...]]:
-    """Open the folder of a run: a new one, or one that holds the same run, finished or not.
+    """Open the folder of a new run, or of the same run, finished or not.
 
-    A run with the first ones of the seeds is the same run, and is added to. Invalid episodes, which
-    the host disturbed, are taken out of it: they are not there. Return the folder and its episodes;
-    UsageError if it holds something else, or another run.
+    A run whose seeds are the first of the requested seeds is the same run, and is extended. Removes
+    invalid episodes, which the host disturbed, for a new flight. Returns the folder and its
+    episodes. Raises UsageError if the folder contains something else, or another run.
     """
     config, seeds = scenario.config, scenario.seeds
     if out is not None:
@@ -250,7 +250,7 @@ def open_folder(
     if grows:
         folder.plan_again(config, seeds)
     if grows or not (out / SCENARIO_FILE).exists():
-        # The file is missing where the process was killed as it wrote the folder's first files.
+        # The file is missing if the process was killed while it wrote the first files.
         save_scenario(scenario.scenario, folder.path / SCENARIO_FILE)
     if disturbed := {episode.index for episode in run.episodes if episode.invalid}:
         folder.forget(disturbed)
@@ -260,7 +260,7 @@ def open_folder(
 def another_config(
     held: Mapping[str, Any], asked: Mapping[str, Any], free: Collection[str] = free_fields("gym")
 ) -> str | None:
-    """Return the first setting, or table of them, not in `free` that differs, or None."""
+    """Return the first setting, or table of settings, not in `free` that differs, or None."""
     old, new = _flat(held), _flat(json.loads(json.dumps(asked)))
     for key in sorted(old.keys() | new.keys()):
         known = key in free or key.partition(".")[0] in free
@@ -275,12 +275,12 @@ def load_info(path: Path) -> RunInfo:
 
 
 def run_info(data: Mapping[str, Any], source: object) -> RunInfo:
-    """Return what an object says, as `run.json` holds it. Raises UsageError, with the source."""
+    """Return the contents of `run.json` from an object. Raises UsageError, with the source."""
     return files.typed(_INFO, data, source)
 
 
 def load(path: Path) -> LoadedRun:
-    """Read a run folder back, or raise UsageError; a last line cut short is passed over."""
+    """Read a run folder, without a truncated last line. Raises UsageError."""
     info = load_info(path)
     records: dict[int, EpisodeRecord] = {}
     stamp_crcs, path_crcs = {}, {}
@@ -312,7 +312,7 @@ def _write_info(path: Path, info: RunInfo) -> None:
 
 
 def _load_arrays(path: Path, crcs: Mapping[int, Any]) -> dict[int, files.Arrays]:
-    """Return the arrays of the episodes that have a line, by index; UsageError: damaged."""
+    """Return the arrays of the episodes with a line, by index. Raises UsageError if damaged."""
     groups = files.read_groups(path)
     found = {}
     for index, crc in crcs.items():
@@ -328,7 +328,7 @@ def _load_arrays(path: Path, crcs: Mapping[int, Any]) -> dict[int, files.Arrays]
 
 
 def _fresh_folder(parent: Path, name: str) -> Path:
-    """Make a new folder; a second one of the same second gets a number."""
+    """Create a new folder; a second one in the same second gets a number."""
     for attempt in range(1, 1000):
         path = parent / (name if attempt == 1 else f"{name}-{attempt}")
         try:

@@ -1,4 +1,4 @@
-"""How a person stops long work without tearing anything that was done."""
+"""Signal handlers that stop long work without losing finished results."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import NoReturn
 
 @contextmanager
 def stop_on_signals() -> Iterator[Callable[[], bool]]:
-    """Give a function that says whether Ctrl-C or SIGTERM has come; a second one is not waited for.
+    """Yield a function that returns True after Ctrl-C or SIGTERM; a second one interrupts at once.
 
-    So nothing is torn: what has ended is saved first. Outside the main thread, where Python
-    delivers no signals, the function always says no.
+    This allows the caller to save finished work first. Outside the main thread, where Python
+    delivers no signals, the function always returns False.
     """
     seen: list[int] = []
 
@@ -29,7 +29,7 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def terminated_as_interrupted() -> Iterator[None]:
-    """Treat SIGTERM as Ctrl-C for a while; does nothing outside the main thread."""
+    """Treat SIGTERM as Ctrl-C in this context; does nothing outside the main thread."""
 
     def interrupt(*_: object) -> NoReturn:
         raise KeyboardInterrupt
@@ -40,7 +40,7 @@ def terminated_as_interrupted() -> Iterator[None]:
 
 @contextmanager
 def signal_handlers(handler: Callable[[int, object], None], *numbers: int) -> Iterator[None]:
-    """Handle signals for a while; does nothing outside the main thread."""
+    """Handle signals in this context; does nothing outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""The vehicle alone: flight controller, plant and camera, for any client, until told to stop."""
+"""Vehicle without a companion: flight controller, plant and camera, for any client."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ from firmware_sim.warm_up import warm_up
 
 @dataclass
 class Listener:
-    """Who is told what happens. All calls come from the thread that flies."""
+    """Callbacks of a stand-alone vehicle. All calls come from the flying thread."""
 
     waiting: Callable[[str], None] = field(default=lambda _what: None)
-    """Real firmware is waited for: how the user starts it."""
+    """Called while real firmware must be started by the user, with instructions."""
     ready: Callable[[str, Goal], None] = field(default=lambda _camera, _goal: None)
-    """The vehicle stands ready: ZeroMQ address of its camera; goal."""
+    """Called when the vehicle is ready, with the ZeroMQ address of its camera and the goal."""
     text: Callable[[Message], None] = field(default=lambda _message: None)
-    """The autopilot said something."""
+    """Called for a text of the autopilot."""
     say: Callable[[str], None] = field(default=lambda _line: None)
-    """How it went, a line at a time."""
+    """Called for each line of progress."""
 
 
 def fly_vehicle(
     asked: StandAloneVehicle, stop: threading.Event, listener: Listener | None = None
 ) -> None:
-    """Fly whatever clients ask for until `stop`; UsageError or FirmwareLostError."""
+    """Fly client commands until `stop`. Raises UsageError or FirmwareLostError."""
     listener = listener or Listener()
     check_vehicle(asked)
     vehicle, computer_w = aircraft_of(asked)
@@ -55,7 +55,7 @@ def fly_vehicle(
         host, instance = asked.companion_host, asked.real.instance
         return bind_device_links(asked.bind, host, instance, insecure=insecure, say=ports.append)
 
-    # Before any port is bound: what is wrong with an arena is told, whatever else is running.
+    # Before binding ports, so that an arena error is reported first.
     episode, goal = episode_of(asked, vehicle, computer_w)
     firmware = build_firmware(
         asked,
@@ -66,7 +66,7 @@ def fly_vehicle(
         gcs_host=asked.gcs_host,
         insecure=asked.insecure,
         log=asked.firmware_log,
-        # It may fly for days, and nobody collects what would be recorded.
+        # Flights may last for days, and their recording is not used.
         recording=False,
         parameters_file=asked.parameters_file,
         bind_devices=bind_devices,
@@ -85,7 +85,7 @@ def fly_vehicle(
 
 
 def aircraft_of(asked: StandAloneVehicle) -> tuple[VehicleProfile, float]:
-    """Return the vehicle with what it carries, and the power of its computer [W], or UsageError."""
+    """Return the loaded vehicle and its computer's power [W]. Raises UsageError."""
     vehicle, computer = equipped(asked.vehicle, asked.computer, asked.payload)
     check_spread(vehicle, asked.spread)
     further = vehicle.cameras.values()
@@ -97,7 +97,7 @@ def aircraft_of(asked: StandAloneVehicle) -> tuple[VehicleProfile, float]:
 def episode_of(
     asked: StandAloneVehicle, vehicle: VehicleProfile, computer_w: float
 ) -> tuple[EpisodeSetup, Goal]:
-    """Return the episode of a laden vehicle, and its goal; UsageError: no such arena."""
+    """Return the episode of a loaded vehicle, and its goal. Raises UsageError without an arena."""
     spec = load_profile("arenas", asked.arena, ArenaSpec)
     check_renderer(vehicle.camera, asked.renderer, spec, vehicle.cameras.values())
     width_m = vehicle.body.width_m

@@ -1,4 +1,4 @@
-"""How an episode is followed to its end, by one set of rules for levels with a companion."""
+"""Rules that end an episode, for all levels with a companion."""
 
 from __future__ import annotations
 
@@ -9,40 +9,40 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome, Referee, TruthSample, Verdict
 
 TAKEOFF_LIMIT_S = 90.0
-"""Longest time from the reset to the start of navigation [simulated s]."""
+"""Maximum time from the reset to the start of navigation [simulated s]."""
 
 ARRIVAL_S = 10.0
-"""Longest time from the goal's edge to where the companion thinks the goal is [simulated s].
-Then it is told to land where it is."""
+"""Maximum time from reaching the goal radius to the companion's own goal position [simulated s].
+After it, the supervisor orders a landing on the spot."""
 
 
 class Order(Enum):
-    """What the companion is told."""
+    """Order to the companion."""
 
     LAND = "land"
     """Stop and land."""
     ABANDON = "abandon"
-    """There is nothing left to land."""
+    """End the mission; landing is impossible."""
 
 
 class Supervisor:
-    """Watches one episode. Pure: no clock, no I/O."""
+    """Supervisor of one episode. Pure: no clock, no I/O."""
 
     def __init__(self, referee: Referee, started_us: int) -> None:
-        """Take the referee, and when the episode began [µs]."""
+        """Take the referee and the start of the episode [µs]."""
         self.referee = referee
         self.started_us = started_us
-        """When the episode began [µs]."""
+        """Start of the episode [µs]."""
         self._called_off = False
 
     @property
     def verdict(self) -> Verdict | None:
-        """The verdict, once there is one."""
+        """Return the verdict, or None before it."""
         return self.referee.verdict
 
     @property
     def due_us(self) -> float:
-        """When an order is due by the passing of time [µs]; inf = none is."""
+        """Return the time of the next timeout order [µs]; inf = no timeout."""
         referee = self.referee
         if self._called_off:
             return math.inf
@@ -53,7 +53,7 @@ class Supervisor:
         return referee.navigation_us + referee.task.time_limit_s * US_PER_S
 
     def see(self, sample: TruthSample) -> Order | None:
-        """Take the next true sample; return what the companion must be told, if anything."""
+        """Process the next true sample; return an order for the companion, or None."""
         referee = self.referee
         if referee.verdict is not None:
             late_us = sample.time_us - referee.verdict.time_us

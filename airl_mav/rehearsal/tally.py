@@ -1,4 +1,4 @@
-"""How a run goes while it is flown: a bar with the success rate so far, lines for programs."""
+"""Progress of a run: a bar with the current success rate, and events for programs."""
 
 from __future__ import annotations
 
@@ -14,47 +14,47 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import reached_goals, wilson
 
 FIGURES = ("flight_time_s", "distance_m", "energy_j")
-"""Of a flight's quality, that programs hear at once; all of them are in its record."""
+"""Quality figures sent to programs at once; the record contains all of them."""
 
 
 @dataclass(frozen=True)
 class RunOpened(Event):
-    """A run begins, or goes on."""
+    """Start or resumption of a run."""
 
     event: ClassVar[str] = "run"
     path: str
-    """Its folder."""
+    """Path of the run folder."""
     planned: int
-    """Number of flights in all."""
+    """Total number of flights."""
     done: int
-    """Number of those that were flown before."""
+    """Number of flights finished before."""
 
 
 @dataclass(frozen=True)
 class FlightEnded(Event):
-    """A flight has ended and is saved."""
+    """End of a saved flight."""
 
     event: ClassVar[str] = "flight"
     path: str
-    """Folder of its run."""
+    """Run folder of the flight."""
     index: int
-    """Its number in the run, from 0."""
+    """Index in the run, from 0."""
     seed: int
     outcome: str
     """`success`, `collision`, `timeout`, `battery` or `aborted`."""
     reason: str
     invalid: tuple[str, ...]
-    """Why it is no test of its policy and enters no figure; mostly empty."""
+    """Reasons why the flight is no valid test and enters no figure; usually empty."""
     flight_time_s: float | None
-    """This and the next two: None where the policy never flew."""
+    """This and the next two: None if the policy never flew."""
     distance_m: float | None
     energy_j: float | None
     sha256: str | None
-    """Fingerprint of the flight in lockstep; None elsewhere."""
+    """Hash of the flight in lockstep; None elsewhere."""
 
     @classmethod
     def of(cls, path: Path, record: EpisodeRecord) -> FlightEnded:
-        """Return what is heard of a record in a run folder."""
+        """Return the event of a record in a run folder."""
         return cls(
             path=str(path),
             index=record.index,
@@ -82,7 +82,7 @@ class Tally:
         done: Sequence[EpisodeRecord],
         planned: int,
     ) -> None:
-        """Open a bar of that label, with the flights that were there before."""
+        """Open a labeled bar with the flights finished before."""
         self._progress, self._folder = progress, folder
         self._reached = list(reached_goals(done))
         self._bar = progress.bar(label, planned, completed=len(done), unit="flights")
@@ -91,7 +91,7 @@ class Tally:
             self._show()
 
     def add(self, record: EpisodeRecord) -> None:
-        """Take a flight that has just ended."""
+        """Add a finished flight."""
         if not record.invalid:
             self._reached.append(record.outcome is Outcome.SUCCESS)
         self._progress.tell(FlightEnded.of(self._folder, record))

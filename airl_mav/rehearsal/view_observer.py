@@ -1,4 +1,4 @@
-"""Reports a rehearsal to a view: the flight, its phases, its texts."""
+"""Observer that reports a rehearsal to a view: flight, phases and texts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ INFO = 6
 
 
 class ViewObserver(Observer):
-    """Tells a view, and passes everything on to another observer."""
+    """Reports to a view, and forwards all events to another observer."""
 
     def __init__(self, ends: ViewEnds, onwards: Observer) -> None:
         """Connect to a view."""
@@ -23,30 +23,30 @@ class ViewObserver(Observer):
         self._onwards = onwards
 
     def waiting(self, what: str) -> None:
-        """Pass on what is being waited for."""
+        """Forward the reason of a wait."""
         self._onwards.waiting(what)
 
     def episode(self, index: int, seed: int, goal: Goal) -> None:
-        """Tell that an episode begins."""
+        """Report the start of an episode."""
         self._feed.send(Flight(index=index, seed=seed, goal=goal))
         self._onwards.episode(index, seed, goal)
 
     def phase(self, phase: str, time_us: int) -> None:
-        """Tell the phase."""
+        """Report the phase."""
         self._feed.send(Phase(time_us=time_us, phase=phase))
         self._onwards.phase(phase, time_us)
 
     def state(self, state: State, started_us: int) -> None:
-        """Pass the state on: the view has it from the simulation, and more often."""
+        """Forward the state: the view gets it from the simulation, and more often."""
         self._onwards.state(state, started_us)
 
     def text(self, text: Text) -> None:
-        """Tell what the autopilot says."""
+        """Report a text of the autopilot."""
         self._feed.send(Said(time_us=text.time_us, severity=text.severity, text=text.text))
         self._onwards.text(text)
 
     def finished(self, record: EpisodeRecord) -> None:
-        """Tell how an episode has ended."""
+        """Report the end of an episode."""
         how = f"flight {record.index:03d}: {record.outcome.value}, {record.reason}"
         self._feed.send(Said(time_us=record.ended_us, severity=INFO, text=how))
         for note in record.notes:
@@ -54,7 +54,7 @@ class ViewObserver(Observer):
         self._onwards.finished(record)
 
     def lost(self, what: str) -> None:
-        """Tell that an episode begins again."""
+        """Report that an episode begins again."""
         self._feed.send(Said(time_us=None, severity=WARNING, text=what))
         self._onwards.lost(what)
 

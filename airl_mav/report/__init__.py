@@ -1,1 +1,1 @@
-"""What a run is shown as: terminal tables, a self-contained HTML page, PNG pictures."""
+"""Reports of a run: terminal tables, a self-contained HTML page, PNG pictures."""

@@ -1,4 +1,4 @@
-"""The vehicle and the arenas of a run, made again from their profiles and seeds."""
+"""Reconstruction of a run's vehicle and arenas from profiles and seeds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
 
 
 def vehicle_of(info: RunInfo) -> VehicleProfile:
-    """Return the vehicle of a run as loaded; raise UsageError where its profile is missing."""
+    """Return the vehicle of a run with its changes; raise UsageError if its profile is missing."""
     vehicle = load_profile("vehicles", info.setup.vehicle.name, VehicleProfile)
     change = info.config.get("environment", {}).get("camera", {})
     given = {name: value for name, value in change.items() if value is not None}
@@ -25,9 +25,9 @@ def vehicle_of(info: RunInfo) -> VehicleProfile:
 
 
 def check_trust(arena: str, spec: ArenaSpec) -> None:
-    """Raise UsageError for an arena whose generator is custom code that this process did not load.
+    """Raise UsageError for an arena with a custom generator that this process did not load.
 
-    A run folder from elsewhere must not choose the code that runs here.
+    A run folder from an untrusted source must not select the code to run.
     """
     if spec.generator != OBSTACLES and not is_loaded(GENERATORS, spec.generator):
         raise UsageError(
@@ -44,7 +44,7 @@ def spec_of(arena: str) -> ArenaSpec:
 
 
 def trust_arenas(run: LoadedRun) -> None:
-    """Load the generators that a run's arenas name. Raises UsageError."""
+    """Load the custom generators of a run's arenas. Raises UsageError."""
     for arena in {record.arena for record in run.episodes} - {NO_ARENA}:
         spec = load_profile("arenas", arena, ArenaSpec)
         if spec.generator != OBSTACLES:
@@ -52,8 +52,8 @@ def trust_arenas(run: LoadedRun) -> None:
 
 
 def arenas_of(records: Iterable[EpisodeRecord], vehicle: VehicleProfile) -> dict[int, Arena]:
-    """Make the arenas of those flights that have one, by episode index. Raises UsageError."""
-    # Imported here: a page can be served, and a wrong run refused, before numba is there.
+    """Generate the arenas of flights, by episode index. Raises UsageError."""
+    # Imported here: serving a page or rejecting an invalid run must not wait for numba.
     from airl_mav.arena.generate import generate
     from airl_mav.arena.tours import set_out_later
 
@@ -77,7 +77,7 @@ def arenas_of(records: Iterable[EpisodeRecord], vehicle: VehicleProfile) -> dict
 
 
 def arena_of(run: LoadedRun, episode: EpisodeRecord) -> Arena | None:
-    """Make the arena of one flight; None where a profile cannot be found any more."""
+    """Generate the arena of a flight; None if a profile is missing."""
     try:
         return arenas_of([episode], vehicle_of(run.info)).get(episode.index)
     except UsageError:

@@ -1,4 +1,4 @@
-"""What a camera sees, as pictures for people: stills, and films of recorded flights."""
+"""Camera pictures for display: stills, and films of recorded flights."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ ROOM = {
     primitives.WALL_NORTH_SOUTH: (178, 184, 192),
     primitives.WALL_EAST_WEST: (208, 212, 218),
 }
-"""Colours of what is no obstacle; no obstacle has a grey."""
+"""Colours of floor, walls, ceiling and sky; obstacles are never grey."""
 
 
 def coloured_segmentation(seen: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Return `Picture.seen` (h, w) as RGB (h, w, 3), obstacles in tab20 without its greys."""
+    """Return `Picture.seen` (h, w) as RGB (h, w, 3); obstacles use tab20 without its greys."""
     tab20 = colormaps["tab20"](np.arange(20), bytes=True)[:, :3]
     own = np.delete(tab20, (14, 15), axis=0)
     most = max(int(seen.max(initial=0)) + 1, primitives.OBSTACLE)
-    # The number of the ceiling is -1: the last row.
+    # The ceiling's number -1 indexes the last row.
     table = np.empty((most + 1, 3), np.uint8)
     table[primitives.OBSTACLE : most] = own[np.arange(most - primitives.OBSTACLE) % len(own)]
     for number, colour in ROOM.items():
@@ -54,24 +54,24 @@ def coloured_segmentation(seen: NDArray[np.int32]) -> NDArray[np.uint8]:
 
 Shown = Literal["rgb", "grey", "depth", "segmentation", "flow"]
 Pixels = NDArray[np.uint8]
-"""(h, w) or (h, w, 3)."""
+"""Picture (h, w) or (h, w, 3)."""
 
 Drawn = Callable[
     [Arena, NDArray[np.float64], Intrinsics, NDArray[np.float64], NDArray[np.float64]], Pixels
 ]
-"""A renderer: arena, obstacle centres, camera, its position and attitude -> picture."""
+"""Renderer: arena, obstacle centres, camera, camera position and attitude -> picture."""
 
 VIDEO = ".mp4"
-"""H.264 in MP4."""
+"""Suffix of H.264 videos in MP4."""
 
 FILMS = (".gif", VIDEO, ".webp")
-"""Kinds of films."""
+"""Supported suffixes of films."""
 
 VIDEO_CRF = 18
-"""Constant rate factor of x264, at which eyes see no loss (x264's documentation)."""
+"""Constant rate factor of x264, visually lossless (x264's documentation)."""
 
 STEP_MS = 10
-"""A GIF counts time in these steps [ms]."""
+"""Time resolution of a GIF [ms]."""
 
 
 def still(
@@ -85,7 +85,7 @@ def still(
     rays: int,
     range_m: float,
 ) -> Pixels:
-    """Return a ray-cast picture of anything but flow, with `rays` a pixel for colours."""
+    """Return a ray-cast picture of any kind except flow; colours use `rays` per pixel."""
     if show in ("rgb", "grey"):
         rgb = antialiased(arena, centers, camera, position, quaternion, rays)
         return rgb if show == "rgb" else grey(rgb)
@@ -96,7 +96,7 @@ def still(
 
 
 def moments(flight: ReplayedFlight, rate_hz: float) -> range:
-    """Return the picture times [µs] of a film, from the start of navigation to the end."""
+    """Return the picture times [µs] of a film from the start of navigation to the end."""
     path, record = flight.path, flight.record
     begin, end = max(record.zero_us, int(path.time_us[0])), int(path.time_us[-1])
     return range(begin, end + 1, period_ms(rate_hz) * US_PER_MS)
@@ -105,7 +105,7 @@ def moments(flight: ReplayedFlight, rate_hz: float) -> range:
 def film(
     flight: ReplayedFlight, camera: Intrinsics, drawn: Drawn, moments: Iterable[int]
 ) -> Iterator[Pixels]:
-    """Yield pictures of a camera mounted as the vehicle's; UsageError if the arena is missing."""
+    """Yield pictures at the vehicle's camera pose; raise UsageError without the arena."""
     if flight.arena is None:
         raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
     mount = PolicyCamera.of(flight.vehicle.camera).mount
@@ -117,7 +117,7 @@ def film(
 
 
 def period_ms(rate_hz: float) -> int:
-    """Return the time between two pictures of a film [ms], in whole steps."""
+    """Return the frame period of a film [ms], a multiple of `STEP_MS`."""
     return STEP_MS * max(round(1000.0 / (STEP_MS * rate_hz)), 1)
 
 
@@ -131,7 +131,7 @@ def write_png(path: Path, pixels: Pixels) -> None:
 def write_film(path: Path, pictures: Iterator[Pixels], rate_hz: float) -> int:
     """Write an animated GIF or WebP, or a video; return the number of pictures.
 
-    A video needs even sides (UsageError) and the extra `film` (ImportError).
+    A video requires even width and height (UsageError) and the extra `film` (ImportError).
     """
     if path.suffix.lower() == VIDEO:
         written, count = _video(pictures, period_ms(rate_hz))
@@ -149,7 +149,7 @@ def _animation(kind: str, pictures: Iterator[Pixels], each_ms: int) -> tuple[byt
 
 
 def _video(pictures: Iterator[Pixels], each_ms: int) -> tuple[bytes, int]:
-    """Encode pictures as they come: a long video needs no more memory than a short one."""
+    """Encode pictures one at a time, with memory independent of the video's length."""
     import av
 
     first = next(pictures)

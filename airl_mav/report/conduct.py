@@ -1,4 +1,4 @@
-"""How a run kept its deadlines, and how smoothly it was commanded and flew."""
+"""Deadlines of a run, and smoothness of its commands and its flight."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ CONDUCT_NOTE = (
 
 @dataclass(frozen=True)
 class Budget:
-    """How late a policy may be that flies at its fastest action."""
+    """Inference budget of a policy at its fastest action."""
 
     t2_s: float
-    """The longest inference with which that speed is safe [s]; below 0: there is none."""
+    """Maximum safe inference time at that speed [s]; negative = the speed is never safe."""
     note: str
 
     def row(self, t2_us: Samples) -> tuple[str, ...]:
-        """Return how many of all decisions (n,) [µs] were later than that."""
+        """Return the share of inference times (n,) [µs] above the budget."""
         ratio = deadline_miss_ratio(t2_us, max(1.0, self.t2_s * US_PER_S))
         told = NONE if ratio is None else f"{100.0 * ratio:.1f} %"
         return "t2 beyond the safe velocity's", told, NONE, f"{t2_us.size:,}"
 
 
 def _budget(run: LoadedRun) -> Budget | None:
-    """Return the budget of a run's policy; None: nothing tells how far off it takes notice."""
-    # Imported here: with scipy's solvers, which few policies need.
+    """Return the budget of a run's policy; None without a known sensing distance."""
+    # Imported here, as it loads scipy's solvers, which few policies need.
     from airl_mav.envs.stopping import DecisionLoop, StoppingTask
 
     try:
@@ -68,7 +68,7 @@ def _budget(run: LoadedRun) -> Budget | None:
 
 
 def conduct_table(run: LoadedRun, summary: measures.RunSummary) -> TableView | None:
-    """Return deadlines and smoothness; None of a run that was recorded without them."""
+    """Return deadlines and smoothness; None for recordings without these measures."""
     q = summary.quality
     if not any(measure.of(q).n for measure in measures.CONDUCT):
         return None

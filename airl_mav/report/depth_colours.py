@@ -1,4 +1,4 @@
-"""Depth images as bytes and in colour: near is bright."""
+"""Depth images as bytes and in colour; near pixels are bright."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import nearness, rgb_of
 
 NO_RETURN = "#262a30"
-"""Colour of pixels that the camera has no depth of: that of the live view."""
+"""Colour of pixels without a depth return, as in the live view."""
 
 LEVELS = 255
-"""Shades from far to near."""
+"""Number of shades from far to near."""
 
 
 def shades(depth_mm: NDArray[np.uint16], range_m: float) -> NDArray[np.uint8]:
-    """Return a depth image (h, w) [mm] as bytes: 0 no return, 1 at `range_m`, 255 at the camera."""
+    """Return a depth image (h, w) [mm] as bytes: 0 no return, 1 at `range_m`, 255 at 0 m."""
     scaled = np.round((LEVELS - 1) * nearness(depth_mm, range_m))
     bytes_of: NDArray[np.uint8] = (1.0 + scaled).astype(np.uint8)
     bytes_of[depth_mm == 0] = 0
@@ -41,5 +41,5 @@ def coloured(depth_mm: NDArray[np.uint16], range_m: float) -> NDArray[np.uint8]:
 
 
 def pictured(image: NDArray[Any], range_m: float) -> NDArray[np.uint8]:
-    """Return a camera's image, `camera.frame.Frame.image`, for people: RGB (h, w, 3)."""
+    """Return a camera image (`camera.frame.Frame.image`) for display: RGB (h, w, 3)."""
     return rgb_of(image) if image.ndim == 3 else coloured(image, range_m)

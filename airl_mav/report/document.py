@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from airl_mav.report.theme import Picture
 
 REPORT_FILE = "report.html"
-"""The page of a single run, in its folder."""
+"""File name of a run's page in its folder."""
 
 SHEET_COLUMNS = 3
 
@@ -33,7 +33,7 @@ Facts = tuple[tuple[str, str], ...]
 
 @dataclass(frozen=True)
 class Headline:
-    """One figure at the top of a page or a section."""
+    """Key figure at the top of a page or a section."""
 
     title: str
     value: str
@@ -43,50 +43,50 @@ class Headline:
 
 @dataclass(frozen=True)
 class Section:
-    """What stands under one heading."""
+    """Contents below one heading."""
 
     title: str
     level: int = 2
-    """Of the heading: 3 belongs to the 2 before it."""
+    """Level of the heading; level 3 belongs to the preceding level 2."""
     headlines: tuple[Headline, ...] = ()
-    """On the page alone."""
+    """Key figures; only on the page."""
     sentences: tuple[str, ...] = ()
     facts: Facts = ()
     tables: tuple[table.TableView, ...] = ()
     draw: Callable[[], Sequence[Picture]] | None = None
-    """Draws the pictures; called only where they are shown."""
+    """Function that draws the pictures; called only for output with pictures."""
     sheet: str = ""
-    """File name of one PNG with all pictures; empty: each has one of its own."""
+    """File name of a PNG with all pictures; empty = one PNG per picture."""
     note: str = ""
-    """Explains the pictures, or the tables where there are no pictures."""
+    """Explanation of the pictures, or of the tables without pictures."""
     in_terminal: bool = True
 
 
 @dataclass(frozen=True)
 class RunLink:
-    """Where a run lies."""
+    """Link to a run's folder and report."""
 
     name: str
     folder: str
-    """From the document's folder."""
+    """Path relative to the document's folder."""
     report: str | None
-    """Address of its own report, if it has one."""
+    """Path of the run's report; None without one."""
 
 
 @dataclass(frozen=True)
 class Document:
-    """Everything that a page says."""
+    """Contents of a page."""
 
     name: str
-    """File name of the page and of its Markdown, without suffix."""
+    """File name of the page and its Markdown, without suffix."""
     title: str
     kicker: str
     sections: tuple[Section, ...]
     lead: str = ""
     answers: tuple[str, ...] = ()
-    """What came out, in whole sentences."""
+    """Results in full sentences."""
     status: str = ""
-    """What that comes to, where it is a verdict: gives the box around it its colour."""
+    """Status of a verdict, which sets the colour of the box around the answers."""
     headlines: tuple[Headline, ...] = ()
     facts: Facts = ()
     facts_title: str = "What flew"
@@ -94,7 +94,7 @@ class Document:
     runs: tuple[RunLink, ...] = ()
     provenance: Facts = ()
     configurations: tuple[tuple[str, str], ...] = ()
-    """Full configuration by the name of a run."""
+    """Name and full configuration of runs."""
     footer: str = ""
 
 
@@ -116,7 +116,7 @@ def estimate_headline(
 
 
 def run_link(name: str, run: Path, folder: Path) -> RunLink:
-    """Return where a run lies, seen from the folder of a document."""
+    """Return the link to a run relative to a document's folder."""
     there = Path(os.path.relpath(run, folder)).as_posix()
     report = f"{there}/{REPORT_FILE}" if (run / REPORT_FILE).exists() else None
     return RunLink(name, there, report)
@@ -124,8 +124,8 @@ def run_link(name: str, run: Path, folder: Path) -> RunLink:
 
 @cache
 def environment() -> Environment:
-    """Return the template engine: everything escaped, nothing undefined passed over."""
-    # Imported here and below: tables and verdicts are printed before anything is drawn.
+    """Return the template engine, with escaping and an error for undefined names."""
+    # Imported here and below: tables and verdicts are printed before these slow imports.
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     made = Environment(
@@ -183,7 +183,7 @@ def write_document(document: Document, folder: Path) -> Path:
 
 
 def markdown(document: Document) -> str:
-    """Return a document without its pictures as Markdown."""
+    """Return a document without pictures as Markdown."""
 
     def listed(facts: Facts) -> str:
         return "\n".join(
@@ -208,7 +208,7 @@ def markdown(document: Document) -> str:
 
 
 def print_verdict(lines: Sequence[str], console: Console) -> None:
-    """Print what came out, before all else."""
+    """Print the lines of a verdict in bold."""
     for line in lines:
         console.print(Text(line, style="bold"))
 
@@ -240,6 +240,6 @@ def print_document(document: Document, console: Console) -> None:
 
 
 def print_place(name: str, place: Path | str, console: Console) -> None:
-    """Print, as the last line, the path of a page or the command that draws it."""
+    """Print the path of a page, or the command that draws it, as the last line."""
     console.print()
     console.print(Text.assemble((f"{name}  ", "dim"), str(place)), soft_wrap=True)

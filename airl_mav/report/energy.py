@@ -1,4 +1,4 @@
-"""Where the energy went, as a figure and as tables: the airframe's parts and the computer."""
+"""Figure and tables of the energy by part: airframe and computer."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from airl_mav.report.table import NONE, Column, TableView, columns_of
 ENERGY_NAME = "energy"
 
 COMPUTER_COLOUR = "#a35bb8"
-"""Of middling lightness: legible on light and on dark paper."""
+"""Colour of medium lightness, legible on light and dark backgrounds."""
 
 BARS = 60
-"""Up to this many flights have a bar each; more of them are sorted by their energy."""
+"""Maximum number of flights drawn as bars; more flights are drawn as areas sorted by energy."""
 
 RANKS = 160
-"""Of more flights so many are drawn, evenly over the order."""
+"""Number of flights drawn if sorted, evenly spaced by rank."""
 
 HIGH = 2.0
-"""Flights with more than this times the 95th percentile would press all others flat: cut off."""
+"""Upper limit of the axis as a multiple of the 95th percentile; keeps other flights visible."""
 
 AIRFRAME = {"hover_j": "hovering", "motion_j": "speed", "manoeuvre_j": "manoeuvres"}
-"""The parts of the airframe's energy, in the order of the tables."""
+"""Parts of the airframe's energy in the order of the tables."""
 
 PARTS = (
     ("hover_j", AIRFRAME["hover_j"], theme.SERIES),
@@ -41,27 +41,27 @@ PARTS = (
     ("motion_j", AIRFRAME["motion_j"], theme.SERIES_SOFT),
     ("computer_j", "computer", COMPUTER_COLOUR),
 )
-"""What is drawn, from the bottom to the top."""
+"""Drawn parts of the energy, from bottom to top."""
 
 
 @dataclass(frozen=True)
 class FlightEnergy:
-    """One flight's energy, from the start of navigation."""
+    """Energy of a flight from the start of navigation."""
 
     record: EpisodeRecord
     quality: Quality
     airframe_j: float
     parts: EnergySplit | None
-    """None where the vehicle or the recording is missing."""
+    """Parts of the airframe's energy; None without the vehicle or the recording."""
 
     @property
     def total_j(self) -> float:
-        """That of airframe and computer."""
+        """Energy of airframe and computer [J]."""
         return self.airframe_j + self.quality.computer_energy_j
 
 
 def flight_energies(run: LoadedRun, vehicle: VehicleProfile | None) -> list[FlightEnergy]:
-    """Return the known energies of all flights that navigated; without `vehicle`, undivided."""
+    """Return the measured energies of flights with navigation; without `vehicle`, undivided."""
     watts = run.info.setup.computer_watts
     flights = []
     for e in run.episodes:
@@ -80,7 +80,7 @@ def flight_energies(run: LoadedRun, vehicle: VehicleProfile | None) -> list[Flig
 
 
 def energy_table(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -> TableView:
-    """Return the energy of all flights together, by part; a computer `on_ground` has no row."""
+    """Return the total energy of all flights by part; a computer `on_ground` has no row."""
     columns = columns_of("<part | all flights [kJ] | share [%] | mean power [W]")
     time_s = sum(f.quality.flight_time_s for f in flights)
     airframe = sum(f.airframe_j for f in flights)
@@ -119,7 +119,7 @@ def energy_table(flights: Sequence[FlightEnergy], *, on_ground: bool = False) ->
 
 
 def energy_flights_table(flights: Sequence[FlightEnergy], most: int) -> TableView:
-    """Return the energy of each flight, of at most so many, those that failed first."""
+    """Return the energy of up to `most` flights, failed flights preferred."""
     columns = (
         Column("#"),
         *(Column(title, "kJ") for title in AIRFRAME.values()),
@@ -143,7 +143,7 @@ def _flight_row(flight: FlightEnergy) -> tuple[str, ...]:
 
 
 def energy_figure(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -> theme.Picture:
-    """Draw the energy of each flight (at least one), its parts on top of each other."""
+    """Draw the energy of each flight (at least one) with stacked parts."""
     figure = theme.new_figure(6.4, 3.4)
     ax = figure.subplots()
     many = len(flights) > BARS
@@ -159,7 +159,7 @@ def energy_figure(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -
     parts = PARTS if whole else (("", "airframe", theme.SERIES), PARTS[-1])
     for name, title, colour in parts[:-1] if on_ground else parts:
         values = np.array([_joules(f, name) for f in ranked]) / 1e3
-        # What is below 0 hangs below the axis. The bar above it is longer than the energy drawn.
+        # Negative parts are stacked below the axis, so the upper bar exceeds the total energy.
         base = np.where(values < 0.0, below, above)
         if many:
             ax.fill_between(x, base, base + values, color=colour, lw=0, step="mid", label=title)
@@ -198,7 +198,7 @@ def energy_figure(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -
 
 
 def _joules(flight: FlightEnergy, name: str) -> float:
-    """Return one part of a flight's energy [J]; no name: the airframe's."""
+    """Return a part of a flight's energy [J]; an empty name selects the airframe."""
     if name == "computer_j":
         return flight.quality.computer_energy_j
     if not name or flight.parts is None:

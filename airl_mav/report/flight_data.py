@@ -1,4 +1,4 @@
-"""What the page's script shows of a flight: its motion, its decisions and what the policy saw."""
+"""Data of a flight for the page's script: motion, decisions and the policy's images."""
 
 from __future__ import annotations
 
@@ -21,47 +21,47 @@ from airl_mav.report.tracking import EstimateErrors, Motion, TrackedFlight
 
 
 class Steps(TypedDict):
-    """A line of numbers as whole steps from one to the next, which compress well."""
+    """Sequence of numbers stored as integer differences, which compress well."""
 
     unit: float
-    """What a step of 1 is."""
+    """Value of a step of 1."""
     steps: list[int]
-    """From 0 to the first number, from each to the next."""
+    """Differences from 0 to the first number and from each number to the next."""
 
 
 LEVEL = 7
-"""Of gzip, 1 to 9: 9 takes three times as long for a page's data, and saves a hundredth of it."""
+"""Compression level of gzip, 1 to 9; level 9 takes three times longer for 1 % smaller data."""
 
 
 def packed(text: str) -> str:
-    """Return a text as base64 of gzip. The same text gives the same bytes."""
+    """Return a text as base64 of gzip; the output is reproducible."""
     return base64.b64encode(gzip.compress(text.encode(), compresslevel=LEVEL, mtime=0)).decode()
 
 
 def steps_of(values: NDArray[np.float64] | Sequence[float], unit: float) -> Steps:
-    """Return numbers (n,), all finite, as steps of a unit: each is kept to half a unit."""
+    """Encode finite numbers (n,) as steps of a unit, accurate to half a unit."""
     whole = np.round(np.asarray(values, np.float64) / unit).astype(np.int64)
     return {"unit": unit, "steps": np.diff(whole, prepend=0).tolist()}
 
 
 TIME_POINTS = 1000
-"""A line has at most this many points: 20 s at the recorded rate, or what is seen of more."""
+"""Maximum number of points of a line: 20 s at the recorded rate; longer flights are thinned."""
 
 UNITS = {"_m_s": 0.01, "_m": 0.01, "_deg": 0.1, "_deg_s": 0.1, "thrust": 0.001}
-"""Numbers are kept to half of this, by the unit that a name ends with."""
+"""Resolution of stored numbers by the suffix of their name."""
 
 IMAGES = 24
-"""Decisions of a flight with an image: all, or the first, the last and some between."""
+"""Maximum number of decisions with an image: first, last and evenly spaced ones."""
 
 LAST = 8
-"""Of them, so many are the last: they led to the end."""
+"""Number of these images from the last decisions, which led to the outcome."""
 
 BEST = 5
-"""So many of a decision's scores are shown, the best first."""
+"""Number of scores shown per decision, best first."""
 
 
 def chosen(count: int, most: int = IMAGES, last: int = LAST) -> list[int]:
-    """Return which of so many decisions are shown, increasing: `most` of them at most."""
+    """Return the indices of up to `most` of `count` decisions, increasing."""
     if count <= most:
         return list(range(count))
     before = np.linspace(0, count - last - 1, most - last).round().astype(int)
@@ -75,7 +75,7 @@ def flight_data(
     range_m: float,
     again: PolicyAgain | None,
 ) -> dict[str, Any]:
-    """Return one flight as plain data, with depth up to `range_m` and the policy's scores."""
+    """Return a flight as plain data, with depth up to `range_m` [m] and the policy's scores."""
     count = len(flight.time_s)
     keep = np.unique(np.linspace(0, count - 1, min(count, TIME_POINTS)).round().astype(int))
     commands = flight.commands
@@ -109,7 +109,7 @@ def _unit(name: str) -> float:
 
 
 def _stages(stamps: Arrays) -> dict[str, list[float | None]]:
-    """Return what each decision that was sent took, stage by stage [ms]; None: not known."""
+    """Return the durations of the sent decisions by stage [ms]; None = unknown."""
     series = decision_series(stamps)
     sent = np.asarray(stamps.get("sent_us", np.zeros(0, np.int64)))
     there = sent != NO_STAMP
@@ -125,10 +125,10 @@ def _stages(stamps: Arrays) -> dict[str, list[float | None]]:
 
 
 def _seen(decision: SeenDecision, range_m: float, again: PolicyAgain | None) -> Mapping[str, Any]:
-    """Return one decision: its image as base64 of bytes, and its best actions."""
+    """Return a decision: its image as base64, and its best actions."""
     seen = decision.image
     height, width = seen.shape[:2]
-    # A byte of the palette a pixel of depth, three of colour.
+    # One palette byte per depth pixel, three bytes per colour pixel.
     pixels = rgb_of(seen) if seen.ndim == 3 else shades(seen, range_m)
     image = base64.b64encode(pixels.tobytes()).decode()
     told: dict[str, Any] = {"number": decision.number, "size": [width, height], "image": image}

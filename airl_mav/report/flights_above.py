@@ -1,4 +1,4 @@
-"""Many flights from above: one panel a run, several panels on the same axes."""
+"""Maps of many flights: one panel per run, several panels on the same axes."""
 
 from __future__ import annotations
 
@@ -27,44 +27,44 @@ from airl_mav.report.table import OUTCOME_LABELS
 OVERVIEW_NAME = "trajectories"
 
 PATH_POINTS = 120
-"""A drawn path has at most this many points: more are not seen where hundreds of paths cross."""
+"""Maximum number of points of a path; more are not visible among hundreds of paths."""
 
 OPAQUE_FLIGHTS = 25
-"""Up to this many paths are drawn in full strength; more of them get fainter."""
+"""Maximum number of paths drawn at full opacity; with more paths, opacity decreases."""
 
 MARGIN_M = 0.5
-"""Left free around walls and paths."""
+"""Margin around walls and paths [m]."""
 
 
 @dataclass(frozen=True)
 class Panel:
-    """The flights of one run."""
+    """Flights of one run."""
 
     title: str
     detail: str
     episodes: Sequence[EpisodeRecord]
     paths: Mapping[int, Trajectory]
-    """By episode index."""
+    """Paths by episode index."""
     arena: Arena | None = None
-    """Of any of the flights: for the walls. Its obstacles are drawn where all flights have it."""
+    """Arena of one flight, for the walls; obstacles are drawn if all flights share the arena."""
 
 
 @dataclass(frozen=True)
 class _Extent:
-    """The part of the world that all panels show [m]."""
+    """Area shown by all panels [m]."""
 
     north: tuple[float, float]
     east: tuple[float, float]
 
     @property
     def tall(self) -> float:
-        """Height by width, within what a page bears."""
+        """Ratio of height to width, limited for the page."""
         tall = (self.north[1] - self.north[0]) / (self.east[1] - self.east[0])
         return min(max(tall, 0.45), 1.6)
 
 
 def flight_pictures(prefix: str, panels: Sequence[Panel]) -> list[theme.Picture]:
-    """Draw each panel by itself, with common axes; names are the prefix and a number."""
+    """Draw each panel as a picture with common axes; names are the prefix and a number."""
     extent = _extent(panels)
     return [
         _draw_panel(
@@ -79,7 +79,7 @@ def flight_pictures(prefix: str, panels: Sequence[Panel]) -> list[theme.Picture]
 
 
 def overview_picture(run: LoadedRun, arenas: Mapping[int, Arena]) -> theme.Picture:
-    """Draw all flights of a run coloured by outcome; `arenas` (by episode index) give the walls."""
+    """Draw all flights of a run by outcome; `arenas` (by episode index) supply the walls."""
     bounds = {arena.bounds for arena in arenas.values()}
     arena = next(iter(arenas.values())) if len(bounds) == 1 else None
     panel = Panel("", "", run.episodes, run.trajectories, arena)
@@ -108,7 +108,7 @@ def _extent(panels: Sequence[Panel]) -> _Extent:
 def _draw_panel(
     name: str, alt: str, panel: Panel, extent: _Extent, *, width_in: float
 ) -> theme.Picture:
-    """Draw one panel, with obstacles only where all its flights share a seed."""
+    """Draw one panel, with obstacles only if all its flights share an arena seed."""
     figure = theme.new_figure(width_in, 1.05 + 0.9 * width_in * extent.tall)
     ax: Axes = figure.subplots()
     seeds = {flight.arena_seed for flight in panel.episodes}
@@ -120,7 +120,7 @@ def _draw_panel(
         opacity = _opacity(len(goals))
         look = {"s": 60.0 * opacity + 6.0, "color": GOAL_COLOUR, "zorder": 4, "alpha": 0.7}
         _mark(ax, goals, marker="*", **look)
-    # What went wrong lies on top.
+    # Failed flights are drawn on top.
     ranked = sorted(panel.episodes, key=lambda flight: flight.outcome is not Outcome.SUCCESS)
     for outcome in dict.fromkeys(flight.outcome for flight in ranked):
         flights = [flight for flight in ranked if flight.outcome is outcome]
@@ -160,7 +160,7 @@ def _draw_paths(
     flights: Sequence[EpisodeRecord],
     paths: Mapping[int, Trajectory],
 ) -> None:
-    """Draw the flights that ended in one way: thin lines, and a mark where they failed."""
+    """Draw flights with one outcome as thin lines; failed flights end with a mark."""
     failed = outcome is not Outcome.SUCCESS
     colour = OUTCOME_COLOURS[outcome]
     lines = [
@@ -169,7 +169,7 @@ def _draw_paths(
         if flight.index in paths and len(paths[flight.index]) > 1
     ]
     lines = [line for line in lines if len(line) > 1]
-    # Hundreds of lines weigh less as pixels than as shapes.
+    # Hundreds of lines are smaller as pixels than as shapes.
     collection = LineCollection(
         lines,
         colors=colour,
@@ -185,7 +185,7 @@ def _draw_paths(
 
 
 def _opacity(count: int) -> float:
-    """Return the opacity of one of so many things that lie over each other."""
+    """Return the opacity of each of `count` overlapping elements."""
     return min(0.9, max(0.12, math.sqrt(OPAQUE_FLIGHTS / max(1, count))))
 
 
@@ -194,7 +194,7 @@ def _mark(ax: Axes, points: NDArray[np.float64], **look: Any) -> PathCollection:
 
 
 def path_points(path: Trajectory, ended_us: int) -> NDArray[np.float64]:
-    """Return some points (k, 2), east and north, of a path up to the verdict."""
+    """Return up to `PATH_POINTS` points (k, 2), east and north, of a path until the verdict."""
     inside = np.flatnonzero(path.time_us <= ended_us)
     keep = np.unique(np.linspace(0, len(inside) - 1, min(len(inside), PATH_POINTS)).astype(int))
     points: NDArray[np.float64] = path.position[inside[keep]][:, [1, 0]]

@@ -1,4 +1,4 @@
-"""What each pixel of a camera truly shows, as arrays and pictures: depth, which thing, its flow."""
+"""Ground truth of camera pixels as arrays and pictures: depth, segmentation, optical flow."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.replay.flight import ReplayedFlight
 
 TURNED_OVER_US = 20_000
-"""Angular rates of a recorded flight are those between so long before and after a moment [µs]."""
+"""Half-width of the difference for angular rates of a recorded flight [µs]."""
 
 
 class TakingCamera:
-    """Takes pictures, one ray a pixel, with the table `imaging` where the camera has one."""
+    """Camera with one ray per pixel, and image formation if its profile has `imaging`."""
 
     def __init__(self, camera: Camera, name: str = "") -> None:
-        """Prepare a profile's camera at its mount; `name` is that of an additional camera."""
+        """Prepare a profile's camera at its mount; `name` identifies an additional camera."""
         self._camera, self._intrinsics = camera, Intrinsics.of(camera)
         self._forming = None if camera.imaging is None else ImageFormation(camera, name)
         self._mount = Mount.of(camera)
@@ -59,7 +59,7 @@ class TakingCamera:
 def taken_film(
     flight: ReplayedFlight, camera: TakingCamera, moments: Iterable[int]
 ) -> Iterator[Pixels]:
-    """Yield what a camera takes along a recorded flight; UsageError if its arena cannot be made."""
+    """Yield a camera's pictures along a recorded flight; raise UsageError without its arena."""
     if flight.arena is None:
         raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
     for time_us in moments:
@@ -69,17 +69,17 @@ def taken_film(
 
 
 def recorded_motion(flight: ReplayedFlight, time_us: int) -> Motion:
-    """Return how the vehicle of a recorded flight moved at a time [µs]."""
+    """Return the motion of a recorded flight's vehicle at a time [µs]."""
     position, velocity, quaternion = pose_at(flight.path, time_us)
     return Motion(position, quaternion, velocity, _rates(flight, time_us))
 
 
 def _rates(flight: ReplayedFlight, time_us: int) -> NDArray[np.float64]:
-    """Return the angular velocity FRD (3,) [rad/s] of a recorded flight, by its attitudes."""
+    """Return the angular velocity FRD (3,) [rad/s] of a recorded flight from its attitudes."""
     *_, before = pose_at(flight.path, time_us - TURNED_OVER_US)
     *_, after = pose_at(flight.path, time_us + TURNED_OVER_US)
     turn = quat_to_matrix(before).T @ quat_to_matrix(after)
-    # Of a small rotation: its skew part.
+    # For a small rotation, the skew part of its matrix is the rotation vector.
     skew = 0.5 * np.array(
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
     )
@@ -88,21 +88,21 @@ def _rates(flight: ReplayedFlight, time_us: int) -> NDArray[np.float64]:
 
 
 ARRAY: Final = ".npy"
-"""Suffix of an array, as numpy writes it."""
+"""Suffix of numpy arrays."""
 
 TRUTHS: Final = tuple(name for name in get_args(Shown) if name not in ("rgb", "grey"))
-"""What is no colour."""
+"""Kinds of pictures other than colour and grey."""
 
 
 def truth_of(
     show: Shown, arena: Arena, elapsed_us: int, camera: Intrinsics, motion: CameraMotion
 ) -> NDArray[Any]:
-    """Return what each pixel shows, some time after the episode's start.
+    """Return the ground truth of each pixel at a time after the episode's start [µs].
 
-    Of `depth` float32 (h, w) [m], as the camera's projection measures it, without a limit of range,
-    0 where there is no surface. Of `segmentation` int32 (h, w): 0 sky, 1 floor, 2 a wall across
-    north, 3 one across east, 4 + i obstacle i. Of `flow` float32 (h, w, 2): columns and rows a
-    second [px/s], NaN where a fisheye sees nothing.
+    `depth` is float32 (h, w) [m] in the camera's projection, without a range limit; 0 = no surface.
+    `segmentation` is int32 (h, w): 0 sky, 1 floor, 2 wall across north, 3 wall across east, 4 + i
+    obstacle i. `flow` is float32 (h, w, 2), columns and rows per second [px/s]; NaN outside a
+    fisheye's image.
     """
     centers = arena.centers_at(elapsed_us)
     picture = render_picture(arena, centers, camera, motion.position, motion.quaternion)
@@ -116,7 +116,7 @@ def truth_of(
 def truth_film(
     show: Shown, flight: ReplayedFlight, camera: Intrinsics, moments: Iterable[int]
 ) -> Iterator[NDArray[Any]]:
-    """Yield `truth_of` along a recorded flight, for a camera mounted as the vehicle's."""
+    """Yield `truth_of` along a recorded flight for a camera at the vehicle's camera mount."""
     if flight.arena is None:
         raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
     mount = PolicyCamera.of(flight.vehicle.camera).mount
@@ -137,7 +137,7 @@ def coloured_flow(flow: NDArray[np.float32]) -> Pixels:
     most = max(float(np.quantile(speed, 0.99)), 1e-6)
     share = np.minimum(speed / most, 1.0)
     turns = np.arctan2(down, across) / (2.0 * np.pi)
-    # A colour wheel: each channel fades with the angle from its own hue.
+    # In the colour wheel, each channel fades with the angle from its hue.
     angle = np.stack([turns, turns - 1.0 / 3.0, turns - 2.0 / 3.0], axis=-1) % 1.0
     wheel = np.clip(2.0 - 6.0 * np.minimum(angle, 1.0 - angle), 0.0, 1.0)
     colours = 255.0 * (1.0 - share[..., None] * (1.0 - wheel))
@@ -147,7 +147,7 @@ def coloured_flow(flow: NDArray[np.float32]) -> Pixels:
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:
-    """Write an array as numpy does. Raises OSError."""
+    """Write an array in numpy's format. Raises OSError."""
     written = io.BytesIO()
     np.save(written, array)
     replace_file(path, written.getvalue())

@@ -1,4 +1,4 @@
-"""A grid of numbers as coloured fields, each with its figure written in it."""
+"""Heat maps: grids of coloured fields with their values as text."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ from airl_mav.report import theme
 
 CELL_WIDTH_IN, CELL_HEIGHT_IN = 1.12, 0.62
 MARGIN_IN = (1.15, 1.05)
-"""Room beside and above the fields, axes and colour bar included."""
+"""Width beside and height above the fields [inch], including axes and colour bar."""
 
 LEAST_IN = (4.4, 2.6)
-"""Smallest figure: titles need room however few the fields."""
+"""Minimum size of a figure [inch], for the titles of small maps."""
 
 DARK_INK, LIGHT_INK = "#010203", "#ffffff"
-"""Figures in bright and in dark fields; the fields keep their colours in a dark page, and so do
-these. They are none of the theme's colours for that reason."""
+"""Text colours on bright and dark fields. Fields keep their colours on a dark page, so these must
+not be colours of the theme."""
 
 BRIGHT = 0.179
-"""Relative luminance of a field on which black and white are read equally well."""
+"""Relative luminance at which black and white text have equal contrast."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """One field of a heat map."""
+    """Field of a heat map."""
 
     value: float
     text: str
-    """What is written, at most two lines."""
+    """Text in the field, at most two lines."""
     marked: bool = False
-    """Framed: the one to look at."""
+    """True to draw a frame as a highlight."""
 
 
 @dataclass(frozen=True)
 class HeatMap:
-    """Rows from bottom to top, columns from left to right; a field that is missing stays empty."""
+    """Heat map; rows from bottom to top, columns from left to right, missing fields are empty."""
 
     title: str
     rows: Sequence[int | str]
@@ -53,17 +53,17 @@ class HeatMap:
     columns: Sequence[int | str]
     column_title: str
     fields: Mapping[Any, Field]
-    """By (row, column)."""
+    """Fields by (row, column)."""
     unit: str
     limits: tuple[float, float]
     """Values of the first and the last colour."""
     logarithmic: bool = False
     note: str = field(default="")
-    """Small, under the title."""
+    """Small text below the title."""
 
     @property
     def size_in(self) -> tuple[float, float]:
-        """Width and height of a figure of it."""
+        """Width and height of the figure [inch]."""
         return (
             max(LEAST_IN[0], MARGIN_IN[0] + CELL_WIDTH_IN * len(self.columns)),
             max(LEAST_IN[1], MARGIN_IN[1] + CELL_HEIGHT_IN * len(self.rows)),
@@ -71,12 +71,12 @@ class HeatMap:
 
 
 def colours() -> Colormap:
-    """Return a map from pale to dark that is read in grey and by the colour-blind too."""
+    """Return a colour map from pale to dark, readable in grey and by colour-blind readers."""
     return ListedColormap(colormaps["YlGnBu"](np.linspace(0.06, 0.92, 256)), name="fields")
 
 
 def heat_picture(name: str, alt: str, heat: HeatMap) -> theme.Picture:
-    """Draw a heat map by itself."""
+    """Draw a heat map as a picture."""
     figure = theme.new_figure(*heat.size_in)
     draw_heat_map(figure, heat)
     return theme.render(figure, name, alt)
@@ -120,7 +120,7 @@ def draw_heat_map(figure: Figure | SubFigure, heat: HeatMap) -> Axes:
 
 
 def _plain(value: float) -> str:
-    """Return a number as people write it: 200 M."""
+    """Return a number with an SI prefix, such as 200 M."""
     for unit, size in ((" G", 1e9), (" M", 1e6), (" k", 1e3)):
         if value >= size:
             return f"{value / size:g}{unit}"
@@ -167,7 +167,7 @@ def _draw_field(
 
 
 def _ink_on(colour: tuple[float, ...]) -> str:
-    """Return what is read on a colour (relative luminance after WCAG 2.1)."""
+    """Return the text colour for a background (relative luminance by WCAG 2.1)."""
     linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(colour)]
     luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
     return DARK_INK if luminance > BRIGHT else LIGHT_INK

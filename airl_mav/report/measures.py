@@ -1,4 +1,4 @@
-"""The measures that runs are compared in, and estimates of them as text."""
+"""Measures for the comparison of runs, and their estimates as text."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.table import NONE
 
 FEW_FLIGHTS = 10
-"""Below this a bootstrap interval covers clearly less than its 95 %."""
+"""Number of flights below which a bootstrap interval covers clearly less than 95 %."""
 
 MANY_FLIGHTS = 100
-"""From here on rates have a decimal."""
+"""Number of flights from which rates have a decimal."""
 
 S_PER_MIN = 60.0
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A measure of the quality of flight."""
+    """Measure of flight quality."""
 
     key: Literal[
         "success_rate",
@@ -49,11 +49,11 @@ class Measure:
         "jerk_rms_m_s3",
         "command_step_m_s",
     ]
-    """Its field in an `Aggregate`; of the first six, also in a `PairedComparison`."""
+    """Field in an `Aggregate`; the first six are also fields of a `PairedComparison`."""
     title: str
     unit: str
     scale: float
-    """From the unit of the field to the shown one."""
+    """Factor from the unit of the field to the displayed unit."""
     digits: int
     difference_unit: str = "%"
 
@@ -68,13 +68,13 @@ class Measure:
         return change
 
     def plain(self, value: float | None, *, unit: bool = False) -> str:
-        """Return a value in the shown unit."""
+        """Return a value in the displayed unit."""
         if value is None:
             return NONE
         return f"{self.scale * value:,.{self.digits}f}{f' {self.unit}' if unit else ''}".rstrip()
 
     def with_interval(self, quality: Aggregate) -> str:
-        """Return the measure of a run in the shown unit, its 95 % interval in brackets."""
+        """Return the measure of a run in the displayed unit, with its 95 % interval in brackets."""
         return with_interval(self.of(quality).scaled(self.scale), self.digits)
 
 
@@ -94,10 +94,10 @@ JERK = Measure("jerk_rms_m_s3", "jerk, flown, RMS", "m/s³", 1.0, 2)
 COMMAND_STEP = Measure("command_step_m_s", "step of the command, mean", "m/s", 1.0, 2)
 
 CONDUCT = (DEADLINE_MISSES, JERK, COMMAND_STEP)
-"""Deadlines and smoothness. Runs that were recorded without have none of these."""
+"""Measures of deadlines and smoothness; empty for runs recorded without them."""
 
 PACK = (ENDURANCE, RANGE, MISSIONS)
-"""Runs that were recorded without have none of these."""
+"""Measures of a full charge; empty for runs recorded without them."""
 
 MEASURES = (SUCCESS_RATE, FLIGHT_TIME, DISTANCE, ENERGY)
 ALL_MEASURES = (*MEASURES, COMPUTER_ENERGY, TOTAL_ENERGY)
@@ -115,7 +115,7 @@ def with_interval(estimate: Estimate, digits: int = 1, sign: str = "") -> str:
 
 
 def interval_of(estimate: Estimate, digits: int, sign: str = "") -> str:
-    """Return the 95 % interval alone; empty where there is none."""
+    """Return only the 95 % interval; empty without one."""
     if estimate.low is None or estimate.high is None:
         return ""
     form = f"{sign}.{digits}f"
@@ -123,7 +123,7 @@ def interval_of(estimate: Estimate, digits: int, sign: str = "") -> str:
 
 
 def rate_digits(rate: Estimate) -> int:
-    """Return the decimals of a rate in percent: one flight more or less shows."""
+    """Return the decimals of a rate in percent, so that a single flight is visible."""
     return 1 if rate.n >= MANY_FLIGHTS else 0
 
 
@@ -142,34 +142,34 @@ MODELLED_STAGES = tuple(
     for stage in SHOWN_STAGES
     if stage.key not in ("send", "control")
 )
-"""Level gym sends in no time, and has link and control in one."""
+"""Stages at level gym: no send time; link and control are one stage."""
 
 
 @dataclass(frozen=True)
 class RunSummary:
-    """Everything that a report's tables say."""
+    """Data of a report's tables."""
 
     stages: dict[str, Summary]
     samples: dict[str, Samples]
-    """Raw durations behind them [µs]."""
+    """Raw durations of the stages [µs]."""
     quality: statistics.Aggregate
     medians: dict[str, statistics.Estimate]
-    """Of the same flights as the means of `quality`, by its field."""
+    """Medians over the flights of `quality`, by its fields."""
     modelled: bool
-    """Times come from a model and were not measured: level gym."""
+    """True if times come from a model instead of measurements: level gym."""
     timed: bool
-    """The flights lived by the wall clock: not gym, not lockstep."""
+    """True if flights ran in wall time: neither gym nor lockstep."""
 
     @property
     def shown_stages(self) -> tuple[Stage, ...]:
-        """The stages of the latency table: at level gym those that its model has."""
+        """Stages of the latency table; at level gym, the stages of its model."""
         if not self.modelled:
             return SHOWN_STAGES
         return tuple(stage for stage in MODELLED_STAGES if self.stages[stage.key].n)
 
 
 def summarize_run(run: LoadedRun) -> RunSummary:
-    """Work out the figures of a run."""
+    """Compute the summary of a run."""
     samples = pool(stage_samples(stamps) for stamps in run.latency.values())
     stages = {stage.key: summarize(samples[stage.key]) for stage in ALL_STAGES}
     good = statistics.successful(run.episodes)

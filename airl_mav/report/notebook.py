@@ -1,4 +1,4 @@
-"""What a notebook shows of a run or a comparison: the verdict, the figures, one picture."""
+"""Notebook output of a run or a comparison: the verdict, key figures, one picture."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from airl_mav.report.verdict import OverallVerdict, load_verdict
 
 
 def run_html(run: LoadedRun) -> str:
-    """Return a run as HTML, without arenas that cannot be made any more."""
+    """Return a run as HTML, without arenas if they cannot be generated."""
     verdict = verdict_of(run)
     table = _figures(run_headlines(run, summarize_run(run)))
     picture = _picture(run) if run.episodes else None
@@ -38,7 +38,7 @@ def run_html(run: LoadedRun) -> str:
 def comparison_html(
     comparison: Comparison, loaded: Mapping[str, LoadedRun], folder: Path, page: Path
 ) -> str:
-    """Return a comparison in a folder as HTML that links to its page."""
+    """Return a comparison in a folder as HTML with a link to its page."""
     verdict = load_verdict(folder)
     document = comparison_to_document(comparison, loaded, folder, verdict)
     table = runs_table(comparison.runs, measures=MEASURES)

@@ -1,6 +1,6 @@
-"""The policy's inputs and choices, recomputed decision by decision from a recording.
+"""Inputs and choices of a policy, recomputed for each decision of a recording.
 
-Images are rendered from the true pose, without noise. Telemetry is the recorded estimate.
+Images are rendered from the true pose without noise. Telemetry is the recorded estimate.
 """
 
 from __future__ import annotations
@@ -39,38 +39,38 @@ from airl_mav.report.forensics.camera_view import PolicyCamera
 ONE = np.zeros(1, np.intp)
 
 SAME_ACTION = 0.01
-"""Commands closer than this are the same action [m/s, rad/s]."""
+"""Tolerance for equal commands [m/s, rad/s]."""
 
 MOST = 2000
-"""Decisions of a flight that are worked out again: the first."""
+"""Maximum number of recomputed decisions, from the start of a flight."""
 
 
 @dataclass(frozen=True)
 class SeenDecision:
-    """One decision."""
+    """Recomputed decision."""
 
     number: int
-    """Its row in `latency.npz`."""
+    """Row in `latency.npz`."""
     image: NDArray[Any]
-    """What the policy saw, as `camera.frame.Frame.image`."""
+    """Input image of the policy, as in `camera.frame.Frame`."""
     scores: NDArray[np.float32] | None
-    """(k,) of each discrete action, as the network gives them; None: nothing tells them."""
+    """Network outputs (k,), one per discrete action; None if unavailable."""
     again: bool | None
-    """Whether the action of the best score is the one that was flown; None without scores."""
+    """True if the action with the best score was flown; None without scores."""
 
 
 @dataclass(frozen=True)
 class PolicyAgain:
-    """A run's policy, ready to be asked again."""
+    """Policy of a run, loaded for recomputing its decisions."""
 
     policy: LearnedPolicy
     actions: NDArray[np.float64]
-    """(k, 3) commands of its actions: forward, right [m/s], yaw rate [rad/s]; of a set of three
-    dimensions (k, 4): behind them the downward speed [m/s]."""
+    """Commands (k, 3) of the actions: forward, right [m/s], yaw rate [rad/s]. 3D action sets have
+    (k, 4) with the downward speed [m/s] last."""
 
     @property
     def scores_are(self) -> str:
-        """What its scores are, in a word."""
+        """Name of the network's outputs."""
         return "Q-value" if "dqn" in self.policy.card.algorithm else "score"
 
 
@@ -107,7 +107,7 @@ def seen_decisions(
     if path is None or not len(path) or any(name not in stamps for name in needed):
         return
     lens = _Lens(arena, PolicyCamera.of(vehicle.camera), path, record.started_us)
-    # Those that the network asks for: it is asked again only on a vehicle that has them.
+    # Only the cameras of the network's input are rendered.
     names = () if again is None else again.policy.card.observation.cameras
     further = {
         name: _Further(_Lens(arena, PolicyCamera.of(camera), path, record.started_us))
@@ -140,7 +140,7 @@ def seen_decisions(
 
 @dataclass(frozen=True)
 class _Lens:
-    """The camera along a recorded path."""
+    """Camera along a recorded path."""
 
     arena: Arena
     camera: PolicyCamera
@@ -148,7 +148,7 @@ class _Lens:
     started_us: int
 
     def image(self, time_us: int) -> NDArray[Any]:
-        """Return what is seen at a time."""
+        """Return the camera image at a time."""
         position, _, quaternion = pose_at(self.path, time_us)
         eye, attitude = camera_pose(position, quaternion, self.camera.mount)
         centers = self.arena.centers_at(time_us - self.started_us)
@@ -157,21 +157,21 @@ class _Lens:
 
 
 class _Further:
-    """A further camera along a recorded path, and what it has shown the decisions so far."""
+    """Additional camera along a recorded path, with its images of earlier decisions."""
 
     def __init__(self, lens: _Lens) -> None:
         self._lens = lens
         self._earlier: deque[NDArray[Any]] = deque(maxlen=MOST_FRAMES - 1)
 
     def view(self, time_us: int) -> observation.View:
-        """Return what a decision sees of an image that was taken at a time; keep it."""
+        """Return a decision's view with the image of a time; store the image for later ones."""
         image, earlier = self._lens.image(time_us), tuple(self._earlier)
         self._earlier.appendleft(image)
         return observation.View(image, self._lens.camera.intrinsics, earlier)
 
 
 class _Companion:
-    """What a companion keeps from one decision to the next, as `companion.pilot` does."""
+    """State of a companion between decisions, as in `companion.pilot`."""
 
     def __init__(self, vehicle: VehicleProfile, camera: PolicyCamera, *, compensates: bool) -> None:
         self._intrinsics = camera.intrinsics
@@ -194,7 +194,7 @@ class _Companion:
         now_us: int,
         further: Mapping[str, observation.View],
     ) -> observation.Observation:
-        """Return what the policy sees: what is, or what will be when its action is sent."""
+        """Return the policy's observation: current, or predicted for the time of sending."""
         age = np.array([age_us])
         if self._compensator is not None:
             images, states = self._compensator.foresee(
@@ -210,7 +210,7 @@ class _Companion:
     def decided(
         self, setpoint: NDArray[np.float64], t2_us: int, sent_us: int, stops_us: int | None
     ) -> None:
-        """Take what was sent."""
+        """Store a sent setpoint."""
         command, t2 = setpoint[None], np.array([t2_us])
         if self._compensator is None:
             self._memory.decided(ONE, command, t2)
@@ -220,7 +220,7 @@ class _Companion:
 
 
 def _telemetry(stamps: Arrays, path: Trajectory, time_us: int) -> observation.Kinematics:
-    """Return the newest estimate at a time; the true state where none was recorded."""
+    """Return the newest estimate at a time, or the true state without recorded estimates."""
     if not len(stamps.get("estimate/time_us", ())):
         return observation.Kinematics(*pose_at(path, time_us))
     at = max(0, int(np.searchsorted(stamps["estimate/time_us"], time_us, side="right")) - 1)

@@ -1,4 +1,4 @@
-"""The flight that a black box holds, as reports and comparisons read it."""
+"""Conversion of a black box to an episode for reports and comparisons."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from airl_mav.rehearsal.run_folder import FlownEpisode, RunInfo, run_info
 from companion.limits import OUT_OF_TIME
 
 NAVIGATING = "navigating"
-"""The phase in which the policy flies (`companion.mission`)."""
+"""Phase in which the policy flies (`companion.mission`)."""
 
 LEAST_NORM = 0.5
-"""A quaternion shorter than this says nothing."""
+"""Minimum norm of a valid quaternion."""
 
 DIGEST = "recording_sha256"
-"""Setting of the run that tells which file it was made of."""
+"""Setting of the run with the checksum of its source file."""
 
 
 @dataclass(frozen=True)
 class FlownPilot:
-    """How the policy was flown."""
+    """Pilot settings of the flight."""
 
     hold_s: float
     goal_radius_m: float
@@ -44,14 +44,14 @@ class FlownPilot:
 
 @dataclass(frozen=True)
 class FlownLimits:
-    """How far it was flown."""
+    """Limits of the flight."""
 
     flight_s: float
 
 
 @dataclass(frozen=True)
 class FlownSettings:
-    """What a flight's page needs of its settings."""
+    """Settings of a flight that its page requires."""
 
     goal: Goal
     seed: int
@@ -64,12 +64,12 @@ _SETTINGS = TypeAdapter(FlownSettings)
 
 
 def settings_of(box: BlackBox) -> FlownSettings:
-    """Return what was asked for. Raises UsageError where the black box does not hold it."""
+    """Return the flight's settings. Raises UsageError if the black box lacks them."""
     return typed(_SETTINGS, box.run.get("config", {}), box.path)
 
 
 def info_of(box: BlackBox, digest: str = "") -> RunInfo:
-    """Return what flew. Raises UsageError where the black box does not hold it."""
+    """Return the description of the run. Raises UsageError if the black box lacks it."""
     run = box.run
     info = run_info(run, box.path)
     return replace(info, config={**info.config, DIGEST: digest})
@@ -78,7 +78,7 @@ def info_of(box: BlackBox, digest: str = "") -> RunInfo:
 def episode_of(
     box: BlackBox, path: Trajectory | None = None, remarks: tuple[str, ...] = ()
 ) -> FlownEpisode:
-    """Return the flight of a black box, or UsageError; a `path` replaces its telemetry."""
+    """Return the flight of a black box, or raise UsageError; `path` replaces its telemetry."""
     asked = settings_of(box)
     path = path_of(box) if path is None else path
     stamps = stamps_of(box)
@@ -127,12 +127,12 @@ def episode_of(
 
 
 def path_of(box: BlackBox) -> Trajectory:
-    """Return the path and power [W] of the telemetry; 0 W where power is unknown."""
+    """Return the path and power [W] of the telemetry; NaN power if never measured."""
     told = box.all_of(Telemetry)
     rows = [(*each.position, *each.velocity, *each.quaternion) for each in told]
     states = np.array(rows, np.float64).reshape(len(rows), 10)  # None becomes NaN
     times = np.array([each.time_us for each in told], np.int64)
-    # Before the first telemetry all is NaN or 0, and a quaternion of 0 is no attitude.
+    # Before the first telemetry, all values are NaN or 0; a zero quaternion is invalid.
     known = np.isfinite(states).all(axis=1) & (np.linalg.norm(states[:, 6:], axis=1) > LEAST_NORM)
     times, states = times[known], states[known]
     later = np.diff(times, prepend=NO_STAMP) > 0
@@ -142,12 +142,12 @@ def path_of(box: BlackBox) -> Trajectory:
 
 
 def stamps_of(box: BlackBox) -> dict[str, NDArray[Any]]:
-    """Return the decisions' columns as `latency.stamps.DecisionLog.columns`."""
+    """Return the columns of the decisions as in `latency.stamps.DecisionLog.columns`."""
     decisions, commands = box.all_of(Decision), settings_of(box).pilot.commands
     columns: dict[str, NDArray[Any]] = {
         name: np.array([getattr(each, name) for each in decisions], np.int64) for name in STAMPS
     }
-    # Of all but the last it is known when the hold ended, not only when it was to end.
+    # The next decision records the actual end of the hold; the last has only its planned end.
     columns["held_until_us"][:-1] = [each.held_before_us for each in decisions[1:]]
     rows = [each.setpoint for each in decisions]
     columns[SETPOINTS[commands]] = np.array(rows, np.float32).reshape(len(rows), 4)
@@ -155,7 +155,7 @@ def stamps_of(box: BlackBox) -> dict[str, NDArray[Any]]:
 
 
 def _power_w(statuses: list[Status], times_us: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the newest power (n,) at times (n,); NaN: never measured, or -1 A as of old PX4."""
+    """Return the newest power (n,) at times (n,); NaN if never measured (old PX4 sends -1 A)."""
     told = [
         (status.time_us, status.voltage_v * status.current_a)
         for status in statuses
@@ -171,7 +171,7 @@ def _power_w(statuses: list[Status], times_us: NDArray[np.int64]) -> NDArray[np.
 
 
 def _ended_us(box: BlackBox, path: Trajectory, navigation_us: int | None) -> int:
-    """Return when navigation ended, or else the recording [µs]."""
+    """Return the end of navigation, or of the recording [µs]."""
     if navigation_us is not None:
         for phase in box.all_of(Phase):
             if phase.time_us >= navigation_us and phase.phase != NAVIGATING:
@@ -181,7 +181,7 @@ def _ended_us(box: BlackBox, path: Trajectory, navigation_us: int | None) -> int
 
 
 def _cut(box: BlackBox, ended_us: int) -> tuple[str, tuple[str, ...]]:
-    """Return the reason and the notes of a flight whose recording was cut off."""
+    """Return the reason and the notes of a flight with a truncated recording."""
     phases = box.all_of(Phase)
     where = f" while {phases[-1].phase}" if phases else ""
     note = "the companion, its computer or the power failed, or the file was damaged there"
@@ -191,7 +191,7 @@ def _cut(box: BlackBox, ended_us: int) -> tuple[str, tuple[str, ...]]:
 def _arrived_us(
     path: Trajectory, navigation_us: int | None, ended_us: int, asked: FlownSettings
 ) -> int | None:
-    """Return when the goal was reached by the referee's rule [µs], before the companion saw it."""
+    """Return the arrival by the referee's rule [µs], before the companion's; None = no arrival."""
     if navigation_us is None:
         return None
     flown = path.between(navigation_us, ended_us)

@@ -1,7 +1,7 @@
-"""The run folder of a black box, beside it, which every report and comparison reads.
+"""Conversion of a black box to a run folder beside it, for reports and comparisons.
 
-Path, power and motor outputs come from the vehicle's log. Its clock is aligned as by NTP, assuming
-equal delays both ways (D. Mills, RFC 5905, section 8).
+With a vehicle log, path, power and motor outputs come from the log. Its clock is aligned as in NTP,
+assuming equal delays both ways (D. Mills, RFC 5905, section 8).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from airl_mav.vehicle_log.ulog import VehicleLog
 
 
 def logged_episode_of(box: BlackBox, log: VehicleLog) -> FlownEpisode:
-    """Return the flight with path, power and motor outputs of the vehicle's log, or UsageError."""
+    """Return the flight with path, power and motor outputs from the log, or raise UsageError."""
     told = path_of(box)
     stamps = stamps_of(box)
     kind = commanded(stamps)
@@ -50,19 +50,19 @@ def logged_episode_of(box: BlackBox, log: VehicleLog) -> FlownEpisode:
 
 
 def offset_us(clocks: Alignment) -> float:
-    """Return the offset from log to companion time [µs], half the round trip if known."""
+    """Return the offset from log to companion time [µs]; assumes equal delays if both are known."""
     if clocks.accepted_us is None:
         return clocks.told_us
     return 0.5 * (clocks.told_us - clocks.accepted_us)
 
 
 def _path(told: Trajectory, log: VehicleLog, told_us: float, ahead_us: float) -> Trajectory:
-    """Return the log's estimate at the times of its attitude, and what the battery gave."""
+    """Return the log's estimate at its attitude times, with the battery's power."""
     attitude, motion = log.attitude, log.motion
     inside = (attitude.time_us >= motion.time_us[0]) & (attitude.time_us <= motion.time_us[-1])
     logged_us, quaternion = attitude.time_us[inside], attitude.values[inside]
     state = motion.at(logged_us)
-    # Both count from the estimator's origin; where they do not, the recording's is the goal's.
+    # Both usually share the estimator's origin; otherwise, the goal uses the recording's origin.
     both = (told.time_us - told_us >= motion.time_us[0]) & (
         told.time_us - told_us <= motion.time_us[-1]
     )
@@ -77,7 +77,7 @@ def _path(told: Trajectory, log: VehicleLog, told_us: float, ahead_us: float) ->
 def _power_w(
     log: VehicleLog, logged_us: NDArray[np.int64], told: Trajectory, times_us: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the power (n,) that the battery gave; the recording's where the log has none."""
+    """Return the battery's power (n,) from the log, or from the recording without log values."""
     battery = log.battery
     known = np.isfinite(battery.values[:, :2]).all(axis=1) if len(battery) else np.zeros(0, bool)
     if not known.any():
@@ -87,7 +87,7 @@ def _power_w(
 
 
 WITH_LOG = "-with-log"
-"""Ends the name of the run folder of a flight with the vehicle's own log."""
+"""Suffix of the run folder's name for a flight with a vehicle log."""
 
 
 def take_in(path: Path, ulg: Path | None = None) -> Path:

@@ -1,4 +1,4 @@
-"""The page of a roofline: the curve, its points, and what binds each computer."""
+"""Page of a roofline: the curves, their points, and each computer's bottleneck."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ BINDS: dict[Bound, str] = {
 }
 
 RATES = 200
-"""Points of a curve."""
+"""Number of points of a curve."""
 
 
 def roofline_document(found: Roofline, made: Mapping[str, Any]) -> Document:
-    """Return the document of a roofline with at least one point, and its provenance."""
+    """Return the document of a roofline with one or more points; `made` is its provenance."""
     return Document(
         name="roofline",
         title=f"Roofline of {found.vehicle}",
@@ -78,7 +78,7 @@ def _facts(found: Roofline) -> Facts:
 
 
 def velocity_table(found: Roofline) -> TableView:
-    """Return the safe velocity on each computer: model, measurement, flight, and the roofs."""
+    """Return the safe velocity on each computer: model, measurement, flight and roofs."""
     columns = columns_of(
         "<computer | F-1 [m/s] | measured [m/s] | flown [m/s] | "
         "roof, F-1 [m/s] | roof [m/s] | <binds"
@@ -104,7 +104,7 @@ def velocity_table(found: Roofline) -> TableView:
 
 
 def aircraft_table(found: Roofline) -> TableView:
-    """Return what each computer costs the aircraft, and the missions that its pack then holds."""
+    """Return mass and power of each computer on board, and the missions per charge."""
     columns = columns_of(
         "<computer | on board [g] | draws [W] | take-off mass [kg] | power [W] | missions"
     )
@@ -127,7 +127,7 @@ def aircraft_table(found: Roofline) -> TableView:
 
 
 def reaction_table(found: Roofline) -> TableView:
-    """Return what the reaction time of each computer is made of, and its knee."""
+    """Return the parts of each computer's reaction time, and the knee."""
     columns = columns_of(
         "<computer | sensor [s] | 2 x t2 [s] | hold [s] | link [s] | "
         "T [s] | 1 / T [Hz] | knee, F-1 [Hz] | knee [Hz]"
@@ -153,7 +153,7 @@ def reaction_table(found: Roofline) -> TableView:
 
 
 def roofline_picture(found: Roofline) -> theme.Picture:
-    """Draw safe velocity against 1 / T: each computer's own curves, and its points."""
+    """Draw safe velocity against 1 / T with the curves and points of each computer."""
     figure = theme.new_figure(7.2, 4.6)
     ax = figure.add_subplot()
     theme.plain_axes(ax)

@@ -1,4 +1,4 @@
-"""The figures of a run's report: latency by stage, the flight from above."""
+"""Figures of a run's report: latency by stage, and maps of flights."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from airl_mav.report import theme
 from airl_mav.report.table import OUTCOME_LABELS, ms
 
 LONG_TAIL = 30.0
-"""A maximum this many times the median: the axis becomes logarithmic."""
+"""Ratio of maximum to median above which the axis is logarithmic."""
 PATH_SEGMENTS = 500
-"""A drawn path has at most this many corners: more are not seen, and weigh."""
+"""Maximum number of points of a drawn path; more add size without visible benefit."""
 PATH_COLOURS = 24
-"""Steps of a path's colour: neighbours of one step are one line."""
+"""Number of colour steps of a path; adjacent segments of one step form one line."""
 
 OUTCOME_COLOURS = {
     Outcome.SUCCESS: "#1b8a3f",
@@ -51,12 +51,12 @@ OUTCOME_MARKERS = {
 
 
 def speed_colours() -> Colormap:
-    """Return viridis without its pale end, which would vanish on the floor's colour."""
+    """Return viridis without its pale end, which is invisible on the floor's colour."""
     return ListedColormap(colormaps["viridis"](np.linspace(0.05, 0.9, 256)), name="speed")
 
 
 def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> theme.Picture:
-    """Draw a stage's durations [µs]: histogram above, cumulative share with percentiles below."""
+    """Draw a stage's durations [µs]: a histogram, and a cumulative curve with percentiles."""
     margins = theme.Margins(left=0.58, right=0.14, bottom=0.42, top=0.27, between=0.1)
     figure, (top, bottom) = theme.stacked_axes(2, 4.2, 2.6, margins, height_ratios=(1.1, 1.0))
     values = np.sort(samples) / US_PER_MS
@@ -100,17 +100,17 @@ def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> theme.Pi
 
 
 def long_tail(values: NDArray[np.float64]) -> bool:
-    """Return whether sorted values call for a logarithmic axis."""
+    """Return True if sorted values require a logarithmic axis."""
     return bool(values[0] > 0.0 and values[-1] > LONG_TAIL * np.median(values))
 
 
 def _bin_edges(values: NDArray[np.float64]) -> list[float]:
-    """Return histogram edges of sorted values: about 2 sqrt(n) bins, an odd number."""
+    """Return histogram edges of sorted values: about 2 sqrt(n) bins, always odd."""
     bins = int(np.clip(2.0 * math.sqrt(len(values)), 12, 40)) | 1
     low, high = float(values[0]), float(values[-1])
     if long_tail(values):
         return [float(edge) for edge in np.geomspace(low, high, bins + 1)]
-    # One duration only, as in lockstep, still needs a width.
+    # A single duration, as in lockstep, requires a non-zero width.
     pad = 0.03 * (high - low) if high > low else max(0.1 * abs(high), 0.001)
     return [float(edge) for edge in np.linspace(low - pad, high + pad, bins + 1)]
 
@@ -118,12 +118,12 @@ def _bin_edges(values: NDArray[np.float64]) -> list[float]:
 def map_figure(
     episode: EpisodeRecord, trajectory: Trajectory | None, arena: Arena | None, top_speed: float
 ) -> theme.Picture:
-    """Draw a flight from above over its arena, as it was at the flight's end, as far as known."""
+    """Draw a map of a flight over its arena, if known, in its state at the flight's end."""
     tall = 1.0
     if arena is not None:
         b = arena.bounds
         tall = (b.north_max - b.north_min) / (b.east_max - b.east_min)
-    # The map takes 4.15 inches across; axis labels and legend about one inch of the height.
+    # The map is 4.15 inches wide; axis labels and legend need about one inch of height.
     figure = theme.new_figure(5.2, 1.0 + 4.15 * min(max(tall, 0.5), 1.6))
     ax = figure.add_subplot()
     if arena is not None:
@@ -195,7 +195,7 @@ def _draw_path(
 def speed_bar(bar: Colorbar) -> None:
     """Style the colour scale of a path."""
     if bar.solids is not None:
-        # 256 colour steps weigh less as pixels than as shapes.
+        # 256 colour steps are smaller as pixels than as shapes.
         bar.solids.set_rasterized(True)
     bar.outline.set_visible(False)
     bar.set_label("speed [m/s]", fontsize=8.5, color=theme.MUTED)
@@ -205,7 +205,7 @@ def speed_bar(bar: Colorbar) -> None:
 def coloured_pieces(
     points: NDArray[np.float64], values: NDArray[np.float64], top: float
 ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
-    """Split a line (n, 2) where the colour of its segments' values (n - 1,) changes."""
+    """Split a line (n, 2) at colour changes, by its segments' values (n - 1,)."""
     step = top / PATH_COLOURS
     levels = np.clip((values / step).astype(int), 0, PATH_COLOURS - 1)
     cuts = np.flatnonzero(np.diff(levels)) + 1

@@ -1,4 +1,4 @@
-"""The report of a run as one HTML file that opens offline, and its pictures as PNG files."""
+"""Report of a run as one offline HTML file, with its pictures as PNG files."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ from airl_mav.report.timeline import (
 from airl_mav.report.verdict import OverallVerdict
 
 SCRIPTS = ("scene.js", "tracks.js", "seen.js", "page.js")
-"""Of the page, in the order in which they build on each other."""
+"""Scripts of the page in order of dependency."""
 
 MAX_LISTED = 200
-"""Flights in the table: those that failed first."""
+"""Maximum number of flights in the table, failed flights preferred."""
 
 
 def build_page(
@@ -61,7 +61,7 @@ def build_page(
     folder.mkdir(parents=True, exist_ok=True)
     summary = summarize_run(run)
     measured = [stage for stage in summary.shown_stages if summary.stages[stage.key].n]
-    # Of what is the same in every decision, the table has said all.
+    # Constant stages need no figure: the table already shows their value.
     drawn = [stage for stage in measured if np.ptp(summary.samples[stage.key])]
     samples = [(s, summary.samples[s.key], summary.stages[s.key]) for s in drawn]
     latency_pictures = [latency_figure(*part) for part in samples]
@@ -154,20 +154,20 @@ def _script() -> str:
 def _link(
     view: ShownFlights, index: int, seconds: float | None = None
 ) -> tuple[int, float | None] | None:
-    """Return where a flight, and a moment of it, is in the view of single flights."""
+    """Return the number of a flight in the view of single flights, and a time in it [s]."""
     number = view.numbers.get(index)
     return None if number is None else (number, None if seconds is None else round(seconds, 3))
 
 
 def _scores_title(view: ShownFlights) -> str:
-    """Say what stands beside the actions."""
+    """Return the heading of the list of actions and scores."""
     if view.policy is None:
         return ""
     return f"{BEST} best of {len(view.policy.actions)} actions and their {view.policy.scores_are}s"
 
 
 def run_headlines(run: LoadedRun, summary: RunSummary) -> list[document.Headline]:
-    """Return the figures that answer the question: how late, how well."""
+    """Return the key figures of flight quality and latency."""
     q = summary.quality
     end_to_end = summary.stages["end_to_end"]
     t2 = summary.stages["t2"]

@@ -1,4 +1,4 @@
-"""The report of a run: from its folder to the page, and to the terminal."""
+"""Report of a run on a page and in the terminal."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from airl_mav.report.verdict import (
 )
 
 MAX_LISTED = 25
-"""Flights with a line of their own in the terminal."""
+"""Maximum number of flights listed in the terminal."""
 
 
 def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None) -> OverallVerdict:
-    """Return a run's verdict by requirements, or by those of its `verdict.json`."""
+    """Return a run's verdict; `requirements` default to the requirements of `verdict.json`."""
     if requirements is None:
         requirements = requirements_of(run.path)
     verdict = judge_run(run.info.setup, aggregate(run.episodes), run.episodes, requirements)
@@ -46,7 +46,7 @@ def write_report(
     run: LoadedRun | Path, out: Path | None = None, verdict: OverallVerdict | None = None
 ) -> Path:
     """Write a run's `report.html`, `verdict.json` and PNG files; return the page's path."""
-    # Imported here: the figures take as long to load as ten flights to be flown and judged.
+    # Imported here: loading the figures takes as long as flying and judging ten flights.
     from airl_mav.report.forensics.evidence import ranked
     from airl_mav.report.forensics.worst import EXAMINED
     from airl_mav.report.run_page import build_page
@@ -63,7 +63,7 @@ def write_report(
 
 
 def print_report(run: LoadedRun, console: Console, verdict: OverallVerdict) -> None:
-    """Print the verdict, what was flown, and the tables."""
+    """Print the verdict, the setup and the tables."""
     print_verdict(verdict.lines, console)
     console.print()
     summary, feeds = summarize_run(run), not run.info.setup.computer_on_ground
@@ -93,7 +93,7 @@ def show_report(
     *,
     draw: bool = True,
 ) -> Path | None:
-    """Print the report of a run, then draw its page, or print the command that draws it."""
+    """Print the report of a run, then draw its page or print the command that draws it."""
     progress = progress or Progress()
     if run.episodes:
         save_verdict(verdict, run.path)

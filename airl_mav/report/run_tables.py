@@ -1,4 +1,4 @@
-"""The tables of a run's report: the terminal and the page show the same ones."""
+"""Tables of a run's report, shared by the terminal and the page."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ BYTES_PER_MIB = 1 << 20
 
 
 def setup_rows(run: LoadedRun) -> tuple[tuple[str, str], ...]:
-    """Return what was flown on what, as (term, text)."""
+    """Return the setup of a run as (term, text)."""
     setup = run.info.setup
     injection = setup.injection
     latency = f"{injection.origin}: {injection.label}"
@@ -62,7 +62,7 @@ def setup_rows(run: LoadedRun) -> tuple[tuple[str, str], ...]:
 
 
 def computer_power(setup: Setup) -> str:
-    """Return what a computer draws from the aircraft's pack, in words."""
+    """Return the text for a computer's power draw from the aircraft's pack."""
     return "on the ground" if setup.computer_on_ground else f"{setup.computer_watts:g} W"
 
 
@@ -91,13 +91,13 @@ def latency_table(summary: RunSummary) -> table.TableView:
 
 
 def failures_first(episodes: Sequence[EpisodeRecord], most: int) -> list[EpisodeRecord]:
-    """Return at most so many episodes, those that failed before all others, in flown order."""
+    """Return up to `most` episodes in flown order, failed episodes preferred."""
     ranked = sorted(episodes, key=lambda e: (e.outcome is Outcome.SUCCESS, e.index))
     return sorted(ranked[:most], key=lambda e: e.index)
 
 
 def episodes_table(run: LoadedRun, most: int | None = None) -> table.TableView:
-    """Return the quality of each flight, or of at most so many, those that failed first."""
+    """Return the quality of up to `most` flights, failed flights preferred."""
     feeds = not run.info.setup.computer_on_ground
     columns = table.columns_of(
         "# | seed | <outcome | time [s] | distance [m] | energy [kJ] | speed [m/s] | "
@@ -144,7 +144,7 @@ def _kilojoules(joules: float | None) -> str:
 
 
 def quality_table(summary: RunSummary, *, computer: bool = True) -> table.TableView:
-    """Return the flight quality with intervals; `computer` = its energy is the vehicle's."""
+    """Return the flight quality with intervals; `computer` adds the row of its energy."""
     columns = table.columns_of("<measure | value | 95 % interval | median | *95 % interval | n")
     q = summary.quality
     rate = replace(SUCCESS_RATE, digits=rate_digits(q.success_rate))
@@ -241,8 +241,8 @@ def _tail_rows(title: str, summary: Summary) -> list[tuple[str, ...]]:
 
 
 def _real_time_factor(run: LoadedRun) -> str:
-    """Return simulated seconds per wall second beside the factor asked for."""
-    # An aborted flight ends when its end is noticed: its wall time counts something else.
+    """Return simulated seconds per wall second and the requested factor."""
+    # The wall time of an aborted flight includes the delay until its end is detected.
     paced = [e for e in run.episodes if e.wall_s and e.outcome is not Outcome.ABORTED]
     wall_s = sum(episode.wall_s or 0.0 for episode in paced)
     if not wall_s or run.info.setup.speed is None:
@@ -261,7 +261,7 @@ ROWS = (
 
 
 def estimation_table(flights: Sequence[TrackedFlight]) -> table.TableView | None:
-    """Return the errors of the estimator in navigation; None where no flight recorded them."""
+    """Return the errors of the estimator in navigation; None without recorded estimates."""
     known = [(f.time_s >= 0.0, f.errors) for f in flights if f.errors is not None]
     known = [(flies, errors) for flies, errors in known if flies.any()]
     if not known:
@@ -280,7 +280,7 @@ def estimation_table(flights: Sequence[TrackedFlight]) -> table.TableView | None
 
 
 def run_ages(run: LoadedRun) -> CommandAges:
-    """Return the ages of a run's commands, from frame until the next command moves the motors."""
+    """Return the ages of a run's commands, from frame to the motors' next command."""
     seen: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
     flown, flight = list(seen), list(seen)
     for number, stamps in sorted(run.latency.items()):
@@ -292,7 +292,7 @@ def run_ages(run: LoadedRun) -> CommandAges:
 
 
 def _acted(stamps: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return frame and motor time of the decisions of an episode that have both [µs]."""
+    """Return frame and motor times [µs] of an episode's decisions with both stamps."""
     nothing: NDArray[np.int64] = np.zeros(0, np.int64)
     if "capture_us" not in stamps or "motor_us" not in stamps:
         return nothing, nothing
@@ -302,7 +302,7 @@ def _acted(stamps: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.int64], NDArr
 
 
 def ages_table(ages: CommandAges, end_to_end: Summary) -> table.TableView | None:
-    """Return the age of the flown command beside its latency; None without consecutive commands."""
+    """Return age and latency of the flown command; None without consecutive commands."""
     n = ages.youngest_us.size
     if not n or not ages.time_us:
         return None
@@ -329,7 +329,7 @@ MAX_LISTED = 60
 
 
 def faults_table(run: LoadedRun) -> table.TableView | None:
-    """Return the faults that acted, a line each; None where nothing failed."""
+    """Return the active faults, one per line; None without faults."""
     lines = [
         (f"{e.index}", acted.fault, f"{from_s:.2f}", f"{to_s:.2f}", table.OUTCOME_LABELS[e.outcome])
         for e in run.episodes

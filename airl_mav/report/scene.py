@@ -1,4 +1,4 @@
-"""Three-dimensional figures of flights for the page's plotly: x east, y north, z up [m]."""
+"""3D figures of flights for plotly in a page: x east, y north, z up [m]."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from airl_mav.report.table import OUTCOME_LABELS
 from airl_mav.view.style import GLASS_OPACITY
 
 POINTS = 240
-"""A path has at most this many points: one a tenth of a second, or what is seen of more."""
+"""Maximum number of points of a path."""
 
 ALL_POINTS = 40
-"""The same where all flights are shown together."""
+"""Maximum number of points of a path in the view of all flights."""
 
 ALL_FLIGHTS = 150
-"""At most so many flights are shown together: those that failed first."""
+"""Maximum number of flights in the common view, failed flights preferred."""
 
 CORNERS = 12
-"""Of a drawn circle."""
+"""Number of corners of a drawn circle."""
 
 MOST_TRIANGLES = 20_000
-"""Of the meshes of one view: a page holds the views of many flights."""
+"""Maximum number of mesh triangles per view; a page contains many views."""
 
 VIEW_M = 6.0
 
@@ -53,7 +53,7 @@ STILL_COLOUR = "#8b97a3"
 HILLS_COLOURS = ("#e3dfd0", "#a8946a")
 
 MOST_CELLS = 4_000
-"""Cells of hills on a page, for each flight."""
+"""Maximum number of terrain cells per flight on a page."""
 
 Floats = NDArray[np.float64]
 Trace = dict[str, Any]
@@ -61,11 +61,11 @@ Trace = dict[str, Any]
 
 @dataclass(frozen=True)
 class SceneFlight:
-    """One flight in the view."""
+    """Flight in the view."""
 
     record: EpisodeRecord
     path: Trajectory
-    """Up to the verdict, two samples or more."""
+    """Path up to the verdict, two or more samples."""
     arena: Arena | None
 
 
@@ -75,7 +75,7 @@ def scene_json(
     everyone: Sequence[EpisodeRecord],
     fov_deg: float,
 ) -> str:
-    """Return as JSON a view of each flight, and one of two or more of `everyone`."""
+    """Return the views of each flight and, for two or more, of `everyone` as JSON."""
     top = top_speed(flights)
     views = [flight_view(flight, top, fov_deg) for flight in flights]
     if len(everyone) > 1:
@@ -93,12 +93,12 @@ def top_speed(flights: Sequence[SceneFlight]) -> float:
 
 @cache
 def plotly_script() -> str:
-    """Return the library that draws the figures, as one script."""
+    """Return plotly.js, which draws the figures, as one script."""
     return (files("plotly") / "package_data" / "plotly.min.js").read_text(encoding="utf-8")
 
 
 def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, Any]:
-    """Return one flight's figure and slider data; `top` [m/s] is the upper end of the colours."""
+    """Return a flight's figure and slider data; `top` [m/s] is the upper end of the colours."""
     record, arena = flight.record, flight.arena
     path = _thinned(flight.path, POINTS)
     place, speed = _east_north_up(path.position), path.speed()
@@ -157,7 +157,7 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
             f"end: {OUTCOME_LABELS[record.outcome]}",
             symbol="x" if record.outcome is not Outcome.SUCCESS else "circle",
         ),
-        # The vehicle between the ends of its field of view; the page's script moves it.
+        # The vehicle with the edges of its field of view; the page's script moves it.
         {
             **_line(place[[-1, -1, -1]], "#2f7fc4", "vehicle", width=3),
             "mode": "lines+markers",
@@ -181,7 +181,7 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
 
 
 def _view(fov_deg: float) -> list[float]:
-    """Return length [m] and half angle [rad] of the field of view; a line if all round."""
+    """Return length [m] and half angle [rad] of the drawn field of view; a line for 360°."""
     if fov_deg >= ALL_ROUND_DEG:
         return [VIEW_M, 0.0]
     return [VIEW_M if fov_deg else 0.0, round(math.radians(fov_deg) / 2.0, 3)]
@@ -200,7 +200,7 @@ def all_flights_view(
         if not paths:
             continue
         thinned = [_east_north_up(_thinned(path, ALL_POINTS).position) for path in paths]
-        # A gap ends each path: one line for all of them.
+        # Gaps between paths allow one line for all of them.
         joined = [part for places in thinned for part in (*_rounded(places), [None] * 3)]
         label = f"{OUTCOME_LABELS[outcome]} ({len(records)})"
         line = _line(np.zeros((0, 3)), OUTCOME_COLOURS[outcome], label, width=3)
@@ -214,7 +214,7 @@ def all_flights_view(
 
 
 def body_mesh(obstacles: Obstacles, i: int, center: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Return obstacle i at a centre NED as a closed mesh: corners ENU [m], triangles."""
+    """Return obstacle i at a centre NED [m] as a closed mesh: corners ENU [m] and triangles."""
     half, yaw = obstacles.half_size[i], float(obstacles.yaw[i])
     if obstacles.shape[i] == Shape.BOX:
         outline = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) * half[:2]
@@ -378,7 +378,7 @@ def _camera(eye: tuple[float, float, float]) -> dict[str, dict[str, float]]:
 
 
 def _thinned(path: Trajectory, points: int) -> Trajectory:
-    """Return at most so many samples, evenly in time, the first and the last included."""
+    """Return up to `points` samples, evenly spaced, including the first and the last."""
     keep = np.unique(np.linspace(0, len(path) - 1, min(len(path), points)).round().astype(int))
     return Trajectory.from_arrays({name: array[keep] for name, array in path.arrays().items()})
 

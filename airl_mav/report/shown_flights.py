@@ -1,4 +1,4 @@
-"""The flights that a page shows one by one: stills of the worst, and what its script shows."""
+"""Single flights of a page: still pictures of the worst, and the data of the page's script."""
 
 from __future__ import annotations
 
@@ -23,41 +23,41 @@ from airl_mav.report.tracking import TrackedFlight, track
 from airl_mav.report.tracking_figure import IMAGES, tracking_figure
 
 MAX_PICTURED = 6
-"""Flights with still pictures: the worst."""
+"""Maximum number of flights with still pictures, worst first."""
 
 MAX_SHOWN = 24
-"""Flights that the page's script shows one by one: the worst."""
+"""Maximum number of flights in the view of single flights, worst first."""
 
 
 @dataclass(frozen=True)
 class PicturedFlight:
-    """One flight that the page shows by itself."""
+    """Flight with still pictures."""
 
     record: EpisodeRecord
     cause: Cause | None
     pictures: tuple[Picture, ...]
     scene: int | None
-    """Its number in the view of single flights; None where it has no path."""
+    """Number in the view of single flights; None without a path."""
 
 
 @dataclass(frozen=True)
 class ShownFlight:
-    """One flight of the view of single flights."""
+    """Flight in the view of single flights."""
 
     scene: SceneFlight
     tracked: TrackedFlight
     seen: tuple[SeenDecision, ...]
-    """Its decisions, worked out again; empty where arena or vehicle is not known."""
+    """Recomputed decisions; empty if the arena or the vehicle is unknown."""
 
 
 @dataclass(frozen=True)
 class ShownFlights:
-    """The flights of the view, the worst first."""
+    """Flights of the view, worst first."""
 
     flights: tuple[ShownFlight, ...]
     policy: PolicyAgain | None
     numbers: dict[int, int] = field(init=False)
-    """Of each flight in the view, by episode index."""
+    """Number of each flight in the view, by episode index."""
 
     def __post_init__(self) -> None:
         """Number the flights."""
@@ -66,7 +66,7 @@ class ShownFlights:
 
     @property
     def note(self) -> str:
-        """How what the policy saw is known."""
+        """Note on the source of the policy's images and scores."""
         told = "Rendered again from the recorded path, without the camera's noise."
         asked = [d.again for flight in self.flights for d in flight.seen if d.again is not None]
         if asked:
@@ -78,19 +78,19 @@ class ShownFlights:
 
 
 def pictured(run: LoadedRun) -> list[EpisodeRecord]:
-    """Return the episodes that get still pictures, the worst first."""
+    """Return the episodes with still pictures, worst first."""
     return ranked(run)[:MAX_PICTURED]
 
 
 def shown(run: LoadedRun) -> list[EpisodeRecord]:
-    """Return the episodes that the script shows one by one, the worst first."""
+    """Return the episodes for the view of single flights, worst first."""
     return ranked(run)[:MAX_SHOWN]
 
 
 def shown_flights(
     run: LoadedRun, arenas: Mapping[int, Arena], vehicle: VehicleProfile | None
 ) -> ShownFlights:
-    """Return the flights of the view: those that have a path."""
+    """Return the flights of the view; flights without a path are skipped."""
     again = None if vehicle is None else policy_again(run.info)
     flights = []
     for record in shown(run):
@@ -111,7 +111,7 @@ def pictured_flights(
     causes: Mapping[int, Cause],
     range_m: float,
 ) -> list[PicturedFlight]:
-    """Draw the flights that get still pictures, the worst first."""
+    """Draw the still pictures of flights, worst first."""
     top = top_speed([flight.scene for flight in view.flights])
     found = []
     for episode in pictured(run):
@@ -132,7 +132,7 @@ def page_data(
     pictures: Sequence[Picture],
     vehicle: VehicleProfile | None,
 ) -> str:
-    """Return all that the page's script shows, as JSON: pictures, views and flights."""
+    """Return the data of the page's script as JSON: pictures, views and flights."""
     fov, range_m = (0.0, 0.0) if vehicle is None else (
         vehicle.camera.horizontal_fov_deg, vehicle.camera.range_m,
     )  # fmt: skip

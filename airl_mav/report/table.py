@@ -1,4 +1,4 @@
-"""A table of text cells, and how the terminal and Markdown show it."""
+"""Tables of text cells, and their output in the terminal and in Markdown."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.latency.percentiles import MIN_SAMPLES, Summary
 
 NONE = "–"
-"""Shown where there is no value."""
+"""Cell text for a missing value."""
 TOO_FEW_CELL = "too few"
 TOO_FEW_NOTE = (
     f"{TOO_FEW_CELL}: a p90 needs {MIN_SAMPLES[90.0]} samples, a p99 {MIN_SAMPLES[99.0]}."
@@ -50,19 +50,19 @@ _INTERVAL = re.compile(r" (\[[^\[\]]*\])")
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table."""
+    """Column of a table."""
 
     title: str
     unit: str = ""
     number: bool = True
-    """Set right, in figures of equal width."""
+    """True to align right with tabular digits."""
     page_only: bool = False
-    """Left out where there is little room: in the terminal."""
+    """True to omit the column in the narrow terminal."""
 
 
 @dataclass(frozen=True)
 class TableView:
-    """A table of text cells."""
+    """Table of text cells."""
 
     key: str
     title: str
@@ -70,7 +70,7 @@ class TableView:
     rows: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...] = ()
     stacked: bool = False
-    """Intervals in brackets stand below their values on a page, which saves width."""
+    """True to print intervals in brackets below their values on a page, to save width."""
     in_terminal: Literal["whole", "stacked", "without intervals", "not"] = "whole"
 
 
@@ -80,12 +80,12 @@ def ms(value_us: float | None, digits: int = 2) -> str:
 
 
 def percentile_cell(value_us: float | None, n: int) -> str:
-    """Return a percentile [µs] as milliseconds, or that its samples are too few."""
+    """Return a percentile [µs] as milliseconds, or "too few" samples."""
     return TOO_FEW_CELL if value_us is None and n else ms(value_us)
 
 
 def columns_of(header: str) -> tuple[Column, ...]:
-    """Return columns by "title [unit] | ..."; "<" before a title: text, "*": `page_only`."""
+    """Parse columns from "title [unit] | ..."; prefix "<" marks text, "*" marks `page_only`."""
     columns = []
     for title in header.split(" | "):
         name, _, unit = title.lstrip("*<").removesuffix("]").partition(" [")
@@ -97,18 +97,18 @@ DURATION_COLUMNS = columns_of("n | mean | p50 | p90 | p99 | max")
 
 
 def duration_cells(s: Summary) -> tuple[str, ...]:
-    """Return a set of durations [µs] as number, mean, percentiles and maximum [ms]."""
+    """Return the cells of durations [µs]: number, mean, percentiles and maximum [ms]."""
     tail = (percentile_cell(s.p90, s.n), percentile_cell(s.p99, s.n))
     return (f"{s.n:,}", ms(s.mean), ms(s.p50), *tail, ms(s.max))
 
 
 def stacked(cell: str) -> str:
-    """Return a cell with its interval in a line of its own."""
+    """Return a cell with its interval on a separate line."""
     return _INTERVAL.sub(r"\n\1", cell)
 
 
 def escape_markdown(text: str) -> str:
-    """Return text in which nothing is taken for Markdown."""
+    """Return text with Markdown's special characters escaped."""
     return "".join(f"\\{c}" if c in "\\|*_`[]<>" else c for c in text)
 
 
@@ -122,7 +122,7 @@ def markdown_table(view: TableView) -> str:
 
 
 def print_table(view: TableView, console: Console, *, wrap: bool = False) -> None:
-    """Print a table and its notes; its cells are broken into lines or kept whole."""
+    """Print a table and its notes; with `wrap`, long cells are wrapped instead of cut."""
     if view.in_terminal == "not":
         return
     console.print(rich_table(view, wrap=wrap))
@@ -131,7 +131,7 @@ def print_table(view: TableView, console: Console, *, wrap: bool = False) -> Non
 
 
 def rich_table(view: TableView, *, wrap: bool = False) -> Table:
-    """Return a table for the terminal, without the columns meant for a page."""
+    """Return a table for the terminal, without `page_only` columns."""
     table = Table(
         title=view.title,
         title_justify="left",
@@ -145,7 +145,7 @@ def rich_table(view: TableView, *, wrap: bool = False) -> Table:
         column = view.columns[i]
         title = f"{column.title} [{column.unit}]" if column.unit else column.title
         side: Literal["left", "right"] = "right" if column.number else "left"
-        # A word that is longer than its column is broken, too: nothing is left out.
+        # Folding also breaks words longer than the column, so no text is lost.
         overflow: Literal["fold", "ellipsis"] = "fold" if wrap else "ellipsis"
         table.add_column(Text(title), justify=side, no_wrap=not wrap, overflow=overflow)
     for row in view.rows:
@@ -159,7 +159,7 @@ def rich_table(view: TableView, *, wrap: bool = False) -> Table:
 
 
 def print_facts(rows: Iterable[tuple[str, str]], console: Console, *, style: str = "dim") -> None:
-    """Print terms with their texts."""
+    """Print terms and their texts."""
     facts = Table.grid(padding=(0, 2))
     facts.add_column(style=style, no_wrap=True)
     facts.add_column(overflow="fold")
@@ -170,7 +170,7 @@ def print_facts(rows: Iterable[tuple[str, str]], console: Console, *, style: str
 
 
 def count_outcomes(outcomes: Sequence[Outcome]) -> str:
-    """Return how many flights ended how, in one line."""
+    """Return the number of flights by outcome on one line."""
     return ", ".join(
         f"{outcomes.count(outcome):,} {label}"
         for outcome, label in OUTCOME_LABELS.items()
@@ -185,7 +185,7 @@ TABLE_FILE = "table.json"
 
 @dataclass(frozen=True)
 class SavedTable:
-    """What the file holds."""
+    """Contents of `TABLE_FILE`."""
 
     title: str
     columns: tuple[str, ...]
@@ -193,7 +193,7 @@ class SavedTable:
     notes: tuple[str, ...]
     policies: tuple[str, ...]
     made: Mapping[str, Any]
-    """With what (`core.provenance.provenance`)."""
+    """Provenance of the table (`core.provenance.provenance`)."""
 
 
 _SAVED = TypeAdapter(SavedTable)
@@ -202,7 +202,7 @@ _SAVED = TypeAdapter(SavedTable)
 def write_table(
     view: TableView, folder: Path, made: Mapping[str, Any], policies: Sequence[str] = ()
 ) -> Path:
-    """Write a table into a folder, whole or not at all; return its path."""
+    """Write a table to a folder atomically; return the file's path."""
     columns = tuple(f"{c.title}, {c.unit}" if c.unit else c.title for c in view.columns)
     saved = SavedTable(view.title, columns, view.rows, view.notes, tuple(policies), made)
     folder.mkdir(parents=True, exist_ok=True)
@@ -212,5 +212,5 @@ def write_table(
 
 
 def read_table(folder: Path) -> SavedTable:
-    """Read the table of a folder. Raises UsageError: it is missing or damaged."""
+    """Read the table of a folder. Raises UsageError if it is missing or damaged."""
     return read_typed(folder / TABLE_FILE, _SAVED, SCHEMA, "table")

@@ -1,4 +1,4 @@
-"""Figures that follow the reader's light or dark setting: SVG by CSS variables; PNG is light."""
+"""Figures for light and dark pages: SVG with CSS variables; PNG is always light."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ MUTED = "#68707a"
 RULE = "#d5d9de"
 """Grid and axis lines."""
 PAPER = "#fffffe"
-"""Background; not quite white, so that white things keep their own."""
+"""Background; not pure white, so that the theme does not replace white elements."""
 SERIES = "#2868a8"
 SERIES_SOFT = "#a9c8e6"
 MARK = "#b4540a"
-"""What to look at: percentiles, phase limits."""
+"""Highlights: percentiles, phase limits."""
 
 HALO = "#fffffd"
-"""Edge of a drawn path, against whatever lies below it."""
+"""Outline of a drawn path, for contrast with the background."""
 
 DARK = {
     INK: "#e4e7eb",
@@ -52,18 +52,18 @@ DARK = {
     GOAL_COLOUR: "#45b36b",
     STATIC_COLOURS[0]: "#7f8a95",
 }
-"""The dark value of each light colour, the arena picture's included."""
+"""Dark value of each light colour, including the arena picture's colours."""
 
 PNG_DPI = 160
 PNG_LEVEL = 3
-"""Of zlib, 1 to 9: its 6 takes half as long again, for files that are a tenth smaller."""
+"""Compression level of zlib, 1 to 9; level 6 takes 50 % longer for 10 % smaller files."""
 SVG_DPI = 120
 _PATH = re.compile(r'\b(?:d|x|y)="[^"]*"')
-# Places on the figure to a tenth of a point; markers, which are small, to a hundredth.
+# Positions are rounded to 0.1 pt; the coordinates of small markers to 0.01 pt.
 _DECIMALS = re.compile(r"(?<=\d)(\d\.\d)\d+|(\.\d\d)\d+")
 _BITMAP = re.compile(r"(data:image/png;base64,)([A-Za-z0-9+/=\s]+)")
 BITMAP_COLOURS = 128
-"""Colours of a bitmap inside a figure: more are not seen, and weigh."""
+"""Palette size of a bitmap in a figure; more colours add size without visible benefit."""
 _SIZE = re.compile(r'<svg[^>]*? width="([\d.]+)pt" height="([\d.]+)pt"')
 CSS_PX_PER_PT = 96.0 / 72.0
 _FONT = re.compile(r"(font: [^;\"]*?px) [^;\"]*")
@@ -71,17 +71,17 @@ _FONT = re.compile(r"(font: [^;\"]*?px) [^;\"]*")
 
 @dataclass(frozen=True)
 class Picture:
-    """One figure in both forms."""
+    """Figure as SVG and PNG."""
 
     name: str
     alt: str
-    """What it shows, for those who do not see it."""
+    """Alternative text for screen readers."""
     svg: str
     png: bytes
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height [CSS px], which keep its place on a page before it is there."""
+        """Width and height [CSS px]; they reserve the picture's space while a page loads."""
         found = _SIZE.search(self.svg)
         if found is None:
             raise ValueError(f"{self.name}: an SVG without its width and height in points")
@@ -94,11 +94,11 @@ class Picture:
 
 
 LABEL_LEFT_IN = 0.04
-"""Where the labels of stacked axes begin, from the left [inch]."""
+"""Left edge of the labels of stacked axes [inch]."""
 
 
 class Margins(NamedTuple):
-    """Room around the axes of a figure, and between them [inch]."""
+    """Margins around and between the axes of a figure [inch]."""
 
     left: float
     right: float
@@ -108,7 +108,7 @@ class Margins(NamedTuple):
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure on the theme's background, apart from any global state."""
+    """Return an empty figure with the theme's background, independent of global state."""
     return _blank(width_in, height_in, "constrained")
 
 
@@ -121,11 +121,11 @@ def _blank(width_in: float, height_in: float, layout: Literal["constrained"] | N
 def stacked_axes(
     rows: int, width_in: float, height_in: float, margins: Margins, **options: Any
 ) -> tuple[Figure, NDArray[np.object_]]:
-    """Return a figure with axes that share x; fixed margins, as computing them is slow."""
+    """Return a figure with axes that share x; margins are fixed, as a layout is slow."""
     figure = _blank(width_in, height_in, None)
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False, **options)[:, 0]
     for ax in axes:
-        # Where they stand is given, or each drawing measures all ticks to keep clear of them.
+        # Fixed positions: automatic placement measures all ticks in each drawing.
         ax.set_title("", y=1.0)
         left_edge = blended_transform_factory(figure.dpi_scale_trans, ax.transAxes)
         ax.yaxis.set_label_coords(LABEL_LEFT_IN, 0.5, left_edge)
@@ -142,7 +142,7 @@ def stacked_axes(
 
 
 def share_grid(axes: Sequence[Axes]) -> None:
-    """Draw one vertical grid through all stacked axes, cheaper than ticks of their own."""
+    """Draw a common vertical grid through stacked axes, faster than separate ticks."""
     lowest = axes[-1]
     low, high = lowest.get_xlim()
     ticks = [float(tick) for tick in lowest.get_xticks() if low <= tick <= high]
@@ -159,7 +159,7 @@ def share_grid(axes: Sequence[Axes]) -> None:
 
 
 def render(figure: Figure, name: str, alt: str) -> Picture:
-    """Render a figure. The bytes depend on the figure alone: no dates, no random identifiers."""
+    """Render a figure. The output is reproducible: no dates, no random identifiers."""
     png = render_png(figure)
     svg = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
@@ -168,11 +168,11 @@ def render(figure: Figure, name: str, alt: str) -> Picture:
 
 
 def render_png(figure: Figure) -> bytes:
-    """Render a figure as PNG in the light colours, and settle its layout."""
+    """Render a figure as PNG in the light colours and fix its layout."""
     if (engine := figure.get_layout_engine()) is not None:
-        # Once for both forms: laying out costs more than drawing.
+        # The layout costs more than the drawing, so PNG and SVG share one run.
         engine.execute(figure)
-        # Any engine, one that does nothing too, has every figure drawn once more beforehand.
+        # With any layout engine set, matplotlib draws every figure twice.
         figure.set_layout_engine(None)
     png = io.BytesIO()
     figure.savefig(png, format="png", dpi=PNG_DPI, pil_kwargs={"compress_level": PNG_LEVEL})
@@ -180,13 +180,13 @@ def render_png(figure: Figure) -> bytes:
 
 
 def slim(svg: str) -> str:
-    """Return an SVG that weighs less: places of no more digits than are seen, few colours."""
+    """Return a smaller SVG with rounded coordinates and small bitmap palettes."""
     svg = _PATH.sub(lambda found: _DECIMALS.sub(r"\1\2", found[0]), svg)
     return _BITMAP.sub(lambda found: found[1] + _with_palette(found[2]), svg)
 
 
 def _with_palette(encoded: str) -> str:
-    """Return a PNG, in base64, with few colours."""
+    """Return a base64 PNG reduced to a small palette."""
     small = io.BytesIO()
     with Image.open(io.BytesIO(base64.b64decode(encoded))) as image:
         few = image.convert("RGBA").quantize(BITMAP_COLOURS, method=Image.Quantize.FASTOCTREE)
@@ -195,7 +195,7 @@ def _with_palette(encoded: str) -> str:
 
 
 def themed(svg: str) -> str:
-    """Return an SVG whose theme colours and font follow the reader's setting."""
+    """Return an SVG with theme colours and font that follow the reader's setting."""
     light = "".join(f"--c{i}:{colour};" for i, colour in enumerate(DARK))
     dark = "".join(f"--c{i}:{colour};" for i, colour in enumerate(DARK.values()))
     query = "@media screen and (prefers-color-scheme:dark)"
@@ -209,11 +209,11 @@ def themed(svg: str) -> str:
 
 GRID_WIDTH = 0.6
 GRID_ORDER = 0.5
-"""Where matplotlib draws a grid that lies below the data."""
+"""Z-order of a matplotlib grid below the data."""
 
 
 def plain_axes(ax: Axes, *, grid: bool = True) -> None:
-    """Style an axes: thin rules, small ticks, no box."""
+    """Style axes: thin rules, small ticks, no box."""
     ax.set_facecolor("none")
     ax.tick_params(colors=MUTED, labelsize=8, length=0, which="both")
     for side, spine in ax.spines.items():
@@ -225,7 +225,7 @@ def plain_axes(ax: Axes, *, grid: bool = True) -> None:
 
 
 def label_axes(ax: Axes, x: str = "", y: str = "", title: str = "") -> None:
-    """Set the labels of an axes and its title, those that are given."""
+    """Set the given labels and title of axes."""
     if x:
         ax.set_xlabel(x, fontsize=8.5, color=MUTED)
     if y:
@@ -235,7 +235,7 @@ def label_axes(ax: Axes, x: str = "", y: str = "", title: str = "") -> None:
 
 
 def logarithmic(ax: Axes, axis: Literal["x", "y"]) -> None:
-    """Make an axis logarithmic, with plain numbers."""
+    """Make an axis logarithmic with plain numbers as labels."""
     ax.set(**{f"{axis}scale": "log"})
     shown = ax.xaxis if axis == "x" else ax.yaxis
     shown.set_major_formatter(StrMethodFormatter("{x:g}"))
@@ -243,36 +243,36 @@ def logarithmic(ax: Axes, axis: Literal["x", "y"]) -> None:
 
 
 def legend_below(figure: Figure | SubFigure, columns: int = 3, **options: Any) -> None:
-    """Put a legend under a figure."""
+    """Add a legend below a figure."""
     look: dict[str, Any] = {"frameon": False, "fontsize": 8, "labelcolor": INK}
     figure.legend(loc="outside lower left", ncols=columns, **(look | options))
 
 
 class LineStyle(NamedTuple):
-    """How one of several lines or bars is drawn."""
+    """Style of a line or bar in a series."""
 
     colour: str
     dashes: str
-    """A matplotlib line style: printed without colour, lines still differ."""
+    """Line style of matplotlib; distinguishes lines in print without colour."""
 
 
 LINE_COLOURS = (
     *("#2f7fc4", "#cf6a12", "#2c9a5b", "#a35bb8"),
     *("#c8435f", "#8d7b1c", "#1697a6", "#7d6b60"),
 )
-"""Of middling lightness: legible on light and on dark paper."""
+"""Line colours of medium lightness, legible on light and dark backgrounds."""
 
 DASHES = ("-", "--", "-.", ":")
 
 
 def line_style(index: int) -> LineStyle:
-    """Return the style of the line with a number, from 0; 32 are different."""
+    """Return the style of the line with an index from 0; styles repeat after 32."""
     step = index // len(LINE_COLOURS)
     return LineStyle(LINE_COLOURS[index % len(LINE_COLOURS)], DASHES[(index + step) % len(DASHES)])
 
 
 def montage(pictures: Sequence[Picture], columns: int) -> bytes:
-    """Return one PNG with all pictures (one or more), row by row."""
+    """Return a PNG with all pictures (one or more) in rows."""
     images = [Image.open(io.BytesIO(picture.png)).convert("RGB") for picture in pictures]
     rows = [images[start : start + columns] for start in range(0, len(images), columns)]
     width = max(sum(image.width for image in row) for row in rows)

@@ -1,4 +1,4 @@
-"""The latency of every decision over a run: each stage in the order flown, outliers marked."""
+"""Latency timeline of a run: each stage of every decision in flown order, with outliers."""
 
 from __future__ import annotations
 
@@ -31,26 +31,26 @@ from airl_mav.report.table import TableView, columns_of, ms
 TIMELINE_NAME = "latency-timeline"
 
 COLUMNS = 320
-"""A row shows at most this many columns: a wider run has several decisions in each."""
+"""Maximum number of columns per row; longer runs have several decisions per column."""
 
 MARKED = 40
-"""Outliers of a row that get a mark: the longest."""
+"""Maximum number of marked outliers per row, longest first."""
 
 BANDS = 40
-"""At most this many bands show where flights begin; longer runs have several flights in each."""
+"""Maximum number of bands that separate flights; longer runs have several flights per band."""
 
 NAMED = 16
-"""Up to this many flights are named above the rows."""
+"""Maximum number of flights with a label above the rows."""
 
 SLOWEST = 8
-"""Rows of the table of decisions that stand out."""
+"""Number of rows in the table of outlying decisions."""
 
 SAW_DECISIONS = 16
-"""With fewer decisions no saw is seen."""
+"""Minimum number of decisions for detecting a sawtooth."""
 
 SAW_STEADY = 0.25
-"""Half of the decisions follow the one before within this share of the camera's period. What
-scatters more has no saw."""
+"""Maximum interquartile range of the decision period for a sawtooth, as a fraction of the camera's
+period."""
 
 OUTLIER_NOTE = (
     f"Marked: above the third quartile by more than {FENCE_RANGES:g} times the interquartile range "
@@ -61,23 +61,23 @@ OUTLIER_NOTE = (
 
 @dataclass(frozen=True)
 class Timeline:
-    """The decisions of a run in the order flown."""
+    """Decisions of a run in flown order."""
 
     flights: tuple[int, ...]
-    """Number of each flight that has decisions."""
+    """Numbers of the flights with decisions."""
     starts: NDArray[np.int64]
-    """(k + 1,) first decision of each, and the number of all."""
+    """First decision of each flight, then the total number n of decisions (k + 1,)."""
     stages: dict[str, Samples]
-    """(n,) duration of each stage [µs], by its key; `NO_STAMP` where there is none."""
+    """Duration of each stage (n,) [µs] by stage key; `NO_STAMP` if missing."""
     since_us: NDArray[np.int64]
-    """(n,) when each decision's frame was taken, from the start of navigation [µs]."""
+    """Time of each decision's frame (n,) from the start of navigation [µs]."""
 
     def __len__(self) -> int:
-        """Return n."""
+        """Return the number of decisions."""
         return int(self.starts[-1])
 
     def flight_of(self, decision: int) -> int:
-        """Return the number of the flight that a decision belongs to."""
+        """Return the number of a decision's flight."""
         return self.flights[int(np.searchsorted(self.starts, decision, side="right")) - 1]
 
 
@@ -102,7 +102,7 @@ def timeline_of(run: LoadedRun) -> Timeline:
 
 
 def timeline_figure(timeline: Timeline, stages: Sequence[Stage]) -> theme.Picture:
-    """Draw each stage (at least one) of all decisions, in the order flown."""
+    """Draw the stages (at least one) of all decisions in flown order."""
     margins = theme.Margins(left=0.62, right=0.12, bottom=0.42, top=0.22, between=0.26)
     figure, rows = theme.stacked_axes(len(stages), 10.6, 0.62 + 1.0 * len(stages), margins)
     band = _draw_bands(rows, timeline)
@@ -126,7 +126,7 @@ def timeline_figure(timeline: Timeline, stages: Sequence[Stage]) -> theme.Pictur
 
 
 def _draw_bands(rows: NDArray[np.object_], timeline: Timeline) -> int:
-    """Shade every other flight, or group of flights; return how many flights a band has."""
+    """Shade every other flight or group of flights; return the number of flights per band."""
     count, per = len(timeline.flights), 1
     while count > BANDS * per:
         # 1, 2, 5, 10, 20, 50, ...
@@ -163,7 +163,7 @@ def _draw_stage(ax: Axes, stage: Stage, durations: Samples) -> None:
     there = np.flatnonzero(durations != NO_STAMP)
     found = durations[there]
     edges = np.linspace(0, len(durations), min(len(durations), COLUMNS) + 1).astype(int)
-    # Where each column begins and ends among the decisions that have this stage.
+    # Limits of each column among the decisions with this stage.
     cuts = np.searchsorted(there, edges)
     middle = np.full((3, len(edges) - 1), np.nan)
     for k, (start, end) in enumerate(pairwise(cuts)):
@@ -213,7 +213,7 @@ def _outlier_text(limit: Fence) -> str:
 
 
 def sawtooth_notes(timeline: Timeline, vehicle: VehicleProfile | None) -> list[str]:
-    """Explain a sawtooth in frame age: the intervals of decisions and camera frames beat."""
+    """Return notes on a sawtooth in frame age, a beat of decision and camera periods."""
     periods = timeline.stages["period"]
     periods = periods[periods != NO_STAMP]
     if vehicle is None or len(periods) < SAW_DECISIONS:
@@ -243,7 +243,7 @@ def sawtooth_notes(timeline: Timeline, vehicle: VehicleProfile | None) -> list[s
 def slowest_table(
     timeline: Timeline, stages: Sequence[Stage]
 ) -> tuple[TableView, list[tuple[int, float]]] | None:
-    """Return the outlying decisions from frame to motors, with flight and navigation time [s]."""
+    """Return the table of outliers from frame to motors, with flight and navigation time [s]."""
     whole = timeline.stages["end_to_end"]
     there = np.flatnonzero(whole != NO_STAMP)
     limit = fence(whole[there])

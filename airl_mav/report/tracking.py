@@ -1,4 +1,4 @@
-"""How a flight followed its commands: commanded, flown and estimated motion on one time axis."""
+"""Command tracking of a flight: commanded, flown and estimated motion on one time axis."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from airl_mav.report.forensics.worst import flown_path
 Floats = NDArray[np.float64]
 
 MOTOR_TIMES, MOTOR_OUTPUTS = "motors/time_us", "motors/output"
-"""Columns of a flight with the vehicle's log: (n,) [µs] and (n, 4), 0 to 1, in PX4's order."""
+"""Columns from the vehicle's log: times (n,) [µs] and outputs (n, 4), 0 to 1, in PX4's order."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """How a vehicle moves, at m moments: as it was, or as its estimator had it."""
+    """True or estimated motion of a vehicle at m times."""
 
     forward_m_s: Floats
-    """(m,) velocity along the own heading, level."""
+    """Horizontal velocity (m,) along the heading."""
     right_m_s: Floats
     height_m: Floats
-    """(m,) above the start."""
+    """Height (m,) above the start."""
     yaw_rate_deg_s: Floats
-    """(m,) clockwise seen from above: the heading's difference from sample to sample."""
+    """Yaw rate (m,), clockwise from above, by differences of the heading between samples."""
     roll_deg: Floats
     pitch_deg: Floats
     heading_deg: Floats | None = None
-    """-180 to 180; this and the following only of a flight that is commanded by them."""
+    """Heading, -180 to 180; None here and below unless the commands include the quantity."""
     body_roll_rate_deg_s: Floats | None = None
-    """About the body's axes FRD, from sample to sample."""
+    """Body rates about FRD axes, by differences between samples."""
     body_pitch_rate_deg_s: Floats | None = None
     body_yaw_rate_deg_s: Floats | None = None
 
@@ -49,58 +49,58 @@ COMMANDED: Mapping[str, tuple[str, ...]] = {
     ATTITUDE: ("roll_deg", "pitch_deg", "heading_deg", "thrust"),
     RATES: ("body_roll_rate_deg_s", "body_pitch_rate_deg_s", "body_yaw_rate_deg_s", "thrust"),
 }
-"""The four numbers of a setpoint by the column that they stand in. Named as the fields of `Motion`,
-and the thrust; what has no name is not shown. What ends with _deg or _deg_s is recorded in rad."""
+"""Names of a setpoint's four numbers by its column: fields of `Motion`, and the thrust. Numbers
+with an empty name are not shown. Values named _deg or _deg_s are recorded in rad."""
 
 
 @dataclass(frozen=True)
 class Commands:
-    """The setpoints of n decisions; each holds until the next one is sent."""
+    """Setpoints of n decisions; each holds until the next is sent."""
 
     sent_s: Floats
-    """(n,) since the start of navigation."""
+    """Send times (n,) since the start of navigation."""
     values: Mapping[str, Floats]
-    """(n,) each, by name (`COMMANDED`); velocities are along the heading, which the vehicle may
-    turn meanwhile."""
+    """Values (n,) by name (`COMMANDED`). Velocities are in the heading frame, which may rotate
+    during the hold."""
 
 
 @dataclass(frozen=True)
 class EstimateErrors:
-    """How far the estimator was from the truth, at m moments."""
+    """Errors of the estimator at m times."""
 
     aside_m: Floats
-    """(m,) between estimated and true position, seen from above."""
+    """Horizontal distance (m,) between estimated and true position."""
     height_m: Floats
-    """(m,) of the height, without its sign."""
+    """Absolute height error (m,)."""
     velocity_m_s: Floats
-    """(m,) length of the velocity's error."""
+    """Norm of the velocity error (m,)."""
     tilt_deg: Floats
-    """(m,) the larger of the errors of roll and pitch."""
+    """Larger of the roll and pitch errors (m,)."""
     heading_deg: Floats
 
 
 @dataclass(frozen=True)
 class TrackedFlight:
-    """A flight up to its verdict."""
+    """Flight up to its verdict."""
 
     record: EpisodeRecord
     time_s: Floats
-    """(m,) since the start of navigation; negative before it."""
+    """Time (m,) since the start of navigation; negative before."""
     flown: Motion
     estimated: Motion | None
-    """None: nothing was recorded of an estimator."""
+    """Estimated motion; None if not recorded."""
     errors: EstimateErrors | None
     commands: Commands
     altitude_m: float | None
-    """Height that was to be held."""
+    """Height setpoint [m]."""
     power_w: Floats | None
-    """None: nobody measured it."""
+    """Electrical power (m,); None if not measured."""
     motors: Floats | None
-    """(m, 4) motor outputs 0 to 1, in PX4's order; None: not recorded."""
+    """Motor outputs (m, 4), 0 to 1, in PX4's order; None if not recorded."""
 
 
 def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
-    """Return how a flight followed its commands; None where no path of it is recorded."""
+    """Return commanded, flown and estimated motion of a flight; None without a path."""
     path = flown_path(run, record)
     if path is None or len(path) < 2:
         return None
@@ -125,7 +125,7 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
         estimated=estimated,
         errors=errors,
         commands=commands,
-        # Who commands no velocity holds a height of its own.
+        # The height setpoint applies only to velocity commands.
         altitude_m=pilot.get("altitude_m") if commanded(stamps) == "velocity" else None,
         power_w=path.power_w if np.isfinite(path.power_w).all() else None,
         motors=_motors(stamps, path.time_us),
@@ -141,7 +141,7 @@ def _motors(stamps: Arrays, time_us: NDArray[np.int64]) -> Floats | None:
 
 
 def commands_of(stamps: Arrays, zero_us: int) -> Commands:
-    """Return the setpoints that were sent, as time counts from `zero_us`."""
+    """Return the sent setpoints with times relative to `zero_us`."""
     sent = np.asarray(stamps.get("sent_us", np.zeros(0)), np.int64)
     column = setpoint_column(stamps) or SETPOINT
     setpoint = np.asarray(stamps.get(column, np.zeros((len(sent), 4))), np.float64)
@@ -174,25 +174,25 @@ def _motion(
 
 
 def _turned(path: Trajectory) -> dict[str, Floats]:
-    """Return the body rates (m,) [deg/s], by their names in `Motion`."""
+    """Return the body rates (m,) [deg/s] by their names in `Motion`."""
     q = path.quaternion
     turn = quat_multiply((q[:-1] * (1.0, -1.0, -1.0, -1.0)).T, q[1:].T).T
     sine = np.linalg.norm(turn[:, 1:], axis=1)
-    # q and -q are the same attitude: by the shorter way.
+    # q and -q are the same attitude; take the shorter rotation.
     angle = 2.0 * np.arctan2(sine, np.abs(turn[:, 0])) * np.where(turn[:, 0] < 0.0, -1.0, 1.0)
     passed_s = np.diff(path.time_us) / US_PER_S
     steps = turn[:, 1:] * (angle / np.maximum(sine, 1e-12) / passed_s)[:, None]
-    # Between two samples; at a sample the mean of both sides.
+    # The steps are rates between samples; each sample gets the mean of both sides.
     sides = np.concatenate([steps[:1], steps, steps[-1:]])
     rates = np.degrees(0.5 * (sides[:-1] + sides[1:]))
     return dict(zip(COMMANDED[RATES], rates.T, strict=False))
 
 
 def _at(stamps: Arrays, time_us: NDArray[np.int64]) -> Trajectory:
-    """Return the estimates, linear between their samples, at other times (m,)."""
+    """Return the estimates, linearly interpolated at times (m,)."""
     times = stamps["estimate/time_us"]
     quaternion = stamps["estimate/quaternion"]
-    # q and -q are the same attitude: what is between two samples must not pass through zero.
+    # q and -q are the same attitude; interpolation between opposite signs would pass through 0.
     flips = np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0.0, -1.0, 1.0)
     near = quaternion * np.cumprod(np.concatenate([[1.0], flips]))[:, None]
 

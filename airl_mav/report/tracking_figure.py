@@ -1,4 +1,4 @@
-"""A flight over time as a still picture: what the policy saw, its commands, what became of them."""
+"""Figure of a flight over time: the policy's images, its commands and the flown motion."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from airl_mav.report.policy_view import SeenDecision
 from airl_mav.report.tracking import Commands, Floats, TrackedFlight
 
 TIME_POINTS = 300
-"""A line has at most this many corners."""
+"""Maximum number of points of a line."""
 
 WIDTH_IN, ROW_IN, STRIP_IN = 5.2, 0.86, 0.78
 LEFT_IN, RIGHT_IN = 0.68, 0.12
 
 BEFORE_S = 2.0
-"""So much of the take-off is shown [s]; all of it where it was not finished."""
+"""Time shown before navigation [s]; the whole take-off if navigation never started."""
 
 IMAGES = 5
 
 ALWAYS = ("forward_m_s", "right_m_s")
-"""Rows that every flight has, whatever it is commanded."""
+"""Rows of every flight, independent of its kind of commands."""
 
 LABELS = {
     "forward_m_s": "forward\n[m/s]",
@@ -48,12 +48,12 @@ LABELS = {
 COMMANDED = theme.MARK
 FLOWN = theme.SERIES
 ESTIMATED = "#2c9a5b"
-"""Of middling lightness: legible on light and on dark paper."""
+"""Colour of medium lightness, legible on light and dark backgrounds."""
 
 
 @dataclass(frozen=True)
 class _Line:
-    """One line of a row."""
+    """Line of a row."""
 
     values: Floats
     colour: str
@@ -132,7 +132,7 @@ def _rows(flight: TrackedFlight) -> list[tuple[str, list[_Line]]]:
 
 
 def held(commands: Commands, name: str, time_s: Floats) -> Floats:
-    """Return what is commanded at each time (m,): the newest setpoint; NaN before the first."""
+    """Return the newest setpoint at each time (m,); NaN before the first setpoint."""
     values = commands.values[name]
     if not len(values):
         return np.full(len(time_s), np.nan)
@@ -161,7 +161,7 @@ def _draw_row(
 
 
 def _mean_power(time_s: Floats, power_w: Floats, keep: NDArray[np.int64]) -> Floats:
-    """Return the mean power between kept samples: it is a mean since the sample before."""
+    """Return the mean power between kept samples; each sample is a mean since the previous."""
     steps = np.diff(time_s, prepend=time_s[0] - 1e-6)
     energy = np.cumsum(power_w * steps)
     passed = time_s[keep] - time_s[0] + 1e-6
@@ -176,13 +176,13 @@ def _draw_image(figure: Figure, place: int, image: NDArray[np.uint8], title: str
     room = (WIDTH_IN - LEFT_IN - RIGHT_IN) / IMAGES
     centre = LEFT_IN + (place + 0.5) * room
     bottom, tall, wide = height - 0.3 - STRIP_IN + 0.04, STRIP_IN - 0.2, room - 0.08
-    # As large as fits, in its own proportions.
+    # The maximum size that fits with the image's aspect ratio.
     scale = min(wide / image.shape[1], tall / image.shape[0])
     across, up = scale * image.shape[1], scale * image.shape[0]
     left, low = centre - 0.5 * across, bottom + 0.5 * (tall - up)
     inches = Bbox.from_bounds(left, low, across, up)
     box = TransformedBbox(inches, figure.dpi_scale_trans)
-    # Each by itself: joined to one image of all, they would be resampled once more.
+    # Composite images would be resampled twice.
     figure.suppressComposite = True
     drawn = BboxImage(box, interpolation="nearest")
     drawn.set_data(image)

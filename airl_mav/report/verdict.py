@@ -1,6 +1,7 @@
-"""The verdict: flown setup, goals reached, and each requirement met, not met or undecided.
+"""Verdict: setup, success rate, and each requirement as met, not met or undecided.
 
-It is the first line of every output, and `verdict.json`, JUnit XML and a badge for CI.
+The verdict is the first line of every output. CI reads it from `verdict.json`, JUnit XML or a
+badge.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from airl_mav.rehearsal.run_folder import RunInfo
 from airl_mav.report.document import environment
 
 SCHEMA = 1
-"""Version of `verdict.json`; docs/run-folder.md describes it."""
+"""Schema version of `verdict.json`, described in docs/run-folder.md."""
 
 VERDICT_FILE = "verdict.json"
 
@@ -50,20 +51,20 @@ BADGE_COLOURS: dict[Status, str] = {
 
 @dataclass(frozen=True)
 class OverallVerdict:
-    """What a run, or a comparison, has come to."""
+    """Verdict on a run or a comparison."""
 
     sentences: tuple[str, ...]
     """Policy, machine and outcome of a run, with intervals."""
     short: str
-    """The same in few words, for a badge."""
+    """Short form for a badge."""
     invalid: tuple[str, ...] = ()
-    """Flights that stayed invalid, one line each: no verdict can be built on them."""
+    """Invalid flights, one line each; any of them makes the verdict invalid."""
     findings: tuple[Finding, ...] = ()
     schema: int = SCHEMA
 
     @property
     def status(self) -> Status:
-        """What it comes to: the worst of all findings."""
+        """Status: the worst of all findings."""
         decisions = {finding.decision for finding in self.findings}
         if self.invalid:
             return "invalid"
@@ -75,12 +76,12 @@ class OverallVerdict:
 
     @property
     def exit_code(self) -> int:
-        """Exit status of a command that has flown all of it."""
+        """Exit status of a command whose flights are complete."""
         return EXIT_CODES[self.status]
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """All that is to be said, the most important first."""
+        """Lines of the verdict, most important first."""
         return (
             *(f"INVALID: {line}" for line in self.invalid),
             *self.sentences,
@@ -89,7 +90,7 @@ class OverallVerdict:
 
 
 def join_verdicts(parts: Sequence[OverallVerdict], short: str) -> OverallVerdict:
-    """Return the verdict of several runs, each of which has to meet what is required."""
+    """Return the verdict of several runs, which must all meet the requirements."""
     return OverallVerdict(
         sentences=tuple(sentence for part in parts for sentence in part.sentences),
         short=short if len(parts) != 1 else parts[0].short,
@@ -106,7 +107,7 @@ def judge_run(
     against: PairedComparison | None = None,
     reference: str = "",
 ) -> OverallVerdict:
-    """Return the verdict of a run; FieldError if a gap is required without a reference."""
+    """Return the verdict of a run; raise FieldError for a required gap without a reference."""
     computer = Path(setup.computer.name).stem
     rate = quality.success_rate
     reached = "no flight was finished"
@@ -132,7 +133,7 @@ def judge_run(
 
 
 def invalid_flights(episodes: Sequence[EpisodeRecord]) -> tuple[str, ...]:
-    """Return a line for each flight that is no test of its policy."""
+    """Return a line for each invalid flight."""
     return tuple(
         f"flight {episode.index:03d}, seed {episode.seed}: {'; '.join(episode.invalid)}"
         for episode in episodes
@@ -141,7 +142,7 @@ def invalid_flights(episodes: Sequence[EpisodeRecord]) -> tuple[str, ...]:
 
 
 def unchecked(runs: Iterable[RunInfo]) -> tuple[str, ...]:
-    """Return the sentence that belongs under a verdict on runs of which one counts every flight."""
+    """Return a note if any run has validity checks disabled; otherwise, an empty tuple."""
     if all(run.config.get("validity", True) for run in runs):
         return ()
     return ("Whether the host kept pace was not checked: every flight counts.",)
@@ -179,7 +180,7 @@ _VERDICT: TypeAdapter[OverallVerdict] = TypeAdapter(OverallVerdict)
 
 
 def save_verdict(verdict: OverallVerdict, folder: Path) -> None:
-    """Write `verdict.json`, whole or not at all; status and exit code stand in it as well."""
+    """Write `verdict.json`, including status and exit code, atomically."""
     data = _VERDICT.dump_python(verdict, mode="json")
     extra = {"status": verdict.status, "exit_code": verdict.exit_code}
     write_json(folder / VERDICT_FILE, {**data, **extra})
@@ -191,14 +192,14 @@ def load_verdict(folder: Path) -> OverallVerdict:
 
 
 def requirements_of(folder: Path) -> tuple[Requirement, ...]:
-    """Return what was last required of a folder; nothing where it has no verdict."""
+    """Return the requirements of a folder's last verdict; empty without a verdict."""
     if not (folder / VERDICT_FILE).exists():
         return ()
     return tuple(dict.fromkeys(f.requirement for f in load_verdict(folder).findings))
 
 
 def write_junit(verdict: OverallVerdict, path: Path, suite: str) -> None:
-    """Write a verdict as JUnit XML: flight validity and each requirement are a case of `suite`."""
+    """Write a verdict as JUnit XML, with a case in `suite` for validity and each requirement."""
     cases = len(verdict.findings) + 1
     failures = sum(finding.decision is not Decision.MET for finding in verdict.findings)
     counts = {
@@ -230,7 +231,7 @@ GLYPH_PX = 6.6
 
 
 def write_badge(verdict: OverallVerdict, path: Path) -> None:
-    """Write a badge (SVG): the short verdict in the colour of its status."""
+    """Write an SVG badge with the short verdict in the colour of its status."""
     left, right = "rehearsal", verdict.short
     if verdict.status != "nothing required":
         right = f"{right}: {verdict.status}"

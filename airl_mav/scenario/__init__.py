@@ -1,1 +1,1 @@
-"""What a rehearsal is asked for: the one model of it, its file, and its resolution."""
+"""Scenario: configuration of a rehearsal, its file format, and its resolution."""

@@ -1,4 +1,4 @@
-"""The aircraft of a scenario: what flies, what it carries, in which wind, and how it is reached."""
+"""Aircraft of a scenario: vehicle, payload, wind, firmware and connections."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ VehicleName = Annotated[
 ]
 
 DEFAULT_VEHICLE = "quad"
-"""What is shipped and flies by default."""
+"""Default vehicle profile."""
 
 GREATEST_PORT = 65_535
 
 GREATEST_INSTANCE = 9
-"""PX4's instances above share one API port, 14549 (px4-rc.mavlink)."""
+"""Maximum instance: PX4's higher instances share one API port, 14549 (px4-rc.mavlink)."""
 
 EstimatorName = Literal["kernel", "filterpy"]
 PlantName = Literal["pybullet", "kernel"]
@@ -34,12 +34,12 @@ def _is_installed(package: str) -> bool:
     try:
         return find_spec(package) is not None
     except ImportError:
-        # Whoever keeps imports in check may refuse the very question.
+        # Restrictive import hooks may raise here.
         return False
 
 
 HAS_PYBULLET = _is_installed("pybullet")
-"""Whether pybullet is installed here."""
+"""True if pybullet is installed."""
 
 DEFAULT_PLANT: PlantName = "pybullet" if HAS_PYBULLET else "kernel"
 
@@ -47,10 +47,10 @@ FREE = "decides no flight"
 """Marks a field that may differ when a run is resumed."""
 
 IN_WORDS = "each in words on a command line"
-"""Marks a list whose items are written as texts, an option each."""
+"""Marks a list of texts, each a separate command-line option."""
 
 NO_TWIN = "at level lockstep or sitl; the twin has none"
-"""Marks a field that must be left as it is at level gym."""
+"""Marks a field that must keep its default at level gym."""
 
 
 def _port(description: str, default: int) -> Any:
@@ -58,7 +58,7 @@ def _port(description: str, default: int) -> Any:
 
 
 class Ports(ProfileModel):
-    """UDP ports of the MAVLink links, as PX4 SITL uses them, and the camera's TCP port."""
+    """UDP ports of the MAVLink links, as in PX4 SITL, and the camera's TCP port."""
 
     api_port: int = _port("UDP port of the onboard API, where MAVSDK listens", 14540)
     api_local_port: int = _port(
@@ -75,7 +75,7 @@ class Ports(ProfileModel):
 
 
 class RealFirmware(ProfileModel):
-    """Real firmware: what to start, or how to reach what the user has started."""
+    """Real firmware: start settings, or the connection to a firmware started by the user."""
 
     px4_dir: Path | None = optional(
         "with firmware px4: start this PX4 for every flight; a SITL build, its source"
@@ -122,7 +122,7 @@ class RealFirmware(ProfileModel):
 
 
 class Aircraft(ProfileModel):
-    """What flies, and how it is reached."""
+    """Aircraft and its connections."""
 
     vehicle: VehicleName = DEFAULT_VEHICLE
     payload: Payload = Field(default_factory=Payload, description="payload")
@@ -168,21 +168,21 @@ class Aircraft(ProfileModel):
 
     @property
     def open_ports(self) -> Ports:
-        """The ports of this instance.
+        """Ports of this instance.
 
-        As PX4's number `-i` does, it moves all of them but the ground station's. Real firmware
-        moves its own.
+        As with PX4's `-i`, the instance number shifts all ports except the ground station's. Real
+        firmware shifts its own ports.
         """
         moved = ["camera_port"]
         if self.firmware == "builtin":
             moved += ["api_port", "api_local_port", "gcs_local_port"]
         asked = self.ports.model_dump()
-        # 0 stays 0: any free one.
+        # 0 stays 0: any free port.
         by_name = {name: asked[name] and asked[name] + self.real.instance for name in moved}
         return self.ports.model_copy(update=by_name)
 
     @property
     def companion_port(self) -> int:
-        """The UDP port on which a companion listens for the flight controller."""
+        """UDP port on which a companion listens for the flight controller."""
         moved = self.real.instance if self.firmware == "px4" else 0
         return self.open_ports.api_port + moved

@@ -1,4 +1,4 @@
-"""Fields that contradict each other, or the vehicle: found before a port is bound."""
+"""Checks for fields that contradict each other, or the vehicle, before a port is bound."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from airl_mav.scenario.aircraft import GREATEST_PORT, HAS_PYBULLET, NO_TWIN, Air
 from airl_mav.scenario.model import LevelName, Scenario
 
 SITL_SPEEDS = 0.5, 10.0
-"""Speeds at which MAVSDK, which lives by the wall clock, still works: slower, it misses heartbeats
-(1 Hz of simulated time, 3 s allowed); faster, its 20 Hz of setpoints come near offboard loss."""
+"""Speed range supported by MAVSDK's wall-clock timeouts: slower, it misses heartbeats (1 Hz of
+simulated time, 3 s allowed); faster, its 20 Hz of setpoints approach offboard loss."""
 
 NOT_IN_THE_AIR = ("ground", "climb", "landing")
-"""Phases of a flight, as faults name them, that a hover start leaves out."""
+"""Flight phases, by fault names, that a hover start skips."""
 
 REAL_FIRMWARE_NEEDS = {
     "px4": ("px4_dir", "px4_connect"),
     "ardupilot": ("ardupilot_dir", "ardupilot_connect"),
     "px4-hitl": ("serial",),
 }
-"""Exactly one of these fields comes with each kind of real firmware."""
+"""Each kind of real firmware requires exactly one of its fields."""
 
 
 def check_level(scenario: Scenario) -> None:
-    """Raise FieldError for a field that the level does not have."""
+    """Raise FieldError for a field that the level does not support."""
     level = scenario.level
     if level == "sitl":
         if scenario.ablate is not None:
@@ -52,7 +52,7 @@ def check_level(scenario: Scenario) -> None:
 
 
 def check_start(scenario: Scenario) -> None:
-    """Raise FieldError for a hover start that the firmware, or a fault, cannot have."""
+    """Raise FieldError for a hover start incompatible with the firmware or a fault."""
     if scenario.start == "ground":
         return
     if scenario.firmware != "builtin":
@@ -65,13 +65,13 @@ def check_start(scenario: Scenario) -> None:
 
 
 def check_drawing(renderer: Renderer, level: LevelName) -> None:
-    """Raise FieldError for a renderer that the level cannot have."""
+    """Raise FieldError for a renderer that the level does not support."""
     if renderer in SLOW and level == TWIN:
         raise FieldError("renderer", renderer, "raycast, but at level lockstep or sitl")
 
 
 def check_faults(asked: Aircraft, level: LevelName) -> None:
-    """Raise FieldError for a fault that the level, or the firmware, cannot have."""
+    """Raise FieldError for a fault that the level or the firmware does not support."""
     if level == TWIN:
         check_twin(asked.faults)
     for fault in asked.faults:
@@ -87,7 +87,7 @@ def check_faults(asked: Aircraft, level: LevelName) -> None:
 
 
 def check_fitted(sensors: Sensors, faults: Sequence[Fault]) -> None:
-    """Raise FieldError for a fault of a sensor that the vehicle does not have."""
+    """Raise FieldError for a fault of a sensor that the vehicle lacks."""
     fitted = {"gps": sensors.gps.fitted, "vision": sensors.vision is not None}
     fitted["rangefinder"] = sensors.rangefinder is not None
     fitted["flow"] = sensors.optical_flow is not None
@@ -97,7 +97,7 @@ def check_fitted(sensors: Sensors, faults: Sequence[Fault]) -> None:
 
 
 def check_plant(asked: Aircraft) -> None:
-    """Raise FieldError for a plant that is not installed here."""
+    """Raise FieldError for a plant that is not installed."""
     if asked.plant == "pybullet" and not HAS_PYBULLET:
         accepted = "kernel: pybullet is not installed (it has wheels for CPython 3.10 and 3.11 on"
         accepted += " Linux x86-64)"
@@ -105,7 +105,7 @@ def check_plant(asked: Aircraft) -> None:
 
 
 def check_ports(ports: Ports, *, any_camera: bool) -> None:
-    """Raise FieldError for an unusable port, or two links on one; 0, if `any_camera`, is free."""
+    """Raise FieldError for an invalid or duplicate port; `any_camera` allows camera port 0."""
     for field in ("api_port", "gcs_port", *(() if any_camera else ("camera_port",))):
         if getattr(ports, field) == 0:
             raise FieldError(f"ports.{field}", 0, "1 <= value <= 65535")

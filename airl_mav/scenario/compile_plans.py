@@ -1,4 +1,4 @@
-"""What commands compile before their first flight. Light to import: functions are named only."""
+"""Compile plans of commands before their first flight. Cheap to import: uses function names."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _VECTORIZED = "airl_mav.envs.warm_up"
 
 
 def plan_of(scenario: ResolvedScenario) -> CompilePlan:
-    """Return what a scenario needs at its level."""
+    """Return the compile plan of a scenario at its level."""
     if scenario.level == "gym":
         return vectorized_plan(scenario.vehicle.camera.kind)
     return flight_plan(scenario.vehicle, scenario.scenario.plant)
 
 
 def flight_plan(vehicle: VehicleProfile, plant: PlantName) -> CompilePlan:
-    """Return what a vehicle needs at levels sitl and lockstep."""
+    """Return the compile plan of a vehicle at levels sitl and lockstep."""
     profile = vehicle.model_dump_json()
     cameras = {each.kind for each in (vehicle.camera, *vehicle.cameras.values())}
     sensors = {name for name, value in vehicle.sensors if value is not None}

@@ -1,4 +1,4 @@
-"""Scenario files: the fields of a scenario as TOML, to be flown, changed and flown again."""
+"""Scenario files: the fields of a scenario as TOML, for repeated and modified runs."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ else:
     import tomli as tomllib
 
 SCENARIO_FILE = "scenario.toml"
-"""Name of the scenario in a run folder."""
+"""Scenario file in a run folder."""
 
 
 def read_scenario_file(path: Path) -> dict[str, Any]:
-    """Return what a scenario file says. Raises UsageError if it cannot be read, or is no TOML."""
+    """Return the contents of a scenario file. Raises UsageError if unreadable or invalid TOML."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -33,14 +33,14 @@ def read_scenario_file(path: Path) -> dict[str, Any]:
 
 
 def save_scenario(scenario: Scenario, path: Path) -> None:
-    """Write a scenario with all its fields and absolute paths; what is left open stays out."""
+    """Write a scenario with absolute paths; fields at None are omitted."""
     data = anchored(scenario).model_dump(mode="json", exclude_none=True)
     replace_file(path, tomli_w.dumps(data).encode())
 
 
 def anchored(scenario: Scenario) -> Scenario:
-    """Return a scenario whose paths are absolute: they mean the same wherever it is flown again."""
-    # Imported here: whoever only reads a command line or a run folder needs no policy.
+    """Return a scenario with absolute paths, independent of the working directory."""
+    # Late import: reading a command line or a run folder needs no policy.
     from airl_mav.policy.registry import policy_names
 
     policy, latency = scenario.policy, scenario.latency or ""

@@ -1,7 +1,7 @@
-"""The scenario: the one model of all that a rehearsal can be asked for.
+"""Scenario: the model of all rehearsal settings.
 
-Command-line options, scenario files, `run.json` and what the processes of a rehearsal are told are
-all this model. Meaning, unit, range and default of a setting stand here and nowhere else.
+Shared by command-line options, scenario files, `run.json` and the processes of a rehearsal.
+Meaning, unit, range and default of a setting are defined only here.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Place = tuple[
     Annotated[float, Field(ge=-180.0, le=180.0)],
     Annotated[float, Field(gt=-12_000.0, lt=100_000.0)],
 ]
-"""Latitude, longitude [deg], altitude above mean sea level [m]; what PX4 takes for an origin."""
+"""Latitude, longitude [deg], altitude above mean sea level [m]; PX4's limits for an origin."""
 
 ArenaName = Annotated[str, Field(description="arena profile: a shipped name, or a path to a .toml")]
 PolicyName = Annotated[
@@ -34,9 +34,9 @@ PolicyName = Annotated[
 ]
 
 DEFAULT_POLICY, DEFAULT_ARENA = "static-obstacles-fast", "static-obstacles"
+"""Default policy and arena of a scenario."""
 ONBOARD_COMPUTER, REFERENCE_COMPUTER = "ras-pi-4", "workstation"
 """Default computers of experiments that compare an onboard computer with a reference."""
-"""What is shipped and decides, and is flown in, by default."""
 
 GREATEST_SEED = 2**31
 GREATEST_EPISODES = 100_000
@@ -55,11 +55,11 @@ def _seed(description: str, default: Any = 1) -> Any:
 
 
 DECISION_TIMEOUT_S = 2.0
-"""A velocity persists so long by default when no other comes [s]."""
+"""Default timeout of a velocity command [s]."""
 
 
 class WatchdogSettings(ProfileModel):
-    """Bounds on the silence of the policy, in simulated time."""
+    """Timeouts for a silent policy, in simulated time."""
 
     decision_timeout_s: float | None = quantity(
         "time since the last action after which the velocity is zeroed; longer than the hold time;"
@@ -93,7 +93,7 @@ class WatchdogSettings(ProfileModel):
         hold_s: float = 0.0,
         on_card: float | None = None,
     ) -> float:
-        """Return the time-out of a decision [s]: as configured, as on the card, or by default."""
+        """Return the decision timeout [s]: configured, from the card, or the default."""
         if self.decision_timeout_s is not None:
             return self.decision_timeout_s
         if on_card is not None:
@@ -102,7 +102,7 @@ class WatchdogSettings(ProfileModel):
 
 
 class LimitSettings(ProfileModel):
-    """What the companion believes, and how far it flies; what is beyond ends the flight."""
+    """Limits on telemetry, camera and flight; a violation ends the flight."""
 
     silence_s: float = quantity(
         "telemetry that stays the same for longer, and frames that come later, are not believed",
@@ -150,28 +150,28 @@ class LimitSettings(ProfileModel):
 
 @dataclass(frozen=True)
 class PilotSettings:
-    """How a policy is flown, decided."""
+    """Resolved settings for flying a policy."""
 
     hold_s: float = 0.5
-    """t3: how long an action is held before the next observation [s]."""
+    """Duration t3 for which an action is held before the next observation [s]."""
     goal_radius_m: float = 2.0
-    """The goal is reached closer than this, seen from above [m]."""
+    """Horizontal goal radius [m]."""
     altitude_m: float = 2.5
-    """Height above the start that is held [m]."""
+    """Height above the start during the flight [m]."""
     max_speed_m_s: float = 5.0
     """Horizontal speed limit of all actions [m/s]."""
     decisions: DecisionTiming = "sequential"
-    """When a decision begins: after the hold of the one before, or as soon as that is ready."""
+    """Start of a decision: after the previous hold, or once the previous decision is ready."""
     compensate: bool = False
-    """Whether what is seen is carried forward to when the decision will act."""
+    """True to predict state and image at the time of effect."""
     commands: CommandKind = "velocity"
-    """What the policy commands."""
+    """Kind of setpoint that the policy commands."""
     origin: tuple[float, float, float] | None = None
-    """Where the flight begins: latitude, longitude [deg], altitude [m]; None = GPS tells it."""
+    """Start position: latitude, longitude [deg], altitude [m]; None = from GPS."""
 
 
 class Inference(ProfileModel):
-    """What runs a policy's network."""
+    """Settings of network inference."""
 
     runtime: RuntimeName = Field(
         default="onnx", description="what runs a learned policy; torch needs its policy.pt2"
@@ -184,7 +184,7 @@ class Inference(ProfileModel):
 
 
 class Decisions(Inference):
-    """Who decides, and how its actions are flown."""
+    """Policy settings and flight settings of its actions."""
 
     cpu_quota: float | None = quantity(
         "hold the companion to this share of one core, for real, by a Linux control group; what it"
@@ -250,7 +250,7 @@ class Decisions(Inference):
 
 
 class Lateness(ProfileModel):
-    """How late every decision is: the latency t2, in simulated time."""
+    """Decision latency t2, in simulated time."""
 
     computer: str = Field(
         default="workstation",
@@ -272,7 +272,7 @@ class Lateness(ProfileModel):
 
 
 class Workers(ProfileModel):
-    """Who carries out the jobs of an experiment; changes no result."""
+    """Execution of an experiment's jobs; has no effect on results."""
 
     executor: Annotated[Literal["process", "ray"], FREE] = Field(
         default="process",
@@ -294,7 +294,7 @@ class Workers(ProfileModel):
 
 
 class Flights(Workers):
-    """Which episodes are flown, and how."""
+    """Episodes of a run and their execution."""
 
     level: LevelName = Field(
         default="sitl",
@@ -350,12 +350,12 @@ class Flights(Workers):
 
 
 class Scenario(Flights, Lateness, Decisions, Aircraft):
-    """All that a rehearsal can be asked for.
+    """Configuration of a rehearsal.
 
-    The fields are flat, but for the tables `payload`, `wind`, `spread`, `sensors`, `watchdog`,
-    `limits`, `real` and `ports`. What is left at None is decided by
-    `airl_mav.scenario.resolve.resolve`, mostly from the policy's card. Raises FieldError if a field
-    is unknown, of the wrong type, or out of range.
+    The fields are flat, except the tables `payload`, `wind`, `spread`, `sensors`, `watchdog`,
+    `limits`, `real` and `ports`. `airl_mav.scenario.resolve.resolve` sets fields at None, mostly
+    from the policy's card. Raises FieldError if a field is unknown, of the wrong type, or out of
+    range.
     """
 
     policy: PolicyName = DEFAULT_POLICY
@@ -364,7 +364,7 @@ class Scenario(Flights, Lateness, Decisions, Aircraft):
     @model_validator(mode="wrap")
     @classmethod
     def _told_in_one_line(cls, data: Any, handler: ModelWrapValidatorHandler[Scenario]) -> Scenario:
-        """Raise the error of a field that `resolve` raises, too: one line instead of pydantic's."""
+        """Raise a one-line FieldError, as `resolve` does, in place of pydantic's error."""
         try:
             return handler(data)
         except ValidationError as error:
@@ -372,16 +372,16 @@ class Scenario(Flights, Lateness, Decisions, Aircraft):
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Seed of each episode, by its index."""
+        """Seed of each episode, by index."""
         return tuple(range(self.seed, self.seed + self.episodes))
 
     def arena_seed_of(self, seed: int) -> int:
-        """Return the seed of the arena of the episode with this seed."""
+        """Return the arena seed of the episode with this seed."""
         return seed if self.arena_seed is None else self.arena_seed
 
 
 def free_fields(level: LevelName) -> frozenset[str]:
-    """Return the names of the fields that decide no flight at a level."""
+    """Return the names of the fields without effect on flights at a level."""
     free = {name for name, field in Scenario.model_fields.items() if FREE in field.metadata}
-    # Level with the wall clock, what this machine takes counts in proportion to the speed.
+    # At level sitl, the effect of this machine's compute time scales with the speed.
     return frozenset(free - {"speed"} if level == "sitl" else free)

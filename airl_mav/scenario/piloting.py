@@ -1,6 +1,6 @@
-"""How a policy is flown and how late it decides: as asked, else as its card says, else by default.
+"""Flight settings and latency of a policy: as configured, else from its card, else defaults.
 
-What the companion needs of a scenario's resolution; imports no simulator.
+The companion's part of a scenario's resolution; imports no simulator.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.model import Decisions, Lateness, LevelName, PilotSettings, WatchdogSettings
 
 ACTION_STREAM = 1
-"""Second word of the seed of a policy's random actions: not the numbers that draw the latency."""
+"""Second word of the seed of a policy's random actions, distinct from latency draws."""
 
 NATIVE_T2_US = round(1.0 * US_PER_MS)
-"""t2 where nothing is injected and no machine's own time counts: as on a desktop computer [µs]."""
+"""Default t2 without injection or native timing: a desktop computer's [µs]."""
 
 TRANSPORT_US = round(5.0 * US_PER_MS)
-"""Exposure to decoding where no machine's own time counts: t1 without the wait for a frame [µs]."""
+"""Default time from exposure to decoding without native timing: t1 minus the frame wait [µs]."""
 
 
 def decide_piloting(
     asked: Decisions, policy: PolicyInfo, goal_radius_m: float
 ) -> tuple[PilotSettings, WatchdogSettings]:
-    """Return how a policy is flown: as configured, else as on its card, else by default.
+    """Return the flight settings of a policy: as configured, else from its card, else defaults.
 
-    `goal_radius_m` is that of a policy without a card. Raises FieldError if a decision would be
-    overdue before its predecessor's hold time is over.
+    `goal_radius_m` applies to a policy without a card. Raises FieldError if a decision would be
+    overdue before the previous hold time is over.
     """
     card = policy.card
     known: dict[str, Any] = {"goal_radius_m": goal_radius_m}
     if policy.commands != "velocity":
-        # A decision with every image: nothing else keeps the vehicle level.
+        # Decide on every image: nothing else keeps the vehicle level.
         known["decisions"] = "pipelined"
     hover_s = asked.watchdog.hover_after_s
     if card is not None:
@@ -80,7 +80,7 @@ def decide_piloting(
 def check_commands(
     policy: PolicyInfo, asked: str, *, level: str, firmware: str = "builtin"
 ) -> None:
-    """Raise FieldError for a policy whose commands the level or the firmware cannot fly."""
+    """Raise FieldError for commands that the level or the firmware does not support."""
     if policy.commands == "velocity":
         return
     words = policy.commands.replace("_", " ")
@@ -94,10 +94,10 @@ def check_commands(
 
 
 def check_compensated(pilot: PilotSettings, policy: PolicyInfo, vehicle: VehicleProfile) -> None:
-    """Raise FieldError where latency is compensated that cannot be.
+    """Raise FieldError for unsupported latency compensation.
 
-    That is of a policy that commands no velocity, whose effect is not foreseen, and of one that
-    sees by further cameras, whose images are not carried forward.
+    Compensation does not support policies without velocity commands, whose effect is not predicted,
+    nor policies with additional cameras, whose images are not predicted.
     """
     if pilot.compensate and policy.commands != "velocity":
         raise FieldError(
@@ -121,7 +121,7 @@ def check_compensated(pilot: PilotSettings, policy: PolicyInfo, vehicle: Vehicle
 
 
 def check_goal_height(policy: PolicyInfo, goal: Goal, field: str, asked: object) -> None:
-    """Raise FieldError, of `field`, for a policy that takes a height, and a goal without one."""
+    """Raise FieldError, of `field`, if the policy requires a goal height and the goal has none."""
     if policy.card is not None and policy.card.observation.goal_height and len(goal) == 2:
         raise FieldError(
             field,
@@ -131,7 +131,7 @@ def check_goal_height(policy: PolicyInfo, goal: Goal, field: str, asked: object)
 
 
 def check_quota(asked: Decisions, injection: Injection, level: LevelName) -> None:
-    """Raise UsageError for a limit on the processor that is of no use, or not permitted."""
+    """Raise UsageError for a processor limit without effect, or without permission."""
     if asked.cpu_quota is None:
         return
     if level != "sitl" or injection.latency is not None:
@@ -145,10 +145,10 @@ def check_quota(asked: Decisions, injection: Injection, level: LevelName) -> Non
 
 
 def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: bool) -> Injection:
-    """Return the latency of a companion that runs alone.
+    """Return the latency of a stand-alone companion.
 
-    `on_this_computer`: it runs on the very computer that it flies as, so that measured latencies
-    are no addition. Raises UsageError for an unknown computer, workload or source.
+    `on_this_computer`: the companion runs on the selected computer itself, so that measured
+    latencies are not added. Raises UsageError for an unknown computer, workload or source.
     """
     return select_injection(
         asked.latency,
@@ -160,7 +160,7 @@ def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: boo
 
 
 def load_asked_policy(asked: Decisions, policy: PolicyInfo, hold_s: float, seed: int) -> Policy:
-    """Return the policy, ready to decide as configured, or raise UsageError."""
+    """Return the configured policy, ready to decide. Raises UsageError."""
     return load_policy(
         policy,
         hold_s,
@@ -173,12 +173,12 @@ def load_asked_policy(asked: Decisions, policy: PolicyInfo, hold_s: float, seed:
 
 
 def action_generator(seed: int) -> np.random.Generator:
-    """Return the source of a policy's random actions in the flight of a seed."""
+    """Return the generator of a policy's random actions in the flight of a seed."""
     return np.random.default_rng((seed, ACTION_STREAM))
 
 
 def between_commands(pilot: PilotSettings, hover_s: float | None) -> str:
-    """Return what happens from one command to the next, in words."""
+    """Return the behaviour between commands as text."""
     words = ["persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms"]
     if pilot.decisions != PilotSettings.decisions:
         words.append(f"{pilot.decisions} decisions")

@@ -1,4 +1,4 @@
-"""Resolve a scenario. Every profile and the policy are read exactly once."""
+"""Resolution of a scenario. Reads every profile and the policy exactly once."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ from airl_mav.scenario.resolved import ResolvedScenario
 
 
 def resolve(scenario: Scenario, policy: PolicyInfo | None = None) -> ResolvedScenario:
-    """Check all that can be wrong before anything starts, and load all that the scenario names.
+    """Validate a scenario before anything starts, and load all referenced profiles.
 
-    `policy` replaces the scenario's. Raises UsageError if a field contradicts another, a profile or
-    the policy cannot be used, or no arena can be made of the first seed. `FieldError`s name the
+    `policy` replaces the scenario's. Raises UsageError if fields contradict each other, a profile
+    or the policy cannot be used, or the first seed has no valid arena. `FieldError`s name the
     field.
     """
     check_level(scenario)
@@ -48,7 +48,7 @@ def resolve(scenario: Scenario, policy: PolicyInfo | None = None) -> ResolvedSce
     check_firmware(scenario, scenario.level, scenario.speed)
     check_start(scenario)
     if scenario.level == "sitl":
-        # The companion connects to the camera by its number: it cannot be "any free one" here.
+        # The companion connects to the camera by its number: 0, any free port, is invalid here.
         check_ports(scenario.open_ports, any_camera=False)
     policy = policy or find_policy(scenario.policy, trust=scenario.trust)
     check_commands(policy, scenario.policy, level=scenario.level, firmware=scenario.firmware)
@@ -80,7 +80,7 @@ def resolve(scenario: Scenario, policy: PolicyInfo | None = None) -> ResolvedSce
         watchdog=watchdog,
     )
     compile_shown([plan_of(resolved)])
-    # What cannot be flown is better found here than by a process that is already flying.
+    # Load everything now, so that errors precede the flight.
     goal = resolved.arena_of(scenario.seed).goal_point
     check_goal_height(policy, goal, "arena", scenario.arena)
     if policy.asked is None:
@@ -90,7 +90,7 @@ def resolve(scenario: Scenario, policy: PolicyInfo | None = None) -> ResolvedSce
 
 
 def _labelled(injection: Injection, scenario: Scenario) -> Injection:
-    """Return the latency as a report of the level calls it."""
+    """Return the latency with the label that the level's report uses."""
     if scenario.cpu_quota is not None:
         label = (
             "native speed of the machine that flew, companion held to "

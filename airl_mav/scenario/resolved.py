@@ -1,4 +1,4 @@
-"""A scenario with all that it names loaded: what everything below takes, never a name."""
+"""Resolved scenario with all referenced content loaded."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ from airl_mav.scenario.piloting import (
 )
 
 HOVER_START_S = 0.3
-"""From the begin of a flight in a hover to navigation: connection and switch to offboard [s]."""
+"""Time from the start in a hover to navigation: connection and switch to offboard [s]."""
 
 BEFORE_CLIMB_S = 9.2
-"""What a take-off of the built-in autopilot takes besides its climb [s]: booting, arming, spinning
-up, slowing down. 150 of them to 2.5 m took 10.6 to 11.2 s, 10.88 s on average."""
+"""Take-off time of the built-in autopilot without the climb [s]: booting, arming, spinning up,
+slowing down. 150 take-offs to 2.5 m took 10.6 to 11.2 s, 10.88 s on average."""
 
 ARRIVAL_SHARE = 0.8
-"""The companion flies to this share of the goal radius: it knows its position only by estimate,
-while the referee measures the true one."""
+"""Share of the goal radius to which the companion flies: it uses the estimated position, the
+referee the true one."""
 
 FIRMWARE_TITLES: dict[FirmwareName, str] = {
     "builtin": BUILT_IN,
@@ -58,7 +58,7 @@ FIRMWARE_TITLES: dict[FirmwareName, str] = {
 
 @dataclass(frozen=True)
 class PlannedEpisode:
-    """An episode to be flown."""
+    """Episode to be flown."""
 
     index: int
     seed: int
@@ -66,20 +66,20 @@ class PlannedEpisode:
 
 @dataclass(frozen=True)
 class ResolvedScenario:
-    """A scenario, checked, and the content of every profile that it names."""
+    """Validated scenario, and the content of every referenced profile."""
 
     scenario: Scenario
     vehicle: VehicleProfile
-    """With its computer and payload on board."""
+    """Vehicle with its computer and payload."""
     arena: ArenaSpec
     computer: ComputerProfile
     policy: PolicyInfo
     injection: Injection
-    """Where t2 is drawn from."""
+    """Source of t2."""
     pilot: PilotSettings
-    """How the policy is flown; the goal radius is the referee's."""
+    """Flight settings of the policy; the goal radius is the referee's."""
     watchdog: WatchdogSettings
-    """Bounds on silence, with what the policy's card says of hovering."""
+    """Watchdog bounds, with the policy card's hover setting."""
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -87,21 +87,21 @@ class ResolvedScenario:
         return self.scenario.seeds
 
     def left(self, done: Iterable[EpisodeRecord] = ()) -> list[PlannedEpisode]:
-        """Return what is left to be flown when some episodes are done."""
+        """Return the episodes that are not in `done`."""
         there = {record.index for record in done}
         return [PlannedEpisode(i, seed) for i, seed in enumerate(self.seeds) if i not in there]
 
     @property
     def config(self) -> dict[str, Any]:
-        """All that is written down of a run, as plain values.
+        """Recorded settings of a run, as plain values.
 
-        The scenario with absolute paths, and with what was left open decided, so that a default and
-        the same value asked for are one run; and the content of profiles and policy. A name does
-        not tell a changed one.
+        The scenario with absolute paths and resolved defaults, so that a default equals the same
+        explicit value; and the content of profiles and policy, because a name does not reveal
+        changes.
         """
         pilot = asdict(self.pilot)
         if pilot["commands"] == "velocity":
-            # As it was before policies could command anything else.
+            # Compatible with versions before other command kinds.
             del pilot["commands"]
         profiles: dict[str, BaseModel] = {
             "vehicle": self.vehicle,
@@ -115,7 +115,7 @@ class ResolvedScenario:
             "speed": self.speed,
             "pilot": pilot,
             "watchdog": self.watchdog.model_dump(mode="json"),
-            # With what it carries: the profile alone does not tell.
+            # The body includes the load, which the profile lacks.
             "vehicle_body": self.vehicle.body.model_dump(),
             "policy_sha256": self.policy.sha256,
             "profiles_sha256": {
@@ -125,13 +125,13 @@ class ResolvedScenario:
 
     @property
     def level(self) -> Level:
-        """Rung of the fidelity ladder, as a report calls it."""
+        """Fidelity level in reports."""
         real = self.scenario.firmware != "builtin"
         return "firmware" if real else self.scenario.level
 
     @property
     def speed(self) -> float | None:
-        """Simulated seconds per wall second; None where time is not paced."""
+        """Simulated seconds per wall second; None without pacing."""
         scenario = self.scenario
         if scenario.level == "sitl":
             return 1.0 if scenario.speed is None else scenario.speed
@@ -139,9 +139,9 @@ class ResolvedScenario:
 
     @property
     def companion_pilot(self) -> PilotSettings:
-        """How the companion flies the policy: closer to the goal than the referee asks for.
+        """Flight settings of the companion, with a smaller goal radius than the referee's.
 
-        A vehicle without GPS is told where it is: here that is known.
+        For a vehicle without GPS, they include the known origin.
         """
         origin = self.pilot.origin
         if origin is None and (told := self.vehicle.told_origin) is not None:
@@ -154,7 +154,7 @@ class ResolvedScenario:
 
     @property
     def takeoff_s(self) -> float:
-        """How long a take-off takes, nearly [s]; 0 at level gym, which has none."""
+        """Approximate duration of a take-off [s]; 0 at level gym, which has none."""
         if self.scenario.level == "gym":
             return 0.0
         if self.scenario.start == "hover":
@@ -163,12 +163,12 @@ class ResolvedScenario:
         return BEFORE_CLIMB_S + self.pilot.altitude_m / parameters["MPC_TKO_SPEED"]
 
     def arena_of(self, seed: int) -> Arena:
-        """Return the arena of the episode of a seed. Raises UsageError if none can be made.
+        """Return the arena of the episode of a seed. Raises UsageError if generation fails.
 
-        Moving obstacles are where the seed's tours begin when navigation does, as nearly as that is
-        known beforehand. The same seed is the same scene at every level.
+        Moving obstacles start the seed's tours when navigation begins, to the precision known
+        beforehand. The same seed gives the same scene at every level.
         """
-        # Imported here: it takes scipy, which a companion has no need of.
+        # Late import of scipy, which a companion does not need.
         from airl_mav.arena.generate import generate
         from airl_mav.arena.tours import set_out_later
 
@@ -182,12 +182,12 @@ class ResolvedScenario:
         return set_out_later(arena, self.takeoff_s)
 
     def task(self, goal: Goal) -> Task:
-        """Return what the referee asks of a flight to a goal."""
+        """Return the referee's task for a flight to a goal."""
         return Task(goal, self.pilot.goal_radius_m, self.scenario.time_limit_s)
 
     @property
     def rules(self) -> str:
-        """The rules of an episode, as a report states them."""
+        """Rules of an episode, as text for reports."""
         pilot = self.pilot
         return (
             f"goal radius {pilot.goal_radius_m:g} m, hold {pilot.hold_s:g} s, "
@@ -196,7 +196,7 @@ class ResolvedScenario:
 
     @property
     def setup(self) -> Setup:
-        """The facts that head every report."""
+        """Setup for the head of every report."""
         scenario, hover_s = self.scenario, self.watchdog.hover_after_s
         without = f" (its input {scenario.ablate!r} made zero)" if scenario.ablate else ""
         return Setup(
@@ -215,18 +215,18 @@ class ResolvedScenario:
         )
 
     def _plant(self) -> Iterator[str]:
-        """Give the plant, where it is not the usual one; level gym has none."""
+        """Yield a non-default plant; level gym has none."""
         if self.level != "gym" and self.scenario.plant != "pybullet":
             yield f"plant {self.scenario.plant}"
 
     def _zone(self) -> Iterator[str]:
-        """Give the curriculum zone of the goals, where one was asked for."""
+        """Yield the requested curriculum zone of the goals."""
         if (zone := self.scenario.zone) is not None:
             yield f"zone {zone} (goals within {self.arena.zones_m[zone]:g} m)"
 
     @property
     def pack_j(self) -> float:
-        """What the battery holds at the start [J]."""
+        """Initial energy of the battery [J]."""
         return self.vehicle.battery.energy_j(self.scenario.battery_charge)
 
     @property
@@ -235,22 +235,22 @@ class ResolvedScenario:
         return Path(self.scenario.arena).stem
 
     def latency_sampler(self, seed: int, *, native: bool) -> LatencySampler | None:
-        """Return the source of t2 of a seed's episode.
+        """Return the source of t2 for a seed's episode.
 
-        Where the companion's own time counts (`native`), None means that nothing is injected.
-        Otherwise t2 is that of a desktop computer.
+        With native timing (`native`), None means no injection. Otherwise the default t2 is a
+        desktop computer's.
         """
         sampler = self.injection.sampler(latency_generator(seed, self.scenario.latency_seed))
         return sampler if native else sampler or FixedSampler(NATIVE_T2_US)
 
     def compensator(self) -> Compensator | None:
-        """Return the compensator of a companion, None without one. Raises FieldError."""
+        """Return the compensator of a companion, or None. Raises FieldError."""
         if not self.pilot.compensate:
             return None
         return Compensator(1, self.vehicle, Intrinsics.of(self.vehicle.camera))
 
     def fresh_policy(self, seed: int) -> Policy:
-        """Return the policy at the start of a seed's flight, or raise UsageError."""
+        """Return the policy at the start of a seed's flight. Raises UsageError."""
         loaded = self._loaded_policy
         if isinstance(loaded, LearnedPolicy):
             return loaded.with_generator(action_generator(seed))
@@ -258,7 +258,7 @@ class ResolvedScenario:
 
     @cached_property
     def _loaded_policy(self) -> Policy:
-        """The policy, its network loaded once."""
+        """Policy, with its network loaded once."""
         return self._load_policy()
 
     def _load_policy(self) -> Policy:
@@ -266,12 +266,12 @@ class ResolvedScenario:
         return load_asked_policy(scenario, self.policy, self.pilot.hold_s, scenario.seed)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave the loaded network behind: each process opens its own."""
+        """Exclude the loaded network: each process opens a new one."""
         return {key: value for key, value in self.__dict__.items() if key != "_loaded_policy"}
 
 
 def _conditions(scenario: Aircraft) -> Iterator[str]:
-    """Give what an aircraft flies with and in, where it is not the default: field and value."""
+    """Yield each non-default condition of an aircraft: field and value."""
     for table in ("payload", "wind", "spread", "sensors"):
         for name, value in getattr(scenario, table).model_dump(exclude_defaults=True).items():
             yield f"{table}.{name} {value:g}"

@@ -1,4 +1,4 @@
-"""What the two programs can be asked for that fly apart: the vehicle alone, the companion alone."""
+"""Settings of the stand-alone programs: vehicle only, and companion only."""
 
 from __future__ import annotations
 
@@ -36,27 +36,27 @@ from airl_mav.scenario.model import (
 from airl_mav.scenario.piloting import TRANSPORT_US
 
 SPEEDS = 0.0, 100.0
-"""Limits of the pace; what a host cannot keep up with is given up and reported."""
+"""Limits of the speed; time beyond the host's capacity is skipped and reported."""
 
 LOCKSTEP_SPEEDS = 0.1, 1000.0
-"""The same in lockstep; slower, the companion would take the vehicle for gone between two turns."""
+"""Limits of the speed in lockstep; slower, the companion would time out between two turns."""
 
 TURN_US = 20_000
-"""A companion in lockstep that does not ask for its next turn has it this long later [µs]."""
+"""Default time to a companion's next turn in lockstep [µs]."""
 
 LONGEST_REST_US = US_PER_S
-"""The companion has a turn at least this often, wanted or not, so that what is sent to it fits into
-its socket's buffer even when it does not read [µs]."""
+"""Maximum time between the companion's turns, so that its messages fit into the socket buffer even
+if it does not read [µs]."""
 
 COMPANION_TIMEOUT_S = 60.0
-"""Longest turn of the companion in lockstep [s of wall time]."""
+"""Timeout of the companion's turn in lockstep [wall s]."""
 
 FARTHEST_M = 10_000.0
-"""Limit of a goal's distance on each axis."""
+"""Maximum goal distance on each axis."""
 
 
 class StandAloneVehicle(Aircraft):
-    """Flight controller, vehicle and camera by themselves, for any client."""
+    """Flight controller, vehicle and camera without a companion, for any client."""
 
     arena: ArenaName = DEFAULT_ARENA
     computer: str = Field(
@@ -134,14 +134,14 @@ class StandAloneVehicle(Aircraft):
 
     @property
     def pace(self) -> float | None:
-        """Simulated seconds per wall second; None: as fast as it goes."""
+        """Simulated seconds per wall second; None: as fast as possible."""
         if self.speed is None:
             return None if self.lockstep else 1.0
         return self.speed if isinstance(self.speed, float) else None
 
 
 Start = Literal["arm", "offboard"]
-"""Who begins a flight: the companion, or a pilot."""
+"""Starter of a flight: the companion, or a pilot."""
 
 
 CameraName = Annotated[
@@ -156,7 +156,7 @@ CameraName = Annotated[
 
 
 class CompanionAddresses(ProfileModel):
-    """Where a companion by itself finds the flight controller and the camera."""
+    """Connections of a stand-alone companion to flight controller and camera."""
 
     connect: str = Field(
         default="udpin://127.0.0.1:14540",
@@ -167,7 +167,7 @@ class CompanionAddresses(ProfileModel):
 
 
 class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
-    """What flies a policy, by itself: on an onboard computer, or against any simulator."""
+    """Stand-alone companion that flies a policy, onboard or against any simulator."""
 
     signing_key: Path | None = optional(
         "sign MAVLink with the key in this file, that of the flight controller (64"
@@ -240,7 +240,7 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
 
 
 def check_vehicle(asked: StandAloneVehicle) -> None:
-    """Raise FieldError for what can be seen to be wrong before a port is bound."""
+    """Raise FieldError for errors detectable before a port is bound."""
     check_ports(asked.open_ports, any_camera=True)
     speed = asked.speed
     level: LevelName = "lockstep" if asked.lockstep else "sitl"
@@ -283,7 +283,7 @@ def check_vehicle(asked: StandAloneVehicle) -> None:
 
 
 def check_companion(asked: StandAloneCompanion) -> None:
-    """Raise FieldError for what can be seen to be wrong before a connection is opened."""
+    """Raise FieldError for errors detectable before a connection is opened."""
     for metres in asked.goal:
         if not abs(metres) <= FARTHEST_M:
             raise FieldError("goal", metres, f"{-FARTHEST_M:g} <= value <= {FARTHEST_M:g} m")
@@ -305,6 +305,6 @@ def check_companion(asked: StandAloneCompanion) -> None:
 
 
 def _check_folder(field: str, file: Path | None) -> None:
-    """Raise FieldError for a file in a folder that is not there."""
+    """Raise FieldError for a file in a missing folder."""
     if file is not None and not file.parent.is_dir():
         raise FieldError(field, file, problem=f"no folder {file.parent}")

@@ -1,1 +1,1 @@
-"""The architecture search: many trainings of template networks, and what came out of them."""
+"""Architecture search: many trainings of template networks, and their results."""

@@ -1,4 +1,4 @@
-"""A sweep as a TOML file: which networks learn in which arenas, how, and how they are judged."""
+"""Sweep configuration as a TOML file: networks, arenas, training and evaluation."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.training.config import SELECTION_SEED, TrainingConfig
 
 GREATEST_LAYERS, GREATEST_FILTERS = 16, 256
-"""As of a template in `training.config.NetworkSpec`."""
+"""Limits of a template in `training.config.NetworkSpec`."""
 
 
 class Grid(ProfileModel):
-    """The cells of one arena: every number of layers with every number of filters."""
+    """Cells of one arena: every number of layers with every number of filters."""
 
     arena: str = Field(description="arena profile: a shipped name, or a path to a .toml")
     layers: Annotated[tuple[int, ...], Each(1, GREATEST_LAYERS, ascending=True)] = quantity(
@@ -28,7 +28,7 @@ class Grid(ProfileModel):
 
     @property
     def name(self) -> str:
-        """Name of the arena, as folders carry it."""
+        """Name of the arena in folder names."""
         return Path(self.arena).stem
 
     @model_validator(mode="after")
@@ -40,7 +40,7 @@ class Grid(ProfileModel):
 
 
 class Examination(ProfileModel):
-    """The flights by which a trained network is judged, in the whole arena of its training."""
+    """Evaluation flights of a trained network, in the whole arena of its training."""
 
     episodes: int = quantity(
         "flights of each trained network, on the same seeds", "1", ge=1, le=100_000, default=100
@@ -60,7 +60,7 @@ class Examination(ProfileModel):
 
 
 class SweepConfig(ProfileModel):
-    """An architecture search."""
+    """Configuration of an architecture search."""
 
     description: str = Field(description="one line for people")
     seeds: Annotated[tuple[int, ...], Each(0, 2**31)] = quantity(
@@ -77,7 +77,7 @@ class SweepConfig(ProfileModel):
     @model_validator(mode="before")
     @classmethod
     def _described(cls, data: Any) -> Any:
-        """Give the trainings a description: each trial has its own anyway."""
+        """Add a default description to the training: each trial replaces it."""
         if isinstance(data, dict) and isinstance(data.get("training"), dict):
             training = {"description": "a trial of a sweep", **data["training"]}
             return {**data, "training": training}
@@ -102,5 +102,5 @@ class SweepConfig(ProfileModel):
 
 
 def load_sweep(name: str) -> SweepConfig:
-    """Load a sweep, shipped or by path. Raises UsageError; see `load_profile`."""
+    """Load a sweep, built-in or by path. Raises UsageError; see `load_profile`."""
     return load_profile("sweeps", name, SweepConfig)

@@ -1,4 +1,4 @@
-"""The page of an architecture search: the networks of each arena, and what they cost."""
+"""Page of an architecture search: the networks of each arena, and their cost."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from airl_mav.sweep.tables import count, interval, networks_table, percent, t2_m
 from airl_mav.sweep.trial import training_of, trials
 
 ASIDE = 1.03
-"""Factor between the dots of one network in two arenas."""
+"""Horizontal factor between the dots of one network in two arenas."""
 MARKERS = ("o", "s", "^", "D", "v")
 LABELLED = 20
-"""So many networks get their name in the trade-off; of more, only the best of each arena."""
+"""Maximum number of labelled networks in the trade-off; beyond, only each arena's best."""
 
 
 def success_picture(sweep: Sweep, arena: str) -> theme.Picture:
@@ -62,7 +62,7 @@ def _success_text(cell: NetworkSummary) -> str:
 
 
 def cost_picture(sweep: Sweep, arena: str) -> theme.Picture:
-    """Draw what each network costs: multiply-accumulates, or the latency estimated from them."""
+    """Draw the cost of each network: multiply-accumulates, or the latency estimated from them."""
     cells = sweep.of(arena)
     values = [_cost(sweep, cell) for cell in cells]
     sizes = [f"{count(cell.macs)} MAC" for cell in cells]
@@ -99,7 +99,7 @@ def _heat_map(
     fields: Sequence[Field],
     **look: Any,
 ) -> HeatMap:
-    """Return the fields of some networks in the grid of an arena."""
+    """Return a heat map of some networks in the grid of an arena."""
     grid = next(grid for grid in sweep.config.grids if grid.name == arena)
     return HeatMap(
         rows=grid.layers,
@@ -141,7 +141,7 @@ def trade_picture(sweep: Sweep) -> theme.Picture:
                     zorder=4,
                 )
     ax.set_xscale("log")
-    # Every 1, 2 and 5 has its number: a grid spans hardly more than a decade.
+    # Label every 1, 2 and 5: a grid spans hardly more than a decade.
     ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.xaxis.set_major_formatter(
         FuncFormatter(lambda v, _: f"{v:g}" if sweep.computer is not None else count(v))
@@ -161,7 +161,7 @@ def trade_picture(sweep: Sweep) -> theme.Picture:
 def _draw_network(
     ax: Axes, cell: NetworkSummary, x: float, number: int, *, chosen: bool, label: str | None
 ) -> None:
-    """Draw one network of the arena with a number."""
+    """Draw one network of an arena, styled by the arena's number."""
     rate, colour = cell.success_rate, theme.line_style(number).colour
     if rate.low is not None and rate.high is not None:
         ends = [100.0 * rate.low, 100.0 * rate.high]
@@ -180,7 +180,7 @@ def _draw_network(
 
 
 def document_of(sweep: Sweep) -> Document:
-    """Return everything that a sweep says; at least one trial has ended."""
+    """Return the page of a sweep with at least one finished trial."""
     sections = [
         Section(
             arena,
@@ -222,7 +222,7 @@ def _arena_pictures(sweep: Sweep, arena: str) -> list[Picture]:
 
 
 def best_sentences(sweep: Sweep, arena: str) -> tuple[str, ...]:
-    """Return which network was best in an arena, how sure that is, and the published one."""
+    """Return sentences on an arena's best network, its interval, and the published one."""
     best, published = sweep.best(arena), published_best(arena)
     if best is None:
         return ("No trial has ended yet.",)
@@ -245,7 +245,7 @@ def best_sentences(sweep: Sweep, arena: str) -> tuple[str, ...]:
 
 
 def sweep_facts(sweep: Sweep) -> Facts:
-    """Return what was searched and how."""
+    """Return the facts of the search."""
     config = sweep.config
     training = training_of(config, trials(config)[0])
     environment, judged = training.environment, config.evaluation

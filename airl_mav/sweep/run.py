@@ -1,4 +1,4 @@
-"""Carry out a sweep: the trials that are left, by any executor."""
+"""Execution of a sweep: runs the remaining trials, by any executor."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from airl_mav.training.store import TrainingFolder
 
 
 class SweepRequest(Workers):
-    """An architecture search, and how it is carried out. The methods raise UsageError."""
+    """Request of an architecture search and its execution. The methods raise UsageError."""
 
     sweep: str = Field(
         default="quick",
@@ -82,7 +82,7 @@ class SweepRequest(Workers):
         return (self.out or Path("runs") / f"sweep-{self.name}").absolute()
 
     def config(self) -> SweepConfig:
-        """Load the sweep, put the values that were given into it, and check it."""
+        """Load the sweep, apply the given values, and validate the result."""
         data = load_sweep(self.sweep).model_dump(exclude_unset=True)
         if self.seeds is not None:
             data["seeds"] = range(1, self.seeds + 1)
@@ -101,7 +101,7 @@ class SweepRequest(Workers):
         return validated(SweepConfig, data)
 
     def executor_settings(self) -> ExecutorSettings:
-        """Return who carries out the trials, and what share of a GPU each takes."""
+        """Return the executor settings of the trials, with their GPU share."""
         gpus = self.ray_gpus
         if gpus is not None and self.executor != "ray":
             raise FieldError("ray_gpus", gpus, "with executor ray")
@@ -110,7 +110,7 @@ class SweepRequest(Workers):
         return validated(ExecutorSettings, data | {"ray_gpus": default if gpus is None else gpus})
 
     def for_computer(self) -> Computer | None:
-        """Return the computer whose decision latency each cell shows; None: none."""
+        """Return the computer for each cell's decision latency, or None."""
         if self.computer is None:
             return None
         computer = Computer(self.computer, load_computer(self.computer))
@@ -122,16 +122,16 @@ LOOK_US = US_PER_S
 """Interval at which the evaluations of the trainings are read [wall µs]."""
 
 MOST_BARS = 12
-"""Trials under way that get a bar of their own."""
+"""Maximum number of running trials with a progress bar."""
 
 
 def _worker(
     folder: SweepFolder,
     command: str,
     device: str,
-    stop: Stop,  # noqa: ARG001 (a worker is ended, and loses no checkpoint)
+    stop: Stop,  # noqa: ARG001 (a worker is killed, and loses no checkpoint)
 ) -> Callable[[Trial], list[TrialResult]]:
-    """Return what carries out a trial."""
+    """Return the function that runs a trial."""
     # Imported late: the learner takes two seconds to load, and only a worker needs it.
     from airl_mav.sweep.run_trial import run_trial
 
@@ -151,10 +151,10 @@ def run_sweep(
 ) -> tuple[Sweep, str | None]:
     """Run the remaining trials; `sweep.json` is written after each.
 
-    All workers see the folder, new or to resume, under this path. `stop` is polled several times a
+    All workers see the folder, new or resumed, under this path. `stop` is polled several times a
     second. True stops the sweep and keeps finished trials. Returns the sweep so far, and the reason
-    of an early end or None. Raises UsageError for invalid input, or if the folder holds something
-    else.
+    of an early end or None. Raises UsageError for invalid input, or if the folder contains
+    something else.
     """
     say = partial(progress.note, style="yellow")
     with open_campaign(path, declaration(config), command=command, say=say) as store:
@@ -191,14 +191,14 @@ def run_sweep(
 
 
 class _TrialBars:
-    """A bar over the sweep, one for each trial under way, and a line for each that has ended."""
+    """Progress bar of the sweep, a bar for each running trial, and a line for each finished one."""
 
     def __init__(
         self, progress: Progress, folder: SweepFolder, total: int, waiting: Sequence[Trial]
     ) -> None:
         self._progress, self._folder = progress, folder
         self._total, self._steps = total, folder.config.training.steps
-        # Measured on one core, a decision's cost grows more slowly than its multiply-accumulates.
+        # Measured on one core: a decision's cost grows more slowly than its multiply-accumulates.
         self._left = {trial: size_of(folder.config, trial).macs ** 0.75 for trial in waiting}
         self._bar = progress.bar("sweep", sum(self._left.values()) or 1.0)
         self._bars: dict[Trial, Bar] = {}
@@ -206,7 +206,7 @@ class _TrialBars:
         self._clock, self._due_us = WallClock(), 0
 
     def finished(self, result: TrialResult) -> None:
-        """Count a trial that has just ended."""
+        """Count a finished trial."""
         trial, trained = result.trial, result.trained
         self._done += self._left.pop(trial)
         if trial in self._bars:
@@ -221,7 +221,7 @@ class _TrialBars:
         self.look()
 
     def look(self) -> None:
-        """Look how far the trainings are; cheap, to be called often."""
+        """Update the progress of the trainings; cheap, call it often."""
         if self._clock.time_us() < self._due_us:
             return
         self._due_us = self._clock.time_us() + LOOK_US

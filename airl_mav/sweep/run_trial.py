@@ -1,4 +1,4 @@
-"""A resumable trial: train, choose the best weights, export them, fly them, write the result."""
+"""Resumable trial: train, select the best weights, export them, fly them, write the result."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from airl_mav.training.store import TrainingFolder, TrainingProgress
 def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> TrialResult:
     """Run or resume a trial on cpu or cuda; return its result. Raises UsageError."""
     config, path = training_of(folder.config, trial), folder.trial_path(trial)
-    # Waits for a worker that is just being ended to let go of the trial.
+    # Waits for an ending worker to release the trial.
     with locked(path, lambda _: None):
         training = TrainingFolder.begin(path, config, command, resume=True)
-        # Looked at under the lock: whoever had it may have ended the trial.
+        # Checked under the lock: its previous owner may have ended the trial.
         if (done := folder.result(trial)) is not None:
             return done
         best = fit(config, training, TrainingProgress(), device)
@@ -37,7 +37,7 @@ def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> T
 
 
 def fly_best(training: TrainingFolder, config: TrainingConfig, seeds: range) -> list[EpisodeResult]:
-    """Fly the exported policy of a training as `airl evaluate` would, at level gym."""
+    """Fly the exported policy of a training like `airl evaluate`, at level gym."""
     policy = load_learned(training.policy, trust=True)
     navigation = Navigation(nominal(config.environment), min(SLOTS, len(seeds)))
     pilots = LearnedPilots(policy, lambda seed: np.random.default_rng(seed))

@@ -1,12 +1,12 @@
-"""The folder of a sweep: a campaign (`experiments.store`) whose cells are the trials.
+"""Folder of a sweep: a campaign (`experiments.store`) with trials as cells.
 
     campaign.json           the search space
-    sweep.json              every result and network so far
-    sweep.md, .html, .png   the same for people
-    <trial>/                a training folder (`training.store`), and of the sweep:
-        result.json         the result: its presence ends a trial
+    sweep.json              current results and networks
+    sweep.md, .html, .png   the results for people
+    <trial>/                a training folder (`training.store`), with a file of the sweep:
+        result.json         the result, which marks a finished trial
 
-Any process on any machine that sees the folder can run a trial or resume it.
+Any process on any machine with access to the folder can run or resume a trial.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ SWEEP_FILE = "sweep.json"
 RESULT_FILE = "result.json"
 
 MAY_CHANGE = ("description", "grids", "seeds")
-"""Fields with which a sweep can go on changed: they add trials, or leave some for later."""
+"""Fields that may change when a sweep resumes: they add or postpone trials."""
 
 
 @dataclass(frozen=True)
 class _ResultFile:
-    """What `result.json` holds."""
+    """Contents of `result.json`."""
 
     evaluation: dict[str, Any]
-    """The flights that the figures rest on."""
+    """Flights behind the figures."""
     result: TrialResult
     schema: int = SCHEMA
 
@@ -50,7 +50,7 @@ _RESULT_FILE = TypeAdapter(_ResultFile)
 
 @dataclass(frozen=True)
 class SweepFolder:
-    """The trials of a sweep on disk. Goes to other processes by pickle."""
+    """Trials of a sweep on disk. Pickled for other processes."""
 
     path: Path
     config: SweepConfig
@@ -61,11 +61,11 @@ class SweepFolder:
 
     @property
     def evaluation(self) -> dict[str, Any]:
-        """On which flights results rest."""
+        """Evaluation flights of the results."""
         return self.config.evaluation.model_dump(mode="json")
 
     def result(self, trial: Trial) -> TrialResult | None:
-        """Return a trial's result, None before its end; UsageError if it is of another trial."""
+        """Return a trial's result, None before its end; UsageError if from another trial."""
         path = self.trial_path(trial) / RESULT_FILE
         if not path.exists():
             return None
@@ -77,11 +77,11 @@ class SweepFolder:
         return held.result
 
     def results(self, wanted: Sequence[Trial]) -> list[TrialResult]:
-        """Return the results that are there, in the order of the trials. Raises UsageError."""
+        """Return the existing results, in the order of the trials. Raises UsageError."""
         return [found for trial in wanted if (found := self.result(trial)) is not None]
 
     def finish(self, result: TrialResult, checkpoints: Path) -> None:
-        """End a trial; what was only there to go on with is removed."""
+        """End a trial, and remove the files needed only to resume."""
         folder = self.trial_path(result.trial)
         held = _ResultFile(self.evaluation, result)
         write_json(folder / RESULT_FILE, _RESULT_FILE.dump_python(held, mode="json"))
@@ -98,7 +98,7 @@ def as_data(config: SweepConfig) -> dict[str, Any]:
 
 
 def declaration(config: SweepConfig) -> Declaration:
-    """Return a sweep as a campaign: its cells are the trials."""
+    """Return a sweep as a campaign with trials as cells."""
     return Declaration(
         kind="sweep",
         settings={key: value for key, value in as_data(config).items() if key not in MAY_CHANGE},

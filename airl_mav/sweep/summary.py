@@ -1,4 +1,4 @@
-"""The cells of a sweep: each network over its training seeds, and the best one of an arena."""
+"""Cells of a sweep: each network over its training seeds, and the best one of an arena."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from airl_mav.sweep.trial import Trial, TrialResult, size_of, trials
 
 @dataclass(frozen=True)
 class Computer:
-    """A computer whose decision latency is estimated for each cell."""
+    """Computer whose decision latency is estimated for each cell."""
 
     name: str
     profile: ComputerProfile
@@ -31,7 +31,7 @@ class Computer:
 
 @dataclass(frozen=True)
 class NetworkSummary:
-    """One network in one arena, over its training seeds."""
+    """Network in one arena, over its training seeds."""
 
     arena: str
     layers: int
@@ -39,11 +39,11 @@ class NetworkSummary:
     parameters: int
     macs: int
     t2_ms: float | None
-    """Estimated decision latency on the computer asked for [ms]; None: no computer."""
+    """Estimated decision latency on the requested computer [ms]; None: no computer."""
     planned: int
     """Number of training seeds."""
     results: tuple[TrialResult, ...]
-    """Of the trials that have ended, by seed."""
+    """Results of finished trials, by seed."""
     success_rate: Estimate
     """Mean over the training seeds, 0 to 1, with its 95 % interval; n counts seeds."""
     success_std: float | None
@@ -57,7 +57,7 @@ class NetworkSummary:
 
     @property
     def network(self) -> str:
-        """The template in short: layers x filters."""
+        """Short name of the template: layers x filters."""
         return f"{self.layers}x{self.filters}"
 
 
@@ -66,7 +66,7 @@ _NETWORK = TypeAdapter(NetworkSummary)
 
 @dataclass(frozen=True)
 class Sweep:
-    """All networks of a sweep, as far as they are."""
+    """All networks of a sweep with their current results."""
 
     folder: SweepFolder
     made: dict[str, Any]
@@ -75,7 +75,7 @@ class Sweep:
 
     @property
     def config(self) -> SweepConfig:
-        """What was asked for."""
+        """Sweep configuration."""
         return self.folder.config
 
     @property
@@ -103,12 +103,12 @@ class Sweep:
 
     @property
     def ended(self) -> int:
-        """Number of trials that have ended."""
+        """Number of finished trials."""
         return sum(len(cell.results) for cell in self.cells)
 
     @property
     def planned(self) -> int:
-        """Number of trials in all."""
+        """Total number of trials."""
         return sum(cell.planned for cell in self.cells)
 
 
@@ -182,7 +182,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def estimated_ms(computer: ComputerProfile, macs: int) -> float:
-    """Return a network's mean t2 [ms] by MACs, or raise UsageError without workload."""
+    """Return a network's mean t2 [ms] by MACs. Raises UsageError without workload."""
     latency = choose_injection(computer, ESTIMATE, macs=macs).latency
     if not isinstance(latency, Latency):
         raise UsageError("--computer: has no workload to estimate from")
@@ -193,7 +193,7 @@ def estimated_ms(computer: ComputerProfile, macs: int) -> float:
 
 
 def write_sweep(sweep: Sweep) -> None:
-    """Write `sweep.json`, whole or not at all."""
+    """Write `sweep.json` atomically."""
     data = {
         "schema": SCHEMA,
         "made": sweep.made,

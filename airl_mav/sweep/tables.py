@@ -1,4 +1,4 @@
-"""The networks of an arena as a table: what they came to, or what they would take."""
+"""Tables of an arena's networks: their results, or their planned cost."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from airl_mav.sweep.store import SweepFolder
 from airl_mav.sweep.summary import Computer, NetworkSummary, Sweep, summarize
 
 Described = tuple[Column, Callable[[NetworkSummary], str]]
-"""A column, and what it says of a network."""
+"""Column, and the function that formats its cells."""
 
 
 def count(number: float) -> str:
@@ -48,7 +48,7 @@ def _seeds(cell: NetworkSummary) -> str:
 
 
 def _mean(field: str, form: str, unit: float = 1.0) -> Callable[[NetworkSummary], str]:
-    """Return what writes a mean over the seeds in a form, as a number of units."""
+    """Return a formatter of a mean over the seeds, in a given unit."""
 
     def write(cell: NetworkSummary) -> str:
         value: float | None = getattr(cell, field)
@@ -77,7 +77,7 @@ RESULTS: tuple[Described, ...] = (
 
 
 def networks_table(sweep: Sweep, arena: str) -> TableView:
-    """Return the networks of an arena, the best first; those without a result last."""
+    """Return the networks of an arena, the best first, networks without a result last."""
     cells = sorted(sweep.of(arena), key=lambda c: (-(c.success_rate.value or -1.0), c.macs))
     notes = [
         "Network: layers x filters. Success: mean over the training seeds, each of the same "
@@ -96,7 +96,7 @@ def networks_table(sweep: Sweep, arena: str) -> TableView:
 def print_plan(
     name: str, config: SweepConfig, computer: Computer | None, path: Path, console: Console
 ) -> None:
-    """Print a sweep's plan; UsageError if the folder holds other results."""
+    """Print a sweep's plan; UsageError if the folder contains other results."""
     sweep = summarize(SweepFolder(path, config), {}, computer)
     steps, episodes = config.training.steps, config.evaluation.episodes
     most = "at most " if config.training.selection.stop_at is not None else ""
@@ -128,7 +128,7 @@ def _table(
     cells: Sequence[NetworkSummary],
     notes: Sequence[str] = (),
 ) -> TableView:
-    """Return a row for each network, with its latency where a computer was named."""
+    """Return a row for each network, with its latency if a computer was named."""
     shown = (*described, *([T2] if sweep.computer is not None else []))
     rows = tuple(tuple(write(cell) for _, write in shown) for cell in cells)
     return TableView(key, title, tuple(column for column, _ in shown), rows, tuple(notes))

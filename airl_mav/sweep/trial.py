@@ -1,4 +1,4 @@
-"""A trial of a sweep: one network, one arena, one seed; and what came out of it."""
+"""Trial of a sweep: one network, one arena, one seed; and its result."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from airl_mav.training.config import NetworkSpec, TrainingConfig
 
 @dataclass(frozen=True, order=True)
 class Trial:
-    """Which network learns where, from which seed."""
+    """Network, arena and seed of a training."""
 
     arena: str
-    """Arena profile, as the sweep names it."""
+    """Arena profile, as named in the sweep."""
     layers: int
     filters: int
     seed: int
-    """Of weights, exploration and episodes."""
+    """Seed of weights, exploration and episodes."""
 
     @property
     def arena_name(self) -> str:
-        """Name of the arena, as folders carry it."""
+        """Name of the arena in folder names."""
         return Path(self.arena).stem
 
     @property
     def network(self) -> str:
-        """The template in short: layers x filters."""
+        """Short name of the template: layers x filters."""
         return f"{self.layers}x{self.filters}"
 
     @property
@@ -46,7 +46,7 @@ class Trial:
 
     @property
     def title(self) -> str:
-        """One line for people."""
+        """Title in one line."""
         return f"template {self.network} in {self.arena_name}, seed {self.seed}"
 
 
@@ -61,7 +61,7 @@ def trials(config: SweepConfig) -> list[Trial]:
 
 
 def training_of(config: SweepConfig, trial: Trial) -> TrainingConfig:
-    """Return how a trial is trained."""
+    """Return the training configuration of a trial."""
     base = config.training
     network = NetworkSpec(kind="template", layers=trial.layers, filters=trial.filters)
     return base.model_copy(
@@ -93,20 +93,20 @@ def size_of(config: SweepConfig, trial: Trial) -> Size:
 
 @dataclass(frozen=True)
 class Trained:
-    """How the training went."""
+    """Training result."""
 
     steps: int
     best_steps: int
-    """Decisions after which the weights were best; those fly."""
+    """Decisions after which the weights were best; these weights fly."""
     selection_success: float
     """Success rate of the best weights on the selection seeds, 0 to 1."""
     seconds: float
-    """Wall time of the training, evaluations left out [s]."""
+    """Wall time of the training without evaluations [s]."""
 
 
 @dataclass(frozen=True)
 class TrialResult:
-    """A trained network in figures. Means are over the flights that reached the goal."""
+    """Figures of a trained network. Means are over the flights that reached the goal."""
 
     trial: Trial
     parameters: int
@@ -116,7 +116,7 @@ class TrialResult:
     successes: int
     outcomes: dict[Outcome, int]
     flight_time_s: float | None
-    """None: no flight reached the goal."""
+    """Mean flight time; None: no flight reached the goal."""
     distance_m: float | None
     energy_j: float | None
 
@@ -130,7 +130,7 @@ def result_of(
     trial: Trial, parameters: int, macs: int, trained: Trained, flown: Sequence[EpisodeResult]
 ) -> TrialResult:
     """Return the figures of a trial's flights, at least one."""
-    # Flights end in an order of their own: sums must not depend on it.
+    # Flights end in arbitrary order: sums must not depend on it.
     flights = sorted(flown, key=lambda flight: flight.seed)
     outcomes = dict.fromkeys(OUTCOMES.values(), 0)
     for flight in flights:

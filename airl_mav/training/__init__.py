@@ -1,1 +1,1 @@
-"""Learning: networks, algorithms, checkpoints."""
+"""Training: networks, algorithms, checkpoints."""

@@ -1,8 +1,8 @@
-"""From a specification to a learner: our double DQN, PPO, and any other of stable-baselines3.
+"""Construction of learners: built-in double DQN, PPO and other stable-baselines3 algorithms.
 
-Networks are those that stable-baselines3 takes. The extractor holds the convolutions and joins
-their output with velocity and goal. The dense layers are the policy's `net_arch`, so that every
-algorithm builds its own heads on it.
+Networks follow stable-baselines3. The extractor contains the convolutions and joins their output
+with velocity and goal. The dense layers are the policy's `net_arch`, so that every algorithm builds
+its own heads on them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from airl_mav.training.table import ALGORITHMS, Algorithm
 BATCH = ALGORITHMS["dqn"].batch
 
 ROLLOUT = 4096
-"""Steps of all vehicles between two rounds of updates of `ppo` and `trpo`."""
+"""Steps of all vehicles in a rollout of `ppo` and `trpo`."""
 
 
 def make_model(
@@ -82,7 +82,7 @@ def _algorithm_class(name: str) -> Any:
 
 
 def _arguments(spec: config.AlgorithmSpec, row: Algorithm, vehicles: int) -> dict[str, Any]:
-    """Return the constructor's arguments, those of `options` included."""
+    """Return the constructor's arguments, including `options`."""
     arguments = {argument: getattr(spec, name) for name, argument in row.fields.items()}
     if spec.learning_rate_final is not None:
         arguments["learning_rate"] = LinearSchedule(
@@ -93,23 +93,22 @@ def _arguments(spec: config.AlgorithmSpec, row: Algorithm, vehicles: int) -> dic
     arguments |= row.defaults
     if row.rollouts:
         arguments["n_steps"] = _rollout_steps(arguments["batch_size"], vehicles)
-    # A TOML list is what stable-baselines3 takes as a tuple.
+    # A TOML list is a tuple in stable-baselines3.
     options = {k: tuple(v) if isinstance(v, list) else v for k, v in spec.options.items()}
     return arguments | options
 
 
 def _rollout_steps(batch_size: int, vehicles: int) -> int:
-    """Return the steps of each vehicle in a rollout that whole batches fill."""
+    """Return the steps of each vehicle in a rollout that divides into whole batches."""
     multiple = batch_size // math.gcd(batch_size, vehicles)
     return max(ROLLOUT // vehicles // multiple, 1) * multiple
 
 
 VECTORS = (VELOCITY, GOAL, IN_FLIGHT)
-"""Inputs that join the convolutions, in this order and before any others. Not every layout has
-all."""
+"""Inputs that join the convolutions, in this order and before any others. Layouts may lack some."""
 
 OWN_DENSE = (128, 128)
-"""Units of the dense layers behind an extractor of the user's, where none are given."""
+"""Default units of the dense layers behind a custom extractor."""
 
 
 class Convolution(NamedTuple):
@@ -132,7 +131,7 @@ def convolutions(spec: NetworkSpec, height_px: int) -> list[Convolution]:
             Convolution(filters, 3, stride, 1)
             for filters, stride in zip((16, 32, 32, 32), strides, strict=True)
         ]
-    # Air Learning's code has 4, 2, 1, 1 for 154 rows; a low image would be gone after two layers.
+    # Air Learning's code has 4, 2, 1, 1 for 154 rows; a low image would vanish after two layers.
     strides = spec.strides or ((4, 2, 1, 1) if height_px >= 48 else (2, 2, 1, 1))
     return [
         Convolution(filters, kernel, stride, 0)
@@ -188,20 +187,20 @@ class ImageExtractor(BaseFeaturesExtractor):
         """Return the features (n, features_dim)."""
         flat = self.convolutions(observations[self.image])
         others = [stack(observations[key]) for key, stack in self.further.items()]
-        # Under autocast the convolutions give bfloat16, the vectors are float32.
+        # Under autocast the convolutions output bfloat16, the vectors are float32.
         vectors = [observations[key].to(flat.dtype) for key in self.vectors]
         return torch.cat([flat, *others, *vectors], dim=1)
 
 
 def further_images(observation_space: spaces.Dict) -> list[str]:
-    """Return the keys of the images of further cameras, sorted."""
+    """Return the keys of the images of additional cameras, sorted."""
     main = image_key(observation_space.spaces)
     found = (key for key, part in observation_space.spaces.items() if len(part.shape or ()) == 3)
     return sorted(key for key in found if key != main)
 
 
 DepthExtractor = ImageExtractor
-"""Its name in models that were saved before there was colour."""
+"""Name in models saved before colour support."""
 
 
 def policy_arguments(spec: NetworkSpec) -> dict[str, Any]:

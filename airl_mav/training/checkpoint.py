@@ -1,8 +1,9 @@
-"""Checkpoints: everything that a training run needs to resume exactly.
+"""Checkpoints: the complete state for an exact resume of a training run.
 
-A checkpoint is a folder, written under another name, synced and renamed. Then the file `latest`
-names it, so that there is always a whole one. Save between two rollouts only (stable-baselines3's
-`on_rollout_start`). Within one, part of the state is in local variables. Nothing is unpickled.
+A checkpoint is a folder, written under another name, synced and renamed. The file `latest` then
+names it, so that a complete one always exists. Save only between two rollouts (stable-baselines3's
+`on_rollout_start`). During a rollout, part of the state is in local variables. Nothing is
+unpickled.
 """
 
 from __future__ import annotations
@@ -50,20 +51,20 @@ COUNTERS = (
     "_current_progress_remaining",
     "exploration_rate",
 )
-"""Plain numbers of a learner; not every one has all of them."""
+"""Plain numbers of a learner; each learner has some of them."""
 
 NOISE = ("exploration_mat", "exploration_matrices")
-"""What gSDE draws at the beginning of a rollout, before stable-baselines3 says that it begins."""
+"""Noise that gSDE draws for a rollout before stable-baselines3 calls `on_rollout_start`."""
 
 
 class Restorable(Protocol):
     """A VecEnv whose state can be saved and restored."""
 
     def get_state(self) -> Mapping[str, NDArray[Any]]:
-        """Return its whole state by name."""
+        """Return the complete state by name."""
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Restore what `get_state` returned."""
+        """Restore the state from `get_state`."""
 
 
 def collect(model: BaseAlgorithm) -> tuple[dict[str, Any], Arrays, dict[str, Any]]:
@@ -102,7 +103,7 @@ def collect(model: BaseAlgorithm) -> tuple[dict[str, Any], Arrays, dict[str, Any
 def restore(
     model: BaseAlgorithm, weights: dict[str, Any], arrays: Arrays, state: dict[str, Any]
 ) -> None:
-    """Restore what `collect` returned; KeyError, RuntimeError or ValueError if it does not fit."""
+    """Restore the state from `collect`; KeyError, RuntimeError or ValueError if it does not fit."""
     model.set_parameters(weights["states"], exact_match=True, device=model.device)
     for name in _variables(model):
         attrgetter(name)(model).data.copy_(weights["variables"][name])
@@ -124,7 +125,7 @@ def restore(
     window = model._stats_window_size
     model.ep_info_buffer = deque(state["episodes"], maxlen=window)
     model.ep_success_buffer = deque(state["successes"], maxlen=window)
-    # Last: what came before may have drawn.
+    # Last, as the calls above may have drawn random numbers.
     version, internal, gauss = state["random"]["python"]
     random.setstate((version, tuple(internal), gauss))
     np.random.set_state(state["random"]["numpy"])  # noqa: NPY002
@@ -140,7 +141,7 @@ def _variables(model: BaseAlgorithm) -> list[str]:
 
 
 def _memory(model: BaseAlgorithm) -> list[torch.Tensor]:
-    """Return what a recurrent learner's networks remember of the flights that go on."""
+    """Return the memory of a recurrent learner's networks for the running episodes."""
     states = getattr(model, "_last_lstm_states", None)
     return [] if states is None else [each for pair in states for each in pair]
 
@@ -151,19 +152,19 @@ def _explorer(model: BaseAlgorithm) -> Any:
 
 
 def _restore_noise(model: BaseAlgorithm, saved: Mapping[str, torch.Tensor]) -> None:
-    """Put gSDE's noise back; the draw with which the next rollout begins has been made."""
+    """Restore gSDE's noise, and skip the draw at the start of the next rollout."""
     explorer = _explorer(model)
     for name in NOISE:
         setattr(explorer.action_dist, name, saved[name].to(model.device))
 
-    def once(n_envs: int = 1) -> None:  # noqa: ARG001 (the signature of what it stands for)
+    def once(n_envs: int = 1) -> None:  # noqa: ARG001 (the replaced method's signature)
         del explorer.reset_noise
 
     explorer.reset_noise = once
 
 
 def _generators(model: BaseAlgorithm) -> list[np.random.Generator]:
-    """Return the generators that a learner draws from, beside the global ones."""
+    """Return the random generators of a learner, without the global ones."""
     own = getattr(model, "generator", None)
     return [model.action_space.np_random, *([] if own is None else [own])]
 
@@ -179,7 +180,7 @@ def _below(prefix: str, arrays: Arrays) -> Arrays:
 
 
 def _get_replay(model: BaseAlgorithm) -> Arrays:
-    """Return the filled part of a learner's replay memory by name; nothing when it has none."""
+    """Return the filled part of a learner's replay memory by name; empty without replay memory."""
     if isinstance(model, DoubleDQN | Imitation):
         return model.replay.get_state()
     buffer = _stock_buffer(model)
@@ -191,7 +192,7 @@ def _get_replay(model: BaseAlgorithm) -> Arrays:
 
 
 def _set_replay(model: BaseAlgorithm, saved: Mapping[str, NDArray[Any]]) -> None:
-    """Put back what `_get_replay` gave. Raises ValueError when it is of another size."""
+    """Restore the data of `_get_replay`. Raises ValueError if the size differs."""
     if isinstance(model, DoubleDQN | Imitation):
         model.replay.set_state(saved)
         return
@@ -217,7 +218,7 @@ def _stock_arrays(buffer: DictReplayBuffer) -> Arrays:
 
 SCHEMA = 1
 KEEP = 2
-"""Checkpoints that stay: the newest, and one to go back to."""
+"""Number of checkpoints kept: the newest and a fallback."""
 
 LATEST = "latest"
 PREFIX = "checkpoint-"
@@ -248,14 +249,14 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, meta: Mapping[str, Any])
     sync_folder(folder)
     replace_file(folder / LATEST, f"{final.name}\n".encode())
     for old in _all(folder)[:-KEEP]:
-        # Half removed, it must not look like a checkpoint.
+        # A partly removed folder must not look like a checkpoint.
         old.rename(old.with_name(old.name + PARTIAL))
         shutil.rmtree(old.with_name(old.name + PARTIAL))
     return final
 
 
 def _write(partial: Path, model: BaseAlgorithm, meta: Mapping[str, Any]) -> None:
-    """Write the files of a checkpoint and bring them to the disk. Raises OSError."""
+    """Write the files of a checkpoint and sync them to disk. Raises OSError."""
     weights, arrays, state = collect(model)
     keywords: dict[str, Any] = dict(arrays)
     with naming(partial):
@@ -297,7 +298,7 @@ def load_latest(
                 f"{' '.join(line.strip() for line in reason)[:200]}"
             ) from None
         for old in damaged:
-            # Out of the count of those that stay.
+            # Damaged checkpoints do not count towards KEEP.
             aside = old.with_name(old.name + DAMAGED)
             shutil.rmtree(aside, ignore_errors=True)
             old.rename(aside)
@@ -309,7 +310,7 @@ def load_latest(
 
 
 def _read(path: Path) -> tuple[dict[str, Any], Arrays, dict[str, Any]]:
-    """Read a checkpoint. Raises DamagedError when it is not what was written."""
+    """Read a checkpoint. Raises DamagedError if its files do not match the manifest."""
     try:
         manifest = read_json(path / MANIFEST, SCHEMA, "checkpoint")
         for name in (WEIGHTS, ARRAYS, STATE):
@@ -349,7 +350,7 @@ def _serial(path: Path) -> int:
 
 
 def _plain(value: Any) -> Any:
-    """Return a numpy scalar or array as JSON has it."""
+    """Return a numpy scalar or array as plain JSON data."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} is no JSON")

@@ -1,4 +1,4 @@
-"""A training run as a TOML file: environment, network, algorithm, and how long."""
+"""Configuration of a training run, a TOML file: environment, network, algorithm, duration."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from airl_mav.profiles.computer import load_computer
 from airl_mav.training.table import ALGORITHMS, ActionKind, fitting
 
 SELECTION_SEED = 500_000
-"""First seed of the selection episodes; those of training begin at a million, those of evaluation
-at one."""
+"""First seed of the selection episodes; training starts at a million, evaluation at one."""
 
 SHIPPED_NETWORKS = ("small", "appendix", "template")
 NetworkKind = Annotated[str, part_name(NETWORKS, SHIPPED_NETWORKS)]
@@ -39,11 +38,11 @@ ACTION_SETS = {
 class NetworkSpec(ProfileModel):
     """Convolutions over the depth image; velocity and goal join before the dense layers.
 
-    `small`: convolutions 16-32-32-32 (3x3), dense 128x2; the fastest that learns well.
-    `appendix`: Air Learning's network: convolutions 32 (4x4), 64 (4x4), 128 (2x2), 64 (1x1),
-    dense 256x3. `template`: Air Learning's sweep: `layers` convolutions of `filters` 3x3 filters,
-    stride 1, and as many dense layers of as many units. Any other is a features extractor of
-    stable-baselines3 of your own, as MODULE:CLASS or FILE.py:CLASS, which sees all inputs.
+    `small`: convolutions 16-32-32-32 (3x3), dense 128x2; the fastest that learns well. `appendix`:
+    Air Learning's network: convolutions 32 (4x4), 64 (4x4), 128 (2x2), 64 (1x1), dense 256x3.
+    `template`: Air Learning's sweep: `layers` convolutions of `filters` 3x3 filters, stride 1, and
+    as many dense layers of as many units. Any other is a custom features extractor for
+    stable-baselines3, as MODULE:CLASS or FILE.py:CLASS, which receives all inputs.
     """
 
     kind: NetworkKind = Field(default="small", description="network")
@@ -71,7 +70,7 @@ class NetworkSpec(ProfileModel):
 
     @property
     def own(self) -> bool:
-        """Whether the extractor is the user's."""
+        """True for a custom extractor."""
         return self.kind not in SHIPPED_NETWORKS
 
     @model_validator(mode="after")
@@ -171,7 +170,7 @@ def check_fields(spec: AlgorithmSpec) -> None:
 
 
 def check_names(spec: AlgorithmSpec, accepted: Iterable[str]) -> None:
-    """Raise FieldError for an option that is not among those accepted."""
+    """Raise FieldError for an option that is not accepted."""
     names = list(accepted)
     for name in spec.options:
         if name not in names:
@@ -183,7 +182,7 @@ def check_names(spec: AlgorithmSpec, accepted: Iterable[str]) -> None:
 
 
 def check_actions(name: str, kind: ActionKind) -> None:
-    """Raise FieldError unless an algorithm can choose from a kind of action set."""
+    """Raise FieldError unless an algorithm supports a kind of action set."""
     wanted = ALGORITHMS[name].actions
     if wanted not in (None, kind):
         sets = ", ".join(ACTION_SETS[wanted])
@@ -235,7 +234,7 @@ class TrainingConfig(ProfileModel):
 
     @model_validator(mode="after")
     def _chooses_from_the_action_set(self) -> TrainingConfig:
-        # A set of the user's is looked at when it is trained with: reading a file runs no code.
+        # A custom set is checked at the start of training: reading a file runs no code.
         if self.environment.actions in SHIPPED:
             check_actions(self.algorithm.name, kind_of(self.environment.actions))
         return self
@@ -256,7 +255,7 @@ def configured(
 
     `steps` are decisions of all vehicles together. The latency t2 is drawn from a `workload` of the
     `computer`, or from the sources `latency`. `initial` is the training run with the initial
-    weights. Raises UsageError if a value is out of range, or needs another one.
+    weights. Raises UsageError if a value is out of range, or requires another one.
     """
     if computer is not None and workload is None:
         known = ", ".join(load_computer(computer).workloads)

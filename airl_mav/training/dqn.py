@@ -2,11 +2,11 @@
 
 Double Q-learning: van Hasselt et al., "Deep Reinforcement Learning with Double Q-learning" (AAAI
 2016). N-step returns: Sutton, "Learning to predict by the methods of temporal differences" (1988);
-as in Rainbow, the behaviour within the n steps is not corrected for.
+as in Rainbow, there is no off-policy correction within the n steps.
 
-A ring of rows, one row a step of all vehicles. Each observation is stored once: the next one is
-that of the next row. Only where the time ran out does a chain need an observation that no row
-holds, the last one of the episode; those lie aside.
+The replay memory is a ring buffer with one row per step of all vehicles. Each observation is stored
+once: the next observation is in the next row. The last observation of a truncated episode is in no
+row and is stored separately.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Batch(NamedTuple):
 class NStepReplay:
     """Replay memory of `steps` transitions, in rows of `vehicles`.
 
-    `shapes` has shape and type of each array of an observation. A chain has at most `n_step`
+    `shapes` contains shape and type of each array of an observation. A chain has at most `n_step`
     rewards.
     """
 
@@ -63,7 +63,7 @@ class NStepReplay:
         n_step: int,
         gamma: float,
     ) -> None:
-        # A sample needs the n rows behind it.
+        # A sample needs the next n rows.
         self.rows = max(steps // vehicles, 1) + n_step
         self.vehicles = vehicles
         self.n_step = n_step
@@ -121,13 +121,13 @@ class NStepReplay:
         return self.transitions((oldest + age) % self.rows, vehicle)
 
     def transitions(self, rows: NDArray[np.int64], vehicles: NDArray[np.int64]) -> Batch:
-        """Return the n-step transitions that begin at (row, vehicle); each row has n behind it."""
+        """Return the n-step transitions from (row, vehicle); each row must have n later rows."""
         returns = np.zeros(len(rows), np.float32)
         weight = np.ones(len(rows), np.float32)
         last = rows
         ended = np.zeros(len(rows), np.bool_)
         for k in range(self.n_step):
-            # A chain that has ended stays on its last row with nothing more to gain.
+            # An ended chain stays at its last row without further rewards.
             last = np.where(ended, last, (rows + k) % self.rows)
             returns += np.where(ended, np.float32(0), weight * self._rewards[last, vehicles])
             weight = np.where(ended, weight, weight * np.float32(self.gamma))
@@ -146,7 +146,7 @@ class NStepReplay:
         )
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Return the whole memory by name; views, not copies."""
+        """Return the complete memory by name; views, not copies."""
         named = self._named_rows()
         state = {name: array[: self.filled] for name, array in named.items()}
         state |= {f"last/{key}": array for key, array in self._last.items()}
@@ -155,7 +155,7 @@ class NStepReplay:
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Restore what `get_state` returned; ValueError for other shapes."""
+        """Restore the state from `get_state`; ValueError for other shapes."""
         named = self._named_rows()
         for name, array in named.items():
             saved = state[name]
@@ -193,8 +193,8 @@ class DoubleDQN(DQN):
     """DQN with double Q-learning, n-step returns and Dict observations of n vehicles.
 
     Intervals count steps of single vehicles. Vehicles explore independently. One generator draws
-    exploration and samples, so that a run can be resumed exactly. Arguments are those of
-    `config.AlgorithmSpec` and of stable-baselines3's DQN.
+    exploration and samples, so that a run can be resumed exactly. Arguments are as in
+    `config.AlgorithmSpec` and stable-baselines3's DQN.
     """
 
     def __init__(
@@ -231,9 +231,9 @@ class DoubleDQN(DQN):
         boxes = {k: cast("spaces.Box", v) for k, v in self.observation_space.spaces.items()}
         shapes = {k: (box.shape, box.dtype) for k, box in boxes.items()}
         self.replay = NStepReplay(self.buffer_size, self.n_envs, shapes, self.n_step, self.gamma)
-        # The base class only hands it from one method to another, and those are overridden below.
+        # The base class only passes it between methods that are overridden below.
         self.replay_buffer = cast("ReplayBuffer", self.replay)
-        # Before the first whole chain there is nothing to learn from.
+        # Learning requires a complete chain.
         self.learning_starts = max(self.learning_starts, self.n_step * self.n_envs)
         self.generator = np.random.default_rng(self.seed)
         super()._setup_model()
@@ -244,7 +244,7 @@ class DoubleDQN(DQN):
         action_noise: ActionNoise | None = None,  # noqa: ARG002 (the base class's signature)
         n_envs: int = 1,
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return an action for each vehicle, twice: as flown and as remembered."""
+        """Return an action for each vehicle, twice: as executed and as stored."""
         warm_up = self.num_timesteps < learning_starts
         share = 1.0 if warm_up else self.exploration_rate
         greedy = self.generator.random(n_envs) >= share
@@ -277,7 +277,7 @@ class DoubleDQN(DQN):
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """Make the updates that are due after the last step of all vehicles."""
+        """Run the updates due after the last step of all vehicles."""
         updates = gradient_steps * self._due(self.env_steps_per_update)
         if not updates:
             return
@@ -291,7 +291,7 @@ class DoubleDQN(DQN):
         self.logger.record("train/loss", float(np.mean(losses)))
 
     def _update(self, batch: Batch) -> float:
-        """Make one update and return its loss."""
+        """Run one update and return its loss."""
         following = self._tensors(batch.next_observations)
         returns, discounts = self._tensor(batch.returns), self._tensor(batch.discounts)
         with torch.no_grad(), self._autocast():
@@ -313,7 +313,7 @@ class DoubleDQN(DQN):
         return [*super()._excluded_save_params(), "replay", "generator"]
 
     def _due(self, interval: int) -> int:
-        """Return how many multiples of an interval lie within the last step of all vehicles."""
+        """Return the number of multiples of an interval within the last step of all vehicles."""
         return self.num_timesteps // interval - (self.num_timesteps - self.n_envs) // interval
 
     def _autocast(self) -> AbstractContextManager[Any]:

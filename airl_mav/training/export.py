@@ -1,4 +1,4 @@
-"""Exports models to policy folders: of stable-baselines3, ours or foreign, and plain modules."""
+"""Export of stable-baselines3 models and torch modules to policy folders."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ from airl_mav.training import export_request, onnx_export
 from airl_mav.training.recurrent import RecurrentNetwork, RecurrentOfAny
 
 DEPTH = "depth"
-"""Key of the image where the camera gives depth."""
+"""Key of the image of a depth camera."""
 
 VECTORS = (VELOCITY, GOAL)
-"""What the shipped layouts give beside the image where nothing else is told."""
+"""Inputs of the shipped layouts besides the image, without additional inputs."""
 
 USUAL = (DEPTH, *VECTORS)
-"""What most networks take."""
+"""Inputs of most networks."""
 
 CHECKED = 64
-"""Random observations on which the model's own decisions are compared."""
+"""Number of random observations to compare decisions on."""
 
 _LIBRARIES = ("airl_mav.training.dqn", "stable_baselines3", "sb3_contrib")
 
 
 class _Network(nn.Module):
-    """From the three inputs to SB3's Dict of observations."""
+    """Adapter from the three inputs to SB3's Dict of observations."""
 
     def __init__(self, inner: nn.Module) -> None:
         super().__init__()
@@ -59,7 +59,7 @@ class _Network(nn.Module):
 
 
 class _ToldNetwork(nn.Module):
-    """The same of a network that is told of its own decisions."""
+    """Adapter like `_Network`, with the additional inputs."""
 
     def __init__(self, inner: nn.Module) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class _ToldNetwork(nn.Module):
 
 
 class _AnyNetwork(nn.Module):
-    """The same of a network that takes any arrays, in the order of these keys."""
+    """Adapter like `_Network`, for any arrays in the order of their keys."""
 
     def __init__(self, inner: nn.Module, keys: Sequence[str]) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ class _AnyNetwork(nn.Module):
 
 
 class _ByName(nn.Module):
-    """From a Dict of observations to arguments of these names."""
+    """Adapter from a Dict of observations to named arguments."""
 
     def __init__(self, inner: nn.Module, names: Sequence[str]) -> None:
         super().__init__()
@@ -134,9 +134,9 @@ class _Actor(nn.Module):
 def network_of(
     model: BaseAlgorithm, keys: Sequence[str] = USUAL, learned: VecNormalize | None = None
 ) -> nn.Module:
-    """Return the deciding part of an SB3 or sb3-contrib model, for `export_network`.
+    """Return the actor of an SB3 or sb3-contrib model, for `export_network`.
 
-    `keys` are those of its layout's arrays, in order, `learned` is the VecNormalize around its
+    `keys` are the keys of the layout's arrays, in order, `learned` is the VecNormalize around the
     environment. Raises UsageError if the policy's class is not supported.
     """
     policy: Any = model.policy
@@ -159,14 +159,14 @@ def network_of(
         return network(policy.q_net)
     actor: Any = getattr(policy, "actor", None)
     if hasattr(actor, "latent_pi"):
-        # SAC and its kin: the mode of the squashed Gaussian is the squashed mean.
+        # SAC and related: the mode of the squashed Gaussian is the squashed mean.
         return network(
             _Actor(actor, actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh())
         )
     if actor is not None:
         return network(actor)
     if hasattr(policy, "mlp_extractor"):
-        # PPO and its kin: logits of discrete actions; else the mean, squashed or cut off.
+        # PPO and related: logits of discrete actions; else the mean, squashed or clipped.
         last: nn.Module = nn.Identity()
         if isinstance(policy.action_space, spaces.Box):
             last = nn.Tanh() if policy.squash_output else nn.Hardtanh(-1.0, 1.0)
@@ -183,7 +183,7 @@ def network_of(
 
 
 def _further_keys(seen: spaces.Space[Any]) -> tuple[str, ...]:
-    """Return the keys of the images of further cameras in an observation space, sorted."""
+    """Return the keys of the images of additional cameras in an observation space, sorted."""
     parts = seen.spaces if isinstance(seen, spaces.Dict) else {}
     found = (key for key, part in parts.items() if len(part.shape or ()) == 3)
     return tuple(sorted(key for key in found if key not in KINDS))
@@ -195,7 +195,7 @@ def check_spaces(
     actions: action_sets.ActionSpec,
     normalised: Collection[str] = (),
 ) -> None:
-    """Raise UsageError unless a model takes a layout's arrays and gives an action set."""
+    """Raise UsageError unless a model's spaces match a layout and an action set."""
     seen = model.observation_space
     wanted = {key: (box.shape, box.dtype) for key, box in boxes(spec).items()}
     accepted = ", ".join(f"{k} {np.dtype(kind)} {shape}" for k, (shape, kind) in wanted.items())
@@ -204,7 +204,7 @@ def check_spaces(
     fits = parts.keys() == wanted.keys() and all(
         isinstance(part, spaces.Box)
         and part.shape == wanted[key][0]
-        # SB3 turns all floats into float32.
+        # SB3 converts all floats to float32.
         and (part.dtype == np.uint8 if key in images else part.dtype.kind == "f")
         for key, part in parts.items()
     )
@@ -237,11 +237,11 @@ def check_spaces(
 
 
 def export(asked: export_request.ExportRequest, command: str) -> PolicyCard:
-    """Export the .zip of an SB3 model, or a plain module, as a policy that flies; return its card.
+    """Export the .zip of an SB3 model, or a torch module, as a policy; return its card.
 
-    A .zip holds pickled Python objects and a module is code. Export only from people you trust.
+    A .zip contains pickled Python objects and a module is code. Export only from trusted sources.
     Raises UsageError if the model cannot be loaded or exported or does not fit its description, or
-    the folder is not writable. Then nothing usable was written.
+    the folder is not writable. In this case no usable policy is written.
     """
     out = asked.out
     if out.exists() and not out.is_dir():
@@ -268,7 +268,7 @@ def export(asked: export_request.ExportRequest, command: str) -> PolicyCard:
 
 
 def taken_by(model: BaseAlgorithm) -> export_request.Taken:
-    """Return what a model's spaces say of the image and the action set."""
+    """Return the image and action set of a model's spaces."""
     seen, space = model.observation_space, model.action_space
     images = seen.spaces if isinstance(seen, spaces.Dict) else {}
     kind = next((key for key in KINDS if key in images), None)
@@ -287,10 +287,10 @@ def taken_by(model: BaseAlgorithm) -> export_request.Taken:
 
 
 def load_module(name: str, weights: Path | None, keys: Sequence[str] = USUAL) -> nn.Module:
-    """Return a user's module for `export_network`, named as in `core.plugins`.
+    """Return a custom module for `export_network`, named as in `core.plugins`.
 
-    `weights` are its `state_dict` as of `torch.save`; None = included. Raises UsageError if it
-    cannot be made, or the weights do not fit.
+    `weights` are its `state_dict` from `torch.save`; None = included. Raises UsageError if the
+    module cannot be constructed, or the weights do not fit.
     """
     found = load_part(MODELS, name)
     try:
@@ -311,19 +311,19 @@ def load_module(name: str, weights: Path | None, keys: Sequence[str] = USUAL) ->
     if len(taken) != 1:
         names = [each.name for each in taken]
         if names != list(keys) and sorted(names) == sorted(keys):
-            # A layout of the user's has its arrays sorted; the module names them as it likes.
+            # A custom layout has sorted arrays; the module may name its arguments in any order.
             return _AnyNetwork(_ByName(module, names), keys)
         return module
     return _Network(module) if tuple(keys) == USUAL else _AnyNetwork(module, keys)
 
 
 def _load_weights(module: nn.Module, path: Path) -> None:
-    """Load a module's weights; nothing is unpickled but tensors. Raises FieldError."""
+    """Load a module's weights; only tensors are unpickled. Raises FieldError."""
     if not path.is_file():
         raise FieldError("weights", path, problem="no such file")
     try:
         module.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
-    except Exception as error:  # Anything, from a bad archive to another network's weights.
+    except Exception as error:  # Any type, from a bad archive to another network's weights.
         told = " ".join(str(error).split())
         raise FieldError("weights", path, problem=f"not the module's: {told[:200]}") from None
 
@@ -355,7 +355,7 @@ def export_sb3(
 def load_sb3(path: Path, algorithm: str) -> BaseAlgorithm:
     """Load a model from a saved .zip of an algorithm's class; UsageError if it is not one.
 
-    The archive holds pickled Python objects: load only those of people you trust.
+    The archive contains pickled Python objects: load only archives from trusted sources.
     """
     learner = algorithm_class(algorithm)
     if not path.is_file():
@@ -363,11 +363,11 @@ def load_sb3(path: Path, algorithm: str) -> BaseAlgorithm:
     if not zipfile.is_zipfile(path):
         raise UsageError(f"{path}: not a .zip of stable-baselines3")
     try:
-        # Nothing will be learned: no room for a million steps.
+        # No training: no replay memory for a million steps.
         model: BaseAlgorithm = learner.load(
             path, device="cpu", custom_objects={"buffer_size": 1000, "tensorboard_log": None}
         )
-    except Exception as error:  # Unpickling raises whatever the pickled objects do.
+    except Exception as error:  # Unpickling raises arbitrary exceptions.
         raise UsageError(
             f"{path}: not a model of {learner.__name__}: {first_line(error)}"
         ) from None
@@ -409,7 +409,7 @@ def _check_decisions(
     if action_sets.discrete_actions(facts.actions) is None:
         same = np.abs(outputs - decided).max() <= slack
     else:
-        # Of two that are as good as each other either may win.
+        # Either of two equally good actions may win.
         same = (outputs[np.arange(CHECKED), decided] >= outputs.max(axis=1) - slack).all()
     if not same:
         raise UsageError(

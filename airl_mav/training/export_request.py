@@ -36,10 +36,10 @@ FIELD = "vec_normalize"
 
 
 class Normalised(nn.Module):
-    """Normalises observations as a VecNormalize does, in front of what takes a Dict of them."""
+    """Normalisation of observations as in VecNormalize, before a network with Dict inputs."""
 
     def __init__(self, inner: nn.Module, learned: VecNormalize) -> None:
-        """Take the statistics as they are."""
+        """Copy the statistics."""
         super().__init__()
         self.inner = inner
         self.keys = normalised_keys(learned)
@@ -50,7 +50,7 @@ class Normalised(nn.Module):
                 self.register_buffer(f"{name}_{key}", torch.from_numpy(np.asarray(values)).float())
 
     def forward(self, seen: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Return what the inner network makes of the normalised observations."""
+        """Return the inner network's output for the normalised observations."""
         seen = dict(seen)
         for key in self.keys:
             away = seen[key].float() - self.get_buffer(f"mean_{key}")
@@ -61,7 +61,7 @@ class Normalised(nn.Module):
 
 
 def normalised_keys(learned: VecNormalize | None) -> tuple[str, ...]:
-    """Return the keys of the observations that are normalised; where rewards alone are, none."""
+    """Return the keys of the normalised observations; empty if only rewards are normalised."""
     if learned is None or not learned.norm_obs:
         return ()
     return tuple(learned.norm_obs_keys or ())
@@ -70,14 +70,14 @@ def normalised_keys(learned: VecNormalize | None) -> tuple[str, ...]:
 def load_normalisation(path: Path) -> VecNormalize:
     """Load a saved VecNormalize of Dict observations, or raise FieldError.
 
-    The file holds pickled Python objects: load only those of people you trust.
+    The file contains pickled Python objects: load only files from trusted sources.
     """
     if not path.is_file():
         raise FieldError(FIELD, path, problem="no such file")
     try:
         with path.open("rb") as file:
-            found = pickle.load(file)  # noqa: S301 (the user was told)
-    except Exception as error:  # Unpickling raises whatever the pickled objects do.
+            found = pickle.load(file)  # noqa: S301 (see the docstring)
+    except Exception as error:  # Unpickling raises arbitrary exceptions.
         raise FieldError(FIELD, path, problem=f"no VecNormalize: {first_line(error)}") from None
     if not isinstance(found, VecNormalize) or (
         found.norm_obs and not isinstance(found.obs_rms, dict)
@@ -87,13 +87,13 @@ def load_normalisation(path: Path) -> VecNormalize:
 
 
 FLOWN = ("hold_s", "goal_radius_m", "altitude_m", "hover_after_s", "decision_timeout_s")
-"""How a policy is flown: fields of the request, of a card and of an environment's episodes."""
+"""Flight settings: fields of the request, of a card and of an environment's episodes."""
 
 SEEN = (
     *("layout", "frames", "kind", "projection", "horizontal_fov_deg", "distortion", "range_m"),
     *("in_flight", "goal_height", "cameras"),
 )
-"""What a policy sees but for the image's size: fields of the request and of a card."""
+"""Observation settings except the image's size: fields of the request and of a card."""
 
 DEFAULTS: dict[str, Any] = {
     "layout": "body",
@@ -118,11 +118,11 @@ DEFAULTS: dict[str, Any] = {
     "decisions": PilotSettings.decisions,
     "compensate": PilotSettings.compensate,
 }
-"""What is said of a model where nobody says anything else."""
+"""Default model metadata."""
 
 
 class Taken(NamedTuple):
-    """What can be read from a model: its images, and its action set."""
+    """Properties read from a model: its images, and its action set."""
 
     image: str | None = None
     frames: int | None = None
@@ -132,7 +132,7 @@ class Taken(NamedTuple):
 
 
 class ExportRequest(BaseModel):
-    """A model, and what cannot be read from it."""
+    """A model, and metadata that the model does not contain."""
 
     model: str = Field(
         description="the .zip that the model's `save` wrote, or a torch.nn.Module of your own, or a"
@@ -221,12 +221,12 @@ class ExportRequest(BaseModel):
 
     @property
     def policy_name(self) -> str:
-        """Short name of the policy that is written."""
+        """Short name of the exported policy."""
         return self.name if self.name is not None else self.out.resolve().name
 
     @property
     def own_module(self) -> bool:
-        """Whether the model is a module of the user's."""
+        """True for a custom module."""
         return names_code(self.model)
 
     def facts(self, command: str, taken: Taken | None = None) -> PolicyFacts:
@@ -270,7 +270,7 @@ class ExportRequest(BaseModel):
 
 
 def _environment(name: str) -> EnvironmentSpec:
-    """Return the environment of a training configuration, its speed bounded if it asks."""
+    """Return the environment of a training configuration, with its speed limit if configured."""
     # Imported here: few exports need them.
     from airl_mav.training.config import TrainingConfig
 
@@ -283,7 +283,7 @@ def _environment(name: str) -> EnvironmentSpec:
 
 
 def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
-    """Return what an environment says of the policies that are made in it."""
+    """Return the metadata that an environment defines for its policies."""
     vehicle = load_vehicle(spec.vehicle)
     camera = spec.camera.of(vehicle.camera)
     return {
@@ -308,7 +308,7 @@ def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
 
 
 def _observation(image: str, data: dict[str, object]) -> ObservationSpec:
-    """Return what the network sees. Raises FieldError that names the options."""
+    """Return the observation of the network. Raises FieldError that names the options."""
     try:
         return validated(ObservationSpec, data)
     except FieldError as error:

@@ -1,9 +1,9 @@
-"""Learning from an expert: behaviour cloning and DAgger, as a learner of stable-baselines3.
+"""Imitation learning: behaviour cloning and DAgger, as a learner of stable-baselines3.
 
-Behaviour cloning flies the expert and learns what it did (Pomerleau, "ALVINN", NIPS 1988). DAgger
-flies the learner, more and more, and asks the expert what it would have done where the learner got
-to (Ross, Gordon, Bagnell, AISTATS 2011, arXiv 1011.0686). Cloning is DAgger in which the expert
-never lets go.
+Behaviour cloning flies the expert and learns its actions (Pomerleau, "ALVINN", NIPS 1988). DAgger
+flies the learner for a growing share of decisions, and labels the visited states with the expert's
+actions (Ross, Gordon, Bagnell, AISTATS 2011, arXiv 1011.0686). Behaviour cloning is DAgger with the
+expert always in control.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from airl_mav.policy.observation_spec import Encoded
 
 
 class Demonstrations:
-    """Observations and the expert's actions; arguments as of `dqn.NStepReplay`."""
+    """Observations and the expert's actions; arguments as in `dqn.NStepReplay`."""
 
     def __init__(
         self,
@@ -52,11 +52,11 @@ class Demonstrations:
         )
 
     def __len__(self) -> int:
-        """Return the number of decisions that are remembered."""
+        """Return the number of stored decisions."""
         return self.filled * self._actions.shape[1]
 
     def add(self, observations: Mapping[str, NDArray[Any]], actions: NDArray[Any]) -> None:
-        """Store what all vehicles saw, and what the expert would have done."""
+        """Store the observations of all vehicles, and the expert's actions."""
         for key, array in self._observations.items():
             array[self.head] = observations[key]
         self._actions[self.head] = actions
@@ -72,12 +72,12 @@ class Demonstrations:
         return seen, self._actions[rows, vehicles]
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Return the whole memory by name; views, not copies."""
+        """Return the complete memory by name; views, not copies."""
         named = {name: array[: self.filled] for name, array in self._named().items()}
         return named | {"head": np.array(self.head)}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Restore what `get_state` returned; ValueError for other shapes."""
+        """Restore the state from `get_state`; ValueError for other shapes."""
         for name, array in self._named().items():
             saved = state[name]
             if saved.shape[1:] != array.shape[1:] or len(saved) > len(array):
@@ -91,11 +91,11 @@ class Demonstrations:
 
 
 class Imitation(BaseAlgorithm):
-    """Learns what an expert does, on the networks of PPO. Their value is not learned.
+    """Imitation of an expert with the networks of PPO, without learning the value.
 
-    Intervals count steps of single vehicles. One generator draws who flies and what is learned
-    from, so that a run can be resumed exactly. `env` is a `NavigationVecEnv`, which the expert
-    looks into. The other arguments are those of `config.AlgorithmSpec`, its options and
+    Intervals count steps of single vehicles. One generator draws the pilot of each decision and the
+    samples, so that a run can be resumed exactly. `env` is a `NavigationVecEnv`, whose state the
+    expert reads. The other arguments are as in `config.AlgorithmSpec`, its options and
     stable-baselines3's base class.
     """
 
@@ -158,7 +158,7 @@ class Imitation(BaseAlgorithm):
 
     @property
     def expert_share(self) -> float:
-        """Share of the decisions that the expert flies at present."""
+        """Present share of the decisions made by the expert."""
         first, last, fraction = self.expert_shares
         gone = 1.0 - self._current_progress_remaining
         return first + (last - first) * min(1.0, gone / fraction)
@@ -196,7 +196,7 @@ class Imitation(BaseAlgorithm):
         return self
 
     def _fly(self) -> list[dict[str, Any]]:
-        """Fly one step of all vehicles and note what the expert would do; return the infos."""
+        """Fly one step of all vehicles and store the expert's actions; return the infos."""
         assert self.env is not None and self._last_obs is not None  # noqa: S101 (_setup_learn)
         seen = cast("Encoded", self._last_obs)
         shown = self._expert.decide()
@@ -215,7 +215,7 @@ class Imitation(BaseAlgorithm):
         return infos
 
     def _train(self) -> None:
-        """Make the updates that are due after the last step of all vehicles."""
+        """Run the updates due after the last step of all vehicles."""
         interval = self.env_steps_per_update
         due = self.num_timesteps // interval - (self.num_timesteps - self.n_envs) // interval
         if not due or self.num_timesteps < self.learning_starts:
@@ -228,7 +228,7 @@ class Imitation(BaseAlgorithm):
         self.logger.record("train/loss", float(np.mean(losses)))
 
     def _update(self) -> float:
-        """Make one update and return its loss."""
+        """Run one update and return its loss."""
         observations, actions = self.replay.sample(self.batch_size, self.generator)
         wanted = torch.from_numpy(actions).to(self.device)
         distribution = self.policy.get_distribution(

@@ -1,4 +1,4 @@
-"""Exports a trained network to a policy folder: ONNX and its card, checked against torch."""
+"""Export of a trained network to a policy folder: ONNX and card, checked against torch."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ from airl_mav.policy.runtime import (
 from airl_mav.training.recurrent import LstmStep, RecurrentNetwork
 
 OPSET = 18
-"""ONNX operators: the newest that torch writes without a conversion."""
+"""ONNX operator set: the newest that torch writes without a conversion."""
 
 TOLERANCE = 1e-4
-"""Greatest error of an exported output, in shares of the greatest output (at least 1)."""
+"""Maximum error of an exported output, as a share of the maximum output (at least 1)."""
 
 CHECKED_ROWS = (1, 3, 64)
-"""Batches on which a network and its export are compared."""
+"""Batch sizes to compare a network and its export."""
 
 
 class Layer(NamedTuple):
-    """A layer that took part in an inference."""
+    """A layer executed in an inference."""
 
     text: str
     macs: int
@@ -103,7 +103,7 @@ def export_network(
             module = copy.deepcopy(module).cpu().eval()
             program = _program(module, example)
             onnx = _onnx(program, [*boxes(spec), *state], state)
-        except Exception as error:  # torch's exporter raises all kinds.
+        except Exception as error:  # torch's exporter raises arbitrary exceptions.
             raise UsageError(f"torch cannot export the network: {first_line(error)}") from error
         archive = _archive(program) if with_torch else None
     try:
@@ -144,7 +144,7 @@ def random_inputs(spec: ObservationSpec, n: int, rng: np.random.Generator) -> En
 
 
 def random_memory(state: Shapes, n: int, rng: np.random.Generator) -> Memory:
-    """Return what n networks may remember: noise between -1 and 1; nothing without a memory."""
+    """Return random memories of n networks between -1 and 1; empty without memory."""
     return {
         name: rng.uniform(-1.0, 1.0, (n, *shape)).astype(np.float32)
         for name, shape in state.items()
@@ -152,14 +152,14 @@ def random_memory(state: Shapes, n: int, rng: np.random.Generator) -> Memory:
 
 
 def memory_of(module: nn.Module) -> Shapes:
-    """Return what a network remembers from decision to decision; mostly nothing."""
+    """Return the memory shapes of a network; empty without memory."""
     return module.state if isinstance(module, RecurrentNetwork) else {}
 
 
 def _compare(
     module: nn.Module, runtime: RecurrentRuntime, spec: ObservationSpec, name: str
 ) -> None:
-    """Raise ValueError unless a runtime gives what the network gives."""
+    """Raise ValueError unless a runtime and the network have the same outputs."""
     rng = np.random.default_rng(1)
     for n in CHECKED_ROWS:
         inputs, memory = random_inputs(spec, n, rng), random_memory(memory_of(module), n, rng)
@@ -187,7 +187,7 @@ def _program(module: nn.Module, example: tuple[torch.Tensor, ...]) -> torch.expo
     rows = {0: torch.export.Dim("n", min=1)}
     free: Any = tuple(rows for _ in example)
     if len(inspect.signature(module.forward).parameters) < len(example):
-        # One parameter that takes them all.
+        # A single variadic parameter.
         free = (free,)
     program = torch.export.export(module, example, dynamic_shapes=free)
     for node in program.graph.nodes:
@@ -196,7 +196,7 @@ def _program(module: nn.Module, example: tuple[torch.Tensor, ...]) -> torch.expo
 
 
 def _onnx(program: torch.export.ExportedProgram, inputs: list[str], state: Shapes) -> bytes:
-    """Turn a program into ONNX, weights inside, without notes on where each operator came from."""
+    """Convert a program to ONNX with weights, without the source locations of operators."""
     written = torch.onnx.export(
         program,
         args=(),
@@ -207,7 +207,7 @@ def _onnx(program: torch.export.ExportedProgram, inputs: list[str], state: Shape
         output_names=[ACTION, *(f"{NEXT}{name}" for name in state)],
         verbose=False,
     )
-    assert written is not None  # noqa: S101 (it is None only for the old exporter)
+    assert written is not None  # noqa: S101 (None only with the old exporter)
     model = written.model_proto
     graph = model.graph
     graph.ClearField("metadata_props")

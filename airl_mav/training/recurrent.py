@@ -1,4 +1,4 @@
-"""Recurrent policies of sb3-contrib: the part that decides, with its memory as inputs and outputs.
+"""Recurrent policies of sb3-contrib: the actor, with its memory as inputs and outputs.
 
 The LSTM is unrolled to one step, so that an export has only products and sums and any batch size.
 """
@@ -20,7 +20,7 @@ from airl_mav.policy.observation_spec import Encoded
 from airl_mav.policy.runtime import Shapes
 
 HIDDEN, CELL = "hidden", "cell"
-"""Names of the two arrays (n, layers, units) that an LSTM remembers."""
+"""Names of the two memory arrays (n, layers, units) of an LSTM."""
 
 
 class LstmStep(nn.Module):
@@ -37,7 +37,7 @@ class LstmStep(nn.Module):
     def forward(
         self, seen: torch.Tensor, hidden: torch.Tensor, cell: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return what the layer gives, which is the next hidden, and the next cell."""
+        """Return the layer's output, which is the next hidden, and the next cell."""
         gates = functional.linear(seen, self.input_weight, self.input_bias)
         gates = gates + functional.linear(hidden, self.hidden_weight, self.hidden_bias)
         # torch's order of the gates.
@@ -78,7 +78,7 @@ class RecurrentNetwork(nn.Module):
     def decided(
         self, seen: dict[str, torch.Tensor], hidden: torch.Tensor, cell: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return what `forward` does, of observations by key."""
+        """Return the outputs of `forward` for observations by key."""
         found = self.features(seen)
         hiddens, cells = [], []
         for layer, step in enumerate(self.steps):
@@ -89,12 +89,12 @@ class RecurrentNetwork(nn.Module):
 
 
 class RecurrentOfAny(RecurrentNetwork):
-    """The same of a network that takes any arrays, in the order of their keys."""
+    """Recurrent network for any arrays, in the order of their keys."""
 
     def __init__(
         self, features: nn.Module, lstm: nn.LSTM, head: nn.Module, keys: Sequence[str]
     ) -> None:
-        """Take the parts as `RecurrentNetwork`, and the keys."""
+        """Initialize as `RecurrentNetwork`, with keys."""
         super().__init__(features, lstm, head)
         self.keys = tuple(keys)
 
@@ -113,7 +113,7 @@ class GreedyDecisions:
         self._new: set[int] = set()
 
     def began(self, slot: int) -> None:
-        """An episode begins in a slot."""
+        """Mark the start of an episode in a slot."""
         self._new.add(slot)
 
     def __call__(self, seen: Encoded) -> NDArray[Any]:

@@ -69,23 +69,23 @@ class TrainRequest(BaseModel):
         return self.out or Path("runs") / f"train-{self.stem}"
 
     def configured(self) -> TrainingConfig:
-        """Return the configuration with what was given put into it. Raises UsageError."""
-        # Imported here: it takes what the extras install, and they are looked for first.
+        """Return the configuration with the given changes. Raises UsageError."""
+        # Imported here, as it needs optional packages, which are checked first.
         from airl_mav.training.config import TrainingConfig, check_fields, configured
 
         loaded = load_profile("training", self.config, TrainingConfig)
         try:
             check_fields(loaded.algorithm)
-        except FieldError as error:  # It is the file's, not an option's.
+        except FieldError as error:  # The error is in the file, not in an option.
             raise UsageError(f"{self.config}: {error.line(sign=' = ')}") from None
-        # Not what a command adds to it.
+        # Without options that are not part of the configuration.
         asked = TrainRequest.model_fields.keys() - {"config", "out", "name", "resume"}
         changes = self.model_dump(include=asked)
         return configured(loaded, **changes)
 
 
 FLOWN_BY_CHANCE = 0.2
-"""So much more of success in training than on the selection's episodes is told."""
+"""Minimum excess of training success over the evaluation's success that is reported."""
 
 
 @dataclass(frozen=True)
@@ -97,14 +97,14 @@ class Evaluated(Event):
     """Decisions of all vehicles so far."""
     episodes: int
     success_rate: float
-    """Of those episodes, 0 to 1."""
+    """Share of the selection episodes, 0 to 1."""
     collision_rate: float
     flight_time_s: float | None
-    """Mean of those that reached the goal; None: none did."""
+    """Mean over the successful episodes; None without success."""
     zone: int | None
-    """Open zone of the curriculum; None: there is none."""
+    """Open zone of the curriculum; None without a curriculum."""
     best: bool
-    """Whether it is better than all before it."""
+    """True if better than all previous evaluations."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class TrainingBar(TrainingProgress):
         self._bar.update(completed=steps, postfix=text, figures=figures)
 
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
-        """Print a line, and tell programs."""
+        """Print a line, and report the evaluation to programs."""
         self._progress.tell(
             Evaluated(
                 steps=evaluation.steps,

@@ -51,9 +51,9 @@ from airl_mav.view.ends import ViewEnds
 def begin_with(model: BaseAlgorithm, run: Path, log_std: float | None = None) -> None:
     """Load the best weights of a training run, value and exploration too; reset the optimiser.
 
-    The run was evaluated, and the learner has the same algorithm, inputs, network and actions.
-    `log_std` is the initial log standard deviation of continuous actions; None = the run's. Raises
-    UsageError for another run, or if the weights do not fit.
+    The run must have an evaluation, and the same algorithm, inputs, network and actions. `log_std`
+    is the initial log standard deviation of continuous actions; None = the run's. Raises UsageError
+    for another run, or if the weights do not fit.
     """
     folder = TrainingFolder(run)
     learned = folder.about()["config"]["algorithm"]["name"]
@@ -62,7 +62,7 @@ def begin_with(model: BaseAlgorithm, run: Path, log_std: float | None = None) ->
     # Only tensors are read: nothing is unpickled.
     _, states, _ = load_from_zip_file(folder.best_model, device=model.device, load_data=False)
     try:
-        # stable-baselines3 calls a network's state a tensor.
+        # stable-baselines3 annotates a network's state as a tensor.
         model.policy.load_state_dict(cast("dict[str, Any]", states["policy"]))
     except RuntimeError:
         raise UsageError(
@@ -74,14 +74,14 @@ def begin_with(model: BaseAlgorithm, run: Path, log_std: float | None = None) ->
 
 
 RECENT = 200
-"""Episodes in training that the shown success rate is of."""
+"""Number of training episodes in the displayed success rate."""
 
 LOG_EVERY = 100
-"""Episodes between two points of the TensorBoard curves; of learners with rollouts: each is one."""
+"""Episodes between points of the TensorBoard curves; learners with rollouts log each rollout."""
 
 
 class TrainingResult(NamedTuple):
-    """What a training run made."""
+    """Result of a training run."""
 
     folder: TrainingFolder
     best: Evaluation
@@ -89,7 +89,7 @@ class TrainingResult(NamedTuple):
 
 
 def nominal(spec: EnvironmentSpec) -> EnvironmentSpec:
-    """Return the environment that policies are judged in: the whole arena, nothing randomised."""
+    """Return the evaluation environment: the complete arena, without randomization."""
     return spec.model_copy(update={"curriculum": None, "randomisation": Randomisation()})
 
 
@@ -110,7 +110,7 @@ def train(
     change the weights. Returns the run's folder, the best evaluation and the policy's card.
 
     Raises:
-        UsageError: Unusable profile or algorithm, `out` is in use or holds another run, or the
+        UsageError: Unusable profile or algorithm, `out` is in use or contains another run, or the
             export fails.
         KeyboardInterrupt: Ctrl-C; `resume` continues from the newest checkpoint.
     """
@@ -124,7 +124,7 @@ def train(
         if view is None:
             best = fit(config, folder, progress, device)
         else:
-            # Imported here: a training that nobody watches does without.
+            # Imported here: only needed for a live view.
             from airl_mav.training.watched import WatchedTraining
 
             with closing(WatchedTraining(view, config.environment, progress)) as watched:
@@ -133,7 +133,7 @@ def train(
 
 
 def check_trainable(config: TrainingConfig, name: str, device: str = "cpu") -> None:
-    """Raise UsageError if a training could not begin, or custom code not be exported."""
+    """Raise UsageError if a training cannot start, or custom code cannot be exported."""
     env = environment_of(config)
     check_actions(config.algorithm.name, kind_of(config.environment.actions))
     model = learner_of(config, env, device)
@@ -145,7 +145,7 @@ def check_trainable(config: TrainingConfig, name: str, device: str = "cpu") -> N
 
 
 def environment_of(config: TrainingConfig, watcher: Watcher | None = None) -> NavigationVecEnv:
-    """Make the environment of a training. Raises UsageError, and FieldError by the file's names."""
+    """Create a training's environment. Raises UsageError, or FieldError with the file's fields."""
     try:
         made = NavigationVectorEnv(config.vehicles, config.environment)
     except FieldError as error:
@@ -155,7 +155,7 @@ def environment_of(config: TrainingConfig, watcher: Watcher | None = None) -> Na
 
 
 def learner_of(config: TrainingConfig, env: NavigationVecEnv, device: str) -> BaseAlgorithm:
-    """Make the learner of a training, with fresh weights. Raises UsageError."""
+    """Create the learner of a training, with fresh weights. Raises UsageError."""
     return make_model(config.algorithm, config.network, env, config.seed, device=device)
 
 
@@ -168,8 +168,8 @@ def fit(
 ) -> Evaluation:
     """Train in a locked folder from the newest checkpoint; return the best weights' evaluation.
 
-    Raises UsageError if the algorithm does not fit the environment, an arena cannot be made, or
-    initial weights are missing.
+    Raises UsageError if the algorithm does not fit the environment, an arena cannot be generated,
+    or initial weights are missing.
     """
     check_actions(config.algorithm.name, kind_of(config.environment.actions))
     env = environment_of(config, watcher)
@@ -187,7 +187,7 @@ def fit(
         begin_with(model, Path(config.initial), log_std)
     left = config.steps - model.num_timesteps
     if left > 0 and not callback.done:
-        # To stable-baselines3 it is a number of episodes, or of rollouts.
+        # stable-baselines3 counts episodes, or rollouts.
         every = 1 if isinstance(model, OnPolicyAlgorithm) else LOG_EVERY
         model.learn(left, callback=callback, log_interval=every, reset_num_timesteps=meta is None)
     callback.finish(model)
@@ -197,7 +197,7 @@ def fit(
 
 
 class _BetweenRollouts(BaseCallback):
-    """Evaluates and saves between two rollouts."""
+    """Evaluation and saving between two rollouts."""
 
     def __init__(
         self,
@@ -216,7 +216,7 @@ class _BetweenRollouts(BaseCallback):
         self._evaluated = -1
         self._saved = 0
         self._zone = 0
-        """Curriculum zones before this one are done, and kept if asked for."""
+        """Current curriculum zone; earlier zones are complete, and saved if requested."""
         self._before_s = 0.0
         self._clock = WallClock()
         self._paused_us = 0
@@ -224,7 +224,7 @@ class _BetweenRollouts(BaseCallback):
     # --- checkpoints
 
     def restore(self, meta: dict[str, Any]) -> None:
-        """Go on from a checkpoint."""
+        """Resume from a checkpoint."""
         self._recent.extend(meta["recent"])
         self._evaluated = meta["evaluated"]
         self._saved = meta["steps"]
@@ -247,7 +247,7 @@ class _BetweenRollouts(BaseCallback):
         save_checkpoint(self._folder.checkpoints, self.model, self._meta())
 
     def _keep_zones(self) -> None:
-        """Keep what the learner is when it has just done with a curriculum zone."""
+        """Save the learner at the end of each curriculum zone, if requested."""
         curriculum = self._env.env.curriculum
         if not self._config.keep_zones or curriculum is None:
             return
@@ -279,7 +279,7 @@ class _BetweenRollouts(BaseCallback):
         return not self.done
 
     def finish(self, model: BaseAlgorithm) -> None:
-        """Evaluate and save the last weights, unless that has been done."""
+        """Evaluate and save the last weights, unless already done."""
         self.model = model
         if self._evaluated < model.num_timesteps:
             self._evaluate(model)
@@ -333,7 +333,7 @@ def summary(
     training_success: float | None,
     zone: int | None,
 ) -> Evaluation:
-    """Return an evaluation in figures."""
+    """Return the summary of evaluation flights."""
     crashed = sum(each.verdict == Verdict.COLLISION for each in flown)
     return Evaluation(
         steps=steps,
@@ -349,7 +349,7 @@ def summary(
 
 
 def model_bytes(model: BaseAlgorithm) -> bytes:
-    """Return a learner as stable-baselines3 saves it, without its replay."""
+    """Return the bytes of a learner saved by stable-baselines3, without replay."""
     buffer = io.BytesIO()
     model.save(buffer, exclude=["replay", "replay_buffer", "generator"])
     return buffer.getvalue()
@@ -360,14 +360,14 @@ def export_best(folder: TrainingFolder, config: TrainingConfig, name: str) -> Po
     best, about = folder.best(), folder.about()
     assert best is not None  # noqa: S101 - a finished run has one
     facts = facts_of(config, name, about["command"], best.steps)
-    # As many as learned: with fewer a rollout would not fill its batches.
+    # The trained number of vehicles: with fewer, a rollout would not fill its batches.
     model = learner_of(config, environment_of(config), "cpu")
     model.set_parameters(str(folder.best_model), device="cpu")
     return export_sb3(model, facts, folder.policy)
 
 
 def facts_of(config: TrainingConfig, name: str, command: str, steps: int) -> PolicyFacts:
-    """Return what the card of a training's policy says, after so many decisions."""
+    """Return the card data of a training's policy after `steps` decisions."""
     environment = config.environment
     return PolicyFacts(
         name=name,

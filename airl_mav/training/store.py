@@ -1,12 +1,12 @@
-"""The folder of a training run: what is in it, and how it is written.
+"""Folder of a training run: content and file formats.
 
-train.json          the configuration and what it was made with
-evaluations.jsonl   one line an evaluation on the selection seeds
+train.json          configuration and provenance
+evaluations.jsonl   one line per evaluation on the selection seeds
 tensorboard/        curves
-checkpoints/        everything needed to go on
-best/               the best weights so far, and which they are
-zones/zone-0/       with keep_zones: a checkpoint and the weights with which the zone was done
-policy/             the result: policy.onnx and card.json
+checkpoints/        complete state to resume
+best/               best weights so far, and their evaluation
+zones/zone-0/       with keep_zones: checkpoint and weights at the end of the zone
+policy/             result: policy.onnx and card.json
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ class Evaluation:
     steps: int
     """Decisions of all vehicles so far."""
     seconds: float
-    """Wall time of the training so far, evaluations left out [s]."""
+    """Wall time of the training so far, without evaluations [s]."""
     episodes: int
     success_rate: float
     collision_rate: float
     flight_time_s: float | None
-    """Mean of the successful ones; None when there is none."""
+    """Mean over the successful episodes; None without success."""
     distance_m: float | None
     training_success: float | None
-    """Of the last episodes in training, exploration included."""
+    """Success rate of the last training episodes, including exploration."""
     zone: int | None
-    """Curriculum zone that is open; None without a curriculum."""
+    """Open curriculum zone; None without a curriculum."""
 
     @property
     def rank(self) -> tuple[float, float]:
-        """Better is greater: success rate first, then flight time."""
+        """Sort key, higher is better: success rate first, then flight time."""
         return self.success_rate, -(self.flight_time_s or 1e9)
 
 
@@ -58,10 +58,10 @@ _EVALUATION = TypeAdapter(Evaluation)
 
 
 class TrainingProgress:
-    """Receives the progress of a training run; by itself it ignores it."""
+    """Progress callbacks of a training run; the base class does nothing."""
 
     def waiting(self, why: str) -> None:
-        """Called when another process has the folder; it is waited for."""
+        """Called while another process holds the folder's lock."""
 
     def trained(self, steps: int, success: float | None, zone: int | None) -> None:
         """Called after each step of all vehicles, with their decisions so far.
@@ -71,11 +71,11 @@ class TrainingProgress:
         """
 
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
-        """Called after an evaluation; `best`: better than all before it."""
+        """Called after an evaluation; `best`: better than all previous ones."""
 
 
 class TrainingFolder:
-    """A training run on disk; it can be read and resumed after a kill at any moment."""
+    """A training run on disk; it can be read and resumed after a kill at any time."""
 
     def __init__(self, path: Path) -> None:
         """Wrap a folder; `begin` makes or checks the run in it."""
@@ -83,7 +83,7 @@ class TrainingFolder:
         self.checkpoints = path / "checkpoints"
         self.tensorboard = path / "tensorboard"
         self.best_model = path / "best" / BEST_MODEL
-        """The best weights so far, as stable-baselines3 saves them."""
+        """Best weights so far, in stable-baselines3's format."""
         self.zones = path / "zones"
         self.policy = path / "policy"
 
@@ -91,7 +91,7 @@ class TrainingFolder:
     def begin(
         cls, path: Path, config: TrainingConfig, command: str, *, resume: bool
     ) -> TrainingFolder:
-        """Begin a run in a folder or open its run; UsageError if it is not to be resumed."""
+        """Start a run in a folder or open its run; UsageError if it cannot be resumed."""
         folder = cls(path)
         if not folder.begun:
             plain = config.model_dump(mode="json", exclude_none=True)
@@ -116,24 +116,24 @@ class TrainingFolder:
 
     @property
     def begun(self) -> bool:
-        """Whether there is a run in it."""
+        """True if the folder contains a run."""
         return (self.path / CONFIG_FILE).exists()
 
     def about(self) -> dict[str, Any]:
-        """Return what `train.json` holds. Raises UsageError when there is no run."""
+        """Return the content of `train.json`. Raises UsageError without a run."""
         return files.read_json(self.path / CONFIG_FILE, SCHEMA, "training run")
 
     def evaluations(self) -> list[Evaluation]:
-        """Return the evaluations so far; a line cut short by a kill is passed over."""
+        """Return the evaluations so far; a line truncated by a kill is skipped."""
         lines = files.read_lines(self.path / EVALUATIONS_FILE, None)
         return [files.typed(_EVALUATION, data, place) for place, data in lines]
 
     def add_evaluation(self, evaluation: Evaluation) -> None:
-        """Append a line; on return it is on the disk."""
+        """Append a line and sync it to disk."""
         files.append_lines(self.path / EVALUATIONS_FILE, [asdict(evaluation)])
 
     def forget_after(self, steps: int) -> None:
-        """Drop evaluations later than a checkpoint: going on from it will make them again."""
+        """Drop evaluations later than a checkpoint: the resumed run repeats them."""
         kept = [each for each in self.evaluations() if each.steps <= steps]
         files.replace_file(
             self.path / EVALUATIONS_FILE, b"".join(files.json_line(asdict(each)) for each in kept)
@@ -147,7 +147,7 @@ class TrainingFolder:
         return files.read_typed(file, _EVALUATION, None, "training run")
 
     def zone(self, zone: int) -> Path:
-        """Return the folder of what is kept of a curriculum zone."""
+        """Return the folder of the files saved for a curriculum zone."""
         return self.zones / f"zone-{zone}"
 
     def save_best(self, model: bytes, evaluation: Evaluation) -> None:

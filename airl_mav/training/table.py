@@ -149,22 +149,22 @@ _SAC_OPTIONS = (
 
 @dataclass(frozen=True)
 class Algorithm:
-    """What sets an algorithm apart."""
+    """Properties of an algorithm."""
 
     source: str
     fields: Mapping[str, str]
-    """Fields of `[algorithm]` that it has, and the names of its arguments for them."""
+    """Supported fields of `[algorithm]`, and the names of the constructor's arguments."""
     options: type[ProfileModel]
     actions: ActionKind | None = None
-    """The only kind of action set that it can choose from; None: both."""
+    """Supported kind of action set; None = both."""
     to_policy: tuple[str, ...] = ()
-    """Options that the network takes, not the learner."""
+    """Options passed to the network instead of the learner."""
     defaults: Mapping[str, Any] = field(default_factory=dict)
-    """Options whose default differs from that of stable-baselines3."""
+    """Options with a default that differs from stable-baselines3."""
     batch: int = 128
-    """Samples an update where `batch_size` is left out."""
+    """Default of `batch_size`: samples per update."""
     rollouts: bool = False
-    """Whether it learns from rollouts of `n_steps` steps that whole batches must fill."""
+    """True if the algorithm learns from rollouts of `n_steps` steps, in whole batches."""
     policy: str = "MultiInputPolicy"
 
 
@@ -311,5 +311,5 @@ ALGORITHMS: dict[str, Algorithm] = {
 
 
 def fitting(kind: ActionKind) -> list[str]:
-    """Return the names of the algorithms that can choose from a kind of action set."""
+    """Return the names of the algorithms that support a kind of action set."""
     return [name for name, row in ALGORITHMS.items() if row.actions in (None, kind)]

@@ -1,6 +1,6 @@
-"""View of a training: the newest episode of its first vehicle, flown again.
+"""Live view of a training: replays the newest episode of its first vehicle.
 
-Training only records that vehicle's seeds and actions. Flights do not depend on others beside them,
+Training only records that vehicle's seeds and actions. Flights are independent of other vehicles,
 so a separate thread repeats them at the viewers' pace, skipping some. Learning is not affected.
 """
 
@@ -32,25 +32,25 @@ from airl_mav.view.pace import Pace
 from airl_mav.view.shown import OFFBOARD
 
 SPEED = 2.0
-"""Pace of the shown flights until the watchers choose another [simulated s per wall s]."""
+"""Default replay speed; viewers can change it [simulated s per wall s]."""
 
 SAMPLES = 2
-"""Of the trace's samples, 20 ms apart, every second one is shown."""
+"""Decimation of the trace's samples, which are 20 ms apart."""
 
 END_US = 1_000_000
-"""How long the end of a flight stays [simulated µs]."""
+"""Display time of the end of a flight [simulated µs]."""
 
 REST_S = 0.01
-"""Least time between two decisions that are flown again [wall s], at whatever pace."""
+"""Minimum time between two replayed decisions [wall s], at any speed."""
 
 LOOK_S = 0.1
-"""So often it is looked for a flight to show [wall s]."""
+"""Polling period for a new flight [wall s]."""
 
 INFO = 6
 
 
 def request_of(name: str, port: int | None = None) -> Request:
-    """Return what the view of a training is asked for; `name` is its configuration's."""
+    """Return the request for the view of a training; `name` is the configuration's name."""
     return Request(
         run=f"{name}, training",
         port=port,
@@ -64,20 +64,20 @@ def request_of(name: str, port: int | None = None) -> Request:
 
 @dataclass
 class Taped:
-    """An episode of the watched vehicle: what it takes to fly it again."""
+    """A recorded episode of the first vehicle."""
 
     number: int
-    """Of its episodes, from 0 on."""
+    """Number of the episode, from 0 on."""
     seed: int
     zone: int | None
     actions: list[NDArray[Any]] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
     outcome: str = ""
-    """Empty: it goes on."""
+    """Outcome; empty while the episode is running."""
 
 
 class Moment(NamedTuple):
-    """What is shown at a time of a flight [simulated µs since its start]."""
+    """Message to show at a time of a flight [simulated µs since its start]."""
 
     time_us: int
     message: messages.Message
@@ -85,7 +85,7 @@ class Moment(NamedTuple):
 
 
 class _Standing(NamedTuple):
-    """How far the training is."""
+    """Progress of the training."""
 
     steps: int = 0
     success: float | None = None
@@ -93,7 +93,7 @@ class _Standing(NamedTuple):
 
 
 class WatchedTraining(TrainingProgress):
-    """Shows a training to a view. An `envs.sb3.Watcher`, and a `TrainingProgress`."""
+    """Adapter from a training to a view. An `envs.sb3.Watcher`, and a `TrainingProgress`."""
 
     def __init__(
         self, ends: ViewEnds, environment: EnvironmentSpec, onwards: TrainingProgress
@@ -112,7 +112,7 @@ class WatchedTraining(TrainingProgress):
         self._thread.start()
 
     def close(self) -> None:
-        """Show nothing more, and disconnect."""
+        """Stop the replay, and disconnect."""
         self._ended.set()
         self._pace.let_go()
         self._thread.join()
@@ -120,13 +120,13 @@ class WatchedTraining(TrainingProgress):
     # --- the training's side
 
     def begun(self) -> None:
-        """All episodes begin now."""
+        """Called when all episodes begin."""
         self._tape_next()
 
     def decided(
         self, seed: int, zone: int, action: NDArray[Any], reward: float, outcome: str | None
     ) -> None:
-        """Keep a decision of the watched vehicle; see `envs.sb3.Watcher`."""
+        """Record a decision of the first vehicle; see `envs.sb3.Watcher`."""
         taping = self._taping
         if taping is not None:
             if not taping.actions:
@@ -144,16 +144,16 @@ class WatchedTraining(TrainingProgress):
         self._count += 1
 
     def waiting(self, why: str) -> None:
-        """Pass on what is waited for."""
+        """Forward the reason for waiting."""
         self._onwards.waiting(why)
 
     def trained(self, steps: int, success: float | None, zone: int | None) -> None:
-        """Keep how far the training is."""
+        """Store the progress of the training."""
         self._standing = _Standing(steps, success, zone)
         self._onwards.trained(steps, success, zone)
 
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
-        """Tell how an evaluation went."""
+        """Report an evaluation."""
         so_far = ", the best so far" if best else ""
         text = f"evaluation after {evaluation.steps:,} decisions: {evaluation.success_rate:.1%}"
         text += f" of {evaluation.episodes} reach the goal{so_far}"
@@ -173,7 +173,7 @@ class WatchedTraining(TrainingProgress):
         self._feed.close()
 
     def _show(self, refly: Reflight, taped: Taped, began_us: int) -> int:
-        """Show a flight that begins at a time of the view [µs]; return when it is over."""
+        """Show a flight that begins at a time of the view [µs]; return the time of its end."""
         now_us = began_us
         for moment in refly.moments(taped, began_us):
             now_us = began_us + moment.time_us
@@ -197,7 +197,7 @@ class WatchedTraining(TrainingProgress):
 
 
 class Reflight:
-    """Flies episodes again, decision by decision, with all that a view is told."""
+    """Replay of episodes, decision by decision, with all messages of a view."""
 
     def __init__(self, environment: EnvironmentSpec) -> None:
         """Prepare a vehicle of the environment."""
@@ -206,7 +206,7 @@ class Reflight:
         self._environment = environment
 
     def moments(self, taped: Taped, began_us: int) -> Iterator[Moment]:
-        """Fly a recorded episode; yield its moments by time, `began_us` apart from the view's."""
+        """Replay a recorded episode; yield moments by time, with messages offset by `began_us`."""
         navigation, trace = self.navigation, self._trace
         navigation.begin([0], [taped.seed], taped.zone)
         yield from (Moment(0, message) for message in self._beginning(taped, began_us))
@@ -272,12 +272,12 @@ class Reflight:
         if spec.kind != "depth":
             return image if image.ndim == 3 else image[..., None]
         far_mm = self.navigation.observation.range_m * MM_PER_M
-        # 0 would be what no depth is known of.
+        # 0 would mean "no return".
         depth: messages.Image = np.maximum(np.rint(image * (far_mm / 255.0)), 1.0).astype(np.uint16)
         return depth
 
     def _decided(self, image: messages.Image, began_us: int) -> Moment:
-        """Return the newest decision, at the time at which it began."""
+        """Return the newest decision, at its start time."""
         record = self._trace.latency(0)
         stamp = {name: int(column[-1]) for name, column in record.items() if column.ndim == 1}
         began = stamp["infer_start_us"]
@@ -303,7 +303,7 @@ class Reflight:
         return Moment(began, message, image)
 
     def _trained(self, taped: Taped, k: int, began_us: int) -> Moment:
-        """Return what decision k came to; how far the training is, is not known here."""
+        """Return action and reward of decision k; the training's progress is unknown here."""
         began = int(self._trace.latency(0)["infer_start_us"][-1])
         action, count = taped.actions[k], discrete_actions(self._environment.action_spec)
         if count is None:
@@ -327,7 +327,7 @@ class Reflight:
         velocity: NDArray[np.float64],
         quaternion: NDArray[np.float64],
     ) -> messages.Vehicle:
-        """Return the vehicle at a time; rotors and battery are those at the decision's end."""
+        """Return the vehicle at a time; rotors and battery are from the end of the decision."""
         fleet = self.navigation.whole_truth().fleet
         return messages.Vehicle(
             time_us=time_us,

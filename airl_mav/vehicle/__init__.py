@@ -1,1 +1,1 @@
-"""The airframe as scalar numba kernels, one vehicle or N: rotors, body, power, battery."""
+"""Airframe as scalar numba kernels, for one vehicle or N: rotors, body, power, battery."""

@@ -1,4 +1,4 @@
-"""The airframe's constants as one typed row for the kernels, and their domain randomization."""
+"""Airframe constants as one typed row for kernels, and their domain randomization."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Airframe(NamedTuple):
 
 @kernel
 def airframe_of(row: Vector) -> Airframe:
-    """Return the airframe of a row (15,): an array is passed to kernels far faster than a tuple."""
+    """Return the airframe of a row (15,): kernels accept an array far faster than a tuple."""
     r = row
     return Airframe(
         r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7],
@@ -65,7 +65,7 @@ def airframe_of(row: Vector) -> Airframe:
 
 
 def spreads(shares: Spread) -> bool:
-    """Return whether any airframe differs from the nominal one."""
+    """Return True if any airframe differs from the nominal one."""
     return any((shares.mass, shares.thrust, shares.drag, shares.rotor_lag))
 
 

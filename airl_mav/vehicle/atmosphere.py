@@ -1,4 +1,4 @@
-"""The International Standard Atmosphere below 11 km (ISO 2533)."""
+"""International Standard Atmosphere below 11 km (ISO 2533)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Electrical power of the aircraft: momentum theory from the rotor's own data, or a regression.
+"""Electrical power of the aircraft: momentum theory from the rotor's data, or a regression.
 
-One kernel for plant and batch twin. Both models give the aircraft's own power, its flight
-controller included. The onboard computer's watts come beside it.
-The battery is a coulomb counter behind an open-circuit voltage and an internal resistance.
+One kernel for plant and vectorized simulator. Both models give the aircraft's power with its flight
+controller, but without the onboard computer.
+
+The battery is a coulomb counter with an open-circuit voltage and an internal resistance.
 """
 
 from __future__ import annotations
@@ -18,36 +19,36 @@ from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotation import Quat, Vec
 
 INDUCED_FACTOR = 1.15
-"""kappa: how much more a real rotor's induced flow takes than an ideal disc's (Leishman,
-Principles of Helicopter Aerodynamics; quoted, not read)."""
+"""Factor kappa of a real rotor's induced power over an ideal disc's (Leishman, Principles of
+Helicopter Aerodynamics; quoted, not read)."""
 
 PROFILE_RISE = 4.65
-"""Profile power grows by this times the advance ratio squared (4.6 to 4.7 after Leishman, quoted,
-not read)."""
+"""Increase of profile power with the advance ratio squared (4.6 to 4.7 after Leishman, quoted, not
+read)."""
 
 LEAST_THRUST_N = 1e-6
-"""Below this thrust the rotors take nothing."""
+"""Thrust below which the rotors consume no power."""
 
 
 class PowerModel(NamedTuple):
-    """Constants of a vehicle's power model, all floats: a row of an array holds them too."""
+    """Constants of a vehicle's power model, all floats, so that an array row can store them."""
 
     momentum: float
     """1: momentum theory, 0: regression."""
     avionics_w: float
-    """Beside the rotors [W]; 0 for a regression, which has it in its constant."""
+    """Power beside the rotors [W]; 0 for a regression, which includes it in its constant."""
     ideal2_per_thrust: float
-    """1 / (2 rho A) of all rotors: v_h² by the thrust [m²/(s² N)]; this and the three below are of
-    momentum theory."""
+    """1 / (2 rho A) of all rotors: v_h² by the thrust [m²/(s² N)]; this and the three below belong
+    to momentum theory."""
     profile: float
     """1 / FM - kappa: profile power over ideal power in a hover."""
     advance: float
-    """What T mu² is by the greatest thrust of a rotor and the square of the velocity in the plane
-    of the discs: the number of rotors over the square of the tip speed at full command [s²/m²]."""
+    """Ratio of T mu² to a rotor's maximum thrust times the squared in-plane velocity: the number of
+    rotors over the squared tip speed at full command [s²/m²]."""
     drive: float
     """Electrical over shaft power: 1 / eta."""
     bandwidth_hz: float
-    """Of the accelerations; this and all below are of the regression."""
+    """Bandwidth of the accelerations; this and all below belong to the regression."""
     payload_g: float
     b1: float
     b2: float
@@ -94,7 +95,7 @@ class PowerModel(NamedTuple):
 
 @kernel
 def power_model_of(row: Vector) -> PowerModel:
-    """Return the model of a row (17,): an array is passed to kernels far faster than a tuple."""
+    """Return the model of a row (17,): kernels accept an array far faster than a tuple."""
     r = row
     return PowerModel(
         r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8],
@@ -104,14 +105,14 @@ def power_model_of(row: Vector) -> PowerModel:
 
 @kernel
 def induced_velocity(ideal2: float, in_plane2: float, climb: float) -> float:
-    """Return the velocity that the discs give the air, v_i [m/s], by Glauert's equation.
+    """Return the induced velocity of the discs, v_i [m/s], by Glauert's equation.
 
     v_i = v_h² / sqrt(V_inplane² + (V_c + v_i)²). One step of Halley's method from the right side
     with the three velocities at right angles to each other. Exact in a hover, and to 4e-4 up to a
     climb of two and an advance of five times v_h, which leaves 2e-4 of the power.
 
-    `ideal2` is v_h² = T / (2 rho A) > 0, of a hover, `in_plane2` the square of the velocity in the
-    plane of the discs against the air [m²/s²], `climb` V_c, that along the thrust, >= 0 [m/s].
+    `ideal2` is v_h² = T / (2 rho A) > 0 of a hover, `in_plane2` the squared in-plane velocity
+    against the air [m²/s²], `climb` the velocity V_c along the thrust, >= 0 [m/s].
     """
     v = ideal2 / math.sqrt(in_plane2 + climb * climb + ideal2)
     # Of f(v) = v sqrt(V_inplane² + (V_c + v)²) - v_h²: f, f' and f'', each times the root.
@@ -130,22 +131,22 @@ def momentum_power_w(
     """Return the power by momentum theory [W].
 
     P = [kappa T v_i + P0 (1 + 4.65 mu²) + T max(V_c, 0)] / eta + P_avionics with P0 = (1/FM -
-    kappa) T v_h. So a hover takes T^1.5 / sqrt(2 rho A) / FM / eta. The body's drag is in T V_c: a
-    vehicle that flies level leans its thrust against it.
+    kappa) T v_h. A hover therefore takes T^1.5 / sqrt(2 rho A) / FM / eta. T V_c includes the
+    body's drag: a vehicle in level flight leans its thrust against it.
 
     A negative V_c counts as 0. Momentum theory does not hold from a hover down to twice the induced
-    velocity. There the rotors fly in their own wake. A descent measured on a 3DR Solo saved 10 %
+    velocity, where the rotors fly in their wake. A descent measured on a 3DR Solo saved 10 %
     (discuss.ardupilot.org, thread 32200).
 
     `thrust` is T, of all rotors [N]. The speed of a rotor follows from its `thrust_max`.
-    `in_plane2` and `climb`, V_c, are as of `induced_velocity`.
+    `in_plane2` and `climb`, V_c, are as in `induced_velocity`.
     """
     if thrust < LEAST_THRUST_N:
         return m.avionics_w
     ideal2 = m.ideal2_per_thrust * thrust
     up = max(0.0, climb)
     inflow = INDUCED_FACTOR * induced_velocity(ideal2, in_plane2, up) + up
-    # T mu² by the rotors' mean square speed: thrust goes with the square of the speed.
+    # T mu² by the rotors' mean square speed: thrust is proportional to the squared speed.
     advance = PROFILE_RISE * m.advance * thrust_max * in_plane2
     profile = m.profile * math.sqrt(ideal2) * (thrust + advance)
     return m.drive * (thrust * inflow + profile) + m.avionics_w
@@ -178,11 +179,11 @@ def felt_share(m: PowerModel, dt: float) -> float:
 
 @kernel
 def felt(before: Vec, velocity: Vec, newer: Vec, kept: float, dt: float, m: PowerModel) -> Vec:
-    """Return the acceleration that a regression goes by: a first-order low-pass, NED [m/s²].
+    """Return the acceleration for a regression: a first-order low-pass, NED [m/s²].
 
     `before` is its value before the tick of dt [s], `velocity` and `newer` are the velocities
-    before and after it, `kept` is `felt_share`. Momentum theory needs no acceleration, and `before`
-    comes back.
+    before and after it, `kept` is `felt_share`. Momentum theory needs no acceleration and returns
+    `before`.
     """
     if m.momentum != 0.0:
         return before
@@ -204,10 +205,10 @@ def flight_power_w(
     airframe: Airframe,
     m: PowerModel,
 ) -> float:
-    """Return the power over a tick of flight [W], without the onboard computer's.
+    """Return the power over a tick of flight [W], without the onboard computer.
 
-    Velocity, attitude (body -> NED) and acceleration (by `felt`) are those at the start of the
-    tick, in which its forces act; `thrust` is that of all rotors [N].
+    Velocity, attitude (body -> NED) and acceleration (by `felt`) apply at the start of the tick, in
+    which its forces act; `thrust` is the sum of all rotors [N].
     """
     if m.momentum == 0.0:
         return regression_power_w(velocity, acceleration, wind, m)
@@ -224,10 +225,10 @@ def flight_power_w(
 
 @kernel
 def standing_power_w(thrust: float, airframe: Airframe, m: PowerModel) -> float:
-    """Return the power of a vehicle that touches something [W]: that of its thrust at rest.
+    """Return the power of a vehicle in contact [W], for its thrust at rest.
 
-    A regression is one of flight, and an impact is no electrical load. Its hover is scaled by
-    T^1.5, as momentum theory has it.
+    A regression only models flight, and an impact is no electrical load. Its hover is scaled by
+    T^1.5, as in momentum theory.
     """
     if m.momentum != 0.0:
         return momentum_power_w(thrust, airframe.thrust_max, 0.0, 0.0, m)
@@ -253,7 +254,7 @@ def level_power_w(speed: float, airframe: Airframe, m: PowerModel) -> float:
 def terminal_voltage(open_circuit_v: float, resistance_ohm: float, power: float) -> float:
     """Return the voltage under a constant-power load [W]: V = E - R P / V, upper root.
 
-    Above the greatest power that the pack can deliver, E²/4R, the voltage at that power: E/2.
+    Above the pack's maximum power, E²/4R, returns the voltage at that power: E/2.
     """
     discriminant = open_circuit_v * open_circuit_v - 4.0 * resistance_ohm * power
     return 0.5 * (open_circuit_v + math.sqrt(max(0.0, discriminant)))

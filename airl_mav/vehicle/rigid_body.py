@@ -1,8 +1,8 @@
 """Forces on the airframe and the free rigid body, in NED / FRD.
 
-The integrator is the one of Bullet's multi-body (semi-implicit Euler, explicit gyroscopic torque,
-exponential map for the attitude), so that the batch twin and the pybullet plant agree to
-rounding while free of contact.
+The integrator is Bullet's multi-body integrator (semi-implicit Euler, explicit gyroscopic torque,
+exponential map for the attitude), so that the vectorized simulator and the pybullet plant agree to
+rounding without contact.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Quaternion kernels for compiled loops; the same conventions as `airl_mav.core.frames`."""
+"""Quaternion kernels for compiled loops; conventions as in `airl_mav.core.frames`."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotation import Vec
 
 N_ROTORS = 4
-# Position of each rotor relative to the middle of them, as signs of the arms (forward, right).
+# Position of each rotor relative to their centre, as signs of the arms (forward, right).
 FORWARD_SIGN = (1.0, -1.0, 1.0, -1.0)
 RIGHT_SIGN = (1.0, -1.0, -1.0, 1.0)
 # Reaction torque on the body about the down axis: a rotor turning counter-clockwise pushes the
@@ -24,7 +24,7 @@ YAW_SIGN = (1.0, 1.0, -1.0, -1.0)
 
 @kernel
 def steady_speed(command: float, thrust_curve: float) -> float:
-    """Return the speed fraction 0..1 that a command 0..1 settles at (thrust ~ speed²)."""
+    """Return the steady speed fraction 0..1 of a command 0..1 (thrust ~ speed²)."""
     u = min(1.0, max(0.0, command))
     return math.sqrt(thrust_curve * u * u + (1.0 - thrust_curve) * u)
 
@@ -44,7 +44,7 @@ def settle(speed: float, command: float, airframe: Airframe, left: float) -> flo
 
 @kernel
 def command_for(thrust: float, thrust_curve: float) -> float:
-    """Return the command 0..1 that gives a share 0..1 of the greatest thrust in steady state."""
+    """Return the command 0..1 for a share 0..1 of maximum thrust in steady state."""
     c = thrust_curve
     if c == 0.0:
         return thrust
@@ -71,9 +71,9 @@ def wrench(s0: float, s1: float, s2: float, s3: float, airframe: Airframe) -> tu
 
 
 def hover_speeds(airframe: Airframe) -> tuple[float, float, float, float]:
-    """Return the speed fractions of the rotors in a hover: they carry the weight, without torque.
+    """Return the rotors' speed fractions in a hover, which carry the weight without torque.
 
-    A rotor carries the more, the closer to the centre of mass it is.
+    Rotors closer to the centre of mass carry more.
     """
     share = airframe.mass * GRAVITY_M_S2 / (N_ROTORS * airframe.thrust_max)
     right, forward = (

@@ -13,11 +13,11 @@ from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.conditions import WindSettings
 
 BLOCK = 256
-"""Gusts are drawn for so many ticks at once; how many changes no value."""
+"""Number of ticks per block of gust samples; has no effect on values."""
 
 
 def wind_of_episode(settings: WindSettings, seed: int) -> WindSettings:
-    """Return the wind of the episode of a seed: what is drawn of it is steady then."""
+    """Return the wind of a seed's episode: the random part becomes steady."""
     if settings.random_m_s == 0.0:
         return settings
     rng = stream(seed, Stream.WIND)
@@ -32,7 +32,7 @@ def wind_of_episode(settings: WindSettings, seed: int) -> WindSettings:
 
 @kernel
 def _blow(noise: Vector, gust: Vector, keep: float, drive: Vector, steady: Vector) -> None:
-    """Turn white noise (n, 3) in place into wind NED [m/s]; the gust (3,) goes on where it was."""
+    """Convert white noise (n, 3) in place into wind NED [m/s]; the gust (3,) continues."""
     for i in range(len(noise)):
         for axis in range(3):
             gust[axis] = keep * gust[axis] + drive[axis] * noise[i, axis]
@@ -45,7 +45,7 @@ class Wind:
     def __init__(
         self, settings: WindSettings, rng: np.random.Generator, tick_s: float = TICK_S
     ) -> None:
-        """Begin an episode; settings are those of `wind_of_episode`, `rng` is the gusts'."""
+        """Begin an episode with settings from `wind_of_episode`; `rng` draws the gusts."""
         self.steady = np.array([settings.north_m_s, settings.east_m_s, 0.0])
         """(3,) NED [m/s]."""
         sigma = settings.gust_m_s * np.array([1.0, 1.0, 0.5])
@@ -66,7 +66,7 @@ class Wind:
         return block
 
     def step(self) -> Vector:
-        """Advance one tick and return the wind (3,) NED [m/s]; not to be written to."""
+        """Advance one tick and return the wind (3,) NED [m/s]; do not modify the result."""
         if self._calm:
             return self.steady
         if self._next == len(self._ahead):

@@ -1,1 +1,1 @@
-"""The flight controller's own log (PX4's .ulg) beside a companion's recording."""
+"""Flight controller's log (PX4's .ulg) and its alignment with a companion's recording."""

@@ -1,13 +1,13 @@
-"""The clocks of a companion and a flight controller, by their recordings of one flight.
+"""Clock alignment of a companion and a flight controller from their recordings of one flight.
 
-Down: velocity and attitude of telemetry are those of the log, later. The shift at which both agree
-best is the offset of the clocks plus the age of telemetry. That is the time on the link, and that
-of the newest message. Up: a setpoint appears in the log between two samples. So each one bounds the
-offset plus its delay. The shift within most of these bounds is taken, as by Marzullo's algorithm
+Downlink: telemetry repeats the log's velocity and attitude with a delay. The best matching shift is
+the clock offset plus the age of telemetry: the link delay plus the age of the newest message.
+Uplink: a setpoint appears in the log between two samples. Each setpoint thus bounds the clock
+offset plus its delay. Marzullo's algorithm finds the shift within most of these bounds
 (K. Marzullo, Maintaining the time in a distributed system, 1984).
 
-Neither alone tells the offset from the time on the link. Their sum is free of the offset. It is the
-round trip, from a setpoint that is sent to telemetry that could tell of it.
+Neither shift alone separates the offset from the link delay. The offset cancels in their sum, which
+is the round trip from sending a setpoint to the first telemetry that can reflect it.
 """
 
 from __future__ import annotations
@@ -27,46 +27,46 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.vehicle_log.ulog import Series, VehicleLog
 
 GRID_US = 40_000
-"""Step of the search over all shifts [µs]: the rate of the companion's recording."""
+"""Step of the search over all shifts [µs]: the period of the companion's recording."""
 
 FINE_US = 100_000
-"""The shift is refined so far around the best one of the search [µs]."""
+"""Half-width of the refinement around the coarse shift [µs]."""
 
 LEAST_CORRELATION = 0.8
-"""Velocities that agree less at their best shift are of different flights."""
+"""Minimum correlation of the velocities; below it, the recordings are of different flights."""
 
 LEAST_SPEED_M_S = 0.5
-"""A flight that never gets faster cannot be told from its noise [m/s]."""
+"""Minimum top speed of a flight [m/s]; slower motion is indistinguishable from noise."""
 
 LEAST_SETPOINTS = 3
-"""Fewer setpoints that both have do not tell how long they took."""
+"""Minimum number of matched setpoints for an uplink delay."""
 
 SAME_SPEED_M_S, SAME_RATE_RAD_S = 0.02, 0.01
-"""Setpoints are the same when their speed and yaw rate differ by less: a heading turns neither."""
+"""Tolerances for equal setpoints: speed and yaw rate, which do not depend on the heading."""
 
 SAME_TURN, SAME_THRUST = 0.001, 0.001
-"""Body rates [rad/s], the numbers of `_down_and_nose` and thrusts are the same when they differ by
-less. Nothing shapes them on their way, as a yaw rate is shaped."""
+"""Tolerances for equal body rates [rad/s], components of `_down_and_nose`, and thrusts. Unlike yaw
+rates, they reach the log unfiltered."""
 
 LONGEST_LINK_US = US_PER_S
-"""Longest time that a setpoint takes [µs]."""
+"""Maximum uplink delay of a setpoint [µs]."""
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """How the clocks of a recording and of a log of the same flight relate."""
+    """Relation of the clocks of a recording and a log of the same flight."""
 
     told_us: float
-    """Companion's time at which something is told, less the flight controller's time of it [µs]."""
+    """Downlink shift: companion's telemetry time minus the flight controller's time [µs]."""
     correlation: float
-    """Of the velocities at that shift, 0 to 1."""
+    """Correlation of the velocities at that shift, 0 to 1."""
     error_m_s: float
     """Root mean square difference of the velocities at that shift [m/s]."""
     accepted_us: float | None
-    """Flight controller's time at which a setpoint is taken, less the companion's time of sending
-    it [µs]; None: too few setpoints were seen in the log."""
+    """Uplink shift: flight controller's time of accepting a setpoint minus the companion's send
+    time [µs]; None = fewer than `LEAST_SETPOINTS` matched setpoints."""
     accepted_range_us: tuple[float, float] | None
-    """The bounds of it that the most setpoints agree on [µs]."""
+    """Bounds of the uplink shift that most setpoints agree on [µs]."""
     setpoints: int
 
     @property
@@ -82,7 +82,7 @@ def align(
     setpoints: NDArray[np.float64],
     commands: CommandKind = "velocity",
 ) -> Alignment:
-    """Return how a recorded flight's clock and its vehicle's log relate, or raise UsageError."""
+    """Return the clock relation of a recorded flight and its vehicle's log, or raise UsageError."""
     told_us = _refined(path, log, _coarse(path, log))
     flown, logged = path.velocity[:, :2], log.motion.at(path.time_us - told_us)[:, 3:5]
     inside = _inside(path, log, told_us)
@@ -106,7 +106,7 @@ def align(
 
 
 def _coarse(path: Trajectory, log: VehicleLog) -> float:
-    """Return the shift [µs], to a step of the grid, at which the velocities correlate best."""
+    """Return the shift [µs] of maximum velocity correlation, rounded to the grid."""
     times = [
         np.arange(int(each[0]), int(each[-1]), GRID_US)
         for each in (path.time_us, log.motion.time_us)
@@ -124,7 +124,7 @@ def _coarse(path: Trajectory, log: VehicleLog) -> float:
 
 
 def _refined(path: Trajectory, log: VehicleLog, coarse_us: float) -> float:
-    """Return the shift [µs] near a coarse one at which attitude and velocity agree best."""
+    """Return the best shift [µs] for attitude and velocity near a coarse shift."""
 
     def cost(shift_us: float) -> float:
         inside = _inside(path, log, shift_us)
@@ -140,7 +140,7 @@ def _refined(path: Trajectory, log: VehicleLog, coarse_us: float) -> float:
 
 
 def _down_and_nose(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the body's down axis, level, and its nose (n, 4), continuous across q and -q."""
+    """Return the horizontal parts of the body's down and nose axes (n, 4), equal for q and -q."""
     w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
     return np.stack(
         [
@@ -154,7 +154,7 @@ def _down_and_nose(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _inside(path: Trajectory, log: VehicleLog, shift_us: float) -> NDArray[np.bool_]:
-    """Return which samples (n,) the log has, too."""
+    """Return a mask (n,) of the samples within the log's time range."""
     times = path.time_us - shift_us
     first = max(log.motion.time_us[0], log.attitude.time_us[0])
     last = min(log.motion.time_us[-1], log.attitude.time_us[-1])
@@ -176,7 +176,7 @@ def _accepted(
     log: VehicleLog,
     told_us: float,
 ) -> tuple[float, float, int]:
-    """Return the bounds [µs] of a setpoint's way, and how many of them agree."""
+    """Return the bounds [µs] of the uplink shift and the number of setpoints that agree."""
     expected_us = np.asarray(sent_us - told_us, np.float64)
     bounds = [
         bound
@@ -192,7 +192,7 @@ def _accepted(
 def _looked_for(
     setpoints: NDArray[np.float64], commands: CommandKind, log: VehicleLog
 ) -> Iterator[tuple[NDArray[np.float64], Series, tuple[float, ...]]]:
-    """Give what was sent (k, m), the topic (n, m) that shows it, and how much less differs (m,)."""
+    """Yield sent setpoints (k, m), their series (n, m) in the log and match tolerances (m,)."""
     if commands == "body_rates":
         yield setpoints, log.rates_setpoint, (*3 * (SAME_TURN,), SAME_THRUST)
         return
@@ -208,7 +208,7 @@ def _looked_for(
         )
         return
     level = log.setpoint.values
-    # The heading turns neither speed nor yaw rate, so both are the same at both ends.
+    # Speed and yaw rate do not depend on the heading, so they are equal at both ends.
     sent = np.stack([np.hypot(setpoints[:, 0], setpoints[:, 1]), setpoints[:, 3]], axis=1)
     seen_level = np.stack([np.hypot(level[:, 0], level[:, 1]), level[:, 3]], axis=1)
     yield sent, Series(log.setpoint.time_us, seen_level), (SAME_SPEED_M_S, SAME_RATE_RAD_S)
@@ -221,7 +221,7 @@ def _bounds(
     seen: Series,
     near: NDArray[np.float64],
 ) -> list[tuple[float, float]]:
-    """Return when after the expected times (k,) each setpoint appears in the log, as intervals."""
+    """Return intervals [µs] after the expected times (k,) in which setpoints enter the log."""
     bounds = []
     for k in range(1, len(sent)):
         if (np.abs(sent[k] - sent[k - 1]) < 2.0 * near).all():
@@ -239,7 +239,7 @@ def _bounds(
 
 
 def marzullo(bounds: NDArray[np.float64]) -> tuple[float, float, int]:
-    """Return the range that the most of some ranges (n, 2) contain, and how many do."""
+    """Return the interval covered by most of the intervals (n, 2), and their number."""
     edges = [(low, -1) for low in bounds[:, 0]] + [(high, 1) for high in bounds[:, 1]]
     edges.sort()
     open_now, best, found = 0, 0, (0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Reader of PX4's log of a flight, versions 1.14 to 1.16; times since boot [µs], NED and FRD."""
+"""Reader of PX4 flight logs, versions 1.14 to 1.16; times since boot [µs], NED and FRD."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _TOPICS = (
 )
 
 _THRUST = "thrust_body[2]"
-"""Of multicopters: along the body's axis down, so negative."""
+"""Thrust field of multicopters, along the body's down axis, so negative."""
 
 _BROKEN = (
     EOFError,
@@ -49,29 +49,29 @@ _BROKEN = (
     struct.error,
     ULogException,
 )
-"""What pyulog raises for a file that is none, or is damaged."""
+"""Exceptions that pyulog raises for other or damaged files."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """n samples of one topic."""
+    """Samples of one topic; their number is n."""
 
     time_us: Times
-    """(n,) increasing [µs]."""
+    """Times (n,), increasing [µs]."""
     values: Floats
-    """(n, k)."""
+    """Values (n, k)."""
 
     def __len__(self) -> int:
-        """Return n."""
+        """Return the number of samples."""
         return len(self.time_us)
 
     def at(self, times_us: NDArray[Any]) -> Floats:
-        """Return the values (m, k) at times (m,) [µs], linear between samples."""
+        """Return the values (m, k) at times (m,) [µs], linearly interpolated."""
         columns = [np.interp(times_us, self.time_us, column) for column in self.values.T]
         return np.stack(columns, axis=1)
 
     def newest(self, times_us: NDArray[Any]) -> Floats:
-        """Return the values (m, k) that held at times (m,) [µs]; NaN before the first."""
+        """Return the newest values (m, k) at times (m,) [µs]; NaN before the first sample."""
         if not len(self):
             return np.full((len(times_us), self.values.shape[1]), np.nan)
         newest = np.searchsorted(self.time_us, times_us, side="right") - 1
@@ -84,50 +84,49 @@ class Series:
 
 
 def empty(width: int) -> Series:
-    """Return a topic that was not logged."""
+    """Return an empty series for a missing topic."""
     return Series(np.zeros(0, np.int64), np.zeros((0, width)))
 
 
 @dataclass(frozen=True)
 class VehicleLog:
-    """What a flight controller logged of a flight; topics that it did not log are empty."""
+    """Topics from a flight controller's log; missing topics are empty."""
 
     path: Path
     attitude: Series
-    """w, x, y, z, body to world."""
+    """Estimated attitude w, x, y, z, body to world."""
     motion: Series
-    """Estimated north, east, down [m], then the velocities [m/s]."""
+    """Estimated position north, east, down [m], then velocity [m/s]."""
     motors: Series
     """Commands of the four motors, 0 to 1."""
     specific_force: Series
-    """Forward, right, down [m/s²]; without the bias that the estimator knows of."""
+    """Specific force forward, right, down [m/s²], corrected by the estimated bias."""
     raw_specific_force: Series
-    """The same as measured, with its bias."""
+    """Measured specific force forward, right, down [m/s²], including bias."""
     raw_rates: Series
-    """Angular velocity about forward, right, down [rad/s], as measured, with its bias."""
+    """Measured angular velocity about forward, right, down [rad/s], including bias."""
     setpoint: Series
-    """Velocity that is tracked, north, east, down [m/s], and yaw rate [rad/s]."""
+    """Velocity setpoint north, east, down [m/s] and yaw rate setpoint [rad/s]."""
     yaw_rate_setpoint: Series
-    """Yaw rate that is tracked [rad/s]; logged more often than `setpoint`."""
+    """Yaw rate setpoint [rad/s]; logged more often than `setpoint`."""
     attitude_setpoint: Series
-    """Attitude that is tracked: w, x, y, z, body to world; then the thrust, 0 to 1."""
+    """Attitude setpoint w, x, y, z, body to world, then thrust, 0 to 1."""
     rates_setpoint: Series
-    """Body rates that are tracked, about forward, right, down [rad/s]; then the thrust, 0 to 1."""
+    """Body rate setpoint about forward, right, down [rad/s], then thrust, 0 to 1."""
     more_than_velocity: Series
-    """Position and acceleration that are commanded beside a velocity, NaN where none is: north,
-    east, down [m], then [m/s²]."""
+    """Commanded position north, east, down [m], then acceleration [m/s²]; NaN = not commanded."""
     nav_state: Series
-    """Mode, as `vehicle_status` numbers them."""
+    """Flight mode, numbered as in `vehicle_status`."""
     battery: Series
-    """Voltage [V], current [A], NaN where none is measured, charge that is left 1 to 0."""
+    """Voltage [V], current [A] (NaN if not measured), remaining charge 1 to 0."""
     wind: Series
-    """Wind towards north, east, as the estimator believes [m/s]."""
+    """Estimated wind velocity north, east [m/s]."""
     parameters: Mapping[str, float] = field(default_factory=dict)
-    """As they were when the log began."""
+    """Parameters at the start of the log."""
 
 
 def read_vehicle_log(path: Path) -> VehicleLog:
-    """Read a .ulg; raise UsageError without attitude or velocity."""
+    """Read a .ulg file; raise UsageError without attitude or velocity."""
     accepted = "a ULog (.ulg) with vehicle_attitude and vehicle_local_position"
     try:
         with path.open("rb") as file:
@@ -174,7 +173,7 @@ def read_vehicle_log(path: Path) -> VehicleLog:
 
 
 def _battery(topics: Mapping[str, Any]) -> Series:
-    """Return what the battery monitor measured; a current that it does not measure is NaN."""
+    """Return the battery measurements; an unmeasured current is NaN."""
     told = _series(topics, "battery_status", ("voltage_v", "current_a", "remaining"))
     told.values[told.values[:, 1] == UNMEASURED_A, 1] = np.nan
     return told
@@ -190,7 +189,7 @@ def _series(topics: Mapping[str, Any], topic: str, fields: Sequence[str]) -> Ser
     data = topics.get(topic)
     if data is None or any(name not in data for name in fields):
         return empty(len(fields))
-    # What was estimated or felt is that of its sample, which was published later.
+    # Values belong to the sample's time; `timestamp` is the later time of publication.
     times = np.asarray(data.get("timestamp_sample", data["timestamp"]), np.int64)
     later = np.diff(times, prepend=-1) > 0
     values = np.stack([np.asarray(data[name], np.float64) for name in fields], axis=1)
@@ -198,13 +197,13 @@ def _series(topics: Mapping[str, Any], topic: str, fields: Sequence[str]) -> Ser
 
 
 def _known(series: Series) -> Series:
-    """Return the samples that are numbers: motors that stand still are NaN."""
+    """Return the finite samples: stopped motors are NaN."""
     there = np.isfinite(series.values).all(axis=1)
     return Series(series.time_us[there], series.values[there])
 
 
 def _upward(series: Series) -> Series:
-    """Return the samples that are numbers, their last column, a thrust, positive."""
+    """Return the finite samples with the thrust, their last column, made positive."""
     known = _known(series)
     return Series(known.time_us, np.column_stack([known.values[:, :-1], -known.values[:, -1]]))
 

@@ -1,1 +1,1 @@
-"""Flights as they are flown, in a browser: what a flight tells, and the process that draws it."""
+"""Live view of flights in a browser: messages from a flight and the process that draws them."""

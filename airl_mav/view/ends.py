@@ -1,4 +1,4 @@
-"""That a view is asked for, and where it is reached. Light: who is not watched imports no more."""
+"""Requests for a live view and their answers; light to import for flights without a view."""
 
 from __future__ import annotations
 
@@ -9,45 +9,45 @@ from pydantic import BaseModel, ConfigDict
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """That flights are to be watched while they fly."""
+    """Request to show flights in a live view."""
 
     port: int | None = None
-    """TCP port of the page; None: any free one."""
+    """TCP port of the page; None = any free port."""
 
 
 class ViewEnds(BaseModel):
-    """Addresses of a view, on this machine."""
+    """ZeroMQ addresses of a view on this machine."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     told: str
     asked: str
-    """Where it says what its watchers ask for."""
+    """Address on which the view publishes its viewers' `Steering`."""
 
 
 class Request(BaseModel):
-    """What a view is to show."""
+    """Configuration of a view process."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     run: str
     port: int | None
-    """TCP port of the page; None: any free one."""
+    """TCP port of the page; None = any free port."""
     paced: bool
-    """Whether the watchers may set the pace."""
+    """True if viewers may set the pace."""
     speed: float | None
     steerable: bool
-    """Whether the watchers may set the latency."""
+    """True if viewers may set the latency."""
     compensable: bool
-    """Whether it can be compensated: the vehicle's response is known."""
+    """True if the vehicle's response is known, which latency compensation requires."""
     compensated: bool
 
 
 class Answer(BaseModel):
-    """Where a view is reached, or why not."""
+    """Port and addresses of a started view."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     port: int = 0
     ends: ViewEnds | None = None
-    """None: the port is taken."""
+    """ZeroMQ addresses; None = the requested port is in use."""

@@ -1,4 +1,4 @@
-"""ZeroMQ link between flight and view; nobody waits: messages to a hanging view are dropped."""
+"""Non-blocking ZeroMQ link between flight and view; messages to a slow view are dropped."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from airl_mav.view.ends import ViewEnds
 from airl_mav.view.messages import Image, Message, Steering, Told, from_parts, to_parts
 
 QUEUED = 64
-"""Messages that wait for a view at most, on either side; more are dropped."""
+"""Queue limit on either side; messages beyond it are dropped."""
 
 SILENCE_S = 5.0
-"""A view that says nothing for so long is gone: nothing that it asked for holds any more [s]."""
+"""Timeout after which a silent view counts as closed and its requests are dropped [s]."""
 
 
 class Feed:
-    """Sends snapshots. To be used from one thread at a time."""
+    """Sender of snapshots. Use from one thread at a time."""
 
     def __init__(self, ends: ViewEnds) -> None:
-        """Connect; the view may start later, or be gone."""
+        """Connect; the view may start later or be closed."""
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PUSH)
         self._socket.setsockopt(zmq.SNDHWM, QUEUED)
@@ -38,16 +38,16 @@ class Feed:
             self._socket.send_multipart(to_parts(message, image), zmq.NOBLOCK)
 
     def close(self) -> None:
-        """Disconnect; what is still on its way is dropped."""
+        """Disconnect and drop queued messages."""
         self._socket.close(linger=0)
         self._context.term()
 
 
 class Asked:
-    """What the watchers ask for. To be used from one thread at a time."""
+    """Receiver of the viewers' requests. Use from one thread at a time."""
 
     def __init__(self, ends: ViewEnds, default: Steering, clock: Clock | None = None) -> None:
-        """Connect to the view; `default` holds until it answers and after it is gone."""
+        """Connect to the view; `default` applies before its first message and after a timeout."""
         self._clock = clock or WallClock()
         self._heard_us = self._clock.time_us()
         self._default = self._newest = default
@@ -59,7 +59,7 @@ class Asked:
         self._socket.connect(ends.asked)
 
     def newest(self, wait_s: float = 0.0) -> Steering:
-        """Return what is asked for now; if it says nothing new, after waiting for so long."""
+        """Return the newest requests, waiting up to `wait_s` [s] for a new message."""
         if self._socket.poll(round(1e3 * wait_s)):
             with suppress(ValidationError):
                 self._newest = Steering.model_validate_json(self._socket.recv())
@@ -75,7 +75,7 @@ class Asked:
 
 
 class Ends:
-    """The view's own ends: takes snapshots in, says what is asked for."""
+    """Sockets of the view: receive snapshots and publish viewers' requests."""
 
     def __init__(self) -> None:
         """Bind two free ports of the loopback address."""
@@ -83,7 +83,7 @@ class Ends:
         self._told = self._bound(zmq.PULL)
         self._asked = self._bound(zmq.PUB)
         self.ends = ViewEnds(told=_address(self._told), asked=_address(self._asked))
-        """Where flights connect."""
+        """Addresses for flights to connect to."""
 
     def _bound(self, kind: int) -> zmq.Socket[bytes]:
         socket: zmq.Socket[bytes] = self._context.socket(kind)
@@ -93,7 +93,7 @@ class Ends:
         return socket
 
     def take(self, wait_s: float) -> list[tuple[Told, Image | None]]:
-        """Return all that has come, oldest first; if it is nothing, after waiting for so long."""
+        """Return all received messages, oldest first, waiting up to `wait_s` [s] for the first."""
         found: list[tuple[Told, Image | None]] = []
         wait_ms = round(1e3 * wait_s)
         while self._told.poll(wait_ms):
@@ -102,11 +102,11 @@ class Ends:
                 found.append(read)
             wait_ms = 0
             if len(found) >= 16 * QUEUED:
-                break  # A flight at full speed: what is there is drawn first.
+                break  # A flight at full speed: draw the received messages first.
         return found
 
     def ask(self, steering: Steering) -> None:
-        """Say what is asked for; again and again, for those who connect later."""
+        """Publish the requests; call repeatedly so that late subscribers receive them."""
         self._asked.send(steering.model_dump_json().encode(), zmq.NOBLOCK)
 
     def close(self) -> None:

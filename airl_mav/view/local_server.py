@@ -1,4 +1,4 @@
-"""viser's server restricted to pages of this computer.
+"""Server of viser restricted to pages of this computer.
 
 Any web page may open a WebSocket to 127.0.0.1, with its `Origin`. viser accepts all of them and
 opens public tunnels on request. A foreign page could change flights or publish them.
@@ -18,14 +18,14 @@ from websockets.http11 import Request, Response
 from airl_mav.core.ports import LOOPBACK
 
 OWN_PAGES = [re.compile(r"http://(127\.0\.0\.1|localhost)(:\d+)?"), None]
-"""Whose pages may connect: those that this computer serves, and programs, which name no origin."""
+"""Accepted origins: pages served by this computer, and programs, which send no origin."""
 
 Answering = Callable[[ServerConnection, Request], Response | None]
-"""Answers a request, or leaves it to the WebSocket: None."""
+"""Handler of HTTP requests; returns None to continue with the WebSocket."""
 
 
 def uncompressed(answering: Answering) -> Answering:
-    """Return the handler without compression, which only slows viser's page on one computer."""
+    """Return the handler without compression, which only slows viser's page on loopback."""
 
     def answer(connection: ServerConnection, request: Request) -> Response | None:
         if "Accept-Encoding" in request.headers:
@@ -36,10 +36,10 @@ def uncompressed(answering: Answering) -> Answering:
 
 
 class LocalServer(viser.ViserServer):
-    """A server on the loopback address that no other site's page reaches and nobody publishes."""
+    """Server on the loopback address that rejects other sites' pages and public tunnels."""
 
     def __init__(self, port: int) -> None:
-        """Serve on a port, 0 for a free one; where it is taken, on another."""
+        """Serve on a port, 0 = any free port; a port in use is replaced by another."""
         module: Any = websockets.asyncio.server
         serve = module.serve
 
@@ -47,7 +47,7 @@ class LocalServer(viser.ViserServer):
             answering = uncompressed(process_request)
             return serve(*words, origins=OWN_PAGES, process_request=answering, **more)
 
-        # viser has no option for it. It listens before its constructor returns.
+        # viser has no option for origins, and listens before its constructor returns.
         module.serve = serve_locally
         try:
             super().__init__(LOOPBACK, port, verbose=False)
@@ -55,4 +55,4 @@ class LocalServer(viser.ViserServer):
             module.serve = serve
 
     def request_share_url(self, verbose: bool = True) -> None:
-        """Open no tunnel, whoever asks."""
+        """Ignore requests for a public tunnel."""

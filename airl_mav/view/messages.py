@@ -1,4 +1,4 @@
-"""Messages from a flight to its view, and their bytes on the wire.
+"""Messages from a flight to its view, and their encoding.
 
 Positions and velocities are local NED [m, m/s], attitudes body FRD -> NED [w, x, y, z], times
 simulated [µs]. A message is one part of JSON. An image follows as a second part: little-endian
@@ -23,23 +23,23 @@ from airl_mav.profiles.vehicle import Momentum, VehicleProfile
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Image = NDArray[Any]
-"""As `camera.frame.Frame.image`: depth (h, w) uint16 [mm], colour (h, w, channels) uint8."""
+"""Image as in `camera.frame.Frame`: depth (h, w) uint16 [mm], colour (h, w, channels) uint8."""
 
 Shape = tuple[int, int] | tuple[int, int, int]
 
 ROTOR_SHARE = 0.8
-"""Radius of a rotor as a share of half the distance to its neighbour, where the profile does not
-say it."""
+"""Rotor radius as a fraction of the shorter arm component; default of profiles without a propeller
+diameter."""
 
 
 class Message(BaseModel):
-    """One message."""
+    """Base class of messages."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class VehicleShape(Message):
-    """What a vehicle looks like, and where its main camera looks [m, deg]."""
+    """Dimensions of a vehicle and mounting of its main camera [m, deg]."""
 
     arm_forward_m: float
     arm_right_m: float
@@ -52,13 +52,13 @@ class VehicleShape(Message):
     camera_yaw_deg: float = 0.0
     camera_projection: Projection
     camera_fov_deg: float
-    """Horizontal."""
+    """Horizontal field of view [deg]."""
     camera_aspect: float
     camera_range_m: float
 
     @classmethod
     def of(cls, vehicle: VehicleProfile) -> VehicleShape:
-        """Return what a vehicle of a profile looks like."""
+        """Return the shape of a profile's vehicle."""
         rotor, camera, power = vehicle.rotor, vehicle.camera, vehicle.power
         radius_m = ROTOR_SHARE * min(rotor.arm_forward_m, rotor.arm_right_m)
         if isinstance(power, Momentum):
@@ -81,22 +81,22 @@ class VehicleShape(Message):
 
 
 class Episode(Message):
-    """An episode begins, in a new arena."""
+    """Start of an episode in a new arena."""
 
     kind: Literal["episode"] = "episode"
     seed: int
     started_us: int
-    """When moving obstacles set out."""
+    """Start time of moving obstacles."""
     arena: Arena | None
-    """None: an endless floor."""
+    """Arena; None = an endless floor."""
     vehicle: VehicleShape
     goal: Goal
-    """North, east [m], and down where it has a height."""
+    """North, east and optionally down [m]."""
     goal_radius_m: float
 
 
 class Vehicle(Message):
-    """The true state of the vehicle."""
+    """True state of the vehicle."""
 
     kind: Literal["vehicle"] = "vehicle"
     time_us: int
@@ -104,26 +104,26 @@ class Vehicle(Message):
     velocity: Vector3
     quaternion: Quaternion
     rotors: Quaternion
-    """Their speeds, as shares of that at full command, in PX4's order."""
+    """Rotor speeds relative to the speed at full command, in PX4's order."""
     battery: float | None
-    """State of charge, 1 to 0; None: not known."""
+    """State of charge, 1 to 0; None = unknown."""
     mode: str
-    """Empty: not known."""
+    """Flight mode; empty = unknown."""
     armed: bool
     collision: str | None
 
 
 class Picture(Message):
-    """The camera's newest image."""
+    """Newest image of the camera."""
 
     kind: Literal["picture"] = "picture"
     captured_us: int
     shape: Shape
-    """Height and width [px]; of colour the channels, too."""
+    """Height, width [px] and, for colour, channels."""
 
 
 class Decided(Message):
-    """A decision that was sent, with the image that the policy saw."""
+    """Decision that was sent, with the policy's input image."""
 
     kind: Literal["decided"] = "decided"
     captured_us: int
@@ -131,19 +131,19 @@ class Decided(Message):
     ready_us: int
     sent_us: int
     expires_us: int | None
-    """When the vehicle is told to hover if no other has come; None: never."""
+    """Time at which the vehicle hovers without a newer decision; None = never."""
     setpoint: Quaternion
-    """Velocity forward, right, down [m/s] in the heading frame, yaw rate [rad/s]; or, by
-    `commands`, as `policy.actions.Attitude` or `BodyRates`."""
+    """Velocity forward, right, down [m/s] in the heading frame and yaw rate [rad/s]. For other
+    `commands`, the fields of `policy.actions.Attitude` or `BodyRates`."""
     commands: CommandKind = "velocity"
     compensated: bool
-    """Whether the policy saw what was expected, not what was."""
+    """True if the policy's input was predicted by latency compensation."""
     shape: Shape
-    """Height and width of the image [px]; of colour the channels, too."""
+    """Height, width [px] and, for colour, channels of the image."""
 
 
 class Flight(Message):
-    """A flight of the run begins, also one that begins again."""
+    """Start or restart of a flight of the run."""
 
     kind: Literal["flight"] = "flight"
     index: int
@@ -152,7 +152,7 @@ class Flight(Message):
 
 
 class Phase(Message):
-    """The companion has entered a phase, or the flight was judged."""
+    """Phase that the companion entered, or the verdict on the flight."""
 
     kind: Literal["phase"] = "phase"
     time_us: int
@@ -160,17 +160,17 @@ class Phase(Message):
 
 
 class Said(Message):
-    """The autopilot has said something, or the run has."""
+    """Text from the autopilot or the run."""
 
     kind: Literal["said"] = "said"
     time_us: int | None
     severity: int
-    """MAV_SEVERITY: 4 is a warning, less is graver."""
+    """MAV_SEVERITY: 4 is a warning; lower is more severe."""
     text: str
 
 
 class Trained(Message):
-    """What the newest decision came to, in a policy's training, and how far that is."""
+    """Result of the newest decision in a training, and the training's progress."""
 
     kind: Literal["trained"] = "trained"
     time_us: int
@@ -179,11 +179,11 @@ class Trained(Message):
     returned: float
     """Sum of the episode's rewards so far."""
     steps: int = 0
-    """Decisions of all vehicles so far."""
+    """Total decisions of all vehicles so far."""
     success: float | None = None
-    """Share of the newest episodes that reached the goal, 0 to 1; None: none has ended."""
+    """Success rate of recent episodes, 0 to 1; None before the first episode ends."""
     zone: int | None = None
-    """Open zone of the curriculum; None: there is none."""
+    """Open zone of the curriculum; None without a curriculum."""
 
 
 Told = Annotated[
@@ -194,21 +194,21 @@ _TOLD: TypeAdapter[Told] = TypeAdapter(Told)
 
 
 class Steering(Message):
-    """What the watchers ask of the flight; the newest one counts."""
+    """Viewers' requests to the flight; the newest message applies."""
 
     paused: bool = False
     speed: float | None = None
-    """Simulated seconds per wall second; None: as fast as it goes."""
+    """Simulated seconds per wall second; None = unlimited."""
     steps: int = 0
-    """How many single decisions were asked for so far, while paused."""
+    """Total of single decisions requested so far while paused."""
     t2_ms: float | None = None
-    """The latency of every decision; None: as the scenario says."""
+    """Latency of every decision [ms]; None = the scenario's latency."""
     compensate: bool | None = None
-    """Whether it is compensated; None: as the scenario says."""
+    """True to compensate latency; None = the scenario's setting."""
 
 
 def to_parts(message: Message, image: Image | None = None) -> list[bytes]:
-    """Return the parts of a message; `image` is its image."""
+    """Return the wire parts of a message and its image."""
     parts = [message.model_dump_json().encode()]
     if image is not None:
         parts.append(np.ascontiguousarray(image, _number(image.shape)).tobytes())
@@ -216,7 +216,7 @@ def to_parts(message: Message, image: Image | None = None) -> list[bytes]:
 
 
 def from_parts(parts: list[bytes]) -> tuple[Told, Image | None] | None:
-    """Return a message and its image; None for what is no message."""
+    """Return a message and its image; None for invalid parts."""
     try:
         message = _TOLD.validate_json(parts[0])
     except (ValidationError, IndexError):
@@ -230,7 +230,7 @@ def from_parts(parts: list[bytes]) -> tuple[Told, Image | None] | None:
 
 
 def shape_of(image: Image) -> Shape:
-    """Return the shape of an image as a message tells it."""
+    """Return the shape of an image for a message."""
     height, width, *channels = image.shape
     return (height, width, channels[0]) if channels else (height, width)
 

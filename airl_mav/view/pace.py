@@ -1,6 +1,6 @@
-"""Pace of a lockstep flight by its viewers: speed, pause, single steps.
+"""Pacing of a lockstep flight by its viewers: speed, pause, single steps.
 
-Only wall time passes here. The flight stays bit-identical.
+Pacing affects only wall time. The flight stays bit-identical.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from airl_mav.view.feed import Asked
 from airl_mav.view.messages import Steering
 
 REAL_TIME = 1.0
-"""The pace of a watched flight in lockstep, unless the scenario has another."""
+"""Default speed of a lockstep flight in a view, in simulated seconds per wall second."""
 
 LOOK_S = 0.1
-"""While it is paused, the watchers are listened to for so long at a time [wall s]."""
+"""Poll timeout for viewers' requests while paused [wall s]."""
 
 BEHIND_S = 0.2
-"""A flight that falls behind by more does not hurry to catch up [wall s]."""
+"""Maximum delay that a flight catches up; a longer delay is skipped [wall s]."""
 
 
 class Pace:
-    """Holds a flight back. Calls come from one thread at a time."""
+    """Limiter of a flight's speed. Call from one thread at a time."""
 
     def __init__(
         self,
@@ -32,17 +32,17 @@ class Pace:
         speed: float | None,
         new_clock: Callable[[float], WallClock] = WallClock,
     ) -> None:
-        """Connect to a view; `speed` is the pace until it says otherwise, None: no limit."""
+        """Connect to a view; `speed` applies until the view sets another, None = unlimited."""
         self._asked = Asked(ends, Steering(speed=speed))
         self._new_clock = new_clock
         self._clock: WallClock | None = None
         self._steps: int | None = None
         self._left = 0
-        """Single steps that were asked for and are not done."""
+        """Single steps requested but not yet executed."""
         self._released = False
 
     def tick(self, time_us: int) -> None:
-        """Return when the flight may go on; it is at simulated `time_us` [µs]."""
+        """Block until the flight may continue from simulated `time_us` [µs]."""
         if self._released:
             return
         asked = self._heard(self._asked.newest())
@@ -63,11 +63,11 @@ class Pace:
         clock.sleep_until(time_us)
 
     def decided(self) -> None:
-        """A decision was sent: a single step ends here."""
+        """End a single step: a decision was sent."""
         self._left = max(0, self._left - 1)
 
     def let_go(self) -> None:
-        """Hold the flight back no longer, from any thread."""
+        """Stop limiting the flight; thread-safe."""
         self._released = True
 
     def close(self) -> None:
@@ -76,7 +76,7 @@ class Pace:
 
     def _heard(self, asked: Steering) -> Steering:
         if self._steps is None or asked.steps < self._steps or not asked.paused:
-            # Of another page, or no longer wanted.
+            # The first request, the count of another view, or no pause: no step is pending.
             self._left = 0
         else:
             self._left += asked.steps - self._steps

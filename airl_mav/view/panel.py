@@ -1,4 +1,4 @@
-"""The panel beside the scene: numbers, the policy's image, the latency strip, texts."""
+"""Panel beside the scene: numbers, the policy's image, the latency strip, texts."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ AGE_COLOUR, T2_COLOUR = "#2868a8", "#b4540a"
 WIDTH_PX = 340
 
 BLANK = np.full((144, 192, 3), 38, np.uint8)
-"""The image before the first decision."""
+"""Image before the first decision."""
 
 NO_PAST = (np.array([0.0, STRIP_S]), np.zeros(2), np.zeros(2))
-"""The strip before it."""
+"""Latency strip before the first decision."""
 
 
 class Panel:
-    """The panel of one server."""
+    """Panel of one server."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class Panel:
         gui: Any = server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         gui.set_panel_label("airl-mav")
-        # Beside the scene, not on it: the vehicle is in the middle of what is seen.
+        # Docked beside the scene: an overlay would hide the vehicle in the middle.
         gui.main_panel.dock_right()
         gui.main_panel.set_width(WIDTH_PX)
         self._title = gui.add_html(title_html(Shown(), run))
@@ -57,16 +57,16 @@ class Panel:
         self._is_blank = True
 
     def name(self, run: str) -> None:
-        """Call the run something else from now on."""
+        """Rename the run in the title."""
         self._run = run
 
     def draw_title(self, shown: Shown) -> None:
-        """Show what flies."""
+        """Update the title with the run and its flight."""
         if self._title.content != (title := title_html(shown, self._run)):
             self._title.content = title
 
     def draw(self, shown: Shown) -> None:
-        """Show the numbers, texts and images of the moment; what has not changed is not sent."""
+        """Update numbers, texts and image; unchanged elements are not sent."""
         self.draw_title(shown)
         for element, text in (
             (self._numbers, numbers_html(shown)),
@@ -85,12 +85,12 @@ class Panel:
                 self._picture.image = camera_picture(shown.decided_image, range_m)
 
     def _add_picture(self) -> None:
-        """Add the image below the numbers, late: its encoder takes longest to import."""
+        """Add the image below the numbers; deferred, as its encoder is slow to import."""
         order = self._numbers.order + 0.5
         self._picture = self._gui.add_image(BLANK, label=self._label, format="png", order=order)
 
     def draw_strip(self, shown: Shown) -> None:
-        """Show the latencies of the last seconds."""
+        """Update the strip with the latencies of the last `STRIP_S` seconds."""
         if len(shown.ages) >= 2:
             seconds, ages, t2s = np.array(shown.ages).T
             self._strip.data = (seconds, ages, t2s)

@@ -1,4 +1,4 @@
-"""Images, numbers and texts of the panel as pure functions; imported late, as that takes long."""
+"""Images, numbers and texts of the panel as pure functions; slow to import, so imported late."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ _COLOURS = """
 addc30afdc2eb2dd2cb5dd2bb7dd29bade27bdde26bfdf24c2df22c5df21c7e01fcae01ecde01dcfe11cd2e11bd4e11a
 d7e219dae218dce218dfe318e1e318e4e318e7e419e9e419ece41aeee51bf1e51cf3e51ef6e61ff8e621fae622fde724
 """
-"""Red, green and blue of each, two hexadecimal digits a part."""
+"""RGB of each colour, two hexadecimal digits per channel."""
 
 VIRIDIS: NDArray[np.uint8] = np.frombuffer(bytes.fromhex(_COLOURS), np.uint8).reshape(256, 3)
 """RGB (256, 3) from dark to bright."""
 
 
 NO_RETURN = (38, 42, 48)
-"""Colour of pixels that the camera has no depth of."""
+"""Colour of pixels without a depth return."""
 
 LEAST_PX = 192
-"""Images are shown at least so wide, each pixel as a square."""
+"""Minimum width of a displayed image [px]; narrower images are scaled by an integer."""
 
 WARNING = 4
 
@@ -50,7 +50,7 @@ NOTHING = "–"
 
 
 def camera_picture(image: Image, range_m: float) -> NDArray[np.uint8]:
-    """Return a `Frame.image` as RGB (h, w, 3); depth up to `range_m` [m] is bright where near."""
+    """Return a `Frame.image` as RGB (h, w, 3); near depth is bright, up to `range_m` [m]."""
     if image.ndim == 3:
         picture = rgb_of(image)
     else:
@@ -62,7 +62,7 @@ def camera_picture(image: Image, range_m: float) -> NDArray[np.uint8]:
 
 
 def numbers_html(shown: Shown) -> str:
-    """Return the numbers of the moment as a table."""
+    """Return the current values as an HTML table."""
     vehicle, decided = shown.vehicle, shown.decided
     rows = [("phase", shown.phase or NOTHING)]
     if (trained := shown.trained) is not None:
@@ -99,8 +99,8 @@ def numbers_html(shown: Shown) -> str:
 
 
 def _setpoint(decided: Decided) -> tuple[str, str]:
-    """Return what was decided, in two lines."""
-    # Added to zero, so that a rounded zero has no sign of its own.
+    """Return the decision's setpoint as two lines of text."""
+    # Adding zero removes the sign of a negative zero.
     if decided.commands == "velocity":
         forward, right, down = (round(number, 1) + 0.0 for number in decided.setpoint[:3])
         turn = round(math.degrees(decided.setpoint[3])) + 0
@@ -115,7 +115,7 @@ def _setpoint(decided: Decided) -> tuple[str, str]:
 
 
 def title_html(shown: Shown, run: str) -> str:
-    """Return what flies, as a heading; `run` names the run."""
+    """Return the run's name and its flight as an HTML heading."""
     flight = shown.flight
     what = "" if flight is None else f"flight {flight.index:03d}, seed {flight.seed}"
     style = "margin:0 1em;font-size:0.85em;line-height:1.3"
@@ -123,7 +123,7 @@ def title_html(shown: Shown, run: str) -> str:
 
 
 def texts_html(shown: Shown) -> str:
-    """Return what was said, the newest first."""
+    """Return the texts as HTML, newest first."""
     began_us = 0 if shown.episode is None else shown.episode.started_us
     lines = []
     for said in reversed(shown.texts):

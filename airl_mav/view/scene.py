@@ -1,4 +1,4 @@
-"""The scene in three dimensions, local NED with up = -z; the vehicle's parts are FRD."""
+"""3D scene in local NED with up = -z; the vehicle's parts are in FRD."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from airl_mav.view.pictures import camera_picture
 from airl_mav.view.shown import Shown
 
 FRUSTUM_M = 0.6
-"""How far ahead the camera's image is drawn, or above where it sees all round [m]."""
+"""Distance of the drawn camera image: ahead, or above for a 360° camera [m]."""
 
 WIDEST_FRUSTUM_DEG = 120.0
-"""Horizontal field of view of the widest frustum that is drawn [deg]."""
+"""Maximum horizontal field of view of a drawn frustum [deg]."""
 
 UNROLLED_M = 2.0
-"""Width of the image of a camera that sees all round [m]."""
+"""Width of the drawn image of a 360° camera [m]."""
 
 AMBIENT, SIDE = 0.9, 0.9
-"""Intensities of the lights besides that from above, which is viser's own."""
+"""Intensities of the ambient and the side light; viser adds a light from above."""
 
 SIDE_NED = (-6.0, -9.0, -5.0)
-"""From where the light from the side falls on the start [m]."""
+"""Position of the side light, NED [m]."""
 
 CHUNK = 200
-"""Segments of a finished part of the trail, which is not sent again."""
+"""Segments per part of the trail; finished parts are not sent again."""
 
 BLADE_TURN_RAD = 1.9
-"""How far a rotor at full speed turns from one drawing to the next. A real one turns some ten
-times between two, which no screen shows."""
+"""Rotation of a rotor at full speed per drawing [rad]. A real rotor turns about ten times per
+drawing, too fast for a screen."""
 
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -49,27 +49,27 @@ Floats = NDArray[np.float64]
 
 
 class FlightScene:
-    """The scene of one server. All calls come from one thread."""
+    """Scene of one server. Call from one thread."""
 
     def __init__(
         self, server: viser.ViserServer, root: str = "/flight", look: style.Look = style.FIRST
     ) -> None:
-        """Prepare an empty scene; all its nodes lie below `root`."""
+        """Prepare an empty scene with all nodes below `root`."""
         self._server = server
         self._root = root
         self._look = look
         self._scene: Any = server.scene
         self._scene.set_up_direction((0.0, 0.0, -1.0))
         self._scene.world_axes.visible = False
-        # A shadow draws the whole scene once more: without a GPU a third of the frames.
+        # Shadows render the scene twice and cost a third of the frame rate without a GPU.
         self._scene.configure_default_lights(cast_shadow=False)
-        # Light from all round is looked up for every pixel, and takes half of the frames without a
-        # GPU: ambient light takes its place, and one from the side tells round from flat.
+        # An environment map halves the frame rate without a GPU. Ambient light replaces it, and
+        # the side light makes round shapes visible.
         self._scene.configure_environment_map(None)
         self._scene.add_light_ambient("/light/ambient", intensity=AMBIENT)
         self._scene.add_light_directional("/light/side", intensity=SIDE, position=SIDE_NED)
         self._drawn = -1
-        """Number of the episode that is drawn."""
+        """Number of the drawn episode."""
         self._base: Any = None
         self._reset()
 
@@ -88,13 +88,13 @@ class FlightScene:
 
     def _add(self, kind: str, name: str, *args: Any, **properties: Any) -> Any:
         if kind == "box":
-            # Its corners have a normal for each side. It looks the same, and a page without a GPU
-            # has one shader fewer to compile before it shows anything.
+            # Box corners have a normal per side, so both settings look the same. Without flat
+            # shading, a page without a GPU compiles one shader less at start.
             properties["flat_shading"] = False
         return getattr(self._scene, f"add_{kind}")(f"{self._root}{name}", *args, **properties)
 
     def draw(self, shown: Shown, *, picture: bool) -> None:
-        """Draw what is shown now; the camera's image only where `picture` says so."""
+        """Draw the current state; with `picture`, also the camera's image."""
         episode = shown.episode
         if episode is None:
             return
@@ -112,7 +112,7 @@ class FlightScene:
             self.draw_picture(shown)
 
     def draw_picture(self, shown: Shown) -> None:
-        """Draw what the camera sees, in the scene that has been drawn."""
+        """Draw the camera's image in the existing scene."""
         if shown.picture is not None and shown.episode is not None and self._look.whole:
             range_m = shown.episode.vehicle.camera_range_m
             self._camera.image = camera_picture(shown.picture, range_m)
@@ -130,7 +130,7 @@ class FlightScene:
     def _build(self, episode: Episode) -> None:
         self._build_vehicle(episode.vehicle)
         none = np.zeros((0, 2, 3), np.float32)
-        # At the vehicle's place, by a message of the same kind: they move with it, not behind it.
+        # Children of a frame at the vehicle's position, so that they move in sync with it.
         self._place = self._add("frame", "/place", show_axes=False)
         self._drop = self._add("line_segments", "/place/drop", none, style.DROP, thickness=0.015)
         sizes = {"shaft_radius": 0.025, "head_radius": 0.07, "head_length": 0.16}
@@ -153,12 +153,12 @@ class FlightScene:
             plane_opacity=1.0,
             fade_distance=400.0,
             position=(*middle, 0.0),
-            # Its upper side is the one that looks along its own +z.
+            # The grid's front side faces along its local +z.
             wxyz=frames.quat_from_euler(math.pi, 0.0, 0.0),
         )
 
     def _build_arena(self, arena: Arena) -> None:
-        # From outside nobody looks through them.
+        # Drawn from inside only: transparent from outside.
         look = {"color": arena.wall_colour, "opacity": style.WALL_OPACITY, "side": "front"}
         self._add(
             "mesh_simple", "/arena/walls", *style.walls(arena.bounds), **look, flat_shading=True
@@ -244,7 +244,7 @@ class FlightScene:
         pitch, yaw = map(math.radians, (shape.camera_pitch_up_deg, shape.camera_yaw_deg))
         turn = frames.quat_from_euler(0.0, pitch, yaw)
         if shape.camera_projection == "cylindrical":
-            # It looks all round: its picture hangs unrolled above the vehicle, ahead in the middle.
+            # A 360° camera: the unrolled image is above the vehicle, centred on forward.
             self._camera = self._add(
                 "image",
                 "/vehicle/camera",
@@ -255,7 +255,7 @@ class FlightScene:
                 wxyz=frames.FRD_FROM_OPTICAL,
             )
             return
-        # A fisheye's is drawn as wide as a frustum can be.
+        # A fisheye's frustum is drawn at the maximum width.
         across = math.tan(0.5 * math.radians(min(shape.camera_fov_deg, WIDEST_FRUSTUM_DEG)))
         self._camera = self._add(
             "camera_frustum",
@@ -292,7 +292,7 @@ class FlightScene:
         self._extend_trail(shown.trail)
 
     def _extend_trail(self, trail: list[tuple[float, float, float]]) -> None:
-        """Draw the trail in parts, of which only the last one changes."""
+        """Draw the trail in parts; only the last part changes."""
         if len(trail) == self._trail_points or len(trail) < 2:
             return
         self._trail_points = len(trail)
@@ -308,7 +308,7 @@ class FlightScene:
 
 
 def _below(arena: Arena | None, place: Sequence[float]) -> float:
-    """Return how high the ground is at a place (>= 2,) NED [m]."""
+    """Return the ground height at a position (>= 2,) NED [m]."""
     if arena is None or arena.ground is None:
         return 0.0
     return arena.ground.height_at(place[0], place[1])

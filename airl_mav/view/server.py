@@ -1,7 +1,7 @@
-"""The view's process: draws snapshots for all viewers and returns their requests.
+"""View process: draws snapshots for all viewers and returns their requests.
 
-Its first line of input is a `Request`, its first line of output an `Answer`. It ends when its input
-does: with the run.
+The first line of its input is a `Request`, the first line of its output an `Answer`. The process
+ends with the run, at the end of its input.
 """
 
 from __future__ import annotations
@@ -29,33 +29,33 @@ from airl_mav.view.watchers import Watchers
 
 FASTEST = "fastest"
 SPEEDS = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "5 x": 5.0}
-"""What may be chosen beside the scenario's own speed and the fastest."""
+"""Speeds offered besides the scenario's speed and the fastest."""
 
 LONGEST_MS = 1000
-"""Greatest latency that may be set by hand [ms]."""
+"""Maximum latency of the slider [ms]."""
 
 FIRST_MS = 400
-"""The latency that the slider begins at: that of the paper's Raspberry Pi 4."""
+"""Initial latency of the slider [ms]: the paper's Raspberry Pi 4."""
 
 
 class Controls:
-    """The controls of one page; callbacks are coroutines, which run before its next message."""
+    """Controls of one page; their callbacks are coroutines, run before the next message."""
 
     def __init__(self, gui: Any, steering: Steering) -> None:
-        """Take viser's interface, and what is asked for at the beginning."""
+        """Store viser's interface and the initial requests."""
         self.steering = steering
-        """What the watchers ask for."""
+        """Current requests of the viewers."""
         self._gui = gui
 
     def _ask(self, **changes: Any) -> None:
         self.steering = self.steering.model_copy(update=changes)
 
     def let_go(self) -> None:
-        """Let a paused flight go on: the last of those who could has left."""
+        """Resume a paused flight after the last viewer disconnects."""
         self._ask(paused=False)
 
     def add_pace(self) -> None:
-        """Add what sets the pace."""
+        """Add the controls of the pace."""
         gui = self._gui
         speeds = dict(SPEEDS)
         if (speed := self.steering.speed) is not None and speed not in speeds.values():
@@ -79,7 +79,7 @@ class Controls:
             self._ask(speed=speeds.get(pace.value))
 
     def add_knob(self, *, compensable: bool, compensated: bool) -> None:
-        """Add the latency control, and that of compensation where the vehicle supports it."""
+        """Add the latency control and, if the vehicle supports it, the compensation control."""
         gui = self._gui
         by_hand = gui.add_checkbox(
             "Set t2 by hand", False, hint="The flight then counts in no statistics."
@@ -104,17 +104,17 @@ class Controls:
 
 
 DRAW_US = 33_333
-"""Time between two drawings of the scene [wall µs]."""
+"""Period of scene updates [wall µs]."""
 
 PICTURE_EVERY, PANEL_EVERY, STRIP_EVERY = 3, 4, 8
-"""Drawings of the scene for one of the camera's image, of the panel, of the strip."""
+"""Scene updates per update of the camera's image, the panel and the strip."""
 
 NICENESS = 10
-"""Less than that of flights: on a busy machine it is the view that waits."""
+"""Nice value of the view; flights have priority on a busy machine."""
 
 
 class View:
-    """The page of a run."""
+    """Page of a run."""
 
     def __init__(self, server: viser.ViserServer, ends: Ends, request: Request) -> None:
         """Build the page."""
@@ -145,9 +145,8 @@ class View:
             now_us = clock.time_us()
             if now_us < due_us:
                 continue
-            # Counted from when it was due, or what drawing takes would come on top each time.
+            # Counted from the due time, so that the drawing time does not lengthen the period.
             due_us = max(due_us, now_us - DRAW_US) + DRAW_US
-            # Nobody watches: nothing is drawn.
             if self._watchers.there:
                 self._draw()
 
@@ -162,9 +161,9 @@ class View:
 
 
 def main() -> int:
-    """Be a view until the input ends."""
+    """Run a view until the input ends."""
     outgoing = os.fdopen(os.dup(1), "wb", buffering=0)
-    # What libraries print must not reach the harness as an answer.
+    # Output of libraries must not reach the harness as an answer.
     os.dup2(2, 1)
     request = Request.model_validate_json(sys.stdin.buffer.readline())
     give_way(NICENESS)

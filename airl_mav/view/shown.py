@@ -1,4 +1,4 @@
-"""What a view shows: the messages so far, folded into the newest of each kind and a short past."""
+"""State of a view: the newest message of each kind and a short history."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from airl_mav.core.goals import goal_distance_m
 from airl_mav.view import messages
 
 STRIP_S = 20.0
-"""How much of the past the strip shows [simulated s]."""
+"""Time span of the latency strip [simulated s]."""
 
 TEXTS = 6
-"""So many of the newest texts are shown."""
+"""Number of recent texts shown."""
 
 TRAIL_STEP_M = 0.05
-"""A point of the trail lies so far from the one before [m]."""
+"""Minimum distance between points of the trail [m]."""
 
 OFFBOARD = "offboard"
-"""The mode in which setpoints are flown."""
+"""Flight mode that follows setpoints."""
 
 Point = tuple[float, float, float]
 
 
 @dataclass
 class Shown:
-    """All that is drawn."""
+    """Data of the scene and the panel."""
 
     flight: messages.Flight | None = None
     phase: str = ""
@@ -39,25 +39,25 @@ class Shown:
     episode: messages.Episode | None = None
     arena: Arena | None = None
     is_surrounded: bool = True
-    """Whether it is known what stands around: not while an arena is being made."""
+    """True if the surroundings are known; False while an arena is being generated."""
     episodes: int = 0
-    """How many episodes have begun so far: another number is another scene."""
+    """Number of episodes started so far; a new number requires a new scene."""
     vehicle: messages.Vehicle | None = None
     trail: list[Point] = field(default_factory=list)
-    """Where the vehicle was in this episode, NED [m]."""
+    """Past positions of the vehicle in this episode, NED [m]."""
     picture: messages.Image | None = None
     decided: messages.Decided | None = None
     decided_image: messages.Image | None = None
-    """What the policy saw at that decision."""
+    """Policy's input image of that decision."""
     trained: messages.Trained | None = None
-    """What a training's newest decision came to; None: nothing is trained."""
+    """Result of a training's newest decision; None outside training."""
     decisions: int = 0
-    """How many were sent in this episode, as far as they were heard of."""
+    """Number of decisions received in this episode."""
     ages: deque[tuple[float, float, float]] = field(default_factory=deque)
-    """Time since the episode began [s], age of the command and t2 of its decision [ms]."""
+    """Time since the episode's start [s], command age and t2 of its decision [ms]."""
 
     def take(self, message: messages.Told, image: messages.Image | None) -> None:
-        """Take in a message, with its image."""
+        """Update the state with a message and its image."""
         if isinstance(message, messages.Vehicle):
             self._move(message)
         elif isinstance(message, messages.Picture):
@@ -96,34 +96,34 @@ class Shown:
 
     @property
     def seconds(self) -> float:
-        """Time since the episode began [simulated s]."""
+        """Time since the episode's start [simulated s]."""
         if self.vehicle is None or self.episode is None:
             return 0.0
         return (self.vehicle.time_us - self.episode.started_us) / US_PER_S
 
     @property
     def flies_setpoints(self) -> bool:
-        """Whether the vehicle flies what was decided."""
+        """True if the vehicle is armed and follows setpoints."""
         vehicle = self.vehicle
         return vehicle is not None and vehicle.armed and vehicle.mode == OFFBOARD
 
     @property
     def age_ms(self) -> float | None:
-        """How old the image is that the present command was decided on [ms]."""
+        """Age of the image behind the current command [ms]; None without such a command."""
         if self.decided is None or self.vehicle is None or not self.flies_setpoints:
             return None
         return max(0.0, (self.vehicle.time_us - self.decided.captured_us) / US_PER_MS)
 
     @property
     def t2_ms(self) -> float | None:
-        """What the newest decision took [ms]."""
+        """Inference time t2 of the newest decision [ms]; None before the first decision."""
         if self.decided is None:
             return None
         return (self.decided.ready_us - self.decided.began_us) / US_PER_MS
 
     @property
     def command(self) -> NDArray[np.float64] | None:
-        """The velocity that is commanded (3,): forward, right, down [m/s]; None: nobody does."""
+        """Commanded velocity (3,): forward, right, down [m/s]; None without one."""
         if self.decided is None or self.vehicle is None or not self.flies_setpoints:
             return None
         if self.decided.commands != "velocity":
@@ -135,7 +135,7 @@ class Shown:
 
     @property
     def to_goal_m(self) -> float | None:
-        """How far the goal is: seen from above, if it has no height [m]."""
+        """Distance to the goal [m]; horizontal for a goal without a height."""
         if self.vehicle is None or self.episode is None:
             return None
         return goal_distance_m(self.episode.goal, self.vehicle.position)

@@ -22,23 +22,23 @@ WALL_OPACITY = 0.25
 GLASS_OPACITY = 0.35
 
 OPEN = Bounds(-50.0, 50.0, -50.0, 50.0, 5.0)
-"""The floor of a flight outside of all arenas: around its start."""
+"""Floor around the start of a flight without an arena."""
 
 ARROW_S = 0.6
-"""A velocity's arrow ends where the vehicle would be after so long [s]."""
+"""Length of a velocity arrow per speed [s]."""
 
 LEAST_ARROW_M = 0.02
 
 
 @dataclass(frozen=True)
 class Look:
-    """What tells one flight from another in the same scene."""
+    """Colours of one flight among several in the same scene."""
 
     trail: Colour
     body: Colour
     disc: Colour
     whole: bool = True
-    """Whether arena, camera and commanded velocity are drawn, too."""
+    """True if arena, camera and commanded velocity are drawn, too."""
 
 
 FIRST = Look((47, 127, 196), (47, 54, 61), (40, 104, 168))
@@ -49,7 +49,7 @@ Floats = NDArray[np.float64]
 
 
 def walls(bounds: Bounds) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Return walls and ceiling, fronts inside: corners (8, 3) NED [m] and triangles (n, 3)."""
+    """Return walls and ceiling facing inward: corners (8, 3) NED [m] and triangles (n, 3)."""
     b = bounds
     ends = [
         (b.north_max, b.east_min),
@@ -67,13 +67,13 @@ def walls(bounds: Bounds) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
 
 
 def arrow(velocity: Floats | None) -> NDArray[np.float32]:
-    """Return the arrow (n, 2, 3) of a velocity (3,) [m/s], from the origin [m]; n = 0: none."""
+    """Return the arrow (n, 2, 3) of a velocity (3,) [m/s] from the origin [m]; n = 0 for None."""
     if velocity is None or np.linalg.norm(velocity) * ARROW_S < LEAST_ARROW_M:
         return np.zeros((0, 2, 3), np.float32)
     return np.array([[np.zeros(3), ARROW_S * velocity]], np.float32)
 
 
 def segments_of(points: list[tuple[float, float, float]]) -> NDArray[np.float32]:
-    """Return the segments (n - 1, 2, 3) of a line through n points."""
+    """Return the segments (n - 1, 2, 3) of a polyline through n points."""
     line = np.array(points, np.float32)
     return np.stack([line[:-1], line[1:]], axis=1)

@@ -1,4 +1,4 @@
-"""Where a flight is looked into: its simulation, and its companion's decisions."""
+"""Sources of a view's messages: the simulation and the companion's decisions."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from firmware_sim.simulation import Simulation
 
 
 class Hand:
-    """What the watchers have set, as one companion flies by it."""
+    """Viewers' settings for one companion's flight."""
 
     def __init__(self, newest: Callable[[], messages.Steering], *, compensate: bool) -> None:
-        """Take what gives the newest that they ask for, and whether the scenario compensates."""
+        """Store the source of requests; `compensate` is the scenario's setting."""
         self.touched = False
-        """Whether a decision of this flight was made otherwise than the scenario says."""
+        """True if a decision of this flight deviated from the scenario's settings."""
         self._newest = newest
         self._known = messages.Steering()
         self._as_asked = compensate
@@ -45,7 +45,7 @@ class Hand:
         return round(t2_ms * US_PER_MS)
 
     def compensates(self) -> bool:
-        """Return whether this decision is compensated."""
+        """Return True if this decision is compensated."""
         wanted = self._known.compensate
         if wanted is None or wanted == self._as_asked:
             return self._as_asked
@@ -54,25 +54,25 @@ class Hand:
 
 
 class HandLatency:
-    """A latency that may be set by hand. Implements `latency.samplers.LatencySampler`."""
+    """Latency that viewers may override. Implements `latency.samplers.LatencySampler`."""
 
     def __init__(self, hand: Hand, sampler: LatencySampler | None) -> None:
-        """Take what is set, and where the scenario draws t2 from; None: nothing is injected."""
+        """Store the settings and the scenario's t2 sampler; None = no injected latency."""
         self._hand, self._sampler = hand, sampler
 
     def sample_us(self) -> int:
         """Return the next latency [µs]."""
-        # Drawn in any case: the scenario's own go on where they would be.
+        # Drawn in any case, so that the scenario's random sequence stays the same.
         drawn_us = 0 if self._sampler is None else self._sampler.sample_us()
         set_us = self._hand.t2_us()
         return drawn_us if set_us is None else set_us
 
 
 class HandCompensator(Compensator):
-    """A compensator that may be switched on and off in flight."""
+    """Compensator that viewers may switch on and off in flight."""
 
     def __init__(self, hand: Hand, scenario: ResolvedScenario) -> None:
-        """Make the one of a scenario; its vehicle's response is known."""
+        """Create the compensator of a scenario, which requires a known vehicle response."""
         super().__init__(1, scenario.vehicle, Intrinsics.of(scenario.vehicle.camera))
         self._hand = hand
 
@@ -84,7 +84,7 @@ class HandCompensator(Compensator):
         now_us: NDArray[np.int64],
         state: Kinematics,
     ) -> tuple[NDArray[np.uint16], Kinematics]:
-        """Return what is seen when the decision will act, or as it is while switched off."""
+        """Return the predicted depth and state, or the current ones while switched off."""
         if self._hand.compensates():
             return super().foresee(who, depth_mm, age_us, now_us, state)
         for i in who.tolist():
@@ -93,14 +93,14 @@ class HandCompensator(Compensator):
 
 
 VEHICLE_EVERY_US = 32_000
-"""The vehicle is shown so often [simulated µs]: every eighth tick of 4 ms, 31 times a second."""
+"""Period of vehicle messages [simulated µs]: every eighth tick of 4 ms, 31 Hz."""
 
 PICTURE_EVERY_US = 100_000
-"""The camera's image is shown so often [simulated µs]."""
+"""Period of camera images [simulated µs]."""
 
 
 class SimulationTap:
-    """Shows the simulation's side of flights. All calls from one thread."""
+    """Sender of the simulation's messages. Call from one thread."""
 
     def __init__(self, ends: ViewEnds, scenario: ResolvedScenario) -> None:
         """Connect to a view."""
@@ -109,7 +109,7 @@ class SimulationTap:
         self._vehicle_due = self._picture_due = -1
 
     def begin(self, seed: int, arena: Arena, started_us: int) -> None:
-        """An episode begins, in an arena."""
+        """Send the start of an episode in an arena."""
         self._vehicle_due = self._picture_due = -1
         self._feed.send(
             messages.Episode(
@@ -128,12 +128,12 @@ class SimulationTap:
         collision: str | None,
         pace: Callable[[int], None] = lambda _time_us: None,
     ) -> None:
-        """Show the newest ticks.
+        """Send the vehicle states of the newest ticks.
 
         Args:
-            simulation: Has flown them.
-            collision: What has been hit so far.
-            pace: Called after each state that was sent, with its time [µs].
+            simulation: Source of the states.
+            collision: Name of the obstacle hit so far; None without a collision.
+            pace: Called after each sent state with its time [µs].
         """
         flight, rotors = simulation.autopilot.flight, simulation.plant.rotor_speeds
         for time_us, motion, _, charge in simulation.truths.tolist():
@@ -157,7 +157,7 @@ class SimulationTap:
             pace(time_us)
 
     def frame(self, frame: Frame) -> None:
-        """The camera has taken a frame."""
+        """Send a new frame of the camera, if due."""
         due = frame.capture_time_us // PICTURE_EVERY_US
         if due == self._picture_due:
             return
@@ -173,7 +173,7 @@ class SimulationTap:
 
 
 class CompanionTap:
-    """Shows a companion's decisions and applies the viewers' latency; called from one thread."""
+    """Sender of a companion's decisions; applies viewers' settings. Call from one thread."""
 
     def __init__(self, ends: ViewEnds, scenario: ResolvedScenario) -> None:
         """Connect to a view."""
@@ -186,26 +186,26 @@ class CompanionTap:
         return Hand(self._asked.newest, compensate=self._scenario.pilot.compensate)
 
     def begin(self) -> None:
-        """A flight begins."""
+        """Reset the viewers' settings for a new flight."""
         self._hand = self._new_hand()
 
     @property
     def touched(self) -> bool:
-        """Whether the watchers have changed the latency or the compensation of this flight."""
+        """True if viewers changed the latency or the compensation of this flight."""
         return self._hand.touched
 
     def latency(self, sampler: LatencySampler | None) -> LatencySampler:
-        """Return a latency that the watchers may set, instead of the scenario's."""
+        """Return a sampler that lets viewers override the scenario's latency."""
         return HandLatency(self._hand, sampler)
 
     def compensator(self) -> Compensator | None:
-        """Return one that the watchers may switch; None: nothing can be carried forward."""
+        """Return a compensator that viewers may switch; None if the vehicle is unsupported."""
         if not self._scenario.vehicle.compensable:
             return None
         return HandCompensator(self._hand, self._scenario)
 
     def decided(self, decision: Decision) -> None:
-        """A decision was sent."""
+        """Send a decision of the companion."""
         first, second, third, fourth = (float(number) for number in decision.setpoint)
         shown = messages.Decided(
             captured_us=decision.seen.frame.capture_time_us,

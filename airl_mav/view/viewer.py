@@ -1,4 +1,4 @@
-"""The view of a run, from the side of who flies: its process, started and ended with the run."""
+"""Process of a run's view, started and stopped with the run."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ MODULE = "airl_mav.view.server"
 
 
 class ViewError(Exception):
-    """The view cannot be shown; the message says why."""
+    """Error for a view that failed to start; the message contains the cause."""
 
 
 def request_of(scenario: ResolvedScenario, name: str, port: int | None = None) -> Request:
-    """Return what a view of a scenario's flights is asked for; arguments as of `Request`."""
+    """Return the request for a view of a scenario's flights; `name` and `port` as in `Request`."""
     paced = scenario.scenario.level == "lockstep"
     return Request(
         run=name,
@@ -38,10 +38,10 @@ def request_of(scenario: ResolvedScenario, name: str, port: int | None = None) -
 
 
 class Viewer:
-    """A page that shows flights, until it is closed."""
+    """Page that shows flights until closed."""
 
     def __init__(self, request: Request) -> None:
-        """Start the viewer and wait for it; FieldError: the port is taken."""
+        """Start the viewer and wait for it; raise FieldError if the port is in use."""
         self._folder = tempfile.TemporaryDirectory(prefix="airl-view-")
         self._child = ChildProcess(
             [sys.executable, "-m", MODULE],
@@ -58,9 +58,9 @@ class Viewer:
             self.close()
             raise
         self.ends: ViewEnds = answer.ends
-        """Where flights connect."""
+        """Addresses for flights to connect to."""
         self.url = f"http://{LOOPBACK}:{answer.port}"
-        """What to open in a browser."""
+        """URL of the page for a browser."""
 
     def _answer(self, request: Request) -> Answer:
         stdin, stdout = self._child.stdin, self._child.stdout
@@ -77,7 +77,7 @@ class Viewer:
             raise ViewError(f"the view did not start\n{self._child.log_tail()}") from None
 
     def close(self) -> None:
-        """End its process; the page says that its server is gone. Harmless when called again."""
+        """Stop the process; open pages report a lost connection. Safe to call again."""
         self._child.stop()
         if self._child.stdout is not None:
             self._child.stdout.close()

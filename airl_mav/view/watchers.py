@@ -1,4 +1,4 @@
-"""Those who watch, and their cameras, which fly along with the vehicle."""
+"""Viewers of a page and their scene cameras, which follow the vehicle."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from airl_mav.core.frames import quat_from_euler
 from airl_mav.view.shown import Shown
 
 AHEAD = Intrinsics(width=1, height=1, focal=1.0, cx=0.0, cy=0.0)
-"""A camera of one ray."""
+"""Camera with a single ray."""
 
 _FAR_M = 1e4
 NO_WALLS = Bounds(-_FAR_M, _FAR_M, -_FAR_M, _FAR_M, 1e-3)
-"""The scene's walls can be looked through from outside; its floor cannot."""
+"""Bounds for ray casting: the scene's walls are transparent from outside, its floor is not."""
 
 KEPT = 0.9
-"""Share of the way to an obstacle that the camera takes."""
+"""Camera distance as a fraction of the distance to an obstacle in between."""
 
 NEAREST_M = 1.0
-"""It comes no nearer, for whatever stands there: less than that shows nothing."""
+"""Minimum distance from camera to target [m], even behind an obstacle."""
 
 
 def unhidden(
     arena: Arena, time_us: int, at: NDArray[np.float64], offset: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the camera's offset from its target NED [m], shortened to before any obstacle."""
-    # Imported here: without numba a view has its page ready sooner than a browser opens it.
+    """Return the camera's offset from its target NED [m], shortened to avoid obstacles."""
+    # Imported here: the page is ready sooner without loading numba.
     from airl_mav.camera.render import render
 
     away = float(np.linalg.norm(offset))
@@ -43,7 +43,7 @@ def unhidden(
         return offset
     north, east, down = offset.tolist()
     look = quat_from_euler(0.0, math.atan2(-down, math.hypot(north, east)), math.atan2(east, north))
-    # Boxes stand in for meshes: nobody looks at the picture, and their file may not be here.
+    # Collision boxes replace meshes: the depth suffices, and mesh files may be missing.
     scene = replace(arena, bounds=NO_WALLS, meshes=())
     depth = render(scene, arena.centers_at(time_us), AHEAD, away, at, look).item()
     if depth == 0.0:
@@ -54,46 +54,46 @@ def unhidden(
 Floats = NDArray[np.float64]
 
 CHASE = np.array([-5.0, 0.0, -3.2])
-"""Where a watcher's camera begins, from the vehicle, NED [m]."""
+"""Initial camera offset from the vehicle, NED [m]."""
 
 SLIM = 1.5
-"""A page so much higher than wide is a phone's, where the panel covers the lower half."""
+"""Minimum height/width ratio of a phone's page, where the panel covers the lower half."""
 
 UNMOVED_M = 0.02
-"""A page tells where its camera is with rounding: nobody has moved it by less."""
+"""Rounding tolerance of reported camera positions [m]; a larger change is the viewer's."""
 
 REMEMBERED = 60
-"""Places that a page may still tell of: those of two seconds."""
+"""Number of recent camera offsets that a page may still report, about two seconds."""
 
 BELOW = np.array([0.0, 0.0, 2.2])
-"""There the camera looks so far below the vehicle, NED [m]."""
+"""Offset of the look-at point from the vehicle on a phone, NED [m]."""
 
 
 class Watchers:
-    """Those of one server."""
+    """Viewers of one server."""
 
     def __init__(
         self, server: viser.ViserServer, deserted: Callable[[], None] = lambda: None
     ) -> None:
-        """Welcome who comes; `deserted` is called when the last one has left."""
+        """Register for connections; `deserted` is called when the last viewer disconnects."""
         self._server = server
         self._deserted = deserted
         self._following: dict[int, Any] = {}
-        """The switch of each."""
+        """Checkbox "Follow the vehicle" of each client."""
         self._asked: dict[int, Floats] = {}
-        """Where each wants the camera, from the vehicle NED [m]."""
+        """Requested camera offset of each client from the vehicle, NED [m]."""
         self._put: dict[int, deque[Floats]] = {}
-        """Where it was put lately; a page may tell of it a little later."""
+        """Recently set camera offsets of each client; pages report them with a delay."""
         server.on_client_connect(self._welcome)
         server.on_client_disconnect(self._part)
 
     @property
     def there(self) -> bool:
-        """Whether anybody watches."""
+        """True if at least one client is connected."""
         return bool(self._server.get_clients())
 
     def expect(self, shown: Shown) -> None:
-        """Let pages that open from now on begin with the vehicle in sight, not somewhere else."""
+        """Set the initial camera of new pages so that the vehicle is visible."""
         if shown.vehicle is None:
             return
         at = np.array(shown.vehicle.position)
@@ -101,7 +101,7 @@ class Watchers:
         begin.position, begin.look_at = at + _in_sight(shown, CHASE), at
 
     def follow(self, shown: Shown) -> None:
-        """Move the cameras that follow along with the vehicle, in front of what would hide it."""
+        """Move the following cameras with the vehicle, in front of obstacles that hide it."""
         if shown.vehicle is None:
             return
         at = np.array(shown.vehicle.position)
@@ -119,12 +119,12 @@ class Watchers:
                 camera.look_at = aim
 
     def _asked_by(self, number: int, found: Floats) -> Floats:
-        """Return where a watcher wants the camera, which was `found` there, from the vehicle."""
+        """Return a client's requested camera offset; `found` is the offset its page reports."""
         if number not in self._asked:
-            # The page may tell once more of where its camera was before it is put anywhere.
+            # The page may still report the camera pose from before the first update.
             self._asked[number], self._put[number] = CHASE, deque([found], maxlen=REMEMBERED)
         elif not any(np.allclose(found, put, atol=UNMOVED_M) for put in self._put[number]):
-            self._asked[number] = found  # The watcher has turned or zoomed it.
+            self._asked[number] = found  # The viewer rotated or zoomed the camera.
         return self._asked[number]
 
     def _welcome(self, client: viser.ClientHandle) -> None:
@@ -140,7 +140,7 @@ class Watchers:
 
 
 def _in_sight(shown: Shown, asked: Floats) -> Floats:
-    """Return where a camera is put that was asked for somewhere, from the vehicle NED [m]."""
+    """Return the unobstructed camera offset for a requested one, from the vehicle NED [m]."""
     vehicle, episode, arena = shown.vehicle, shown.episode, shown.arena
     if vehicle is None or episode is None or arena is None:
         return asked

@@ -1,4 +1,4 @@
-"""The camera that `--camera` names: an address, a driver that is shipped, or one of the user's."""
+"""Lookup of the camera in `--camera`: an address, a built-in driver or a custom driver."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from companion.cameras.driver import CameraThread, DepthCamera
 from companion.cameras.fitting import Fitting, Lens, check_coverage
 
 REALSENSE, OAK_D, ROS2, ROSBAG = "realsense", "oak-d", "ros2", "rosbag"
-"""Drivers that are shipped: words before a colon."""
+"""Names of built-in drivers, before a colon."""
 
 EXTRAS = {
     REALSENSE: "librealsense (pip install pyrealsense2)",
@@ -25,18 +25,18 @@ EXTRAS = {
 
 
 class OpenCamera(FrameSource, Protocol):
-    """A frame source that is let go of in the end, and that says why it fell silent."""
+    """Frame source that can be closed and reports failures."""
 
     @property
     def failure(self) -> str | None:
-        """Return why no more frames come; None: they do, or it is not known."""
+        """Return the reason for missing frames; None = no failure, or unknown."""
 
     @property
     def dropped(self) -> int:
-        """Return how many images of the camera never came here; 0 where that is not known."""
+        """Return the number of lost camera images; 0 if unknown."""
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Release the camera."""
 
 
 def open_named_camera(
@@ -46,13 +46,13 @@ def open_named_camera(
     whose: str,
     further: Mapping[str, Intrinsics] | None = None,
 ) -> OpenCamera:
-    """Open a camera by its name, or raise FieldError if it is missing, sees too little or no depth.
+    """Open a camera by name; FieldError if it is missing, sees too little or has no depth.
 
-    Names are tcp://HOST:PORT or ipc://PATH, used as they are; "realsense", "realsense:SERIAL" or
+    Names are tcp://HOST:PORT or ipc://PATH, used unchanged; "realsense", "realsense:SERIAL" or
     "realsense:FILE.bag"; "oak-d" or "oak-d:DEVICE"; "ros2:/TOPIC"; "rosbag:PATH" or
-    "rosbag:PATH:/TOPIC"; FILE.py:NAME, MODULE:NAME or the entry point of a driver. Images become
-    those that are `wanted` by their owner, `whose`: "vehicle quad"; a driver's additional ones, by
-    name, fit `further`.
+    "rosbag:PATH:/TOPIC"; FILE.py:NAME, MODULE:NAME or the entry point of a driver. Images are
+    converted to the `wanted` camera of `whose`, such as "vehicle quad"; a driver's additional
+    images to the cameras in `further`, by name.
     """
     if "://" in name:
         return open_camera(name, clock)
@@ -75,7 +75,7 @@ def open_named_camera(
 
 
 def _check_fits(name: str, wanted: Intrinsics, whose: str) -> None:
-    """Raise FieldError for a camera whose images no driver gives."""
+    """Raise FieldError for a camera kind unsupported by drivers."""
     if wanted.kind != "depth":
         raise FieldError(
             "camera",
@@ -102,14 +102,14 @@ def _driver(name: str, clock: Clock) -> DepthCamera:
     try:
         camera: DepthCamera = made()
     except Exception as error:
-        # What a driver raises when its camera is not there.
+        # A driver may raise any exception if its camera is missing.
         told = " ".join(f"{type(error).__name__}: {error}".split())
         raise FieldError("camera", name, problem=told) from error
     return camera
 
 
 def _shipped(brand: str, which: str, clock: Clock) -> DepthCamera:
-    """Open a camera of a driver that is shipped, imported when it is asked for: few have one."""
+    """Open a camera of a built-in driver, imported on demand, as its packages are optional."""
     if brand == REALSENSE:
         from companion.cameras.realsense import open_realsense
 

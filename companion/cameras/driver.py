@@ -1,7 +1,7 @@
 """Interface of camera drivers, and the thread that keeps their newest image as a frame.
 
-A driver is a class made without arguments, with a `lens` and `read`; time stamps, size and threads
-are handled here.
+A driver is a class constructed without arguments, with a `lens` and `read`; time stamps, size and
+threads are handled here.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from companion.camera import ReceivedFrame
 from companion.cameras.fitting import Fitting, Lens
 
 READ_S = 0.1
-"""A driver is asked for its next image for this long at a time [s], so that it can be closed."""
+"""Timeout of one `read` of a driver [s]; between reads the thread can end."""
 
 FAILED_S = 5.0
-"""A camera that delivers nothing for so long has failed [s of waiting]."""
+"""Time without an image after which a camera has failed [s of waiting]."""
 
 
 OLDEST_US = US_PER_S
-"""An image that seems to be older is stamped by another clock [µs]."""
+"""Maximum age of an image [µs]; older stamps are from another clock."""
 
 
 def plausible_age_us(age_us: int) -> int:
@@ -38,58 +38,58 @@ def plausible_age_us(age_us: int) -> int:
 
 
 class Silence:
-    """How long a driver has waited for its next image."""
+    """Timer of a driver's wait for its next image."""
 
     def __init__(self) -> None:
-        """Begin with none."""
+        """Create the timer at 0 s."""
         self._waited_s = 0.0
 
     def broken(self) -> None:
-        """An image has come."""
+        """Reset the timer after an image."""
         self._waited_s = 0.0
 
     def lasted(self, waited_s: float) -> None:
-        """None came in this time [s]. Raises RuntimeError when that makes 5 s."""
+        """Add a wait without an image [s]. Raises RuntimeError after 5 s in total."""
         self._waited_s += waited_s
         if self._waited_s >= FAILED_S:
             raise RuntimeError(f"no image for {FAILED_S:g} s")
 
 
 class DepthImage(NamedTuple):
-    """One image of a camera, as its driver returns it."""
+    """Image returned by a camera driver."""
 
     depth_mm: NDArray[np.uint16]  # (height, width) along the optical axis [mm]; 0 = no return
     age_us: int
-    """Time since the exposure, by the driver's stamps [µs]; 0 where it has none."""
+    """Time since the exposure, by the driver's stamps [µs]; 0 without stamps."""
     number: int | None = None
-    """Counts up by one per image that the camera takes; None where the camera does not count."""
+    """Image counter, increases by one per captured image; None = not supported."""
     further: Mapping[str, NDArray[np.uint16]] = {}
-    """Images that further cameras took at the same moment, by name; see `lenses`."""
+    """Simultaneous images of additional cameras, by name; see `lenses`."""
 
 
 class DepthCamera(Protocol):
-    """A camera of the companion computer; `lenses` names the lenses of additional images."""
+    """Camera of the companion computer; `lenses` has the lenses of additional images by name."""
 
     @property
     def lens(self) -> Lens:
-        """Return the lens; it stays the same."""
+        """Return the constant lens."""
 
     def read(self, timeout_s: float) -> DepthImage | None:
         """Wait for the next image; None after a timeout [s]. Exceptions are camera failures."""
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Release the camera."""
 
 
 def missing_between(last: int | None, number: int | None) -> int:
-    """Return the number of images missing between two; None without numbers or after a restart."""
+    """Return the number of images missing between two; 0 without numbers or after a restart."""
     if last is None or number is None:
         return 0
     return max(0, number - last - 1)
 
 
 class CameraThread:
-    """The newest image of a driver, as a frame of the wanted size. Implements `FrameSource`."""
+    """Newest image of a driver, as a frame of the target size. Implements `FrameSource`."""
 
     def __init__(
         self,
@@ -99,11 +99,11 @@ class CameraThread:
         fitting: Fitting,
         further: Mapping[str, Fitting] | None = None,
     ) -> None:
-        """Start to read a driver, which `close` closes; images without a fitting are left out."""
+        """Start to read a driver, which `close` closes; images without a fitting are omitted."""
         self.failure: str | None = None
-        """Why no more images come, once the driver has raised."""
+        """Error of the driver, after which images end; None = no error."""
         self.dropped = 0
-        """Images that the camera took and the driver never returned, by their numbers."""
+        """Number of captured images that the driver never returned, by the image counters."""
         self._name, self._camera, self._clock, self._fitting = name, camera, clock, fitting
         self._further = further or {}
         self._newest: ReceivedFrame | None = None
@@ -113,11 +113,11 @@ class CameraThread:
         self._thread.start()
 
     def latest(self) -> ReceivedFrame | None:
-        """Return the newest frame so far, without waiting; None before the first."""
+        """Return the newest frame without waiting; None before the first frame."""
         return self._newest
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a frame that is not the one already seen; see `FrameSource`."""
+        """Wait for a frame with another sequence; see `FrameSource`."""
         with self._changed:
             arrived = self._changed.wait_for(
                 lambda: (
@@ -128,7 +128,7 @@ class CameraThread:
             return self._newest if arrived else None
 
     def close(self) -> None:
-        """End the thread and let go of the camera."""
+        """End the thread and release the camera."""
         self._ended.set()
         self._thread.join(10.0 * READ_S)
         self._camera.close()
@@ -143,7 +143,7 @@ class CameraThread:
                 taken_us = self._clock.time_us() - image.age_us
                 self.dropped += missing_between(last_number, image.number)
                 last_number = image.number
-                # Fitted before the stamp of arrival: it is part of how long a frame takes.
+                # Fitted before the arrival stamp, as fitting is part of a frame's latency.
                 depth_mm = self._fitting.fit(image.depth_mm)
                 if missing := self._further.keys() - image.further.keys():
                     raise ValueError(f"an image without those of {', '.join(sorted(missing))}")
@@ -158,7 +158,7 @@ class CameraThread:
                     self._changed.notify_all()
                 sequence += 1
         except Exception as error:
-            # A driver may raise anything. The watchdog stops the vehicle: no frame comes.
+            # A driver may raise any exception. Without frames, the watchdog stops the vehicle.
             told = " ".join(f"{type(error).__name__}: {error}".split())
             self.failure = f"camera {self._name} failed: {told}"
             traceback.print_exc(file=sys.stderr)

@@ -1,9 +1,9 @@
-"""Makes a camera's images those of the vehicle profile's camera, with which policies are trained.
+"""Conversion of a camera's images to the vehicle profile's camera, which policies are trained with.
 
-The profile's camera has few pixels, in the middle of what a real one sees. Each of its pixels is
-looked up in the camera's image at the points of a grid, and the nearest return of them wins. The
-function with which the shipped layouts shrink an image for the network. So a thin obstacle is not
-lost. A hole of the stereo matcher is "no return" only where all points are.
+The profile's camera has few pixels, in the middle of a real camera's field of view. Each pixel is
+sampled in the real image at the points of a grid, and the nearest return counts, by the function
+with which the built-in layouts downsample an image for the network. Thin obstacles are preserved. A
+pixel is "no return" only if all its points are holes of the stereo matcher.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from airl_mav.policy.images import nearest_returns
 from airl_mav.profiles.distortion import Distortion, distorted, sees_to, undistorted
 
 MOST_POINTS = 16
-"""Points looked up along each side of a pixel, at most."""
+"""Maximum number of sample points along each side of a pixel."""
 
 LEAST_FORWARD = 1e-3
-"""Of a ray in whose direction anything has a depth along the optical axis."""
+"""Minimum forward component of a ray with a depth along the optical axis."""
 
 LEAST_COVERAGE = 0.9
-"""Share of the wanted image that a camera must see. A D435 at the end of its tolerance, 84 degrees
-wide instead of 87, sees 0.91 of the image of the vehicle profile `quad-d435`."""
+"""Minimum share of the target image that a camera must see. A D435 at its tolerance limit, 84
+degrees wide instead of 87, sees 0.91 of the image of the vehicle profile `quad-d435`."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole whose images are free of distortion, as depth cameras deliver them, or a fisheye.
+    """Pinhole lens with undistorted images, as delivered by depth cameras, or a fisheye lens.
 
     A pixel (u, v) of a pinhole looks along ((u - cx) / fx, (v - cy) / fy, 1) in the optical frame
-    (right, down, forward). Pixel centres are at whole numbers, as in librealsense and ROS 2's
-    CameraInfo. Depth is along the optical axis of either, which no more than 90 degrees from it
-    anything has.
+    (right, down, forward). Pixel centres are at integers, as in librealsense and ROS 2's
+    CameraInfo. Depth is along the optical axis for both, so it exists only within 90 degrees of the
+    axis.
     """
 
     width: int
@@ -51,11 +51,11 @@ class Lens:
     cx: float
     cy: float
     distortion: Distortion | None = None
-    """Coefficients of a fisheye, Kannala and Brandt's; None: a pinhole."""
+    """Kannala-Brandt coefficients of a fisheye; None = a pinhole."""
 
     @property
     def field_of_view(self) -> str:
-        """Horizontal and vertical field of view, in words."""
+        """Horizontal and vertical field of view, as text."""
         sides = (0.5 * self.width / self.fx, 0.5 * self.height / self.fy)
         return _in_words(*(_half_rad(side, self.distortion) for side in sides))
 
@@ -67,17 +67,17 @@ class Lens:
 
 
 class Fitting:
-    """From the images of one camera to another that looks the same way."""
+    """Conversion of images between two cameras with the same orientation."""
 
     def __init__(self, lens: Lens, wanted: Intrinsics) -> None:
-        """Find where each pixel of the wanted camera lies in the images of the lens."""
+        """Look up each pixel of the target camera in the images of the lens."""
         self.wanted = wanted
-        """What `fit` returns images of."""
+        """Target camera of the images returned by `fit`."""
         points = math.ceil(max(lens.fx, lens.fy) / wanted.focal)
         points = min(max(points, 1), MOST_POINTS)
         self._shape = lens.height, lens.width
         self._deeper: NDArray[np.float32] | None = None
-        """What depth along the axis is multiplied with; None: it is what is wanted."""
+        """Factors from depth along the axis to the target's depth; None = factor 1."""
         if lens.distortion is None and wanted.projection == "pinhole":
             columns, off_side = _places(
                 *(wanted.width, wanted.focal, wanted.cx), *(lens.width, lens.fx, lens.cx), points
@@ -88,7 +88,7 @@ class Fitting:
             self._rows, self._columns = rows[:, None], columns[None, :]
             self._unseen = off_end[:, None] | off_side[None, :]
             self.coverage = 1.0 - float(self._unseen.mean())
-            """Share of the wanted image that the lens sees, 0 to 1."""
+            """Share of the target image seen by the lens, 0 to 1."""
             return
         rays = rays_of(finer(wanted, points))
         row, column = _looked_up(lens, rays)
@@ -111,7 +111,7 @@ class Fitting:
         seen[self._unseen] = 0
         if self._deeper is not None:
             seen = np.minimum(np.rint(seen * self._deeper), MAX_MM).astype(np.uint16)
-        # Values of nearest_returns are one less; "no return" wraps back to 0.
+        # Values of nearest_returns are one less; "no return" wraps around to 0.
         nearest = nearest_returns(seen[None], self.wanted.height, self.wanted.width)
         fitted: NDArray[np.uint16] = nearest[0] + np.uint16(1)
         return fitted
@@ -138,7 +138,7 @@ def _looked_up(
 
 
 def _half_rad(side: float, distortion: Distortion | None) -> float:
-    """Return the angle from the axis to an edge that is so many focal lengths off [rad]."""
+    """Return the angle from the axis to an edge at a distance in focal lengths [rad]."""
     if distortion is None:
         return math.atan(side)
     return min(float(undistorted(np.array(side), distortion)), sees_to(distortion))
@@ -150,7 +150,7 @@ def _in_words(half_wide_rad: float, half_high_rad: float) -> str:
 
 
 def _seen_by(k: Intrinsics) -> str:
-    """Return the field of view of a profile's camera, in words."""
+    """Return the field of view of a profile's camera, as text."""
     bent = k.distortion if k.projection == "fisheye" else None
     return _in_words(0.5 * k.horizontal_fov_rad, _half_rad(0.5 * k.height / k.focal, bent))
 
@@ -164,7 +164,7 @@ def _places(
     lens_centre: float,
     points: int,
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return the nearest lens pixels along an axis of a pinhole (size x points,), and misses."""
+    """Return the nearest lens pixels along a pinhole's axis (size x points,) and a miss mask."""
     at = (np.arange(size * points) + 0.5) / points - 0.5
     place = np.rint(lens_centre + lens_focal * (at - centre) / focal).astype(np.intp)
     return np.clip(place, 0, lens_size - 1), (place < 0) | (place >= lens_size)

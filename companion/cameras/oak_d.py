@@ -1,7 +1,7 @@
 """Luxonis OAK-D stereo cameras, through depthai (the extra `oak`).
 
-The camera matches on its own, as in the profile `quad-oak-d`. Images have 640 x 400 pixels,
-disparities up to 95 px in steps of an eighth.
+The camera performs the stereo matching, as in the profile `quad-oak-d`. Images have 640 x 400
+pixels, disparities up to 95 px in steps of an eighth.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from airl_mav.core.errors import FieldError
 from companion.cameras.driver import FAILED_S, DepthImage, Silence, plausible_age_us
 from companion.cameras.fitting import Lens
 
-# Its crash reporter takes signals over as it is imported. SIGXFSZ is one: where a log reaches a
-# limit of the file's size, the companion would end in flight instead of going on without the log.
+# On import, depthai's crash reporter handles signals, including SIGXFSZ: at a file size limit of a
+# log, the companion would end in flight instead of continuing without the log.
 os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
 import depthai as dai
 
 RATE_HZ = 30.0
 SIZE_PX = 640, 400
-"""Width and height of the images that are matched (400P): half of what the sensors have, for which
-the camera's matcher keeps up with 30 images a second in subpixel mode."""
+"""Width and height of the matched images (400P): half the sensors' resolution, at which the
+camera's matcher keeps up with 30 images/s in subpixel mode."""
 
 SUBPIXEL_BITS = 3
-"""Steps of disparity are 2^-3 px."""
+"""Fractional bits of disparity: steps of 2^-3 px."""
 
 _US = timedelta(microseconds=1)
 
 
 class OakD:
-    """The depth images of a running pipeline. Implements `driver.DepthCamera`."""
+    """Depth images of a running pipeline. Implements `driver.DepthCamera`."""
 
     def __init__(
         self,
@@ -47,9 +47,9 @@ class OakD:
     ) -> None:
         """Start a `depthai.Pipeline`, and wait for its first image, which describes the lens.
 
-        `close` stops the pipeline. `depth` is its rectified output: RAW16 [mm], 0 = no return;
-        `now` the monotonic host time of depthai's stamps. Raises FieldError if no image comes, or
-        the first one is without intrinsics or no depth image.
+        `close` stops the pipeline. `depth` is the rectified output: RAW16 [mm], 0 = no return;
+        `now` is the monotonic host time of depthai's stamps. Raises FieldError without an image, or
+        if the first image lacks intrinsics or is not a depth image.
         """
         self._pipeline, self._silence = pipeline, Silence()
         self._now: Callable[..., timedelta] = dai.Clock.now if now is None else now
@@ -60,7 +60,7 @@ class OakD:
             if first is None:
                 raise ValueError(f"no image for {FAILED_S:g} s")
             self.lens = _lens_of(first)
-            """Lens of the rectified images, by the calibration that the device holds."""
+            """Lens of the rectified images, from the calibration stored on the device."""
             _checked(first)
         except (RuntimeError, ValueError) as error:
             self.close()
@@ -76,7 +76,7 @@ class OakD:
             self._silence.lasted(timeout_s)
             return None
         self._silence.broken()
-        # The middle of the exposure, as depthai reckons it from the stamp of the readout.
+        # Middle of the exposure, computed by depthai from the readout stamp.
         taken = frame.getTimestamp(dai.CameraExposureOffset.MIDDLE)
         return DepthImage(
             _checked(frame),
@@ -85,10 +85,10 @@ class OakD:
         )
 
     def close(self) -> None:
-        """Stop the camera, and disconnect from it."""
-        with suppress(RuntimeError):  # unplugged: there is nothing to stop
+        """Stop the camera and disconnect."""
+        with suppress(RuntimeError):  # unplugged: nothing to stop
             self._pipeline.stop()
-            # Its threads still run: depthai does not survive that they outlive the pipeline.
+            # Wait for the threads: depthai crashes if they outlive the pipeline.
             self._pipeline.wait()
 
     def _taken(self, timeout_s: float) -> Any | None:
@@ -99,7 +99,7 @@ class OakD:
 
 
 def _lens_of(frame: Any) -> Lens:
-    """Return an image's lens, as depthai's point-cloud nodes use it, or raise ValueError."""
+    """Return the lens of an image, as used by depthai's point-cloud nodes, or raise ValueError."""
     about = frame.getTransformation()
     if not about.isValid():
         raise ValueError("its images come without intrinsics: the device is not calibrated")
@@ -114,15 +114,15 @@ def _checked(frame: Any) -> Any:
     """Return the depth (height, width) of an image [mm]. Raises ValueError for another kind."""
     if frame.getType() != dai.ImgFrame.Type.RAW16:
         raise ValueError(f"an image of type {frame.getType().name}; accepted: RAW16")
-    # Copied: what depthai returns may be its own memory.
+    # Copied, as depthai may return its internal memory.
     return np.array(frame.getFrame(), np.uint16)
 
 
 def open_oak_d(which: str) -> OakD:
-    """Open a camera, and start to match, or raise FieldError.
+    """Open a camera and start the stereo matching, or raise FieldError.
 
-    "" is the first camera; others are a device id, as `depthai` lists it, or a network address
-    (PoE), which need not be in the list.
+    `which` is "" for the first camera, a device id listed by `depthai`, or a network address (PoE),
+    which need not be listed.
     """
     name = f"oak-d:{which}" if which else "oak-d"
     found = [each.getDeviceId() for each in dai.Device.getAllAvailableDevices()]
@@ -149,12 +149,12 @@ def _is_address(which: str) -> bool:
 
 
 def _matching(pipeline: Any) -> Any:
-    """Make the camera match its images as the profile says; return the output of depth images."""
+    """Configure stereo matching as in the profile; return the output of depth images."""
     stereo = pipeline.create(dai.node.StereoDepth).build(
         autoCreateCameras=True, size=SIZE_PX, fps=RATE_HZ
     )
     stereo.setRectification(True)
-    # Disparities that the other image's view does not confirm are wrong ones at edges.
+    # Reject disparities not confirmed by the other image, which are wrong at edges.
     stereo.setLeftRightCheck(True)
     stereo.setExtendedDisparity(False)
     stereo.setSubpixel(True)

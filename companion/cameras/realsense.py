@@ -18,15 +18,15 @@ from companion.cameras.fitting import Lens
 
 RATE_HZ = 30
 WIDTH_PX = 848
-"""The stereo modules of the D400 family match best at 848 x 480 (Intel, "Tuning depth cameras for
-best performance")."""
+"""Preferred image width: D400 stereo modules match best at 848 x 480 (Intel, "Tuning depth cameras
+for best performance")."""
 
 RECORDINGS = ".bag", ".db3"
-"""Files of librealsense's recorder, by its version."""
+"""File name suffixes of librealsense's recorder versions."""
 
 
 class RealSense:
-    """The depth stream of one device. Implements `driver.DepthCamera`."""
+    """Depth stream of one device. Implements `driver.DepthCamera`."""
 
     def __init__(self, device: Any, utc_now_us: Callable[[], int] = utc_us) -> None:
         """Start the depth stream of a `pyrealsense2.device`, or raise FieldError."""
@@ -41,14 +41,14 @@ class RealSense:
         self._sensor.start(self._queue)
 
     def read(self, timeout_s: float) -> DepthImage | None:
-        """Wait for the next image; RuntimeError after 5 s: unplugged, or a recording is over."""
+        """Wait for the next image; RuntimeError after 5 s: unplugged, or end of a recording."""
         arrived, frame = self._queue.try_wait_for_frame(int(timeout_s * US_PER_S / US_PER_MS))
         if not arrived:
             self._silence.lasted(timeout_s)
             return None
         self._silence.broken()
         depth = frame.as_depth_frame()
-        # Copied: librealsense reuses the memory once the frame is gone.
+        # Copied, as librealsense reuses the memory after the frame is released.
         image = np.array(depth.get_data(), np.uint16)
         unit_mm = depth.get_units() * MM_PER_M
         if abs(unit_mm - 1.0) > 1e-6:
@@ -61,14 +61,14 @@ class RealSense:
         self._sensor.close()
 
     def _age_us(self, frame: Any) -> int:
-        """Return how old an image is [µs]; 0 where it is stamped by the camera's own clock."""
+        """Return the age of an image [µs]; 0 for stamps of the camera's clock."""
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
             return 0
         return plausible_age_us(self._utc_now_us() - int(frame.get_timestamp() * US_PER_MS))
 
 
 def open_realsense(which: str) -> RealSense:
-    """Open the first camera, a serial number, or a .bag or .db3 file; FieldError: none."""
+    """Open the first camera, a serial number, or a .bag or .db3 file; FieldError if missing."""
     context = rs.context()
     if which.endswith(RECORDINGS):
         if not Path(which).is_file():
@@ -85,7 +85,7 @@ def open_realsense(which: str) -> RealSense:
     try:
         return RealSense(found[which] if which else next(iter(found.values())))
     except RuntimeError as error:
-        # Another program has it, or the bus is too slow.
+        # The camera is in use by another program, or the bus is too slow.
         raise FieldError("camera", _name(which), problem=str(error)) from None
 
 
@@ -94,7 +94,7 @@ def _name(which: str) -> str:
 
 
 def _depth_stream(device: Any) -> tuple[Any, Any]:
-    """Return the sensor and the profile that fit best: 848 pixels wide, 30 images a second."""
+    """Return the sensor and the profile closest to 848 pixels width and 30 images/s."""
     offered = [
         (sensor, profile)
         for sensor in device.query_sensors()

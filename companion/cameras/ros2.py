@@ -1,11 +1,11 @@
-"""Depth images that a ROS 2 node publishes, without ROS: over DDS, the protocol under it.
+"""Depth images of a ROS 2 node, received without ROS: over DDS, its transport protocol.
 
 ROS 2 sends a message of the topic /a/b and the type p/msg/T as a DDS sample of the topic rt/a/b and
 the type p::msg::dds_::T_ (ROS 2 design, "Topic and Service name mapping to DDS"). Cyclone DDS
-receives it, and rosbags reads it.
+receives the sample, and rosbags decodes it.
 """
 
-# No annotations from the future: Cyclone DDS reads the types of fields when a class is made.
+# No `from __future__ import annotations`: Cyclone DDS reads field types at class creation.
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,11 +27,10 @@ from companion.cameras.driver import DepthImage, Silence
 from companion.cameras.ros_images import CAMERA_INFO, IMAGE, age_us, depth_mm, info_topic, lens_of
 
 DESCRIBED_S = 5.0
-"""A camera whose description has not come by then is not there [s]. ROS 2 nodes find each other
-within a second."""
+"""Timeout of the camera's description [s]. ROS 2 nodes discover each other within a second."""
 
 MOST_DOMAIN = 232
-"""The greatest ROS_DOMAIN_ID: the ports of a greater one do not exist."""
+"""Maximum ROS_DOMAIN_ID; a larger id has no valid ports."""
 
 HERE_ALONE = """<CycloneDDS><Domain>
 <General><Interfaces><NetworkInterface name="lo"/></Interfaces>\
@@ -39,12 +38,12 @@ HERE_ALONE = """<CycloneDDS><Domain>
 <Discovery><ParticipantIndex>auto</ParticipantIndex>\
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery>
 </Domain></CycloneDDS>"""
-"""Cyclone DDS' configuration for what ROS_LOCALHOST_ONLY=1 asks for."""
+"""Cyclone DDS configuration for ROS_LOCALHOST_ONLY=1."""
 
 _messages = get_typestore(Stores.ROS2_HUMBLE)
 
 NEWEST = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(1))
-"""What fits every publisher: no image is sent again, and only the newest counts."""
+"""QoS compatible with every publisher: no retransmission, only the newest image."""
 
 
 @dataclass
@@ -83,7 +82,7 @@ class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
 
     @classmethod
     def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Any:
-        """Read a sample. Cyclone DDS' own way makes a number in Python of every byte."""
+        """Decode a sample. Cyclone DDS's decoder converts every byte to a Python number."""
         return _messages.deserialize_cdr(data, IMAGE)
 
 
@@ -120,12 +119,12 @@ class CameraInfo(IdlStruct, typename="sensor_msgs::msg::dds_::CameraInfo_"):
 
     @classmethod
     def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Any:
-        """Read a sample, as an image is read."""
+        """Decode a sample, like `Image`."""
         return _messages.deserialize_cdr(data, CAMERA_INFO)
 
 
 class Ros2Camera:
-    """An image topic and its camera_info. Implements `driver.DepthCamera`."""
+    """Image topic and its camera_info. Implements `driver.DepthCamera`."""
 
     def __init__(self, topic: str, utc_now_us: Callable[[], int] = utc_us) -> None:
         """Subscribe to depth images, and wait for the camera's description, or raise FieldError."""
@@ -144,7 +143,7 @@ class Ros2Camera:
             )
         try:
             self.lens = lens_of(info, topic)
-            """Lens that camera_info described at first."""
+            """Lens described by the first camera_info."""
         except ValueError as error:
             raise FieldError("camera", name, problem=f"{described}: {error}") from None
         self._images = self._reader(topic, Image)
@@ -164,7 +163,7 @@ class Ros2Camera:
         return DepthImage(depth_mm(message), age_us(message, self._utc_now_us()))
 
     def close(self) -> None:
-        """Leave the domain: with the participant go its readers."""
+        """Leave the domain by releasing the participant and its readers."""
         del self._images, self._participant
 
 
@@ -188,7 +187,7 @@ def _domain() -> int:
 
 
 _restricted: dict[int, Domain] = {}
-"""Domains that were configured for this computer alone; Cyclone DDS configures one once."""
+"""Domains configured for localhost only; Cyclone DDS can configure a domain only once."""
 
 
 def _participant() -> DomainParticipant:

@@ -1,4 +1,4 @@
-"""Depth images and camera parameters of ROS 2 messages from any decoder, read by field names."""
+"""Depth images and camera parameters of ROS 2 messages from any decoder, read by field name."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from companion.cameras.driver import plausible_age_us
 from companion.cameras.fitting import Lens
 
 IMAGE, CAMERA_INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
-"""The types of the two topics of a camera."""
+"""Message types of the two topics of a camera."""
 
 MILLIMETRES, METRES = ("16UC1", "mono16"), ("32FC1",)
-"""Encodings of depth images, by their unit (ROS Enhancement Proposal 118)."""
+"""Encodings of depth images, by unit (ROS Enhancement Proposal 118)."""
 
 
 def depth_mm(message: Any) -> NDArray[np.uint16]:
     """Return the depth image (height, width) of a sensor_msgs/Image [mm], or raise ValueError.
 
-    0 is no return. In metres, NaN, infinity and non-positive values are no return (ROS
+    0 = no return. In metres, NaN, infinity and non-positive values mean no return (ROS
     Enhancement Proposal 117).
     """
     if message.encoding not in (*MILLIMETRES, *METRES):
@@ -52,30 +52,30 @@ def depth_mm(message: Any) -> NDArray[np.uint16]:
 
 
 def stamped_us(message: Any) -> int:
-    """Return the stamp of a message: calendar time since 1970 [µs], where nothing simulates it."""
+    """Return the stamp of a message: calendar time since 1970 [µs], unless time is simulated."""
     stamp = message.header.stamp
     return int(stamp.sec) * US_PER_S + int(stamp.nanosec) // NS_PER_US
 
 
 def age_us(message: Any, now_us: int) -> int:
-    """Return how old an image is at a time since 1970 [µs]; 0 where its clock is another one."""
+    """Return the age of an image [µs] at a time since 1970 [µs]; 0 for another clock's stamp."""
     return plausible_age_us(now_us - stamped_us(message))
 
 
 EQUIDISTANT = "equidistant"
-"""The distortion model whose D are the coefficients of Kannala and Brandt, k1 to k4."""
+"""Distortion model with the Kannala-Brandt coefficients k1 to k4 in D."""
 
 RECTIFIED = "rect"
-"""What names of topics of rectified images have in their last part, by ROS's image_proc."""
+"""Mark of rectified images in the last part of a topic name, as used by ROS's image_proc."""
 
 
 def lens_of(message: Any, image_topic: str = "") -> Lens:
-    """Return the lens that a sensor_msgs/CameraInfo describes, or raise ValueError.
+    """Return the lens described by a sensor_msgs/CameraInfo, or raise ValueError.
 
-    Without distortion K describes the camera. With distortion P does, for the rectified images that
-    drivers subscribe to. Images of the model `equidistant` (fisheye) are used unrectified with K
-    and D, unless the last part of their topic says that they are rectified. Images that are binned
-    or cropped are not described.
+    Without distortion, K describes the camera. With distortion, P describes the rectified images
+    that drivers subscribe to. Images of the model `equidistant` (fisheye) are used unrectified with
+    K and D, unless the last part of their topic marks them as rectified. Binned or cropped images
+    are unsupported.
     """
     roi = message.roi
     cropped = (roi.width, roi.height) not in ((0, 0), (message.width, message.height))
@@ -97,7 +97,7 @@ def lens_of(message: Any, image_topic: str = "") -> Lens:
 
 
 def _coefficients(message: Any) -> Distortion:
-    """Return those of a fisheye's description. Raises ValueError where they are none."""
+    """Return the coefficients of a fisheye's description. Raises ValueError if invalid."""
     told = [float(each) for each in message.d]
     if len(told) != 4 or not all(abs(each) <= MOST_COEFFICIENT for each in told):
         raise ValueError(
@@ -109,5 +109,5 @@ def _coefficients(message: Any) -> Distortion:
 
 
 def info_topic(image_topic: str) -> str:
-    """Return the topic that describes the camera of an image topic: its neighbour camera_info."""
+    """Return the camera_info topic in the namespace of an image topic."""
     return f"{image_topic.rpartition('/')[0]}/camera_info"

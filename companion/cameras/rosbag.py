@@ -1,4 +1,4 @@
-"""Depth images of a recording by `ros2 bag record`, at the pace at which they were recorded."""
+"""Depth images of a recording by `ros2 bag record`, at the recorded rate."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from companion.cameras.ros_images import CAMERA_INFO, IMAGE, age_us, depth_mm, i
 
 
 class RosBag:
-    """The depth images of one topic of a recording. Implements `driver.DepthCamera`."""
+    """Depth images of one topic of a recording. Implements `driver.DepthCamera`."""
 
     def __init__(self, which: str, clock: Clock) -> None:
-        """Open a recording, PATH of its folder or file, or PATH:TOPIC; else FieldError."""
+        """Open a recording by PATH of its folder or file, or PATH:TOPIC; else FieldError."""
         path, separator, topic = which.rpartition(":/")
         if not separator:
             path, topic = which, ""
@@ -38,7 +38,7 @@ class RosBag:
         try:
             self._topic = self._chosen(name, path, f"/{topic}" if separator else None)
             self.lens = self._described(name)
-            """Lens that camera_info described at first."""
+            """Lens described by the first camera_info."""
         except FieldError:
             self._bag.close()
             raise
@@ -46,7 +46,7 @@ class RosBag:
         self._next: tuple[int, Any] | None = None
 
     def _chosen(self, name: str, path: str, topic: str | None) -> str:
-        """Return the topic that was asked for, or the one whose images are depth."""
+        """Return the requested topic, or the only topic with depth images."""
         images = sorted(each.topic for each in self._bag.connections if each.msgtype == IMAGE)
         if topic is None:
             images = [each for each in images if self._is_depth(each)]
@@ -79,7 +79,7 @@ class RosBag:
             raise FieldError("camera", name, problem=f"{described}: {error or 'empty'}") from None
 
     def _messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Give times of arrival at the recorder [µs since 1970] and messages."""
+        """Yield arrival times at the recorder [µs since 1970] and messages."""
         which = [each for each in self._bag.connections if each.topic == topic]
         for connection, time_ns, data in self._bag.messages(connections=which):
             yield time_ns // NS_PER_US, self._bag.deserialize(data, connection.msgtype)

@@ -26,13 +26,13 @@ ALIGN_US = US_PER_S // 2
 """Time at rest over which attitude and barometer are averaged at start [µs]."""
 
 LONGEST_ALIGN_US = 10 * US_PER_S
-"""Averaging begins anew when a sensor has been waited for so long [µs]."""
+"""Timeout for a missing sensor [µs]; averaging restarts after it."""
 
 IMU, COMPASS, BAROMETER, FIXES = range(4)
-"""Places in `rest_count`."""
+"""Indices into `rest_count`."""
 
 _ACCEL, _FIELD, _ALTITUDE, _PLACE = slice(0, 3), slice(3, 6), 6, slice(7, 10)
-"""Places in `rest_sum`."""
+"""Indices into `rest_sum`."""
 
 _NO_COMPASS = 5
 """EKF2_MAG_TYPE: the compass is not used."""
@@ -43,35 +43,35 @@ class Aligned(NamedTuple):
 
     quaternion: Vector  # (4,) body -> NED
     altitude_baro_m: float
-    """Of the standard atmosphere, by the barometer [m]."""
+    """Pressure altitude in the standard atmosphere, from the barometer [m]."""
     fix: Geodetic | None
-    """Where GPS says that the vehicle is; None where it was not waited for."""
+    """GPS position; None if the alignment did not require GPS."""
     by_compass: bool
-    """Whether the heading is the compass's; else it is 0."""
+    """True if the heading comes from the compass; False: the heading is 0."""
 
 
 class Alignment:
-    """Waits for each sensor that is needed, and for the vehicle to have rested."""
+    """Alignment that waits for the required sensors and for the vehicle to be at rest."""
 
     def __init__(self, value: Callable[[str], float], record: Record) -> None:
-        """Begin without a sample.
+        """Start without samples.
 
         Args:
-            value: Looks up EKF2_* parameters by name.
-            record: Of the flight controller, which has the sums of all samples.
+            value: Look-up for EKF2_* parameters by name.
+            record: Flight controller's record, which holds the sums of all samples.
         """
         self._value = value
         self._record = record
         self.field: Vector | None = None
-        """The mean field (3,) FRD [gauss], also where it is too disturbed to be used."""
+        """Mean field (3,) FRD [gauss], also set if the field is too disturbed to use."""
 
     def take(self, sample: SensorSample) -> None:
-        """Add one tick's sensors, which the record has already, to the sums."""
+        """Add one tick's sensors, already stored in the record, to the sums."""
         measured = MAG * (sample.mag is not None) | PRESSURE * (sample.pressure_hpa is not None)
         add_record(self._record, measured | GPS * (sample.gps is not None))
 
     def finish(self) -> Aligned | None:
-        """Return what is known once it is enough."""
+        """Return the alignment, or None until there are enough samples."""
         record, needed = self._record, self._needed()
         elapsed_us = record["time_us"].item(0) - record["rest_since_us"].item(0)
         counts = record["rest_count"][0].tolist()
@@ -87,7 +87,7 @@ class Alignment:
             level = tuple(quat_from_euler(roll, pitch, 0.0).tolist())
             self.field = field = sums[_FIELD] / counts[COMPASS]
             if FieldCheck.read(self._value).disturbed(field, level):
-                # A heading by it would be wrong, and nothing would show before the vehicle moves.
+                # A wrong heading would stay unnoticed until the vehicle moves.
                 self._restart()
                 return None
             heading = es.true_heading(field, level, MAGNETIC_DECLINATION)
@@ -96,16 +96,16 @@ class Alignment:
         return Aligned(quat_from_euler(roll, pitch, heading), altitude_m, fix, by_compass)
 
     def _needed(self) -> tuple[int, ...]:
-        """Return the slower sensors of which one sample each is needed.
+        """Return the slow sensors that must deliver at least one sample.
 
-        GPS is not waited for where external vision may take its place.
+        GPS is not required if external vision may replace it.
         """
         gps = self._value("EKF2_GPS_CTRL") != 0 and not self._value("EKF2_EV_CTRL")
         mag = self._value("EKF2_MAG_TYPE") != _NO_COMPASS
         return (*(FIXES,) * gps, *(COMPASS,) * mag, BAROMETER)
 
     def _restart(self) -> None:
-        """Forget all samples."""
+        """Discard all samples."""
         self._record["rest_since_us"] = -1
         self._record["rest_count"], self._record["rest_sum"] = 0, 0.0
 
@@ -114,7 +114,7 @@ class Alignment:
 def add(c: Any, measured: int) -> None:
     """Add the newest sensors of a flight controller at rest (its fields) to the sums.
 
-    `measured` has bits of the slower sensors that are new in this tick (`engine.record`).
+    `measured` has the bits of the slow sensors with new data in this tick (`engine.record`).
     """
     if c.rest_since_us < 0:
         c.rest_since_us = c.time_us
@@ -136,5 +136,5 @@ def add(c: Any, measured: int) -> None:
 
 @kernel
 def add_record(controller: Record, measured: int) -> None:
-    """Add the newest sensors of a record (1,) to the sums; as `add`."""
+    """Add the newest sensors of a record (1,) to the sums, like `add`."""
     add(controller[0], measured)

@@ -1,4 +1,4 @@
-"""When an armed vehicle is disarmed by itself: landed, never taken off, or stopped for good."""
+"""Automatic disarming: after landing, without a take-off, or after a termination."""
 
 from __future__ import annotations
 
@@ -14,26 +14,25 @@ _TERMINATION = Mode.TERMINATION
 
 
 class AutoDisarm:
-    """Counts the time on the ground and the time of a termination, in simulated time."""
+    """Timer for the time on the ground and the time since termination, in simulated time."""
 
     def __init__(self, value: Callable[[str], float]) -> None:
-        """Take a lookup of PX4 parameter names."""
+        """Store the look-up for PX4 parameters."""
         self._value = value
         self._standing_since_us: int | None = None
         self._stopped_since_us: int | None = None
         self._flown = False
         self.due_us = math.inf
-        """When something is due, unless the flight changes [µs]."""
+        """Time of the next timeout if the flight does not change [µs]."""
 
     def armed(self) -> None:
-        """A flight begins: time on the ground before it does not count."""
+        """Start a flight: earlier time on the ground does not count."""
         self._standing_since_us = None
 
     def event(self, flight: Flight, time_us: int, *, idle: bool) -> Event | None:
-        """Return what is due.
+        """Return the event of an expired timeout, or None.
 
-        `idle`: the motors are stopped; the spool-up and the ramp of a take-off do not count as time
-        on the ground.
+        `idle`: the motors are stopped. Spool-up and take-off ramp do not count as ground time.
         """
         self.due_us = math.inf
         if flight.mode is _TERMINATION and flight.phase >= _GROUND:

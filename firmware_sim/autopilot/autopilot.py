@@ -1,4 +1,4 @@
-"""The built-in autopilot: sensors in, motor commands out, PX4's behaviour towards its clients."""
+"""Built-in autopilot: sensors in, motor commands out, PX4 behaviour towards clients."""
 
 from __future__ import annotations
 
@@ -72,28 +72,28 @@ from firmware_sim.interfaces import (
 )
 
 CLIENTS_SENSOR = 1
-"""Source of ranges: not the vehicle's own sensor."""
+"""Source id of ranges from a client, as opposed to the vehicle's sensor."""
 
-# Bound once: looking up a member of an enumeration at every tick is slow.
+# Bound once: looking up an enum member in every tick is slow.
 _GROUND, _AIR = Phase.GROUND, Phase.AIR
 
 
 class BuiltinAutopilot:
-    """Implements `FlightController` towards the plant and `port.AutopilotPort` to MAVLink."""
+    """Autopilot: `FlightController` towards the plant, `port.AutopilotPort` towards MAVLink."""
 
     rate_hz = TICK_HZ
 
     def __init__(self, parameters: Parameters, new_filter: NewFilter = KernelFilter) -> None:
-        """Boot: not armable until the estimator, whose filter `new_filter` makes, has converged."""
+        """Boot. Arming requires convergence of the estimator, whose filter `new_filter` creates."""
         self.parameters = parameters
-        """The parameter store."""
+        """Parameter store."""
         self.plans = Plans()
-        """The mission, the geofence and the rally points that are stored aboard."""
+        """Mission, geofence and rally points stored on board."""
         value = parameters.value
         self.estimator = Estimator(value, new_filter)
-        """For consistency checks."""
+        """Estimator, public for consistency checks."""
         self.record = record = self.estimator.record
-        """Samples, estimate, control loops."""
+        """Record of samples, estimate and control loops."""
         self._state = self.estimator.state
         self._guidance = Guidance(value, self._say, record)
         self._navigator = Navigator(self.plans, value, self)
@@ -101,7 +101,7 @@ class BuiltinAutopilot:
         self._manual_control = ManualControl(value)
         self._events: list[Told] = []
         self.supervisor = Supervisor(value, self.estimator, self._events.append)
-        """Failsafes and pre-arm checks."""
+        """Failsafe and pre-arm checks."""
         self._auto_disarm = AutoDisarm(value)
         self._land_detector = LandDetector(value, record)
         self._controller = Controller(Gains.from_parameters(value), record)
@@ -109,24 +109,24 @@ class BuiltinAutopilot:
         parameters.on_change(self._parameters_changed)
         self._messages: list[Message] = []
         self._demand: AnyDemand | None = None
-        """What is being flown; None = the motors are stopped."""
+        """Active demand; None = the motors are stopped."""
         self._taken_us = -1
-        """Time of the newest sample that the estimator has taken [µs]."""
+        """Time of the newest sample in the estimator [µs]."""
         self._due_us: float = 0
-        """When to decide again [µs]."""
+        """Time of the next decision [µs]."""
         self._decided_on: tuple[Flight | None, object] = (None, None)
-        """The commander's state and the setpoint that the newest decision is of."""
+        """Commander state and setpoint at the newest decision."""
         self._decided_healthy = 0
-        """Whether the estimator was healthy then, 0 or 1."""
+        """Health of the estimator at the newest decision, 0 or 1."""
         self._is_steady = False
-        """Whether its demand stays the same in the air until something changes."""
+        """True if the demand in the air is constant until something changes."""
         self._told: tuple[object, ...] = ()
         self._unsaid = 0
-        """What clients could see at the newest decision, and how many texts and events waited."""
+        """Client-visible state and number of queued texts and events at the newest decision."""
         self._has_news = False
-        """Whether a decision has changed that: the next tick is the last of its stretch."""
+        """True if a decision has changed client-visible state: the next tick ends the stretch."""
         self._navigated_on: tuple[object, ...] = ()
-        """State, home, and numbers of changes of plans and parameters at the newest step."""
+        """State, home and change counters of plans and parameters at the newest navigation."""
         self._newest = NewestSensors(record)
         self._home = Home(self.estimator, self._guidance)
         self._whereabouts = Whereabouts(self.estimator, self._newest, self._home, value)
@@ -152,19 +152,19 @@ class BuiltinAutopilot:
         )
         self._snapshot: AutopilotState | None = None
         self.failures: Failures | None = None
-        """Injects failures on request of a client. Set by the simulation."""
+        """Failure injection for client requests. Set by the simulation."""
         self.logs: LogStore = NoLogs()
-        """Where clients find the flight logs; whoever writes them sets it."""
+        """Flight logs for clients. Set by the log writer."""
         self.on_setpoint: Callable[[Wire, int], None] | None = None
-        """Called with every accepted setpoint, as received, and its time of receipt, if set."""
+        """Callback for accepted setpoints: setpoint as received, time of receipt [µs]."""
         self.on_message: Callable[[Message], None] | None = None
-        """Called with every text for the operator, if set."""
+        """Callback for operator texts."""
         self._say_all(parameters.take_texts())
 
     # --- towards the plant
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Take one tick's sensors and return the motor commands until the next."""
+        """Process one tick's sensors; return the motor commands until the next tick."""
         self.take(sample)
         self.decide_if_due()
         if climb_record(self.record):
@@ -179,7 +179,7 @@ class BuiltinAutopilot:
         )
 
     def take(self, sample: SensorSample) -> None:
-        """Take one tick's sensors into the estimate; harmless when called again."""
+        """Update the estimate with one tick's sensors. Repeated calls have no effect."""
         if sample.time_us == self._taken_us:
             return
         sensors = self.supervisor.sensors
@@ -195,7 +195,7 @@ class BuiltinAutopilot:
             self.supervisor.watch.hear_escs(sample.time_us, self._motors, sample.esc_outputs)
 
     def decide(self) -> None:
-        """Decide what is flown: commander, failsafes, navigator, modes."""
+        """Run commander, failsafes, navigator and modes, and update the demand."""
         time_us, supervisor = self._taken_us, self.supervisor
         if time_us < 0:
             return
@@ -227,7 +227,7 @@ class BuiltinAutopilot:
     # --- compiled ticks
 
     def decide_if_due(self) -> float:
-        """Decide where something is due or has arrived; return when to ask again [µs]."""
+        """Decide if due or if new input has arrived; return the time of the next decision [µs]."""
         flight, setpoint = self._decided_on
         healthy = self.record["healthy"].item(0)
         changed = flight is not self._commander.flight or healthy != self._decided_healthy
@@ -242,14 +242,14 @@ class BuiltinAutopilot:
         return self._taken_us if self._has_news else self._due_us
 
     def _is_undisturbed(self) -> bool:
-        """Return whether the newest decision holds but for setpoints and looks."""
+        """Return whether the newest decision holds apart from setpoints and failsafe checks."""
         said = len(self._messages) + len(self._events) > self._unsaid
         if said or not self._is_steady or self._manual_control.was_heard:
             return False
         return self._home.place is not None and not self._guidance.is_done(self._state)
 
     def _follow(self) -> bool:
-        """Fly the newest setpoint if nothing else has changed; return whether that is done."""
+        """Apply the newest setpoint if nothing else has changed; return True if applied."""
         guidance = self._guidance
         if self.estimator.is_changed or not (guidance.is_steady(_AIR) and self._is_undisturbed()):
             return False
@@ -259,7 +259,7 @@ class BuiltinAutopilot:
         return True
 
     def _finds_nothing_new(self) -> bool:
-        """Return whether a look of the failsafes is all that is due, and changes nothing."""
+        """Return whether only a failsafe check is due and its result is unchanged."""
         supervisor, flight = self.supervisor, self._commander.flight
         if not (self._is_undisturbed() and self._is_idle()):
             return False
@@ -276,7 +276,7 @@ class BuiltinAutopilot:
         self._due_us = min(supervisor.next_us, self._navigator.due_us)
         if climb.flies:
             self.record["climb_due_us"] = self._taken_us
-        else:  # A mode may count on being asked: offboard follows another kind of setpoint then.
+        else:  # A mode may rely on the call: offboard detects a new setpoint type there.
             self._demand = self._guidance.demand(self._state, _AIR, self._taken_us)
             self._controller.command(self._demand)
             self._is_steady = self._guidance.is_steady(_AIR)
@@ -285,7 +285,7 @@ class BuiltinAutopilot:
         return True
 
     def _look_for_news(self) -> bool:
-        """Return whether clients are to be told of the newest decision."""
+        """Return whether clients need an update after the newest decision."""
         plans, waiting = self.plans, len(self._messages) + len(self._events)
         told = (
             *(self._commander.flight, self._guidance.destination, self._home.place),
@@ -299,7 +299,7 @@ class BuiltinAutopilot:
         return news or said
 
     def _prepare(self) -> None:
-        """Prepare the record for compiled ticks, and say when to decide again."""
+        """Prepare the record for compiled ticks and set the time of the next decision."""
         self.estimator.prepare()
         self._decided_on = flight, _ = self._commander.flight, self._guidance.context.setpoint
         self._decided_healthy = self.record["healthy"].item(0)
@@ -316,22 +316,22 @@ class BuiltinAutopilot:
             self._due_us = min(self._due_us, self._taken_us + DECIDE_US)
 
     def fuse(self, sample: SensorSample, left: int) -> None:
-        """Fuse what a compiled tick leaves to Python.
+        """Fuse the measurements that a compiled tick leaves to Python.
 
         Args:
-            sample: Of the tick.
-            left: What is left of it, as `engine.ticks.estimate` returns it.
+            sample: Sensors of the tick.
+            left: Bits of the remaining work, as returned by `engine.ticks.estimate`.
         """
         sensors = self.supervisor.sensors
         sensors.repeated(sample.time_us, left, left >> REPEATED_BITS)
         self.estimator.fuse_rest(sensors.trusted(sample) if sensors.distrusted else sample)
 
     def flown(self, read: Callable[[], SensorSample], event: int) -> bool:
-        """Take note of compiled ticks; return whether the commander's state has changed by them.
+        """Process the results of compiled ticks; return whether the commander's state has changed.
 
         Args:
-            read: Returns the newest sample, which the estimator has taken.
-            event: What ended them (`engine.ticks`).
+            read: Returns the newest sample, which is already in the estimate.
+            event: Event that ended the ticks (`engine.ticks`).
         """
         before, self._snapshot = self._commander.flight, None
         self._taken_us = self.estimator.flown()
@@ -368,11 +368,11 @@ class BuiltinAutopilot:
         return self._commander.flight, self._home.place, *changes
 
     def _is_idle(self) -> bool:
-        """Return whether the navigator has nothing to do, as at its newest step."""
+        """Return whether the navigator has no work, as in its newest step."""
         return self._navigator.idle and self._navigates_on() == self._navigated_on
 
     def _return_place(self) -> Place | None:
-        """Return where Return goes: home, or what RTL_TYPE prefers."""
+        """Return the destination of Return: home, or the place selected by RTL_TYPE."""
         context, now = self._guidance.context, self._situation()
         home = Place(context.home, context.home_yaw)
         return home if now is None else self._navigator.return_place(now, home)
@@ -387,7 +387,7 @@ class BuiltinAutopilot:
     # --- texts
 
     def _look_anew(self, mode: Mode) -> None:
-        """Look, and act on it, before a client's wish for a mode is answered."""
+        """Run the failsafe checks and act on them before a client's mode request is answered."""
         if mode is Mode.MISSION:
             valid = self._navigator.mission_is_valid(self._situation())
             self.supervisor.watch.reports.mission_missing = not valid
@@ -413,12 +413,12 @@ class BuiltinAutopilot:
 
     @property
     def flight(self) -> Flight:
-        """The commander's state."""
+        """Commander state."""
         return self._commander.flight
 
     @property
     def sample(self) -> SensorSample | None:
-        """The newest tick's sensors; None before the first."""
+        """Sensors of the newest tick; None before the first."""
         return self._newest.sample
 
     @property
@@ -429,13 +429,13 @@ class BuiltinAutopilot:
 
     @property
     def attitude(self) -> Vector:
-        """Estimate (4,) body -> NED."""
+        """Estimated attitude quaternion (4,) body -> NED."""
         attitude: Vector = self._state[Q:RATES].copy()
         return attitude
 
     @property
     def ticks_to_motors(self) -> int:
-        """After how many more ticks the motors reflect what is demanded in the next one."""
+        """Number of ticks after the next until the motors reflect its demand."""
         ticks, wanted = ticks_to_motors(self._memory), self._guidance.context.setpoint
         if isinstance(wanted, RateDemand):
             return 0
@@ -443,17 +443,17 @@ class BuiltinAutopilot:
 
     @property
     def internals(self) -> BuiltinAutopilot:
-        """Itself: it shows everything."""
+        """The autopilot itself: all internals are accessible."""
         return self
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
-        """Ignore the true state: it flies by its estimate alone."""
+        """Ignore the true state: the autopilot flies by its estimate."""
 
     def close(self) -> None:
-        """Do nothing: it holds nothing."""
+        """Do nothing: there are no resources to release."""
 
     def report(self, message: Message) -> None:
-        """Say something to the operator that does not come from flying."""
+        """Send a text to the operator that does not come from flying."""
         self._say(message)
 
     def take_messages(self) -> list[Message]:
@@ -469,11 +469,11 @@ class BuiltinAutopilot:
         return taken
 
     def tell_checks(self) -> None:
-        """Tell all failing pre-arm checks anew (MAV_CMD_RUN_PREARM_CHECKS)."""
+        """Report all failing pre-arm checks again (MAV_CMD_RUN_PREARM_CHECKS)."""
         self.supervisor.tell_checks()
 
     def arm(self, *, force: bool) -> Result:
-        """Ask to arm. PX4 runs its checks although a client asks by force, and so do we."""
+        """Request arming. The pre-arm checks also run for a forced request, as in PX4."""
         del force
         if self.sample is None or self.flight.phase >= _GROUND:
             return self._commander.handle(Event.ARM)
@@ -483,15 +483,15 @@ class BuiltinAutopilot:
         return self._commander.handle(Event.ARM_UNREADY if refusals else Event.ARM)
 
     def terminate(self) -> Result:
-        """Ask to stop the motors for good (MAV_CMD_DO_FLIGHTTERMINATION)."""
+        """Request permanent motor stop (MAV_CMD_DO_FLIGHTTERMINATION)."""
         return self._commander.handle(Ask(Mode.TERMINATION))
 
     def disarm(self, *, force: bool) -> Result:
-        """Ask to disarm; force = kill, also in the air."""
+        """Request disarming; force = kill, also in the air."""
         return self._commander.handle(Event.KILL if force else Event.DISARM)
 
     def takeoff(self, altitude_m: float | None, place: tuple[float, float] | None = None) -> Result:
-        """Ask to climb to a height above home [m], and to a place; None = as it is by default."""
+        """Request a take-off to a height above home [m] and a place; None = default."""
         flying = self.flight.phase is _AIR
         self._guidance.take_off_to(altitude_m, place, self._state, flying=flying)
         return self._ask(Mode.TAKEOFF)
@@ -499,7 +499,7 @@ class BuiltinAutopilot:
     def set_mode(
         self, mode: Mode, request: Request | None = None, *, commanded: bool = False
     ) -> Result:
-        """Ask for a mode, with what it takes beyond its name; see `port.AutopilotPort`."""
+        """Request a mode with its optional arguments; see `port.AutopilotPort`."""
         if mode is Mode.TAKEOFF:
             return self.takeoff(None)
         return self._ask(mode, request, COMMANDED.get(mode) if commanded else None)
@@ -520,7 +520,7 @@ class BuiltinAutopilot:
         self._guidance.context.travel.speed_m_s = speed_m_s
 
     def start_mission(self, index: int) -> Result:
-        """Arm and fly the mission from an item on (MAV_CMD_MISSION_START); -1 = as it stands."""
+        """Arm and fly the mission from an item (MAV_CMD_MISSION_START); -1 = current item."""
         if not self._navigator.mission_is_valid(self._situation()):
             self.say(Message.of(Severity.CRITICAL, events.MISSION_DENIED))
             return Result.DENIED
@@ -536,19 +536,19 @@ class BuiltinAutopilot:
     # --- towards the mission (navigation.executor.Crew)
 
     def say(self, message: Message) -> None:
-        """Tell the operator."""
+        """Send a text to the operator."""
         self._say(message)
 
     def set_home(self, place: Geodetic | None) -> Result:
-        """Move home; None = to the present place."""
+        """Move home; None = the current position."""
         done = self._home.set_here() if place is None else self._home.set_to(place)
         self._snapshot, self._due_us = None, 0
         return Result.ACCEPTED if done else Result.TEMPORARILY_REJECTED
 
     def set_origin(self, place: Geodetic) -> Result:
-        """Let local NED be zero at another place; refused while armed.
+        """Move the origin of local NED; rejected while armed.
 
-        PX4 moves it in flight, too, and shifts all that it flies by.
+        PX4 also moves it in flight and shifts all local positions.
         """
         if self.flight.phase >= _GROUND:
             self.say(Message(Severity.WARNING, "Origin is not moved while armed"))
@@ -559,7 +559,7 @@ class BuiltinAutopilot:
         return Result.ACCEPTED
 
     def look_at(self, place: Geodetic | None) -> None:
-        """Turn to a place while a mission is flown; None = to none."""
+        """Turn the nose to a place during a mission; None = cancel."""
         roi = self._navigator.mission.roi
         if place is None:
             roi.reset()
@@ -567,11 +567,11 @@ class BuiltinAutopilot:
             roi.look_at(place)
 
     def return_to_launch(self) -> None:
-        """End the mission and return."""
+        """Abort the mission and return."""
         self.set_mode(Mode.RETURN, commanded=True)
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
-        """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""
+        """Pass on a valid offboard setpoint, received at `time_us` of simulated time."""
         self._guidance.context.offer(setpoint)
         self.supervisor.setpoint(setpoint, time_us)
         if self.on_setpoint is not None:
@@ -580,18 +580,18 @@ class BuiltinAutopilot:
     def offer_attitude(
         self, demand: AttitudeDemand | RateDemand, time_us: int, wire: Wire = UNTOLD
     ) -> None:
-        """Hand over an offboard setpoint of attitude or body rates, received at `time_us`."""
+        """Pass on an offboard setpoint of attitude or body rates, received at `time_us`."""
         self._guidance.context.offer(demand)
         self.supervisor.setpoint(None, time_us)
         if self.on_setpoint is not None:
             self.on_setpoint(wire, time_us)
 
     def refuse_setpoint(self, reason: str, time_us: int) -> None:
-        """Note why an offboard setpoint was refused: the failsafe that follows names it."""
+        """Record the reason of a rejected offboard setpoint, which the next failsafe names."""
         self._commander.refusal = reason, time_us
 
     def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
-        """Hand over the pilot's sticks, received at `time_us` of simulated time."""
+        """Pass on the pilot's sticks, received at `time_us` of simulated time."""
         moved = self._manual_control.offer(sticks, source, time_us)
         self.supervisor.watch.hear_pilot(time_us)
         flown, override = self.flight.mode, int(self.parameters["COM_RC_OVERRIDE"])
@@ -605,37 +605,37 @@ class BuiltinAutopilot:
             self._say(Message.of(Severity.INFO, events.PILOT_TOOK_OVER))
 
     def see(self, odometry: Odometry) -> None:
-        """Hand over a pose that something else has estimated."""
+        """Pass on a pose from an external estimator."""
         self.estimator.see(odometry)
         self._snapshot = None
 
     def measure_distance(self, reading: DistanceReading) -> None:
-        """Hand over what a client's distance sensor measures."""
+        """Pass on a range from a client's distance sensor."""
         self.estimator.measure(reading, CLIENTS_SENSOR)
         self._snapshot = None
 
     def look_down(self, reading: FlowReading) -> None:
-        """Hand over what a client's optical flow sensor measures."""
+        """Pass on a reading from a client's optical flow sensor."""
         self.estimator.look_down(reading)
 
     def see_obstacles(self, obstacles: Obstacles) -> None:
-        """Hand over how far obstacles are."""
+        """Pass on the distances to obstacles."""
         self._guidance.context.obstacles = obstacles
 
     def follow(self, target: FollowedTarget) -> None:
-        """Hand over where the target is that Follow follows."""
+        """Pass on the position of the Follow target."""
         self._guidance.context.target = target
 
     def landing_target(self, target: LandingTarget) -> None:
-        """Hand over where the target of a precision landing is."""
+        """Pass on the position of the precision landing target."""
         self._guidance.context.landing_target = target
 
     def gcs_heartbeat(self, time_us: int) -> None:
-        """A ground station was heard."""
+        """Record a heartbeat from a ground station."""
         self.supervisor.gcs_heartbeat(time_us)
 
     def state(self) -> AutopilotState:
-        """Return the snapshot after the newest tick. Raises RuntimeError before the first."""
+        """Return the snapshot after the newest tick. Raises RuntimeError before the first tick."""
         status = self._commander.status
         if self._snapshot is not None and self._snapshot.status is status:
             return self._snapshot

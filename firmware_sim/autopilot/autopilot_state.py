@@ -1,6 +1,6 @@
 """State of the autopilot: plain data for MAVLink, the recorder and tests.
 
-Whatever is created for every snapshot is a named tuple, which is faster than a dataclass.
+Types created for every snapshot are named tuples, which are faster than dataclasses.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Arming(IntEnum):
     """Arming state."""
 
     BOOT = 0
-    """Estimator not yet converged: cannot arm."""
+    """Estimator not converged: arming is disabled."""
     STANDBY = 1
     ARMED = 2
 
@@ -45,22 +45,22 @@ class Mode(IntEnum):
     LAND = 3
     RETURN = 4
     POSITION = 5
-    """Needs a pilot's input, as the other modes with sticks. Without it PX4 was measured to brake
-    and to descend to the ground: the offboard-loss fallback."""
+    """Requires pilot input, like all stick modes. Without input, PX4 brakes and descends to the
+    ground (measured): the offboard-loss fallback."""
     MISSION = 6
     MANUAL = 7
-    """As Stabilized, for a multicopter."""
+    """Same as Stabilized for a multicopter."""
     STABILIZED = 8
     ACRO = 9
     ALTITUDE = 10
     ORBIT = 11
     FOLLOW = 12
     DESCEND = 13
-    """Comes down level without knowing where; failsafes alone choose it."""
+    """Level descent without a position estimate; selected by failsafes only."""
     TERMINATION = 14
-    """The motors stand still for good."""
+    """The motors are stopped permanently."""
     PRECISION_LAND = 15
-    """Onto a landing target that is reported."""
+    """Landing on a reported landing target."""
 
 
 MODE_NAMES = {
@@ -81,15 +81,15 @@ MODE_NAMES = {
     Mode.TERMINATION: "Termination",
     Mode.PRECISION_LAND: "Precision Landing",
 }
-"""As PX4's texts name them."""
+"""Mode names in PX4's texts."""
 
 
 WITH_STICKS = frozenset({Mode.POSITION, Mode.MANUAL, Mode.STABILIZED, Mode.ACRO, Mode.ALTITUDE})
-"""Modes that need a pilot's input."""
+"""Modes that require pilot input."""
 
 
 class Landed(IntEnum):
-    """Landing detector."""
+    """State of the landing detector."""
 
     ON_GROUND = 0
     TAKEOFF = 1
@@ -112,24 +112,24 @@ class Severity(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A text for the operator (STATUSTEXT)."""
+    """Text for the operator (STATUSTEXT)."""
 
     severity: Severity
     text: str
     event: Event | None = field(default=None, compare=False)
-    """The same as an event, for ground stations that know it; None = there is none."""
+    """Equivalent event for ground stations with event support; None = no event."""
 
     @classmethod
     def of(
         cls, severity: Severity, definition: Definition, *values: float, text: str | None = None
     ) -> Message:
-        """Return an event with its arguments, and its text; None = the words of the event."""
+        """Return an event with its arguments and its text; None = the event's message."""
         words = definition.message if text is None else text
         return cls(severity, words, definition.event(*values))
 
 
 class Result(IntEnum):
-    """Answer to a command; the numbers are MAV_RESULT."""
+    """Command result; values are MAV_RESULT."""
 
     ACCEPTED = 0
     TEMPORARILY_REJECTED = 1
@@ -140,15 +140,15 @@ class Result(IntEnum):
 
 
 Wire: TypeAlias = "tuple[float, float, float, float]"
-"""Four numbers of an offboard setpoint exactly as received: what latency analysis recognises a
-message by."""
+"""Four numbers of an offboard setpoint exactly as received; latency analysis matches messages by
+them."""
 
 UNTOLD: Wire = (math.nan, math.nan, math.nan, math.nan)
-"""Of a setpoint that no message brought."""
+"""Placeholder for a setpoint without a message."""
 
 
 class Setpoint(NamedTuple):
-    """An offboard setpoint, already in local NED. NaN = not commanded on that axis."""
+    """Offboard setpoint in local NED. NaN = axis not commanded."""
 
     position: Vector  # (3,) NED [m]
     velocity: Vector  # (3,) NED [m/s]
@@ -157,12 +157,12 @@ class Setpoint(NamedTuple):
     yaw_rate: float
     """[rad/s], positive clockwise seen from above."""
     wire: Wire = UNTOLD
-    """Velocity and yaw rate (or yaw, where no rate is commanded)."""
+    """Velocity and yaw rate, or yaw if no rate is commanded."""
     acceleration: Vector = np.full(3, math.nan)  # (3,) NED [m/s²]
 
 
 class Estimate(NamedTuple):
-    """The estimator's output."""
+    """Output of the estimator."""
 
     time_us: int
     position: Vector  # (3,) local NED [m]
@@ -179,23 +179,23 @@ class Estimate(NamedTuple):
     """(4,) newest normalised innovation (test ratio, 1 = rejection gate) of horizontal velocity
     and position (GPS), height (barometer), magnetometer, GPS height/vertical speed."""
     healthy: bool
-    """Converged: may be armed and flown on."""
+    """True if converged: the vehicle may arm and fly."""
 
 
 class Clearance(NamedTuple):
     """Estimated height above the ground (vehicle_local_position)."""
 
     dist_bottom_m: float
-    """Not negative."""
+    """Height above the ground [m], not negative."""
     valid: bool
     variance_m2: float
-    """Of where the ground is, as PX4 reports it."""
+    """Variance of the terrain height, as reported by PX4."""
     by_range: bool
-    """Whether ranges say where the ground is."""
+    """True if the terrain height comes from ranges."""
     resets: int
-    """How often the ground has been put elsewhere."""
+    """Number of terrain height resets."""
     ratio: float
-    """Mean test ratio of ranges, as a share of the gate; NaN = none are fused."""
+    """Mean test ratio of ranges relative to the gate; NaN = no ranges are fused."""
 
 
 class CommanderStatus(NamedTuple):
@@ -213,11 +213,11 @@ class MissionProgress(NamedTuple):
     """Progress of the mission."""
 
     current: int = 0
-    """Index of the item that is flown, or will be when the mission goes on."""
+    """Index of the active item, or of the next item if the mission is paused."""
     total: int = 0
-    """Number of items; 0 = no mission is stored."""
+    """Number of items; 0 = no mission stored."""
     mission_id: int = 0
-    """PX4's opaque id of the mission; 0 = none, as of the two below."""
+    """PX4's opaque mission id; 0 = none. The same applies to the two ids below."""
     fence_id: int = 0
     rally_points_id: int = 0
 
@@ -233,20 +233,20 @@ class FenceStatus(NamedTuple):
     altitude: bool = False
     """Higher above home than GF_MAX_VER_DIST."""
     custom: bool = False
-    """Outside the uploaded fence, or inside what it excludes."""
+    """Outside the uploaded fence, or inside an exclusion zone."""
     breaches: int = 0
-    """How many there were since boot."""
+    """Number of breaches since boot."""
     time_us: int = 0
-    """When the newest breach began [µs]."""
+    """Start time of the newest breach [µs]."""
 
     @property
     def breached(self) -> tuple[bool, bool, bool]:
-        """Present breaches: distance, altitude, custom."""
+        """Active breaches: distance, altitude, custom."""
         return self.distance, self.altitude, self.custom
 
 
 class OrbitStatus(NamedTuple):
-    """The circle that Orbit mode flies."""
+    """Circle of Orbit mode."""
 
     radius_m: float
     """Positive clockwise."""
@@ -255,7 +255,7 @@ class OrbitStatus(NamedTuple):
 
 
 class Health(NamedTuple):
-    """What can be believed and used, as sensors, estimator and pre-arm checks have it."""
+    """Usability of sensors and estimates, from sensor, estimator and pre-arm checks."""
 
     gyro: bool = True
     accel: bool = True
@@ -263,24 +263,24 @@ class Health(NamedTuple):
     baro: bool = True
     gps: bool = True
     distance: bool | None = None
-    """None: arming asks for no distance sensor, or there never was one."""
+    """Flag: distance sensor healthy; None: arming does not require it, or none was connected."""
     attitude: bool = True
     velocity: bool = True
-    """Horizontal, of the estimate."""
+    """Horizontal velocity estimate."""
     position: bool = True
-    """Horizontal, of the estimate."""
+    """Horizontal position estimate."""
     altitude: bool = True
     accel_error: bool = False
-    """Inertial data disagreed with the GPS lately."""
+    """Inertial data disagreed with GPS recently."""
     battery: bool = True
     armable: bool = True
-    """No check keeps the vehicle from arming in its mode."""
+    """No check prevents arming in the current mode."""
 
 
 class AutopilotState(Protocol):
-    """The autopilot after its newest tick, for whoever speaks for it; valid until the next one.
+    """State of the autopilot after its newest tick; valid until the next tick.
 
-    Implementations compute a property when it is read: most ticks need a few of them.
+    Implementations compute a property when it is read, as most ticks need only a few.
     """
 
     @property
@@ -289,7 +289,7 @@ class AutopilotState(Protocol):
 
     @property
     def revision(self) -> object:
-        """The same object as long as nothing has changed that a tick's log lacks; None = it may."""
+        """Same object while log data outside the tick's log is unchanged; None = unknown."""
 
     @property
     def estimate(self) -> Estimate:
@@ -301,7 +301,7 @@ class AutopilotState(Protocol):
 
     @property
     def setpoint(self) -> Setpoint:
-        """Setpoint that the controller tracks, in every mode."""
+        """Setpoint of the position controller, in every mode."""
 
     @property
     def attitude_setpoint(self) -> Vector:
@@ -317,7 +317,7 @@ class AutopilotState(Protocol):
 
     @property
     def motors(self) -> tuple[float, float, float, float]:
-        """Commands of the motors, 0..1."""
+        """Motor commands, 0..1."""
 
     @property
     def accel(self) -> Vector:
@@ -349,11 +349,11 @@ class AutopilotState(Protocol):
 
     @property
     def home(self) -> Geodetic | None:
-        """Set when the estimator's origin is set and at arming; None before."""
+        """Home position; set with the estimator's origin and at arming, None before."""
 
     @property
     def origin(self) -> Geodetic | None:
-        """The point of the globe where local NED is zero; None before the first fix."""
+        """Geodetic origin of local NED; None before the first fix."""
 
     @property
     def load(self) -> float:
@@ -377,15 +377,15 @@ class AutopilotState(Protocol):
 
     @property
     def orbit(self) -> OrbitStatus | None:
-        """The circle that is flown, in Orbit mode."""
+        """Active circle in Orbit mode."""
 
     @property
     def health(self) -> Health:
-        """What can be believed and used."""
+        """Usability of sensors and estimates."""
 
     @property
     def hover_thrust(self) -> float:
-        """Collective that hovers, 0..1."""
+        """Collective thrust in hover, 0..1."""
 
     @property
     def destination(self) -> tuple[float, float, float] | None:
@@ -397,35 +397,35 @@ class AutopilotState(Protocol):
 
     @property
     def sticks(self) -> Sticks | None:
-        """A pilot's; None = none are heard."""
+        """Pilot's sticks; None = no pilot."""
 
     @property
     def esc_outputs(self) -> tuple[float, float, float, float] | None:
-        """What the speed controllers report that their motors do; None: what they are told."""
+        """Motor outputs reported by the speed controllers; None: outputs equal commands."""
 
     @property
     def odometry(self) -> Odometry | None:
-        """The newest pose that something else has estimated; None before any."""
+        """Newest pose from an external estimator; None before the first."""
 
     @property
     def odometry_us(self) -> int:
-        """Time of its arrival [µs]."""
+        """Time of arrival of the pose [µs]."""
 
     @property
     def distance(self) -> DistanceReading | None:
-        """The newest of a distance sensor; None before any."""
+        """Newest distance reading; None before the first."""
 
     @property
     def distance_us(self) -> int:
-        """Time of its arrival [µs]."""
+        """Time of arrival of the distance reading [µs]."""
 
     @property
     def flow(self) -> FlowReading | None:
-        """The newest of an optical flow sensor; None before any."""
+        """Newest optical flow reading; None before the first."""
 
     @property
     def flow_us(self) -> int:
-        """Time of its arrival [µs]."""
+        """Time of arrival of the flow reading [µs]."""
 
     @property
     def clearance(self) -> Clearance | None:

@@ -1,7 +1,7 @@
-"""The vertical trajectory of a take-off.
+"""Vertical trajectory of a take-off.
 
 Source: PX4 1.16, `PositionSmoothing` on the vertical axis (`trajectory`). The jerk limit of the
-speed itself is left out: it delays a change of speed by a tenth of a second.
+speed is omitted; it delays a speed change by 0.1 s.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from firmware_sim.engine.record import (
 )
 
 DECIDE_US = 20_000
-"""Time between two decisions of a mode whose demand changes in flight: PX4's flight modes run at 50
-Hz (FlightModeManager) [µs]."""
+"""Decision period of a mode whose demand changes in flight [µs]. PX4's flight modes run at 50 Hz
+(FlightModeManager)."""
 
 SETTLED_M = 0.01
-"""From this close to it, the take-off altitude is held like any other [m]."""
+"""Distance to the take-off altitude from which it is held like any other altitude [m]."""
 
 HEIGHT, SPEED, TARGET, HOME_DOWN, END, NEAR_GROUND = range(6)
-"""Layout of `climb`: present height [m] and vertical speed, upwards positive [m/s]; the altitude;
-home, NED; where the take-off ends, and the next mode climbs on; up to where it climbs gently."""
+"""Layout of `climb`: current height [m], vertical speed [m/s] (positive up), target height, home
+(NED), height at which the take-off ends, and upper limit of the gentle climb."""
 
 _BEGAN, _SPOOL_UP, _TAKES, _FROM, _UP_TO = range(5)
-"""Layout of `ramp`: when the spool-up began [µs], how long it and the ramp take [s], the first and
-the last speed of the ramp [m/s]."""
+"""Layout of `ramp`: start of the spool-up [µs], durations of spool-up and ramp [s], first and last
+speed of the ramp [m/s]."""
 
 _GENTLY, _UP, _DOWN = range(3)
-"""Rows of `climb_limits`, each as `ClimbLimits`."""
+"""Rows of `climb_limits`, each in the order of `ClimbLimits`."""
 
 _braking_speed = kernel(braking_speed)
 
 
 class ClimbLimits(NamedTuple):
-    """Limits of a vertical movement."""
+    """Limits of vertical motion."""
 
     speed_m_s: float
     acceleration_m_s2: float
@@ -57,7 +57,7 @@ class ClimbLimits(NamedTuple):
 
 @kernel
 def move_on(c: Fields, now_us: int) -> None:
-    """Move the climb of a flight controller on to a time [µs], which rises from call to call."""
+    """Advance the climb of a flight controller to a time [µs], which must not decrease."""
     own, row = c.climb, _DOWN
     if own[TARGET] > own[HEIGHT]:
         row = _GENTLY if c.climbs == RISING and own[HEIGHT] < own[NEAR_GROUND] else _UP
@@ -70,7 +70,7 @@ def move_on(c: Fields, now_us: int) -> None:
     c.climb_us = now_us
     own[HEIGHT] += own[SPEED] * elapsed_s
     left_m = own[TARGET] - own[HEIGHT]
-    # The greatest speed that can still be braked.
+    # Maximum speed from which braking is still possible.
     wanted = math.copysign(min(speed, _braking_speed(abs(left_m), acceleration, jerk)), left_m)
     most = acceleration * elapsed_s
     own[SPEED] += min(most, max(-most, wanted - own[SPEED]))
@@ -78,10 +78,10 @@ def move_on(c: Fields, now_us: int) -> None:
 
 @kernel
 def ramp_m_s(ramp: Vector, now_us: int) -> float:
-    """Return the limit of the vertical speed of a vehicle on the ground [m/s].
+    """Return the limit of the vertical speed on the ground [m/s].
 
-    Source: PX4's Takeoff: after COM_SPOOLUP_TIME it rises in MPC_TKO_RAMP_T from the value that
-    commands zero thrust to the take-off speed.
+    Source: PX4's Takeoff. After COM_SPOOLUP_TIME, the limit rises over MPC_TKO_RAMP_T from the
+    value for zero thrust to the take-off speed.
     """
     ramp_s = (now_us - ramp[_BEGAN]) / US_PER_S - ramp[_SPOOL_UP]
     limit_m_s = ramp[_FROM]
@@ -92,7 +92,7 @@ def ramp_m_s(ramp: Vector, now_us: int) -> float:
 
 @kernel
 def climb_if_due(c: Fields) -> bool:
-    """Let a climb change the demand when that is due; return whether the take-off has ended."""
+    """Update the demand from the climb if due; return whether the take-off has ended."""
     own = c.climb
     if c.climbs not in (RAMPING, RISING, SETTLING) or c.time_us < c.climb_due_us:
         return False
@@ -118,7 +118,7 @@ def climb_if_due(c: Fields) -> bool:
 
 @kernel
 def climb_record(controller: Record) -> bool:
-    """Let the climb of a record (1,) change the demand; as `climb_if_due`."""
+    """Update the demand from the climb of a record (1,), like `climb_if_due`."""
     return bool(climb_if_due(controller[0]))
 
 
@@ -128,29 +128,29 @@ def _move_record_on(controller: Record, now_us: int) -> None:
 
 
 class Climb:
-    """A vertical trajectory towards a height. Its speed changes no faster than its limits.
+    """Vertical trajectory to a height with limited acceleration.
 
-    Where it is flown (`fly`), compiled ticks move it on.
+    After `fly`, compiled ticks advance the trajectory.
     """
 
     def __init__(self, record: Record | None = None) -> None:
-        """Start in the record of a flight controller; None = in a new one."""
+        """Use the record of a flight controller; None = a new record."""
         self._record = record = new_controller() if record is None else record
         self._own, self._limits = record["climb"][0], record["climb_limits"][0]
 
     height_m = property(lambda self: self._own.item(HEIGHT))
-    """Present height [m]."""
+    """Current height [m]."""
     speed_m_s = property(lambda self: self._own.item(SPEED))
-    """Present vertical speed, upwards positive [m/s]."""
+    """Current vertical speed, positive up [m/s]."""
 
     @property
     def flies(self) -> bool:
-        """Whether compiled ticks move it on."""
+        """True if compiled ticks advance the trajectory."""
         return self._record["climbs"].item(0) in (RAMPING, RISING, SETTLING)
 
     @property
     def has_ended(self) -> bool:
-        """Whether they have brought it to its end, which its mode has not noticed yet."""
+        """True if the climb has ended and its mode has not processed the end yet."""
         return bool(self._record["climbs"].item(0) == CLIMB_ENDED)
 
     def restart(self, speed_m_s: float) -> None:
@@ -158,19 +158,19 @@ class Climb:
         self._own[SPEED], self._record["climb_us"] = speed_m_s, -1
 
     def stop(self, *, ended: bool = False) -> None:
-        """Leave the demand to Python; `ended` = until its mode notices that it has ended."""
+        """Leave the demand to Python; `ended` = until the mode has processed the end."""
         self._record["climbs"] = CLIMB_ENDED if ended else NO_CLIMB
 
     def ramp(
         self, began_us: int, value: Callable[[str], float], time_us: int, *, flies: bool
     ) -> float:
-        """Begin the climb anew at a time [µs] of the ramp on the ground; return its limit [m/s].
+        """Restart the climb at a time [µs] of the ground ramp; return the speed limit [m/s].
 
         Args:
-            began_us: When the spool-up began [µs].
-            value: Looks up PX4 parameters by name.
-            time_us: Rises from call to call.
-            flies: Whether compiled ticks move it on from there.
+            began_us: Start of the spool-up [µs].
+            value: Look-up for PX4 parameters by name.
+            time_us: Current time, increasing from call to call.
+            flies: True if compiled ticks continue the climb.
         """
         ramp, record = self._record["ramp"][0], self._record
         ramp[_BEGAN:_TAKES] = began_us, value("COM_SPOOLUP_TIME")
@@ -190,25 +190,25 @@ class Climb:
         near_ground_m: float,
         limits: tuple[ClimbLimits, ClimbLimits, ClimbLimits],
     ) -> None:
-        """Say where it leads.
+        """Set the target of the climb.
 
         Args:
             target_m: Height above home [m].
             home_down_m: Home, local NED [m].
             end_m: Height at which the take-off ends [m].
-            near_ground_m: A take-off climbs gently up to this height [m].
-            limits: Near the ground, upwards, downwards.
+            near_ground_m: Upper limit of the gentle climb of a take-off [m].
+            limits: Limits near the ground, upwards and downwards.
         """
         self._own[TARGET:] = target_m, home_down_m, end_m, near_ground_m
         self._limits[:] = limits
 
     def fly(self, kind: int, time_us: int, height_m: float | None = None) -> None:
-        """Move on to a time [µs], and let compiled ticks move it on from there.
+        """Advance to a time [µs] and let compiled ticks continue.
 
         Args:
             kind: `RISING` or `SETTLING`.
-            time_us: Rises from call to call.
-            height_m: Where the vehicle is; None = where the trajectory is.
+            time_us: Current time, increasing from call to call.
+            height_m: Height of the vehicle; None = height of the trajectory.
         """
         if height_m is not None:
             self._own[HEIGHT] = height_m

@@ -1,8 +1,8 @@
-"""The commander: an explicit table of (phase, event) -> what happens. Pure, no time, no I/O.
+"""Commander: an explicit transition table by phase and event. Pure: no clock, no I/O.
 
-Who may arm, which mode follows which, what is refused and with which text: as PX4 does it
-(measured on PX4 1.16 with MAVSDK 4.1). When a failsafe decides instead is `failsafes/`, when the
-vehicle disarms by itself `auto_disarm`; what a mode flies lives in `modes/`.
+Arming rules, mode changes, rejections and their texts follow PX4 (measured on PX4 1.16 with MAVSDK
+4.1). `failsafes/` holds the failsafe decisions, `auto_disarm` the disarm timeouts, and `modes/` the
+behaviour of each mode.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ class Phase(IntEnum):
     STANDBY = 1
     """Ready, disarmed."""
     GROUND = 2
-    """Armed, standing."""
+    """Armed, on the ground."""
     AIR = 3
     """Armed, flying."""
 
 
 class Ask(NamedTuple):
-    """The user asks for a mode."""
+    """User request for a mode."""
 
     mode: Mode
     available: bool = True
-    """Whether the mode has what it needs; offboard: a fresh setpoint."""
+    """True if the mode's requirements are met; offboard: a fresh setpoint."""
 
 
 class Event(Enum):
-    """Everything else that can happen to a flight."""
+    """Events other than mode requests."""
 
     READY = auto()
     """The estimator has converged."""
@@ -62,11 +62,11 @@ class Event(Enum):
     KILL = auto()
     """Forced disarm."""
     LIFTED = auto()
-    """The landing detector sees flight."""
+    """Lift-off detected by the landing detector."""
     LANDED = auto()
-    """The landing detector sees ground."""
+    """Landing detected by the landing detector."""
     MODE_DONE = auto()
-    """The mode has reached its end; take-off: its altitude."""
+    """The mode has reached its goal; take-off: its altitude."""
     DISARM_TIMEOUT = auto()
     """Armed on the ground for COM_DISARM_PRFLT."""
     LANDED_TIMEOUT = auto()
@@ -79,36 +79,36 @@ class Event(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """The commander's whole state."""
+    """Complete state of the commander."""
 
     phase: Phase = Phase.BOOT
     mode: Mode = Mode.HOLD
-    """What flies."""
+    """Active mode."""
     intended: Mode = Mode.HOLD
-    """The mode that the user asked for last."""
+    """Last mode requested by the user."""
     after_disarm: Mode = Mode.HOLD
-    """The last requested mode but take-off, landing and return: disarming restores it."""
+    """Mode after disarming: the last requested mode except take-off, landing and return."""
     failsafe: bool = False
-    """Whether a failsafe chose the mode."""
+    """True if a failsafe selected the mode."""
 
 
 class Choice(Enum):
-    """Choice of the next mode by a row."""
+    """Rule for the next mode in a table row."""
 
     KEEP = auto()
     """No change."""
     ASK = auto()
-    """The user wants `Row.mode`."""
+    """Switch to `Row.mode`, requested by the user."""
     RESTORE = auto()
-    """Disarmed: back to the last lasting mode."""
+    """Disarmed: return to the last lasting mode."""
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One cell of the table."""
+    """Cell of the transition table."""
 
     phase: Phase | None = None
-    """Next phase; None = the same."""
+    """Next phase; None = unchanged."""
     choice: Choice = Choice.KEEP
     mode: Mode = Mode.HOLD
     result: Result = Result.ACCEPTED
@@ -145,12 +145,12 @@ def _unavailable(mode: Mode) -> Row:
 
 
 def _asked(mode: Mode) -> tuple[Row, Row, Row, Row]:
-    # Also on the ground and disarmed: accepted, the vehicle stays (as PX4 does it).
+    # PX4 also accepts the mode on the ground and disarmed; the vehicle stays.
     return (_ask(mode),) * 4
 
 
 def _asked_in_vain(mode: Mode) -> tuple[Row, Row, Row, Row]:
-    # Disarmed, PX4 grants every mode, and refuses to arm in one that lacks what it needs.
+    # Disarmed, PX4 accepts any mode and rejects arming if its requirements are unmet.
     return (_ask(mode), _ask(mode), _unavailable(mode), _unavailable(mode))
 
 
@@ -164,7 +164,7 @@ COMMANDED = {
     Mode.PRECISION_LAND: _info("Precision landing", events.LANDING_PRECISELY.event()),
     Mode.RETURN: Message.of(Severity.INFO, events.RETURNING),
 }
-"""Texts for modes that a command of their own grants, armed or not; DO_SET_MODE is silent."""
+"""Texts for modes with a separate MAVLink command, armed or not; DO_SET_MODE has no text."""
 
 _DISARMED = _disarm(ArmingReason.COMMAND_EXTERNAL)
 _UNUSED = _disarm(ArmingReason.AUTO_DISARM_PREFLIGHT)
@@ -173,7 +173,7 @@ _DENIED = Row(result=Result.DENIED)
 
 TABLE: dict[Ask | Event, tuple[Row, Row, Row, Row]] = {
     Event.READY: (Row(phase=_S), _IGNORE, _IGNORE, _IGNORE),
-    # In the air there is no way back to the ground state: the estimate is flown as it is.
+    # No transition from air back to boot: the vehicle continues with the estimate as is.
     Event.NOT_READY: (_IGNORE, Row(phase=_B), _IGNORE, _IGNORE),
     Event.ARM: (_NO_ARM, _ARMED, _IGNORE, _IGNORE),
     Event.ARM_UNREADY: (_NO_ARM, _NO_ARM, _IGNORE, _IGNORE),
@@ -188,10 +188,10 @@ TABLE: dict[Ask | Event, tuple[Row, Row, Row, Row]] = {
     Event.FAILSAFE_DISARM: (_IGNORE, _IGNORE, _CUT, _CUT),
     **{Ask(mode): _asked(mode) for mode in Mode},
     **{Ask(mode, available=False): _asked_in_vain(mode) for mode in Mode},
-    # Disarmed there is nothing to terminate.
+    # There is nothing to terminate while disarmed.
     Ask(Mode.TERMINATION): (_DENIED, _DENIED, _ask(Mode.TERMINATION), _ask(Mode.TERMINATION)),
 }
-"""[event][phase]: what an event does in BOOT, STANDBY, GROUND and AIR; a test checks every pair."""
+"""[event][phase]: effect of an event in BOOT, STANDBY, GROUND and AIR; tests cover every pair."""
 
 
 def _unless_ignored(event: Event, phase: Phase) -> Event | None:
@@ -202,8 +202,8 @@ READINESS = tuple(
     (_unless_ignored(Event.NOT_READY, phase), _unless_ignored(Event.READY, phase))
     for phase in Phase
 )
-"""[phase][whether the estimator is healthy]: the event to handle, None where the table ignores it.
-Looked up at every tick."""
+"""[phase][estimator healthy]: event to handle, None if the table ignores it. Looked up in every
+tick."""
 
 _PASSING = {
     *(Mode.TAKEOFF, Mode.LAND, Mode.PRECISION_LAND, Mode.RETURN),
@@ -213,7 +213,7 @@ _PASSING = {
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """The outcome of one event."""
+    """Outcome of an event."""
 
     flight: Flight
     result: Result
@@ -221,7 +221,7 @@ class Step:
 
 
 def transition(flight: Flight, event: Ask | Event) -> Step:
-    """Return what an event does to a flight. Nobody leaves a termination."""
+    """Return the outcome of an event for a flight. Termination has no exit."""
     if flight.mode is Mode.TERMINATION:
         if isinstance(event, Ask):
             refused = _unavailable(event.mode)
@@ -243,7 +243,7 @@ def transition(flight: Flight, event: Ask | Event) -> Step:
 
 
 def status_of(flight: Flight) -> CommanderStatus:
-    """Return what is reported of a state."""
+    """Return the reported status of a state."""
     arming = (Arming.BOOT, Arming.STANDBY, Arming.ARMED, Arming.ARMED)[flight.phase]
     if flight.phase is not Phase.AIR:
         landed = Landed.ON_GROUND

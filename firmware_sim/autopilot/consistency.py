@@ -1,15 +1,14 @@
-"""Tells sensors that have gone wrong from noise by how the filter's innovations go on.
+"""Innovation monitor: distinguishes sensor faults from noise.
 
-Noise changes its sign from sample to sample, however strong it is. Once the accelerometer or the
-gyro has an error that the filter does not expect, the innovations of velocity and heading stay on
-one side. Then the filter must open up again: what it is sure of, above all the biases, is so no
-longer. A receiver whose velocity is noisier than stated shows in the differences of innovations,
-which slow errors leave alone.
+Noise of any strength changes its sign from sample to sample. An unmodelled accelerometer or gyro
+error keeps the innovations of velocity and heading on one side. The filter then needs larger
+variances, above all for the biases. A receiver with more velocity noise than stated shows in the
+differences between innovations, which slow errors do not affect.
 
-Sources: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation,
-ch. 5.4 (consistency) and 11.2 (adjusting the noise upon a test of the innovations). PX4's EKF2 has
-the same answers with other tests: it raises the accelerometer's noise (`BADACC_BIAS_PNOISE`),
-resets the variance of the gyro's bias, and gives up a compass (`mag_fault`).
+Sources: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, ch.
+5.4 (consistency) and 11.2 (adjusting the noise upon a test of the innovations). PX4's EKF2 has the
+same responses with other tests: it raises the accelerometer noise (`BADACC_BIAS_PNOISE`), resets
+the gyro bias variance, and stops using a compass (`mag_fault`).
 """
 
 from __future__ import annotations
@@ -24,43 +23,43 @@ from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 
 FAR = 3.0
-"""An innovation beyond this many standard deviations is one of a run."""
+"""Threshold in standard deviations beyond which an innovation counts towards a run."""
 
 VELOCITY_RUN = 6
-"""GPS velocities in a row beyond `FAR` on the same side: 0.6 s at 10 Hz. By chance once in 10^16
-samples."""
+"""Consecutive GPS velocities beyond `FAR` on the same side: 0.6 s at 10 Hz. False alarm rate: once
+in 10^16 samples."""
 
 HEADING_RUN = 25
-"""Headings in a row: 0.5 s at 50 Hz."""
+"""Consecutive headings beyond `FAR`: 0.5 s at 50 Hz."""
 
 LATE_S = 0.5
-"""A receiver may be so much later than stated. A velocity that differs by no more than what the
-vehicle has changed its own in that time says nothing of the inertial sensors [s]."""
+"""Tolerated additional receiver delay [s]. Velocity innovations within the vehicle's velocity
+change over this time do not count as an inertial sensor fault."""
 
 LOOK_BACK = 6
-"""Samples over which the greatest acceleration is looked for."""
+"""Number of samples searched for the maximum acceleration."""
 
 REFUSED_US = US_PER_S
-"""A compass that the gate has refused for so long is given up [µs]."""
+"""Time of continuous rejection after which a compass is disabled [µs]."""
 
 NOISY = 4.0
-"""A velocity with this many times the variance that it should have is that of a noisy receiver."""
+"""Ratio of measured to expected velocity variance beyond which a receiver counts as noisy."""
 
 _NOISE_SHARE = 0.1
-"""Share of the newest sample in the mean: it looks back 1 s at 10 Hz."""
+"""Weight of the newest sample in the mean: 1 s at 10 Hz."""
 
 _OUTLIER = 12.0
-"""No sample counts for more: one outlier, which differs twice, is not yet noise."""
+"""Upper limit of a sample's contribution: one outlier, which differs twice, is not yet noise."""
 
 
 class Limits(NamedTuple):
-    """Least and greatest standard deviation after a restart."""
+    """Minimum and maximum standard deviation after a restart."""
 
     least: float
     greatest: float
 
     def bound(self, sigma: float) -> float:
-        """Return a standard deviation within the limits."""
+        """Return a standard deviation clipped to the limits."""
         return min(max(sigma, self.least), self.greatest)
 
 
@@ -75,7 +74,7 @@ GYRO_BIAS = Limits(0.04, 0.2)
 
 
 class Restart(NamedTuple):
-    """How far off the filter may be now, as standard deviations."""
+    """Standard deviations of the filter's errors after a restart."""
 
     velocity_m_s: float
     attitude_rad: float
@@ -84,10 +83,10 @@ class Restart(NamedTuple):
 
 
 def restart_for(velocity_m_s: float, seconds: float) -> Restart:
-    """Return what explains a velocity that has gone off by so much in so long.
+    """Return the sensor errors that explain a velocity error accumulated in a time [s].
 
-    Either the accelerometer is off by `velocity / time`, or the vehicle is tilted by that much of
-    gravity, or the gyro by what tilts it so in that time.
+    Candidates are an accelerometer error of `velocity / time`, a tilt with that share of gravity,
+    and a gyro error that causes this tilt in that time.
     """
     acceleration = abs(velocity_m_s) / seconds
     tilt = acceleration / GRAVITY_M_S2
@@ -100,21 +99,21 @@ def restart_for(velocity_m_s: float, seconds: float) -> Restart:
 
 
 class Run:
-    """How many innovations in a row were far off on the same side."""
+    """Counter for consecutive large innovations on the same side."""
 
     def __init__(self, needed: int) -> None:
-        """Begin without any; `needed` of them are no noise."""
+        """Start at zero; `needed` innovations in a row are not noise."""
         self._needed = needed
         self._side = 0
         self.length = 0
-        """How many there are."""
+        """Current length of the run."""
         self._since_us = 0
 
     def take(self, deviations: float, time_us: int) -> float:
-        """Take an innovation in standard deviations.
+        """Add an innovation in standard deviations.
 
         Returns:
-            How long the run has lasted where it is long enough to be no noise [s], else 0.
+            Duration of the run [s] if it is too long to be noise, else 0.
         """
         side = (deviations > FAR) - (deviations < -FAR)
         if side == 0 or side != self._side:
@@ -125,15 +124,15 @@ class Run:
         return (time_us - self._since_us) / US_PER_S if self.length >= self._needed else 0.0
 
     def restart(self) -> None:
-        """Begin again."""
+        """Reset the run."""
         self._side = self.length = 0
 
 
 class Compass:
-    """Gives up a compass that the gate has refused for some time.
+    """Compass monitor that disables a compass after continuous rejection.
 
-    Without it the heading's variance grows until the gate lets any heading in. What comes back must
-    be as close as was asked for when it was given up.
+    Without a compass the heading variance grows until the gate accepts any heading. To enable the
+    compass again, a heading must lie within the gate of the first rejection.
     """
 
     def __init__(self) -> None:
@@ -144,20 +143,20 @@ class Compass:
 
     @property
     def is_suspect(self) -> bool:
-        """Whether headings are refused, or were lately."""
+        """True if headings are rejected, or were recently."""
         return self.given_up or self._failed or self._refused_us is not None
 
     def admits(self, innovation_rad: float) -> bool:
-        """Return whether a heading may be fused, if it passes the gate too."""
+        """Return whether a heading may be fused if it also passes the gate."""
         near = not self.given_up or abs(innovation_rad) <= self._gate_rad
         return near and not self._failed
 
     def fail(self) -> None:
-        """Give it up for good: the vehicle has been seen to point elsewhere."""
+        """Disable the compass permanently: the heading has been proven wrong."""
         self.given_up = self._failed = True
 
     def tested(self, innovation_rad: float, ratio: float, time_us: int) -> None:
-        """Note the test ratio of a heading: beyond 1 it was refused."""
+        """Record the test ratio of a heading: above 1 it was rejected."""
         if ratio <= 1.0:
             self.given_up, self._refused_us = False, None
         elif self._refused_us is None:
@@ -168,12 +167,12 @@ class Compass:
 
 @kernel
 def note_velocity(record: Any, deviations: Vector, acceleration: Vector) -> None:
-    """Note a velocity in the record of a flight controller: its noise, the vehicle's acceleration.
+    """Record a velocity's noise and the vehicle's acceleration in a flight controller's record.
 
     Args:
         record: Updated.
         deviations: Innovation in standard deviations (3,).
-        acceleration: As estimated (3,) NED [m/s²].
+        acceleration: Estimate (3,) NED [m/s²].
     """
     square, slot = 0.0, record.fixes % LOOK_BACK
     for i in range(3):
@@ -182,7 +181,7 @@ def note_velocity(record: Any, deviations: Vector, acceleration: Vector) -> None
         record.accelerations[slot, i] = abs(acceleration[i])
     record.fixes += 1
     if not math.isnan(square):
-        # Two independent samples differ by twice the variance of one.
+        # The difference of two independent samples has twice the variance.
         variance = min(square / 6.0, _OUTLIER)
         record.velocity_noise += _NOISE_SHARE * (variance - record.velocity_noise)
 
@@ -193,51 +192,51 @@ def _note_velocity(records: Any, deviations: Vector, acceleration: Vector) -> No
 
 
 class Consistency:
-    """Watches the innovations of velocity and heading."""
+    """Monitor for the innovations of velocity and heading."""
 
     def __init__(self, record: Any = None) -> None:
-        """Begin in the record of a flight controller; None = in a new one."""
+        """Use the record of a flight controller; None = a new record."""
         if record is None:
             from firmware_sim.engine.record import new_controller
 
             record = new_controller()
         self._record = record
         self.restarts = 0
-        """How often the filter has been restarted."""
+        """Number of filter restarts."""
         self.restarted_us: int | None = None
-        """When that was last."""
+        """Time of the last restart."""
         self._runs = [Run(VELOCITY_RUN) for _ in range(3)]
         self._heading = Run(HEADING_RUN)
 
     @property
     def velocity_deviates(self) -> bool:
-        """Whether the newest velocities were far off on one side, or noisy."""
+        """True if the newest velocities were far off on one side, or noisy."""
         return any(run.length for run in self._runs) or self.velocity_excess > 1.0
 
     @property
     def heading_deviates(self) -> bool:
-        """Whether the newest headings were far off on one side."""
+        """True if the newest headings were far off on one side."""
         return self._heading.length > 0
 
     @property
     def velocity_excess(self) -> float:
-        """By how much the variance of the velocity exceeds what it should be; 1 = it does not."""
+        """Ratio of measured to expected velocity variance if above `NOISY`, else 1."""
         noise: float = self._record["velocity_noise"].item(0)
         return noise if noise > NOISY else 1.0
 
     def velocity(
         self, innovation: Vector, sigma: Vector, acceleration: Vector, time_us: int
     ) -> Restart | None:
-        """Take a GPS velocity.
+        """Check a GPS velocity.
 
         Args:
-            innovation: Measured less expected (3,) NED [m/s].
-            sigma: Standard deviation that the innovation should have (3,) [m/s].
-            acceleration: As estimated (3,) NED [m/s²].
-            time_us: When.
+            innovation: Measured minus expected (3,) NED [m/s].
+            sigma: Expected standard deviation of the innovation (3,) [m/s].
+            acceleration: Estimate (3,) NED [m/s²].
+            time_us: Current time [µs].
 
         Returns:
-            What to restart the filter with; None: it may go on.
+            Standard deviations for a filter restart; None: no restart needed.
         """
         deviations = innovation / sigma
         if not np.isfinite(deviations).all():
@@ -256,10 +255,9 @@ class Consistency:
         return self._anew(restart_for(float(np.abs(innovation).max()), max(lasted)))
 
     def heading(self, deviations: float, time_us: int, *, within: bool) -> Restart | None:
-        """Take a heading's innovation in standard deviations, and whether it is within the gate.
+        """Check a heading innovation in standard deviations; `within` = inside the gate.
 
-        A compass that points elsewhere leaves the gate at once. A gyro's error grows through it:
-        only such a run counts.
+        A compass fault leaves the gate at once. Only a gyro error grows through it and counts.
         """
         if not within and self._heading.length == 0:
             return None
@@ -267,7 +265,7 @@ class Consistency:
         return self._anew(restart_for(0.0, lasted)) if lasted else None
 
     def restarted(self, time_us: int) -> None:
-        """Note that the filter was restarted with what was returned."""
+        """Record that the filter was restarted with the returned values."""
         self.restarts += 1
         self.restarted_us = time_us
 

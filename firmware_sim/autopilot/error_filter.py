@@ -1,4 +1,4 @@
-"""What carries the covariance of the estimator's error: `filter_kernel`, `filter_filterpy`."""
+"""Interface of the error filters `filter_kernel` and `filter_filterpy`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from airl_mav.core.frames import Vector
 
 
 class ErrorFilter(Protocol):
-    """Carries the covariance of the error, and moves corrections into the nominal state.
+    """Filter for the error covariance; injects corrections into the nominal state.
 
     The nominal state is a row of `error_state.ROW_SIZE` floats, updated in place.
     """
@@ -19,24 +19,24 @@ class ErrorFilter(Protocol):
         """Covariance of the error, (16, 16)."""
 
     def predict(self, state: Vector, gyro: Vector, accel: Vector) -> None:
-        """Move nominal state and covariance by one tick's IMU sample, each (3,) FRD."""
+        """Advance nominal state and covariance by one tick's IMU sample, each (3,) FRD."""
 
     def restart(self, covariance: Vector) -> None:
-        """Go on from another covariance (16, 16): what was known is so no longer."""
+        """Continue from another covariance (16, 16), discarding the current one."""
 
     def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
         """Correct the nominal state by one measurement, unless it fails the gate.
 
         Args:
             state: Nominal state.
-            innovation: Measured less expected (m,).
-            h: Jacobian of what is expected by the error (m, 16).
-            variance: Of the independent noises (m,).
+            innovation: Measured minus expected (m,).
+            h: Jacobian of the expected measurement by the error (m, 16).
+            variance: Variances of the independent noises (m,).
 
         Returns:
-            The test ratio: 1 = at the gate; above it, or NaN, nothing was corrected.
+            Test ratio: 1 = at the gate; above 1, or NaN, nothing was corrected.
         """
 
 
 NewFilter = Callable[[Vector, Vector], ErrorFilter]
-"""Makes a filter from the first covariance (16, 16) and what each tick adds to its diagonal."""
+"""Factory: filter from the first covariance (16, 16) and each tick's increment of its diagonal."""

@@ -1,11 +1,11 @@
-"""What the estimator's filters share: the states, their propagation, the measurement models.
+"""States, propagation and measurement models of the estimator's filters.
 
-The nominal state is a row of `ROW_SIZE` floats, so that compiled code takes it as it is. The error
-that a filter estimates has 16 states, in this order: position (3) [m], velocity (3) [m/s],
-attitude (3, rotation vector in body axes) [rad], gyro bias (3) [rad/s], accelerometer bias (3)
-[m/s²], barometer offset (1) [m]. Between measurements the error is zero by construction; a
-measurement's correction is moved into the nominal state at once (Solà, Quaternion kinematics for
-the error-state Kalman filter, arXiv 1711.02508, sections 5-6).
+The nominal state is a row of `ROW_SIZE` floats, directly usable by compiled code. The estimated
+error has 16 states, in this order: position (3) [m], velocity (3) [m/s], attitude (3, rotation
+vector in body axes) [rad], gyro bias (3) [rad/s], accelerometer bias (3) [m/s²], barometer offset
+(1) [m]. Between measurements the error is zero by construction. A measurement's correction is
+injected into the nominal state at once (Solà, Quaternion kinematics for the error-state Kalman
+filter, arXiv 1711.02508, sections 5-6).
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from airl_mav.vehicle.rotation import Quat, Vec, conjugate, exponential, multipl
 
 N_STATES = 16
 POS, VEL, ATT, GYRO, ACC, BARO = 0, 3, 6, 9, 12, 15
-"""Where each error begins: three states each, one for the barometer."""
+"""Index of each error's first state: three states each, one for the barometer."""
 
-# Layout of the nominal state's row. What control needs comes first (`Controller.fly`).
+# Layout of the nominal state's row. Values for control come first (`Controller.fly`).
 P, V, Q, RATES, GYRO_BIAS, ACCEL_BIAS, BARO_OFFSET = 0, 3, 6, 10, 13, 16, 19
 ACCELERATION = 20
 """NED, gravity removed [m/s²]."""
@@ -40,7 +40,7 @@ GATE = 5.0
 """Innovations beyond this many standard deviations are not fused (EKF2_*_GATE)."""
 
 _READY_SIGMA = (1.5,) * 3 + (0.3,) * 3 + (math.radians(2.0),) * 2 + (math.radians(5.0),)
-"""Converged when position, velocity, tilt and heading are known better than this."""
+"""Convergence thresholds of position, velocity, tilt and heading."""
 
 _STEEPEST = math.sin(math.radians(80.0))
 """Sine of the pitch beyond which the heading is not observable."""
@@ -59,13 +59,13 @@ def new_state() -> Vector:
 
 @kernel
 def propagate(row: Vector, gyro: Vector, accel: Vector, transition: Vector, dt: float) -> None:
-    """Move the nominal state by one IMU sample; write the error's transition matrix.
+    """Advance the nominal state by one IMU sample; write the error's transition matrix.
 
     Args:
         row: Nominal state (ROW_SIZE,), updated.
         gyro: Sample (3,) FRD [rad/s].
         accel: Sample (3,), specific force FRD [m/s²].
-        transition: (16, 16), updated where it is not that of the identity.
+        transition: (16, 16), updated where it differs from the identity.
         dt: Time step [s].
     """
     wx = gyro[0] - row[GYRO_BIAS]
@@ -103,7 +103,7 @@ def propagate(row: Vector, gyro: Vector, accel: Vector, transition: Vector, dt: 
 
 @kernel
 def inject(row: Vector, error: Vector) -> None:
-    """Move an error (16,) into the nominal state (ROW_SIZE,)."""
+    """Inject an error (16,) into the nominal state (ROW_SIZE,)."""
     turn = exponential((error[ATT], error[ATT + 1], error[ATT + 2]))
     q = normalize(multiply(attitude(row), turn))
     sign = 1.0 if q[0] >= 0.0 else -1.0
@@ -122,10 +122,10 @@ def inject(row: Vector, error: Vector) -> None:
 
 @kernel
 def true_heading(field: Vector, q: Quat, declination: float) -> float:
-    """Return the heading [rad] that a field measurement (3,) FRD shows, less that of q.
+    """Return the heading [rad] of a field measurement (3,) FRD minus the heading of q.
 
-    The field is turned into the world by q. With a q of heading 0 it is the true heading itself,
-    with the vehicle's attitude it is the error of its heading.
+    The field is rotated into the world by q. With heading 0 in q the result is the true heading;
+    with the vehicle's attitude it is the heading error.
     """
     north, east, _ = rotate(q, (field[0], field[1], field[2]))
     angle = declination - math.atan2(east, north)
@@ -157,7 +157,7 @@ def observe_heading(
 
 @kernel
 def gate_ratio(innovation: Vector, variance: Vector) -> float:
-    """Return the test ratio of an innovation (m,) by its variance (m,).
+    """Return the test ratio of an innovation (m,) with a variance (m,).
 
     1 = at the gate, NaN = an innovation is not finite.
     """

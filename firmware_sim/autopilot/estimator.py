@@ -1,8 +1,8 @@
-"""The estimator: an error-state extended Kalman filter.
+"""Estimator: an error-state extended Kalman filter.
 
-What the states and the sensors are is in `error_state`; how the error's covariance is carried is a
-filter's business: `filter_kernel` is the default, `filter_filterpy` its reference. This module is
-the order of events: wait at rest, align, then predict and fuse whatever has been measured.
+`error_state` defines the states and sensor models. A filter carries the error's covariance:
+`filter_kernel` is the default, `filter_filterpy` its reference. This module is the sequence: wait
+at rest, align, then predict and fuse the available measurements.
 """
 
 from __future__ import annotations
@@ -56,16 +56,16 @@ _NO_COMPASS = 5
 """EKF2_MAG_TYPE: the compass is not used."""
 
 GPS_GONE_US = 1_000_000
-"""GPS that was not fused for so long no longer aids the filter (EKF2: its data are late)."""
+"""Time without GPS fusion after which GPS counts as lost (EKF2: its data are delayed) [µs]."""
 
 _JUDGED_EVERY_US = US_PER_S // 10
-"""What `consistency` counts are samples of a usual GPS."""
+"""Interval of velocity checks by `consistency`, the sample period of a typical GPS [µs]."""
 
 BIAS_STEP_S = 0.01
-"""PX4's filter runs at 100 Hz; its bias process noises (EKF2_*_B_NOISE) are per such a step [s]."""
+"""Time step of PX4's filter, 100 Hz [s]; its bias process noises (EKF2_*_B_NOISE) are per step."""
 
 BARO_WALK_M_SQRT_S = 0.01
-"""Process noise of the barometer's offset [m/sqrt(s)]."""
+"""Process noise of the barometer offset [m/sqrt(s)]."""
 
 _POSITION, _VELOCITY = slice(es.P, es.V), slice(es.V, es.Q)
 _ACCELERATION = slice(es.ACCELERATION, es.SIGMA)
@@ -73,11 +73,11 @@ _QUATERNION, _ANGULAR_VELOCITY = slice(es.Q, es.RATES), slice(es.RATES, es.GYRO_
 _GYRO_BIAS = slice(es.GYRO_BIAS, es.ACCEL_BIAS)
 _ACCEL_BIAS = slice(es.ACCEL_BIAS, es.BARO_OFFSET)
 _SIGMA, _INNOVATION_RATIO = slice(es.SIGMA, es.RATIO), slice(es.RATIO, None)
-"""Where the fields of an `Estimate` are in the state."""
+"""Slices of the state for the fields of an `Estimate`."""
 
 
 class Estimator:
-    """Turns noisy sensors into position, velocity, attitude and biases; never sees the truth."""
+    """Estimator of position, velocity, attitude and biases from noisy sensors."""
 
     def __init__(
         self,
@@ -88,35 +88,35 @@ class Estimator:
         """Start unaligned.
 
         Args:
-            value: Looks up EKF2_* parameters by name.
-            new_filter: Makes what carries the error's covariance.
-            record: Of the flight controller, whose state and covariance are used; None = a new one.
+            value: Look-up for EKF2_* parameters by name.
+            new_filter: Factory for the covariance filter.
+            record: Flight controller's record with state and covariance; None = a new record.
         """
         self.record = record = new_controller() if record is None else record
-        """Of the flight controller."""
+        """Record of the flight controller."""
         self._value = value
         self.origin: Geodetic | None = None
-        """Where local NED is zero: the mean of the first fixes, or what somebody has said; None
-        while neither is known."""
+        """Geodetic origin of local NED: mean of the first fixes, or a client's choice; None while
+        unknown."""
         self.state: Vector = record["state"][0]
-        """The nominal state, by `error_state`'s layout."""
+        """Nominal state in the layout of `error_state`."""
         self.state[:] = es.new_state()
         self.filter = new_filter(np.diag(es.INITIAL_SIGMA**2), self._process_noise())
-        """Carries the error's covariance."""
+        """Filter for the error's covariance."""
         if isinstance(self.filter, KernelFilter):
             self.filter.keep_in(
                 record["covariance"][0], record["transition"][0], record["process_noise"][0]
             )
         self.innovations: Callable[[str, Vector, Vector], None] | None = None
-        """Called with name, innovation and its covariance for every measurement, if set."""
+        """Callback with name, innovation and its covariance for every measurement."""
         self._alignment = Alignment(value, record)
         self._judged_us = 0
-        """When a velocity of external vision was last held against the inertial sensors."""
+        """Time of the last check of external vision velocity against the inertial sensors [µs]."""
         self._chosen_origin: Geodetic | None = None
-        """Where local NED shall be zero, chosen before alignment; None = where the vehicle is."""
+        """Origin of local NED chosen before alignment; None = the vehicle's position."""
         self._time_us = 0
         self._fixed_us: int | None = None
-        """When it was aligned where GPS had said that it is; None: not yet, or without GPS."""
+        """Time of alignment with a GPS position; None: not aligned, or aligned without GPS."""
         self._estimate: Estimate | None = None
         horizontal = selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
         record["gps_horizontal_h"] = horizontal
@@ -134,26 +134,26 @@ class Estimator:
         self._heading = Measurement("heading", 2, heading_h, heading_us)
         self._horizon = FusionHorizon()
         self.yaw = YawEstimator(record)
-        """The heading without a compass."""
+        """Heading estimate without a compass."""
         self.recovery = Recovery(self.state, self.filter, self.yaw, record)
-        """What is done about inertial sensors and a heading that have gone wrong."""
+        """Recovery from inertial sensor and heading faults."""
         self.vision = ExternalVision(value, self.state, self.filter, self._fuse, self._judge)
-        """What something else has estimated of the vehicle's pose."""
+        """Fusion of poses from an external estimator."""
         self._horizons = [self._horizon, self.vision.horizon]
         self.odometry: Odometry | None = None
-        """The newest pose that something else has estimated; None before any."""
+        """Newest pose from an external estimator; None before the first."""
         self.odometry_us = 0
-        """When it was told [µs]."""
+        """Time of arrival of the pose [µs]."""
         self.range: RangeFinder | None = None
-        """What tells how far the ground is below; None before the first range, or flow."""
+        """Range fusion for the height above ground; None before the first range or flow reading."""
         self.flow: OpticalFlow | None = None
-        """What tells how the ground moves below; None before the first flow."""
+        """Optical flow fusion; None before the first reading."""
         self.is_changed = True
-        """Whether Python has changed what compiled ticks need to know: `prepare` them."""
+        """True if Python has changed inputs of compiled ticks; see `prepare`."""
 
     @property
     def healthy(self) -> bool:
-        """Converged: may be armed and flown on."""
+        """True if converged: the vehicle may arm and fly."""
         return bool(self.record["healthy"].item(0))
 
     @healthy.setter
@@ -162,7 +162,7 @@ class Estimator:
 
     @property
     def flying(self) -> bool:
-        """Whether the vehicle is in the air; set by whoever knows."""
+        """True if the vehicle is in the air; set by the caller."""
         return bool(self.record["flying"].item(0))
 
     @flying.setter
@@ -171,7 +171,7 @@ class Estimator:
 
     @property
     def _origin_altitude_baro(self) -> float:
-        """Altitude of local NED's origin by the barometer [m]."""
+        """Barometer altitude of local NED's origin [m]."""
         return self.record["baro_origin_m"].item(0)
 
     @_origin_altitude_baro.setter
@@ -179,7 +179,7 @@ class Estimator:
         self.record["baro_origin_m"] = altitude
 
     def step(self, sample: SensorSample) -> None:
-        """Take one tick's sensors."""
+        """Process one tick's sensors."""
         self._time_us, self._estimate, self.is_changed = sample.time_us, None, True
         self._note(sample)
         if not self.aligned:
@@ -223,7 +223,7 @@ class Estimator:
             record["gps_velocity"] = sample.gps.velocity_ned
 
     def _fuse_slower(self, sample: SensorSample) -> None:
-        """Fuse what GPS, barometer and compass have measured."""
+        """Fuse the measurements of GPS, barometer and compass."""
         if sample.gps is not None and self._uses_gps:
             self._fuse_gps(sample.gps)
         if sample.pressure_hpa is not None:
@@ -239,7 +239,7 @@ class Estimator:
 
     @property
     def compiled(self) -> bool:
-        """Whether compiled ticks estimate as `step` does: no aid besides GPS is in use."""
+        """True if compiled ticks are equivalent to `step`: GPS is the only aid in use."""
         return (
             self.range is None
             and self.flow is None
@@ -250,9 +250,9 @@ class Estimator:
         )
 
     def prepare(self) -> None:
-        """Tell the record what the parameters, and what was measured so far, ask of the filter.
+        """Write the filter's parameters and sensor modes to the record.
 
-        That is what Python has changed since the last call.
+        Does nothing unless Python has changed something since the last call.
         """
         if not self.is_changed:
             return
@@ -266,7 +266,7 @@ class Estimator:
         self._suspect()
 
     def _suspect(self) -> None:
-        """Tell the record which sensors have to be judged sample by sample."""
+        """Write to the record which sensors require a check of every sample."""
         recovery = self.recovery
         headed, moving = recovery.consistency.heading_deviates, recovery.consistency
         suspect = recovery.compass.is_suspect or headed
@@ -276,19 +276,19 @@ class Estimator:
         self.record["gps"] = OFF if not self._uses_gps else SUSPECT if suspect else TRUSTED
 
     def fuse_rest(self, sample: SensorSample) -> None:
-        """Fuse what a compiled tick leaves to Python."""
+        """Fuse the measurements that a compiled tick leaves to Python."""
         self._time_us, self._estimate = sample.time_us, None
         self._fuse_slower(sample)
         self._suspect()
         settle_record(self.record)
 
     def flown(self) -> int:
-        """Take note that compiled ticks have moved the estimate; return their time [µs]."""
+        """Process the end of compiled ticks; return the time of the estimate [µs]."""
         self._time_us, self._estimate = self.record["time_us"].item(0), None
         return self._time_us
 
     def see(self, odometry: Odometry) -> None:
-        """Take what something else has estimated, now."""
+        """Process a pose from an external estimator, received now."""
         self.odometry, self.odometry_us = odometry, self._time_us
         if self.aligned:
             gps = self._uses_gps and self.fuses_gps(self._time_us)
@@ -296,12 +296,12 @@ class Estimator:
             self._estimate = None
 
     def measure(self, reading: DistanceReading, source: int = 0) -> None:
-        """Take what a distance sensor measures now; 0 = the vehicle's own, else a client's."""
+        """Process a range measured now; source 0 = the vehicle's sensor, else a client's."""
         if self.aligned:
             self._know_ground().take(reading, self._time_us, source)
 
     def look_down(self, reading: FlowReading) -> None:
-        """Take what an optical flow sensor measures now."""
+        """Process an optical flow reading measured now."""
         if not self.aligned:
             return
         if self.flow is None:
@@ -310,7 +310,7 @@ class Estimator:
         self.flow.take(reading, self._time_us)
 
     def _know_ground(self) -> RangeFinder:
-        """Return what knows the ground; from the first call on the filter does, too."""
+        """Return the range finder; the first call adds the terrain state to the filter."""
         if self.range is None:
             terrain = TerrainFilter(self.filter)
             self.filter = terrain
@@ -324,7 +324,7 @@ class Estimator:
         """Return a copy of the estimate after the newest tick."""
         if self._estimate is None:
             row = self.state.copy()
-            # By place, and with slices made once: this is done at nearly every tick.
+            # Positional arguments and prebuilt slices: this runs in nearly every tick.
             self._estimate = Estimate(
                 self._time_us,
                 row[_POSITION],
@@ -341,14 +341,14 @@ class Estimator:
         return self._estimate
 
     def move_origin(self, origin: Geodetic) -> None:
-        """Let local NED be zero at another place of the globe; the vehicle stays where it is.
+        """Move the origin of local NED; the vehicle's geodetic position is unchanged.
 
         Source: PX4 1.16, Ekf::setEkfGlobalOrigin.
         """
         before, self._chosen_origin, self.is_changed = self.origin, origin, True
         if before is None:
             if self.aligned:
-                # Local NED goes on, and is now known to lie there.
+                # Local NED continues; its geodetic origin is now known.
                 self.origin, self._estimate = origin, None
             return
         here = local_to_geodetic(self.state[es.P : es.V], before)
@@ -358,13 +358,13 @@ class Estimator:
         self._origin_altitude_baro += origin.altitude_m - before.altitude_m
         self.origin, self._estimate = origin, None
 
-    # --- what is known (PX4: EKF2's dead reckoning)
+    # --- validity (PX4: EKF2's dead reckoning)
 
     def knows_position(self, now_us: int, *, flying: bool = True) -> bool:
         """Return whether horizontal position and velocity are valid.
 
-        Without GPS they are for EKF2_NOAID_TOUT: that long the vehicle flies by dead reckoning. On
-        the ground, where the biases have hardly been learnt, nobody begins a flight so.
+        Without GPS they stay valid for EKF2_NOAID_TOUT in flight (dead reckoning). On the ground,
+        where the biases are barely observable, the limit is `GPS_GONE_US`.
         """
         longest_us = self._value("EKF2_NOAID_TOUT") if flying else GPS_GONE_US
         if not self.aligned:
@@ -391,7 +391,7 @@ class Estimator:
         )
 
     def _aids(self) -> Aids:
-        """Return what measures the motion besides ranges."""
+        """Return the aids besides ranges that measure motion."""
         gps, seen = self._uses_gps and self.fuses_gps(self._time_us), self.vision.fused
         told = (self._baro, self._gps_vertical, self.vision.height)
         return Aids(
@@ -402,13 +402,13 @@ class Estimator:
 
     @property
     def _aided(self) -> bool:
-        """Whether anything but optical flow measures horizontal motion."""
+        """True if a sensor other than optical flow measures horizontal motion."""
         seen = self.vision.fused & (Control.HORIZONTAL | Control.VELOCITY)
         return bool(seen) or (self._uses_gps and self.fuses_gps(self._time_us))
 
     @property
     def aligned(self) -> bool:
-        """Whether the attitude is known: the sensors have been averaged at rest."""
+        """True if the attitude is known: the sensors have been averaged at rest."""
         return bool(self.record["aligned"].item(0))
 
     @aligned.setter
@@ -417,17 +417,17 @@ class Estimator:
 
     @property
     def knows_place(self) -> bool:
-        """Whether a position in local NED is one on the globe, too."""
+        """True if positions in local NED can be converted to geodetic ones."""
         return self.origin is not None and self.vision.is_north_known
 
     def fuses_gps(self, now_us: int) -> bool:
-        """Return whether GPS has been fused lately."""
+        """Return whether GPS was fused recently."""
         fused = self._gps_horizontal.fused_us
         return fused is not None and now_us - fused <= GPS_GONE_US
 
     @property
     def field_disturbed(self) -> bool:
-        """Whether the compass measures something else than the earth's field, by EKF2_MAG_CHECK."""
+        """True if the compass measures a field other than the earth's, by EKF2_MAG_CHECK."""
         field = self.record["mag"][0] if self.aligned else self._alignment.field
         if field is None:
             return False
@@ -440,7 +440,7 @@ class Estimator:
         return math.hypot(north, east), math.hypot(v_north, v_east)
 
     def _recent(self, m: Measurement, now_us: int, longest_us: float) -> bool:
-        """Return whether it was fused lately; right after alignment by GPS all are."""
+        """Return whether a measurement was fused recently; a GPS alignment counts for all."""
         fused_us = m.fused_us
         since = self._fixed_us if fused_us is None else fused_us
         return since is not None and now_us - since <= longest_us
@@ -448,7 +448,7 @@ class Estimator:
     # --- start
 
     def align(self) -> bool:
-        """Align attitude, height and place by what was averaged at rest; return whether it can."""
+        """Align attitude, height and position from the averages at rest; return success."""
         aligned = self._alignment.finish()
         if aligned is None:
             return False
@@ -464,7 +464,7 @@ class Estimator:
 
     @property
     def _uses_gps(self) -> bool:
-        """Whether GPS is fused, by EKF2_GPS_CTRL."""
+        """True if GPS fusion is enabled by EKF2_GPS_CTRL."""
         return self._value("EKF2_GPS_CTRL") != 0
 
     def _process_noise(self) -> Vector:
@@ -489,7 +489,7 @@ class Estimator:
     # --- measurements
 
     def _fuse(self, m: Measurement) -> bool:
-        """Fuse a measurement, if it is within the gate; return whether it was."""
+        """Fuse a measurement if it is within the gate; return whether it was."""
         if self.innovations is not None:
             s = m.h @ self.filter.covariance @ m.h.T + np.diag(m.variance)
             self.innovations(m.name, m.innovation.copy(), s)
@@ -502,7 +502,7 @@ class Estimator:
 
     def _fuse_gps(self, fix: GpsFix) -> None:
         if self.origin is None:
-            # Vision has said where the vehicle is; now it is known where that is.
+            # Vision has defined the local position; the first fix gives its geodetic origin.
             self.origin = local_to_geodetic(-self.state[es.P : es.V], fix.position)
         measured, value = geodetic_to_local(fix.position, self.origin), self._value
         r_p, r_v = value("EKF2_GPS_P_NOISE") ** 2, value("EKF2_GPS_V_NOISE") ** 2
@@ -522,10 +522,10 @@ class Estimator:
         m, then = self._gps_vertical, self._then()
         m.innovation[0] = measured[2] - then[2]
         m.innovation[1] = fix.velocity_ned[2] - then[5]
-        # A receiver's height is about half as good as its horizontal position.
+        # The height error of a receiver is about twice its horizontal error.
         m.variance[0], m.variance[1] = max(fix.epv_m, math.sqrt(r_p)) ** 2, r_v
         if self.range is not None and self.range.is_reference:
-            # Heights are counted from the ground: that of GPS would need a bias of its own.
+            # The ground is the height reference: GPS height would need a separate bias state.
             sinking = self._gps_sinking
             sinking.innovation[0], sinking.variance[0] = m.innovation[1], r_v
             self._fuse(sinking)
@@ -540,7 +540,7 @@ class Estimator:
         self.yaw.observe(velocity, accuracy, bias, flying=self.flying)
 
     def _then(self) -> Vector:
-        """Return position and velocity (6,) NED when a fix of now was measured."""
+        """Return position and velocity (6,) NED at the measurement time of the current fix."""
         state, horizon = self.state, self._horizon
         return horizon.seen_from(state) if horizon.is_past else state[es.P : es.Q]
 
@@ -566,14 +566,14 @@ class Estimator:
         self._fuse(m)
         self.recovery.take_heading(innovation, self.state.item(m.slot), self._now)
 
-    # --- inertial sensors that have gone wrong
+    # --- inertial sensor faults
 
     @property
     def _now(self) -> Moment:
         return Moment(self._time_us, self.flying, self._gps_horizontal.fused_us)
 
     def _judge(self, innovation: Vector, variance: Vector) -> float:
-        """Hold a velocity of external vision against the inertial sensors, as often as GPS's."""
+        """Check a velocity of external vision against the inertial sensors, at GPS's rate."""
         by_gps = self._uses_gps and self.fuses_gps(self._time_us)
         if not by_gps and self._time_us - self._judged_us >= _JUDGED_EVERY_US:
             self._judged_us = self._time_us

@@ -1,9 +1,9 @@
-"""External vision: poses that a companion computer or a camera system estimates, fused as by PX4.
+"""External vision: fusion of poses from a companion computer or camera system, as in PX4.
 
-EKF2_EV_CTRL says what is fused: 1 horizontal position, 2 vertical position, 4 velocity, 8 heading.
-Source: PX4 1.16, EKF/aid_sources/external_vision. Not taken over is its estimate of a bias between
-two sources of position: where GPS is fused the position of vision waits, and where the height's
-reference is another one (EKF2_HGT_REF) so does its height.
+EKF2_EV_CTRL selects the fused data: 1 horizontal position, 2 vertical position, 4 velocity, 8
+heading. Source: PX4 1.16, EKF/aid_sources/external_vision. The bias estimate between two position
+sources is not implemented: while GPS is fused, vision position is not used, and neither is vision
+height with another height reference (EKF2_HGT_REF).
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from firmware_sim.autopilot.sensor_monitor import LEARN_US
 from firmware_sim.interfaces import Odometry
 
 LONGEST_INTERVAL_US = 200_000
-"""Odometry has to come at least so often before it is fused (EV_MAX_INTERVAL) [µs]."""
+"""Maximum odometry interval to start fusion (EV_MAX_INTERVAL) [µs]."""
 
 SILENT_US = 2 * LONGEST_INTERVAL_US
-"""After so long without any it is no longer fused [µs]."""
+"""Timeout without odometry after which fusion stops [µs]."""
 
 RESETS = 5
-"""In the air the position may be put to what vision says so often."""
+"""Maximum number of in-flight position resets to vision."""
 
 LEAST_VARIANCE = 0.01**2
-"""PX4's floor of the variance of a position [m²] and of a heading [rad²]."""
+"""PX4's minimum variance of a position [m²] and of a heading [rad²]."""
 
 FRAME_SHARE = 0.001
-"""Share of a new sample in what is known of how vision's frame is turned (PX4's filter)."""
+"""Weight of a new sample in the estimated rotation of the vision frame (PX4's filter)."""
 
 HEIGHT_BY_VISION = 3
-"""EKF2_HGT_REF."""
+"""EKF2_HGT_REF value for vision height."""
 
 
 class Control(IntFlag):
@@ -54,20 +54,20 @@ class Control(IntFlag):
 
 
 class _Sample(NamedTuple):
-    """One pose, and what is thought of it."""
+    """Pose with its quality flags."""
 
     odometry: Odometry
     now_us: int
     good: bool
-    """Of the quality that is asked for."""
+    """True if the quality meets EKF2_EV_QMIN."""
     begins: bool
-    """Whether what is not fused yet may begin: it is good, and poses come often enough."""
+    """True if fusion may start: good quality and a sufficient rate."""
     jumped: bool
-    """Whether it says that it has jumped."""
+    """True if the reset counter has changed."""
 
 
 class ExternalVision:
-    """Takes odometry and has the filter fuse what of it is asked for."""
+    """Fusion of odometry as selected by EKF2_EV_CTRL."""
 
     def __init__(
         self,
@@ -77,56 +77,55 @@ class ExternalVision:
         fuse: Callable[[Measurement], bool],
         judge: Callable[[Vector, Vector], float],
     ) -> None:
-        """Begin without any.
+        """Start without odometry.
 
         Args:
-            value: Looks up EKF2_* parameters by name.
-            state: The nominal state, by `error_state`'s layout; updated.
-            error_filter: Carries its covariance; restarted where the state is put elsewhere.
+            value: Look-up for EKF2_* parameters by name.
+            state: Nominal state in the layout of `error_state`; updated.
+            error_filter: Covariance filter; restarted when the state is reset.
             fuse: Fuses a measurement now; returns whether it was within the gate.
-            judge: Looks at the innovation (3,) of a velocity of some variance (3,), restarts the
-                filter where that says that inertial sensors are wrong, and returns how many times
-                the variance the velocity's is.
+            judge: Checks the innovation (3,) and variance (3,) of a velocity, restarts the filter
+                upon an inertial sensor fault, and returns the ratio of measured to stated variance.
         """
         self._value, self._state, self._filter = value, state, error_filter
         self._fuse, self._judge = fuse, judge
         self.horizon = FusionHorizon(0.0)
-        """Where the vehicle was when odometry that comes now was measured (EKF2_EV_DELAY)."""
+        """Vehicle motion since the measurement time of current odometry (EKF2_EV_DELAY)."""
         self.position = Measurement("vision_position", 0, selecting(es.POS, es.POS + 1))
         self.height = Measurement("vision_height", 3, selecting(es.POS + 2))
         self.velocity = Measurement("vision_velocity", 0, selecting(es.VEL, es.VEL + 1, es.VEL + 2))
         self.yaw = Measurement("vision_heading", 2, np.zeros((1, es.N_STATES)))
         self.fused = Control(0)
-        """What is being fused."""
+        """Data currently fused."""
         self.is_north_known = True
-        """Whether the heading is that of the globe: not where it is of vision's own frame."""
+        """True if the heading is relative to north; False: relative to the vision frame."""
         self._newest: Odometry | None = None
         self._first_us = 0
-        """When the first came."""
+        """Time of the first odometry [µs]."""
         self._has_noise: bool | None = None
-        """Whether no two are the same at rest, either; None = not known yet."""
+        """True if successive poses differ even at rest; None = not known yet."""
         self._previous: Odometry | None = None
-        """The newest that was good."""
+        """Newest odometry of good quality."""
         self._previous_us = 0
         self._frame = (1.0, 0.0, 0.0, 0.0)
-        """Turns vision's frame into the filter's (quaternion)."""
+        """Rotation from the vision frame to the filter's frame (quaternion)."""
         self._is_frame_known = False
         self._resets_left = RESETS
         self.on_height_moved: Callable[[float], None] | None = None
-        """Called with how much further down [m] the vehicle is put where vision says so, if set."""
+        """Callback with the downward shift [m] of a height reset to vision."""
 
     def use(self, error_filter: ErrorFilter) -> None:
-        """Go on with another filter, which carries the same errors."""
+        """Continue with another filter that carries the same errors."""
         self._filter = error_filter
 
     def take(self, odometry: Odometry, now_us: int, *, gps: bool, flying: bool) -> None:
-        """Fuse what of it is asked for.
+        """Fuse the selected data of a pose.
 
         Args:
-            odometry: As it came.
-            now_us: Now.
-            gps: Whether GPS is being fused.
-            flying: Whether the vehicle is in the air.
+            odometry: Pose as received.
+            now_us: Current time [µs].
+            gps: True if GPS is being fused.
+            flying: True if the vehicle is in the air.
         """
         asked = Control(int(self._value("EKF2_EV_CTRL")) & 15)
         if self._is_stuck(odometry, now_us, flying=flying):
@@ -155,10 +154,9 @@ class ExternalVision:
             self._previous, self._previous_us = odometry, now_us
 
     def _is_stuck(self, odometry: Odometry, now_us: int, *, flying: bool) -> bool:
-        """Return whether it repeats itself where nothing is measured twice.
+        """Return whether odometry is frozen: repeated values from a source that has noise.
 
-        In the air nothing is, and at rest nothing by what has noise: that is learnt in its first
-        second.
+        In the air any repetition is a fault. At rest it is one if the first second showed noise.
         """
         before = self._newest
         repeats = before is not None and all(
@@ -173,7 +171,7 @@ class ExternalVision:
         return repeats and (flying or bool(self._has_noise))
 
     def look(self, now_us: int) -> None:
-        """Stop fusing where nothing comes any more."""
+        """Stop fusion after the odometry timeout."""
         if now_us - self._previous_us > SILENT_US:
             self.fused, self._previous, self._is_frame_known = Control(0), None, False
 
@@ -183,12 +181,12 @@ class ExternalVision:
         odometry, now_us, good, begins, jumped = sample
         quaternion, active = odometry.quaternion, bool(self.fused & Control.YAW)
         in_ned = odometry.pose_frame == "ned"
-        # A heading of vision's own frame would turn what GPS measures.
+        # A heading relative to the vision frame would rotate GPS measurements.
         if quaternion is None or (gps and not in_ned) or not (active or begins):
             self.fused &= ~Control.YAW
             return
         yaw = yaw_of(tuple(quaternion.tolist()))
-        # PX4 takes EKF2_EVA_NOISE [rad] for the variance here.
+        # PX4 uses EKF2_EVA_NOISE [rad] as the variance here.
         noise = self._value("EKF2_EVA_NOISE")
         told = self._variance(odometry.orientation_variance, noise).item(2)
         variance = max(told, noise, LEAST_VARIANCE)
@@ -196,7 +194,7 @@ class ExternalVision:
         if active:
             anew = jumped or self._is_overdue(m, now_us)
         else:
-            # There is nothing that it could be held against.
+            # There is no reference for a gate.
             anew = not (in_ned and self.is_north_known)
         if anew and good:
             self._filter.restart(turn_to(self._state, self._filter.covariance, yaw, variance))
@@ -207,12 +205,12 @@ class ExternalVision:
             m.innovation[0] = math.remainder(yaw - yaw_of(q), 2.0 * math.pi)
             m.variance[0] = variance
             m.h[0, es.ATT : es.GYRO] = yaw_by_turn(q)
-            # Where the compass says otherwise, it is not given up for vision.
+            # A compass that disagrees is not disabled in favour of vision.
             if self._fuse(m):
                 self.fused |= Control.YAW
 
     def _is_overdue(self, m: Measurement, now_us: int) -> bool:
-        """Return whether it has been refused for so long that it is taken over."""
+        """Return whether a measurement was rejected for EKF2_NOAID_TOUT and needs a reset."""
         since_us = m.fused_us
         return since_us is not None and now_us - since_us > self._value("EKF2_NOAID_TOUT")
 
@@ -230,7 +228,7 @@ class ExternalVision:
         m.h[:, es.ATT : es.GYRO] = 0.0
         if frame == "body":
             body = quat_to_matrix(self._state[es.Q : es.RATES])
-            # An error of the attitude turns what was measured in body axes.
+            # An attitude error rotates a velocity measured in body axes.
             m.h[:, es.ATT : es.GYRO] = body @ _cross(measured)
             measured = body @ measured
         elif frame == "frd" and not self.fused & Control.YAW:
@@ -239,7 +237,7 @@ class ExternalVision:
         m.innovation[:] = measured - self._then()[3:]
         m.variance[:] = self._variance(odometry.velocity_variance, noise)
         m.variance *= self._judge(m.innovation.copy(), m.variance)
-        # The filter may have been restarted.
+        # The check may have restarted the filter.
         m.innovation[:] = measured - self._then()[3:]
         self._fuse(m)
         self.fused |= Control.VELOCITY
@@ -298,20 +296,20 @@ class ExternalVision:
         return position, variance
 
     def _variance(self, told: Vector, noise: float) -> Vector:
-        """Return the variance (3,): what was told, at least the parameter's (EKF2_EV_NOISE_MD)."""
+        """Return the variance (3,): as reported, at least the parameter's (EKF2_EV_NOISE_MD)."""
         if self._value("EKF2_EV_NOISE_MD") == 0 and np.isfinite(told).all():
             return np.maximum(told, noise**2)
         return np.full(3, noise**2)
 
     def _then(self) -> Vector:
-        """Return position and velocity (6,) when odometry of now was measured."""
+        """Return position and velocity (6,) at the measurement time of current odometry."""
         state, horizon = self._state, self.horizon
         return horizon.seen_from(state) if horizon.is_past else state[es.P : es.Q]
 
     # --- jumps
 
     def _put(self, place: Vector, variance: Vector) -> None:
-        """Put the horizontal position elsewhere; nothing else is known of it."""
+        """Reset the horizontal position and its covariance."""
         moved = place[:2] - self._then()[:2]
         self._state[es.P : es.P + 2] += moved
         covariance = self._filter.covariance.copy()
@@ -320,7 +318,7 @@ class ExternalVision:
         self._filter.restart(covariance)
 
     def _put_height(self, down: float, variance: float) -> None:
-        """Put the height elsewhere; the barometer's offset goes with it."""
+        """Reset the height; the barometer offset shifts with it."""
         moved = down - self._then().item(2)
         self._state[es.P + 2] += moved
         self._state[es.BARO_OFFSET] += moved
@@ -352,7 +350,7 @@ class ExternalVision:
 
 
 def yaw_by_turn(q: tuple[float, float, float, float]) -> tuple[float, float, float]:
-    """Return how the yaw changes by a turn about each body axis (Euler's kinematic equations)."""
+    """Return the change of yaw by a turn about each body axis (Euler's kinematic equations)."""
     w, x, y, z = q
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
@@ -366,6 +364,6 @@ def _cross(v: Vector) -> Vector:
 
 
 def _forget(covariance: Vector, index: int, variance: float) -> None:
-    """Set a state's variance, and its correlations to none, in place."""
+    """Set a state's variance and clear its correlations, in place."""
     covariance[index, :] = covariance[:, index] = 0.0
     covariance[index, index] = variance

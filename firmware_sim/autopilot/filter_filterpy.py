@@ -1,6 +1,6 @@
-"""The filter of the estimator's error on filterpy: the reference of `filter_kernel`.
+"""Error filter based on filterpy: the reference of `filter_kernel`.
 
-It is many times slower, and follows the textbook.
+It follows the textbook and is many times slower.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from firmware_sim.autopilot.error_state import N_STATES, gate_ratio, inject, pro
 
 
 class FilterpyFilter:
-    """Implements `error_filter.ErrorFilter`."""
+    """Implementation of `error_filter.ErrorFilter` with filterpy."""
 
     def __init__(self, covariance: Vector, noise: Vector) -> None:
-        """Start with a covariance (16, 16); variances `noise` (16,) are added at every tick."""
+        """Start with a covariance (16, 16); variances `noise` (16,) are added in every tick."""
         self._ekf = ExtendedKalmanFilter(dim_x=N_STATES, dim_z=1)
         self._ekf.x = np.zeros(N_STATES)
         self._ekf.P, self._ekf.Q = covariance.copy(), np.diag(noise)
@@ -29,12 +29,12 @@ class FilterpyFilter:
         return p
 
     def predict(self, state: Vector, gyro: Vector, accel: Vector) -> None:
-        """Move the nominal state, updated in place, and the covariance by one tick."""
+        """Advance the nominal state, updated in place, and the covariance by one tick."""
         propagate(state, gyro, accel, self._ekf.F, TICK_S)
         self._ekf.predict()
 
     def restart(self, covariance: Vector) -> None:
-        """Go on from another covariance (16, 16)."""
+        """Continue from another covariance (16, 16)."""
         self._ekf.P = covariance.copy()
 
     def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:

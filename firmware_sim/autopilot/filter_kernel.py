@@ -1,10 +1,9 @@
-"""The filter of the estimator's error as compiled code: the default.
+"""Error filter in compiled code: the default.
 
-The same filter as `filter_filterpy` up to rounding, with what is known of its matrices: most rows
-of the transition matrix are the identity's. The noises of a measurement's components are
-independent: fusing them one after the other equals fusing them together (Bar-Shalom, Li,
-Kirubarajan, Estimation with Applications to Tracking and Navigation, ch. 7.2.2). The covariance is
-exactly symmetric at any time.
+Equivalent to `filter_filterpy` up to rounding. It uses the structure of the matrices: most rows of
+the transition matrix equal the identity's. The noises of a measurement's components are
+independent, so sequential fusion equals joint fusion (Bar-Shalom, Li, Kirubarajan, Estimation with
+Applications to Tracking and Navigation, ch. 7.2.2). The covariance is always exactly symmetric.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from firmware_sim.autopilot.error_state import (
 )
 
 _MOVING = 9
-"""Position, velocity and attitude move; biases and the barometer's offset stay as they are."""
+"""Number of propagated states: position, velocity, attitude. Biases and offset are constant."""
 
 
 @kernel
@@ -52,7 +51,7 @@ def _times_transposed(f: Vector, p: Vector, columns: int, out: Vector) -> None:
 def predict(
     state: Vector, p: Vector, noise: Vector, f: Vector, gyro: Vector, accel: Vector, dt: float
 ) -> None:
-    """Move the nominal state and its covariance, p = f p f' + noise, in place."""
+    """Advance the nominal state and its covariance, p = f p f' + noise, in place."""
     propagate(state, gyro, accel, f, dt)
     half = np.empty((N_STATES, _MOVING))
     whole = np.empty((_MOVING, _MOVING))
@@ -69,7 +68,7 @@ def predict(
 
 @kernel
 def fuse(state: Vector, p: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
-    """Correct the nominal state and its covariance in place; return the gate's ratio."""
+    """Correct the nominal state and its covariance in place; return the gate ratio."""
     m = len(innovation)
     column = np.empty(N_STATES)
     total = np.empty(m)
@@ -94,7 +93,7 @@ def fuse(state: Vector, p: Vector, innovation: Vector, h: Vector, variance: Vect
 
 @kernel
 def spread(p: Vector, row: Vector, out: Vector) -> float:
-    """Write p row' (16,); return row p row'. Skips the many zeros of the row."""
+    """Write p row' (16,); return row p row'. Zeros of the row are skipped."""
     out[:] = 0.0
     for k in range(N_STATES):
         if row[k] != 0.0:
@@ -107,25 +106,25 @@ def spread(p: Vector, row: Vector, out: Vector) -> float:
 
 
 class KernelFilter:
-    """Implements `error_filter.ErrorFilter`."""
+    """Implementation of `error_filter.ErrorFilter` in compiled code."""
 
     def __init__(self, covariance: Vector, noise: Vector) -> None:
-        """Start with a covariance (16, 16); variances `noise` (16,) are added at every tick."""
+        """Start with a covariance (16, 16); variances `noise` (16,) are added in every tick."""
         self.covariance = covariance.copy()
         self._noise = noise.copy()
         self._transition = np.eye(N_STATES)
 
     def keep_in(self, covariance: Vector, transition: Vector, noise: Vector) -> None:
-        """Keep covariance and transition (16, 16) and noise (16,) in these arrays from now on."""
+        """Use these arrays for covariance and transition (16, 16) and noise (16,) from now on."""
         covariance[:], transition[:], noise[:] = self.covariance, self._transition, self._noise
         self.covariance, self._transition, self._noise = covariance, transition, noise
 
     def predict(self, state: Vector, gyro: Vector, accel: Vector) -> None:
-        """Move the nominal state, updated in place, and the covariance by one tick."""
+        """Advance the nominal state, updated in place, and the covariance by one tick."""
         predict(state, self.covariance, self._noise, self._transition, gyro, accel, TICK_S)
 
     def restart(self, covariance: Vector) -> None:
-        """Go on from another covariance (16, 16)."""
+        """Continue from another covariance (16, 16)."""
         self.covariance[:] = covariance
 
     def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:

@@ -1,4 +1,4 @@
-"""The commander at work: what its table, the user and the failsafes decide is carried out."""
+"""Commander runtime: applies the table, user requests and failsafe decisions."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from firmware_sim.autopilot.requests import Request
 _GROUND, _AIR = Phase.GROUND, Phase.AIR
 
 REFUSAL_US = 2 * US_PER_S
-"""A setpoint that was refused within this time explains the loss of offboard [µs]."""
+"""Time within which a rejected setpoint explains the loss of offboard [µs]."""
 
 
 class Commanded(NamedTuple):
-    """Who carries out what the commander decides."""
+    """Components that execute the commander's decisions."""
 
     supervisor: Supervisor
     guidance: Guidance
@@ -35,7 +35,7 @@ class Commanded(NamedTuple):
 
 
 class FlightCommander:
-    """Holds the commander's state, and moves it by events."""
+    """Commander state and its changes by events."""
 
     def __init__(
         self,
@@ -47,24 +47,24 @@ class FlightCommander:
         """Boot.
 
         Args:
-            commanded: Who carries out what is decided.
-            newest: Tells the time.
-            state: The estimator's nominal state (`error_state`), updated in place.
-            say: Tells the operators something.
+            commanded: Components that execute decisions.
+            newest: Newest sensors, for the time.
+            state: Nominal state of the estimator (`error_state`), updated in place.
+            say: Sends a text to the operator.
         """
         self._commanded, self._newest, self._state, self._say = commanded, newest, state, say
         self.flight = Flight()
         self.status = status_of(self.flight)
         """Reported status of `flight`, replaced with every change."""
         self.refusal = ("", 0)
-        """Why an offboard setpoint was refused last, and when [µs]."""
+        """Reason and time [µs] of the last rejected offboard setpoint."""
         self.armed_us = self.takeoff_us = 0
-        """When it was armed and took off; 0 while it is disarmed."""
+        """Times of arming and take-off [µs]; 0 while disarmed."""
 
     _now_us = property(lambda self: self._newest.time_us)
 
     def look(self) -> None:
-        """Let the failsafes look, and do what they decide."""
+        """Run the failsafe checks and apply their decision."""
         supervisor = self._commanded.supervisor
         if not supervisor.is_unchanged(self._now_us, self.flight):
             sample = self._newest.sample
@@ -75,12 +75,12 @@ class FlightCommander:
     def handle(
         self, event: Ask | Event, request: Request | None = None, granted: Message | None = None
     ) -> Result:
-        """Carry out an event.
+        """Process an event.
 
         Args:
-            event: What happened, or was asked for.
-            request: What a user wants beyond a mode's name.
-            granted: What is said when it is granted.
+            event: Event or mode request.
+            request: Optional arguments of a mode.
+            granted: Text to send upon acceptance.
         """
         step = transition(self.flight, event)
         text = granted if step.text is None and step.result is Result.ACCEPTED else step.text
@@ -89,7 +89,7 @@ class FlightCommander:
         flown = self.flight.mode
         asked = isinstance(event, Ask) and step.result is Result.ACCEPTED
         if asked and step.flight.phase >= _GROUND:
-            # A failsafe may insist, or yield to the user.
+            # A failsafe may persist, or yield to the user.
             self._become(step.flight, step.flight.mode)
             self.obey(Intervention(mode_chosen=True), flown, request)
         else:
@@ -97,7 +97,7 @@ class FlightCommander:
         return step.result
 
     def _become(self, flight: Flight, flown: Mode, request: Request | None = None) -> None:
-        """Take a new state; `flown` is the mode that guidance is in, `request` the user's."""
+        """Set a new state; `flown` is the mode in guidance, `request` the user's."""
         before = self.flight
         self.flight, self.status = flight, status_of(flight)
         if flight.failsafe and before.mode is Mode.OFFBOARD and not before.failsafe:
@@ -122,7 +122,7 @@ class FlightCommander:
         flown: Mode | None = None,
         request: Request | None = None,
     ) -> None:
-        """Do what the failsafes decide; see `_become`."""
+        """Apply the failsafes' decision; see `_become`."""
         flown, asked = self.flight.mode if flown is None else flown, self.flight.mode
         decision = self._commanded.supervisor.decide(self._now_us, self.flight, intervention)
         if decision is None:
@@ -137,7 +137,7 @@ class FlightCommander:
             self.handle(Event.FAILSAFE_DISARM)
 
     def _note_times(self, phase: Phase) -> None:
-        """Note when it was armed and took off, and forget both once it is disarmed."""
+        """Record the times of arming and take-off; reset both when disarmed."""
         now_us = self._now_us
         if phase < _GROUND:
             self.armed_us = self.takeoff_us = 0
@@ -147,7 +147,7 @@ class FlightCommander:
             self.takeoff_us = now_us
 
     def _explain_loss(self) -> None:
-        """Say which setpoints were refused lately, if any."""
+        """Report the reason of recently rejected setpoints."""
         reason, refused_us = self.refusal
         if reason and self._now_us - refused_us <= REFUSAL_US:
             self._say(Message(Severity.WARNING, f"Offboard setpoints refused: {reason}"))

@@ -1,4 +1,4 @@
-"""Turns the mode into a demand for the cascade. What each mode flies stands in `modes`."""
+"""Guidance: demand of the active mode for the controllers; `modes` implements the modes."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMod
 from firmware_sim.autopilot.requests import Request
 from firmware_sim.engine.record import Record
 
-# Bound once: looking up a member of an enumeration at every tick is slow.
+# Bound once: looking up an enum member in every tick is slow.
 _GROUND, _AIR = Phase.GROUND, Phase.AIR
 
 
 class Guidance:
-    """Flies the present mode; `enter` notifies it of mode changes.
+    """Dispatcher of the flight modes; `enter` switches the active mode.
 
-    Every `state` is the estimator's newest nominal state (`error_state`).
+    `state` is always the estimator's newest nominal state (`error_state`).
     """
 
     def __init__(
         self, value: Callable[[str], float], say: Callable[[Message], None], record: Record
     ) -> None:
-        """Begin in Hold.
+        """Start in Hold.
 
         Args:
-            value: Looks up PX4 parameters by name.
-            say: Tells the operators something.
-            record: Of the flight controller.
+            value: Look-up for PX4 parameters by name.
+            say: Sends a text to the operator.
+            record: Record of the flight controller.
         """
         self.context = FlightContext(value, Climb(record), say=say)
-        """Shared by the modes."""
+        """Context shared by the modes."""
         self._modes = {mode: new(self.context) for mode, new in MODES.items()}
         self._flown: FlightMode = self._modes[Mode.HOLD]
         self._stopped = False
-        """Whether the motors stand still for good."""
+        """True if the motors are stopped permanently."""
         self._spool_since_us: int | None = None
 
     def enter(self, mode: Mode, state: Vector, request: Request | None = None) -> None:
-        """Begin a mode at the present state, with what the user asks for beyond its name."""
+        """Start a mode at the current state, with the optional arguments of a user request."""
         self.context.climb.stop()
         self._stopped = mode is Mode.TERMINATION
         if self._stopped:
@@ -60,7 +60,7 @@ class Guidance:
         self._flown.enter(state, request)
 
     def at_home(self, state: Vector) -> None:
-        """Make the present position home: the ground under the vehicle at arming."""
+        """Set home to the current position: the ground under the vehicle at arming."""
         self.context.home, self.context.home_yaw = here(state)
         self._spool_since_us = None
 
@@ -74,8 +74,8 @@ class Guidance:
     ) -> None:
         """Set the height above home [m] and the place (north, east [m]) of the next take-off.
 
-        No height = MIS_TAKEOFF_ALT; in flight, PX4 climbs that much from where the vehicle is. No
-        place = straight up.
+        Default height: MIS_TAKEOFF_ALT, in flight above the current height as in PX4. Default
+        place: straight up.
         """
         context = self.context
         context.takeoff_place = place
@@ -92,16 +92,16 @@ class Guidance:
         context.takeoff_altitude_m = altitude_m
 
     def is_done(self, state: Vector) -> bool:
-        """Return whether the present mode has reached its end."""
+        """Return whether the active mode has reached its goal."""
         return not self._stopped and self._flown.is_done(state)
 
     @property
     def destination(self) -> Vec | None:
-        """Where the present mode is going, local NED [m]; None = nowhere of its own choice."""
+        """Destination of the active mode, local NED [m]; None = no destination."""
         return None if self._stopped else self._flown.destination
 
     def demand(self, state: Vector, phase: Phase, time_us: int) -> AnyDemand | None:
-        """Return what to fly now; None = the motors are stopped."""
+        """Return the current demand; None = the motors are stopped."""
         self.context.standing = phase is not _AIR
         if self._stopped:
             return None
@@ -114,7 +114,7 @@ class Guidance:
         return None
 
     def is_steady(self, phase: Phase) -> bool:
-        """Return whether the demand stays the same until something is asked for or decided."""
+        """Return whether the demand is constant until the next request or decision."""
         if self._stopped or phase < _GROUND:
             return True
         if phase is _AIR or not self._flown.lifts:
@@ -122,17 +122,17 @@ class Guidance:
         return self.context.climb.flies
 
     def _ramped(self, demand: AnyDemand, time_us: int) -> AnyDemand:
-        """Return a demand for a vehicle on the ground, its climb rate limited by the take-off ramp.
+        """Return a demand on the ground with the climb rate limited by the take-off ramp.
 
-        A height becomes that rate.
+        A height is replaced by that rate.
         """
         if isinstance(demand, AttitudeDemand | RateDemand):
-            return demand  # thrust is commanded: there is nothing to limit
+            return demand  # direct thrust: there is nothing to limit
         if self._spool_since_us is None:
             self._spool_since_us = time_us
         context = self.context
         straight = self._flown is self._modes[Mode.TAKEOFF] and context.takeoff_place is None
-        # Off the floor, the climb goes on from the ramp.
+        # After lift-off, the climb continues from the ramp.
         limit = context.climb.ramp(self._spool_since_us, context.value, time_us, flies=straight)
         (north, east, _), (vn, ve, vd) = demand.position, demand.velocity
         down = -limit if math.isnan(vd) else max(vd, -limit)

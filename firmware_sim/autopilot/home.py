@@ -1,4 +1,4 @@
-"""The home position: where it is, and who has put it there."""
+"""Home position: storage, automatic updates and client requests."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.guidance import Guidance
 
 LEAST_MOVE_M, LEAST_CLIMB_M = 1.0, 1.5
-"""A vehicle that stands farther from home, or higher or lower, has been moved [m]."""
+"""Minimum horizontal and vertical distance from home that count as a move [m]."""
 
 
 class Home:
-    """Where the vehicle stands while it is disarmed, unless somebody has chosen a place."""
+    """Home position; follows the disarmed vehicle unless a client or mission chose a place."""
 
     def __init__(self, estimator: Estimator, guidance: Guidance) -> None:
-        """Begin without one; guidance is told of every change."""
+        """Start without a home; guidance receives every change."""
         self._estimator, self._guidance = estimator, guidance
         self.place: Geodetic | None = None
-        """None until there is a fix."""
+        """Geodetic home; None before the first fix."""
         self._is_chosen = False
-        """Whether a client or a mission has placed it: arming does not move it."""
+        """True if set by a client or a mission; arming then keeps it."""
 
     def locate(self) -> None:
-        """Set it in flight, once it is known where on the globe the vehicle was armed."""
+        """Set home in flight, once the geodetic position of arming is known."""
         origin, context = self._estimator.origin, self._guidance.context
         if origin is not None:
             self.place = local_to_geodetic(np.array(context.home), origin)
             context.home_amsl_m = self.place.altitude_m
 
     def stands(self) -> None:
-        """Follow a disarmed vehicle that stands elsewhere, unless home was chosen.
+        """Move home with a disarmed vehicle, unless home was chosen.
 
         Source: PX4 1.16, HomePosition::hasMovedFromCurrentHomeLocation.
         """
@@ -49,14 +49,14 @@ class Home:
             self.set_here()
 
     def armed(self) -> bool:
-        """Set it to where the vehicle was armed, unless it was chosen; return whether it is new."""
+        """Set home to the arming position unless chosen; return whether home is new."""
         if self._estimator.origin is None:
             self._guidance.at_home(self._estimator.state)
             return False
         return not self._is_chosen and self.set_here()
 
     def set_here(self) -> bool:
-        """Set it to the present position; return False where that is unknown on the globe."""
+        """Set home to the current position; return False if there is no geodetic origin."""
         origin, state = self._estimator.origin, self._estimator.state
         if origin is None:
             return False
@@ -67,7 +67,7 @@ class Home:
         return True
 
     def set_to(self, place: Geodetic) -> bool:
-        """Set it to a chosen place; return False without a fix."""
+        """Set home to a chosen place; return False without a fix."""
         if self._estimator.origin is None:
             return False
         self.place, self._is_chosen = place, True
@@ -75,7 +75,7 @@ class Home:
         return True
 
     def find(self) -> None:
-        """Tell guidance where it is in local NED: it, or the origin, has moved."""
+        """Update guidance's local NED home after a move of home or origin."""
         origin, place = self._estimator.origin, self.place
         if origin is None or place is None:
             return

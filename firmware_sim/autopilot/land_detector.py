@@ -1,4 +1,4 @@
-"""The landing detector: thrust, speed and time decide, as PX4's multicopter land detector."""
+"""Landing detector by thrust, speed and time, like PX4's multicopter land detector."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from airl_mav.core.kernels import kernel
 from firmware_sim.autopilot.autopilot_state import Clearance
 from firmware_sim.autopilot.error_state import V
 
-# Share of the way from least to hover thrust below which the floor must be carrying
+# Share of the range from minimum to hover thrust below which the ground must carry the vehicle
 # (LNDMC_LOW_T_THR).
 LOW_THRUST = 0.3
-# Thrust this close to hover, going up: it flies.
+# Thrust relative to hover thrust that indicates lift-off while climbing.
 LIFT_THRUST = 0.95
 LIFT_SPEED_M_S = 0.15
-# So fast it flies at any thrust, as multiples of LNDMC_Z_VEL_MAX: PX4's bound for vertical movement
-# right after take-off, wider than later so that what motors do to sensors is not taken for one.
+# Vertical speed that indicates flight at any thrust, in multiples of LNDMC_Z_VEL_MAX: PX4's limit
+# right after take-off, wide enough to exclude motor-induced sensor noise.
 LIFTED_SPEED = 2.5
-# Further above the ground than this, by a range, nothing stands [m].
+# Height above ground by range beyond which the vehicle is not landed [m].
 NEAR_GROUND_M = 1.0
-# A range that tells no ground any more makes the detection take so many times as long.
+# Factor on the detection time while the range to the ground is invalid.
 UNSURE = 3.0
 
 
@@ -35,11 +35,11 @@ _TRIGGER_US, _CARRIED_THRUST, _SLOW_DOWN, _SLOW, _LIFT_THRUST, _LIFTED_M_S, _NEA
 
 
 def thresholds(value: Callable[[str], float]) -> Vector:
-    """Return the thresholds by the parameters (7,).
+    """Return the thresholds from the parameters (7,).
 
-    LNDMC_TRIG_TIME [µs]; the thrust below which the floor must be carrying; vertical and horizontal
-    speed of a vehicle at rest [m/s]; thrust of one that flies; vertical speed of one that has left
-    the floor at any thrust [m/s]; 1 = near the ground as far as is known.
+    LNDMC_TRIG_TIME [µs]; thrust below which the ground must carry the vehicle; vertical and
+    horizontal speed at rest [m/s]; thrust in flight; vertical speed that indicates flight at any
+    thrust [m/s]; 1 = near the ground, or unknown.
     """
     low, hover, vertical = value("MPC_THR_MIN"), value("MPC_THR_HOVER"), value("LNDMC_Z_VEL_MAX")
     return np.array(
@@ -57,7 +57,7 @@ def thresholds(value: Callable[[str], float]) -> Vector:
 
 @kernel
 def rests(state: Vector, thrust: float, land: Vector) -> bool:
-    """Return whether a vehicle at a collective 0..1 moves as one that the floor carries."""
+    """Return whether motion and collective 0..1 indicate a vehicle carried by the ground."""
     slow = abs(state[V + 2]) < land[_SLOW_DOWN]
     return bool(
         thrust <= land[_CARRIED_THRUST]
@@ -69,9 +69,9 @@ def rests(state: Vector, thrust: float, land: Vector) -> bool:
 
 @kernel
 def lifts_off(state: Vector, thrust: float, land: Vector) -> bool:
-    """Return whether a standing vehicle has left the floor.
+    """Return whether a standing vehicle has left the ground.
 
-    MPC_THR_HOVER may be wrong: one that is lighter than it says climbs at less thrust.
+    MPC_THR_HOVER may be wrong: a lighter vehicle climbs at less thrust.
     """
     climb_m_s = -state[V + 2]
     hovers = climb_m_s > LIFT_SPEED_M_S and thrust > land[_LIFT_THRUST]
@@ -79,25 +79,25 @@ def lifts_off(state: Vector, thrust: float, land: Vector) -> bool:
 
 
 class LandDetector:
-    """Keeps the thresholds of a flight controller's record; compiled ticks detect."""
+    """Thresholds in a flight controller's record; compiled ticks do the detection."""
 
     def __init__(self, value: Callable[[str], float], record: NDArray[Any]) -> None:
-        """Take a lookup of PX4 parameter names and the record of a flight controller."""
+        """Store the look-up for PX4 parameters and the record of a flight controller."""
         self._value, self._record = value, record
         self._ground: Clearance | None = None
         self._ground_seen = False
-        """Whether ranges have ever told the ground."""
+        """True if ranges have ever measured the ground."""
         self.read_parameters()
 
     def read_parameters(self) -> None:
-        """Read the parameters anew."""
+        """Read the parameters again."""
         self._record["land"] = thresholds(self._value)
         self.see(self._ground)
 
     def see(self, ground: Clearance | None) -> None:
-        """Take how far the ground is below; None = nothing tells it.
+        """Update the height above ground; None = not measured.
 
-        A vehicle stands only where ranges allow it; without any they do.
+        Landing requires that ranges, if present, indicate the ground.
         """
         land, self._ground = self._record["land"][0], ground
         if ground is None:

@@ -1,7 +1,7 @@
-"""Whether a compass measures the earth's field: by its strength, and by how steeply it dips.
+"""Compass check: strength and inclination of the measured field against the earth's field.
 
-Source: PX4 1.16, EKF2 `checkMagField` and its parameters; the field that is expected is that of the
-place (`core.frames`), in PX4 by the World Magnetic Model.
+Source: PX4 1.16, EKF2 `checkMagField` and its parameters. The expected field is the local one
+(`core.frames`); PX4 uses the World Magnetic Model.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from airl_mav.vehicle.rotation import Quat, rotate
 
 STRENGTH_GAUSS = float(np.linalg.norm(MAGNETIC_FIELD_NED))
 INCLINATION_RAD = math.asin(MAGNETIC_FIELD_NED[2] / STRENGTH_GAUSS)
-"""Downwards positive."""
+"""Inclination [rad], positive down."""
 
 _LEAST_GAUSS = 1e-4
-"""A weaker field points nowhere."""
+"""Minimum strength of a field with a defined direction."""
 
 
 class Checked(IntFlag):
@@ -32,16 +32,16 @@ class Checked(IntFlag):
 
 
 class FieldCheck(NamedTuple):
-    """What is expected of the field, and how closely."""
+    """Tolerances for the measured field."""
 
     checked: int
     strength_gauss: float
-    """Greatest error."""
+    """Maximum error of the strength [gauss]."""
     inclination_rad: float
 
     @classmethod
     def read(cls, value: Callable[[str], float]) -> FieldCheck:
-        """Read it by a lookup of PX4 parameter names."""
+        """Read the tolerances with a look-up for PX4 parameters."""
         return cls(
             int(value("EKF2_MAG_CHECK")),
             value("EKF2_MAG_CHK_STR"),
@@ -49,11 +49,11 @@ class FieldCheck(NamedTuple):
         )
 
     def disturbed(self, field: Vector, attitude: Quat) -> bool:
-        """Return whether this is not the earth's field.
+        """Return whether the field differs from the earth's field.
 
         Args:
-            field: As measured (3,) FRD [gauss].
-            attitude: Body to world; its heading does not matter.
+            field: Measured field (3,) FRD [gauss].
+            attitude: Rotation from body to world; its heading has no effect.
         """
         strength = float(np.linalg.norm(field))
         if self.checked & Checked.STRENGTH and not (

@@ -1,4 +1,4 @@
-"""The pilot's sticks: from a joystick (MANUAL_CONTROL) or a radio (RC_CHANNELS_OVERRIDE).
+"""Pilot's sticks from a joystick (MANUAL_CONTROL) or a radio (RC_CHANNELS_OVERRIDE).
 
 Source: PX4 1.16, ManualControlSelector.
 """
@@ -12,24 +12,24 @@ from typing import NamedTuple
 from airl_mav.core.constants import US_PER_S
 
 FOLLOWED_S = 0.3
-"""Time constant with which the rest position follows the sticks [s]: what differs from it moves."""
+"""Time constant of the rest position's low-pass [s]; a difference from it counts as motion."""
 
 
 class Sticks(NamedTuple):
-    """Deflections -1..1."""
+    """Stick deflections -1..1."""
 
     roll: float
-    """Right positive."""
+    """Positive right."""
     pitch: float
-    """Forward positive."""
+    """Positive forward."""
     throttle: float
-    """Up positive; 0 = the centre."""
+    """Positive up; 0 = centre."""
     yaw: float
-    """Clockwise positive."""
+    """Positive clockwise."""
 
 
 class Source(Enum):
-    """Source of sticks."""
+    """Input device of the sticks."""
 
     RADIO = auto()
     JOYSTICK = auto()
@@ -41,26 +41,26 @@ _ALLOWED = {
     2: (Source.RADIO, Source.JOYSTICK),
     3: (Source.RADIO, Source.JOYSTICK),
 }
-"""By COM_RC_IN_MODE; 3 stays with the first one, 4 takes none."""
+"""Allowed sources by COM_RC_IN_MODE; 3 keeps the first source, 4 allows none."""
 
 
 class ManualControl:
-    """The newest sticks of the source that counts."""
+    """Newest sticks of the selected source."""
 
     def __init__(self, value: Callable[[str], float]) -> None:
-        """Take a lookup of PX4 parameter names."""
+        """Store the look-up for PX4 parameters."""
         self._value = value
         self.was_heard = False
-        """Whether any sticks were taken since boot."""
+        """True if sticks have been received since boot."""
         self._sticks: Sticks | None = None
         self._source: Source | None = None
         self._time_us = 0
         self._rest = Sticks(0.0, 0.0, 0.0, 0.0)
 
     def offer(self, sticks: Sticks, source: Source, time_us: int) -> bool:
-        """Take sticks, if their source counts; return whether the pilot moves them.
+        """Accept sticks from an allowed source; return whether the pilot moves them.
 
-        They move if one differs from where it was by more than COM_RC_STICK_OV [%].
+        The threshold is a change of any stick by more than COM_RC_STICK_OV [%].
         """
         mode = int(self._value("COM_RC_IN_MODE"))
         if source not in _ALLOWED.get(mode, ()):
@@ -82,7 +82,7 @@ class ManualControl:
         return any(abs(s - r) > limit for s, r in zip(sticks, self._rest, strict=True))
 
     def sticks(self, time_us: int) -> Sticks | None:
-        """Return the sticks, None when there are none or none for COM_RC_LOSS_T."""
+        """Return the sticks; None before the first and after COM_RC_LOSS_T without input."""
         limit_us = self._value("COM_RC_LOSS_T") * US_PER_S
         if self._sticks is None or time_us - self._time_us > limit_us:
             return None

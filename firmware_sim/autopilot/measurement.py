@@ -1,4 +1,4 @@
-"""What the estimator fuses: buffers of each kind of measurement."""
+"""Measurement buffers of the estimator."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from firmware_sim.autopilot import error_state as es
 
 
 class Measurement:
-    """Buffers of one kind of measurement: innovation, its variance and Jacobian."""
+    """Buffers for one type of measurement: innovation, its variance and Jacobian."""
 
     def __init__(
         self, name: str, ratio: int, h: Vector, fused: NDArray[np.int64] | None = None
     ) -> None:
-        """Allocate them.
+        """Allocate the buffers.
 
         Args:
-            name: Of the measurement.
-            ratio: Its index in the estimate's ratios.
+            name: Name of the measurement.
+            ratio: Index in the estimate's test ratios.
             h: Jacobian (m, 16).
-            fused: (1,) keeps the time of the newest fusion [µs]; None = an array of its own.
+            fused: (1,) array for the time of the newest fusion [µs]; None = a new array.
         """
         self.name = name
         self.slot = es.RATIO + ratio
@@ -41,5 +41,5 @@ class Measurement:
 
 
 def selecting(*errors: int) -> Vector:
-    """Return the Jacobian (m, 16) of a sensor that measures these states themselves."""
+    """Return the Jacobian (m, 16) of a sensor that measures these states directly."""
     return np.eye(es.N_STATES)[list(errors)]

@@ -1,4 +1,4 @@
-"""PX4's numbers of the flight modes: in custom_mode, in checks and in messages.
+"""PX4's mode numbers in custom_mode, checks and messages.
 
 Source: PX4 1.16, commander/px4_custom_mode.h, msg/versioned/VehicleStatus.msg and
 src/lib/events/enums.json.
@@ -48,7 +48,7 @@ _MORE_STATES = {
 STATE_BITS = {
     mode: 1 << state | _MORE_STATES.get(mode, 0) for mode, state in NAVIGATION_STATES.items()
 }
-"""A mode's navigation states, each a bit of what a check says of modes."""
+"""Navigation states of each mode as bits, as in the mode masks of checks."""
 
 
 def custom_mode(mode: Mode) -> int:
@@ -58,5 +58,5 @@ def custom_mode(mode: Mode) -> int:
 
 
 def named(mode: Mode) -> NavigationMode:
-    """Return the number by which a message names a mode."""
+    """Return the number of a mode in messages."""
     return _NUMBERS[mode][3]

@@ -1,10 +1,10 @@
-"""Optical flow: how the ground moves in the image of a camera that looks down, fused as by PX4.
+"""Optical flow: fusion of ground motion in a downward camera, as in PX4.
 
-Together with how far the ground is, it tells the velocity over it. Where something else tells the
-velocity, it tells how far the ground is. EKF2_OF_CTRL switches it.
-Source: PX4 (main of 2026, one sensor), EKF/aid_sources/optical_flow and ZeroVelocityUpdate,
-FakePosFusion of the same folder. Not taken over: limits of height and speed that such a sensor sets
-to what is flown in piloted modes, and SENS_FLOW_MINHGT, _MAXHGT, _MAXR, which are as by default.
+With a known height above ground, flow measures velocity. With a known velocity, it measures the
+height above ground. EKF2_OF_CTRL enables it. Source: PX4 (main of 2026, one sensor),
+EKF/aid_sources/optical_flow and ZeroVelocityUpdate, FakePosFusion of the same folder. Not
+implemented: the sensor's height and speed limits in piloted modes, and changes of SENS_FLOW_MINHGT,
+_MAXHGT and _MAXR, which keep their defaults.
 """
 
 from __future__ import annotations
@@ -24,42 +24,42 @@ from firmware_sim.autopilot.terrain_filter import GROUND
 from firmware_sim.interfaces import FlowReading
 
 LEAST_HEIGHT_M, GREATEST_HEIGHT_M, GREATEST_RAD_S = 0.08, 100.0, 8.0
-"""SENS_FLOW_MINHGT, SENS_FLOW_MAXHGT, SENS_FLOW_MAXR by default: within them flow is believed."""
+"""Valid range: defaults of SENS_FLOW_MINHGT, SENS_FLOW_MAXHGT and SENS_FLOW_MAXR."""
 
 LONGEST_S = 1.0
-"""A measurement that took longer is none [s]."""
+"""Maximum integration time of a measurement [s]."""
 
 STUCK = 10
-"""The same flow, other than none, so many times in a row is that of a sensor that hangs, which is
-not fused: PX4 would. In the air nothing is measured twice; none may be, by a coarse sensor."""
+"""Number of identical non-zero measurements that indicate a frozen sensor, which is not fused (PX4
+would fuse it). In the air values never repeat, except zeros of a coarse sensor."""
 
 _TO_BEGIN = 10
-"""So many measurements come before the first is fused."""
+"""Number of measurements before the first fusion."""
 _BEGIN_AGAIN_US = 2 * US_PER_S
-"""After its last use it does not begin again before this [µs]."""
+"""Minimum time between the last fusion and a new start [µs]."""
 _UNUSED_US = US_PER_S
-"""Refused for so long it is taken over, or given up (no_aid_timeout_max) [µs]."""
+"""Time of rejection after which a reset or stop follows (no_aid_timeout_max) [µs]."""
 _SILENT_US = 7 * US_PER_S
-"""Silent for so long it is given up (reset_timeout_max) [µs]."""
+"""Timeout without data after which fusion stops (reset_timeout_max) [µs]."""
 _COS_GREATEST_TILT = math.cos(math.radians(45.0))
-"""range_cos_max_tilt"""
+"""Cosine of the maximum tilt: range_cos_max_tilt."""
 _LEAST_CLEARANCE_M = 0.01
 _LEAST_NOISE_RAD_S = 0.05
 _BIAS_SHARE, _GREATEST_BIAS_RAD_S = 0.01, 0.1
-"""How the difference between the sensor's gyro and the vehicle's is learnt."""
+"""Filter gain and limit for the difference between the sensor's gyro and the vehicle's."""
 _SMOOTHED_SHARE = 0.1
-"""Share of a new sample in the smoothed flow: a low-pass of 0.09 s at steps of 0.01 s."""
+"""Weight of a new sample in the smoothed flow: a 0.09 s low-pass at 0.01 s steps."""
 _UNKNOWN_GROUND_M2 = 100.0
-"""Variance of the ground where flow puts it."""
+"""Variance of a terrain height reset by flow."""
 _BEST_QUALITY = 255.0
 
 _STAND_EVERY_US = 200_000
 _STANDING_M, _STANDING_M_S = 0.01, 0.001
-"""How well it is known that a vehicle on the ground stays where it is."""
+"""Standard deviations of the zero-motion measurement on the ground."""
 
 
 class OpticalFlow:
-    """Takes the measurements of one sensor and has the filter fuse them."""
+    """Fusion of one optical flow sensor."""
 
     def __init__(
         self,
@@ -68,50 +68,50 @@ class OpticalFlow:
         ground: RangeFinder,
         fuse: Callable[[Measurement], bool],
     ) -> None:
-        """Begin without any.
+        """Start without measurements.
 
         Args:
-            value: Looks up EKF2_* parameters by name.
-            state: The nominal state, by `error_state`'s layout; updated.
-            ground: Knows where the ground is, with its filter.
-            fuse: Fuses a measurement that is none of the ground.
+            value: Look-up for EKF2_* parameters by name.
+            state: Nominal state in the layout of `error_state`; updated.
+            ground: Range finder with the terrain filter.
+            fuse: Fuses a measurement without terrain.
         """
         self._value, self._state = value, state
         self._ground, self._terrain = ground, ground.terrain
         self._fuse_standing = fuse
         self.horizon = FusionHorizon(0.0)
-        """Where the vehicle was in the middle of the time that a measurement that comes now took:
-        half of that ago, and EKF2_OF_DELAY."""
+        """Vehicle motion since the middle of the integration time of current measurements: half
+        that time plus EKF2_OF_DELAY ago."""
         self.fused = False
-        """Whether it is being fused."""
+        """True if flow is being fused."""
         self.fused_us: int | None = None
-        """When one was last within the gate; None = never."""
+        """Time of the newest measurement within the gate [µs]; None = never."""
         self.innovation, self.ratio = np.zeros(2), np.zeros(2)
-        """Of the newest measurement [rad/s]; test ratios, 1 = at the gate."""
+        """Innovation [rad/s] and test ratios of the newest measurement; 1 = at the gate."""
         self.reading: FlowReading | None = None
-        """The newest."""
+        """Newest reading."""
         self.reading_us = 0
-        """When it came [µs]."""
+        """Time of arrival of the reading [µs]."""
         self._waiting = False
         self._repeated = 0
         self._count = 0
         self._turned, self._turned_s = np.zeros(3), 0.0
-        """How far the vehicle's gyro has turned since the newest measurement [rad], and how long
-        that is."""
+        """Rotation of the vehicle's gyro since the newest measurement [rad], and the time since
+        then [s]."""
         self._rate = np.zeros(3)
-        """How fast it turned before that [rad/s]."""
+        """Mean rate of the vehicle's gyro before the newest measurement [rad/s]."""
         self._gyro_bias = np.zeros(3)
         self._smoothed_velocity, self._smoothed_rate = np.zeros(2), np.zeros(2)
         """Body velocity [m/s] and flow [rad/s]."""
         held = selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
         self.standing = Measurement("standing", 0, held)
-        """That a vehicle on the ground does not move."""
+        """Zero-motion measurement of a vehicle on the ground."""
         self.standing.variance[:] = [_STANDING_M**2] * 2 + [_STANDING_M_S**2] * 2
         self._stands_at: Vector | None = None
         self._stood_us = 0
 
     def take(self, reading: FlowReading, now_us: int) -> None:
-        """Take a measurement, fused in this tick; of what turn it does not tell, the vehicle's."""
+        """Store a measurement for this tick; missing rotation comes from the vehicle's gyro."""
         interval_s = reading.interval_s
         told = np.isfinite(reading.flow).all() and 0.0 <= interval_s < LONGEST_S
         if not told or (interval_s == 0.0 and reading.quality > 0):
@@ -130,17 +130,17 @@ class OpticalFlow:
         self.reading_us, self._waiting = now_us, self._repeated < STUCK
 
     def turn(self, gyro: Vector) -> None:
-        """Note a tick's turn (3,) FRD [rad/s]."""
+        """Integrate a tick's rate (3,) FRD [rad/s]."""
         self._turned += gyro * TICK_S
         self._turned_s += TICK_S
 
     def step(self, now_us: int, *, aided: bool, flying: bool) -> None:
-        """Fuse a measurement that has come; once a tick.
+        """Fuse a received measurement; call once per tick.
 
         Args:
-            now_us: Now.
-            aided: Whether anything else measures horizontal motion.
-            flying: Whether the vehicle is in the air.
+            now_us: Current time [µs].
+            aided: True if another sensor measures horizontal motion.
+            flying: True if the vehicle is in the air.
         """
         if self._value("EKF2_OF_CTRL") != 1:
             self._stop()
@@ -152,12 +152,12 @@ class OpticalFlow:
         self._stand(now_us, free=flying or aided)
 
     def told_motion_since(self, since_us: float) -> bool:
-        """Return whether it has told since then [µs] how the vehicle moves, or that it stands."""
+        """Return whether flow or zero motion was fused since then [µs]."""
         times = (self.fused_us, self.standing.fused_us)
         return any(time is not None and time >= since_us for time in times)
 
     def is_coming(self, now_us: int) -> bool:
-        """Return whether measurements come that would tell the motion in the air."""
+        """Return whether measurements arrive that would be fused in the air."""
         lately = self.reading is not None and now_us - self.reading_us <= _UNUSED_US
         return lately and self._value("EKF2_OF_CTRL") == 1
 
@@ -178,7 +178,7 @@ class OpticalFlow:
             and self._rotation[2, 2] > _COS_GREATEST_TILT
         )
         if good:
-            # PX4 smooths what it does not believe, too: the velocity may be put to that.
+            # As in PX4, invalid flow is also smoothed: the velocity may be reset to it.
             self._smooth(compensated)
         height = self._terrain.down - self._state.item(es.P + 2)
         possible = LEAST_HEIGHT_M <= height <= GREATEST_HEIGHT_M
@@ -197,7 +197,7 @@ class OpticalFlow:
             self._begin(compensated, gyro, variance, now_us, aided=aided)
 
     def _may_begin(self, now_us: int, *, aided: bool) -> bool:
-        """Return whether what it needs beside a good measurement is there."""
+        """Return whether the conditions for fusion besides a good measurement are met."""
         lately = self.fused_us is not None and now_us - self.fused_us <= _BEGIN_AGAIN_US
         known = aided or self._ground.is_reference or self._ground.clearance().valid
         return self._count > _TO_BEGIN and known and not lately
@@ -222,10 +222,10 @@ class OpticalFlow:
     def _fuse(
         self, compensated: Vector, gyro: Vector, variance: float, now_us: int, *, ground: bool
     ) -> bool:
-        """Fuse both axes, one after the other; return whether they were within the gate."""
+        """Fuse both axes in sequence; return whether they were within the gate."""
         if (self.ratio > 1.0).any():
             return False
-        # Both are linearised about the state before.
+        # Both axes are linearised at the state before.
         jacobian = self._jacobian()
         for axis in range(2):
             row = jacobian[axis]
@@ -243,9 +243,9 @@ class OpticalFlow:
         return True
 
     def _rates(self, reading: FlowReading) -> tuple[Vector, Vector]:
-        """Return flow (2,) and gyro (3,) of a measurement [rad/s], by PX4's signs.
+        """Return flow (2,) and gyro (3,) of a measurement [rad/s], with PX4's signs.
 
-        These are opposite to those of the sensor: positive where the scene turns about the axis.
+        The signs are opposite to the sensor's: positive for a scene rotating about the axis.
         """
         if reading.interval_s == 0.0:
             return np.zeros(2), np.zeros(3)
@@ -256,7 +256,7 @@ class OpticalFlow:
         return -reading.flow / reading.interval_s, gyro - self._gyro_bias
 
     def _variance(self, quality: int) -> float:
-        """Return the variance of the flow [rad²/s²], by its quality."""
+        """Return the variance of the flow [rad²/s²] for a quality."""
         value, least = self._value, self._value("EKF2_OF_QMIN")
         best = max(value("EKF2_OF_N_MIN"), _LEAST_NOISE_RAD_S)
         worst = max(value("EKF2_OF_N_MAX"), _LEAST_NOISE_RAD_S)
@@ -265,7 +265,7 @@ class OpticalFlow:
         return (best * share + worst * (1.0 - share)) ** 2
 
     def _test(self, compensated: Vector, gyro: Vector, variance: float) -> None:
-        """Note how a measurement fits."""
+        """Compute innovation and test ratios of a measurement."""
         self.innovation = compensated - self._predicted(gyro)
         jacobian = self._jacobian()
         for axis in range(2):
@@ -285,7 +285,7 @@ class OpticalFlow:
             self._smoothed_rate += _SMOOTHED_SHARE * (compensated - self._smoothed_rate)
         self._count += 1
 
-    # --- what is expected
+    # --- expected measurement
 
     @property
     def _rotation(self) -> Vector:
@@ -297,36 +297,36 @@ class OpticalFlow:
 
     @property
     def _then(self) -> Vector:
-        """Position and velocity (6,) NED when a measurement of now was made."""
+        """Position and velocity (6,) NED at the time of the current measurement."""
         state, horizon = self._state, self.horizon
         return horizon.seen_from(state) if horizon.is_past else state[es.P : es.Q]
 
     @property
     def _height_m(self) -> float:
-        """How far the ground is below the sensor, never nothing [m]."""
+        """Height of the sensor above ground, at least `_LEAST_CLEARANCE_M` [m]."""
         offset = (self._rotation @ self._place).item(2)
         return max(abs(self._terrain.down - self._then.item(2) - offset), _LEAST_CLEARANCE_M)
 
     @property
     def _range_m(self) -> float:
-        """How far what is in the middle of the image is [m]."""
+        """Distance along the optical axis to the ground [m]."""
         return self._height_m / self._rotation.item(2, 2)
 
     def _predicted(self, gyro: Vector) -> Vector:
-        """Return the flow (2,) that is expected, without the turn [rad/s]."""
+        """Return the expected flow (2,) without rotation [rad/s]."""
         rotation = self._rotation
         body = rotation.T @ self._then[3:] + np.cross(-gyro, self._place)
         scale = rotation.item(2, 2) / self._height_m
         return np.array([body[1] * scale, -body[0] * scale])
 
     def _jacobian(self) -> Vector:
-        """Return how the flow changes by the 16 errors and the ground (2, 17)."""
+        """Return the Jacobian of the flow by the 16 errors and the ground (2, 17)."""
         return flow_by_errors(self._rotation, self._then[3:], self._height_m)
 
     # --- jumps
 
     def _put_velocity(self, variance: float, now_us: int) -> None:
-        """Put the horizontal velocity to what flow says."""
+        """Reset the horizontal velocity to the flow velocity."""
         state, p = self._state, self._terrain.covariance.copy()
         level = self._rotation[:2, :2] @ self._smoothed_velocity
         state[es.V : es.V + 2] = level
@@ -337,7 +337,7 @@ class OpticalFlow:
         self._agree(now_us)
 
     def _put_ground(self, now_us: int) -> None:
-        """Put the ground where flow at the known velocity says."""
+        """Reset the terrain height from flow at the known velocity."""
         state = self._state
         forward, right = -self._smoothed_rate.item(1), self._smoothed_rate.item(0)
         seen = math.hypot(*(self._rotation[:2, :2] @ np.array([forward, right])).tolist())
@@ -348,14 +348,14 @@ class OpticalFlow:
         self._agree(now_us)
 
     def _agree(self, now_us: int) -> None:
-        """Note that what is estimated has been made what was measured."""
+        """Record that the estimate has been reset to the measurement."""
         self.innovation, self.ratio = np.zeros(2), np.zeros(2)
         self.fused_us = now_us
 
     # --- on the ground
 
     def _stand(self, now_us: int, *, free: bool) -> None:
-        """Hold a vehicle that stands where it is, as long as flow comes and nothing else does."""
+        """Hold position on the ground while flow arrives without other aids."""
         if free or not self.is_coming(now_us):
             self._stands_at = None
             return
@@ -373,19 +373,19 @@ class OpticalFlow:
 def flow_by_errors(rotation: Vector, velocity: Vector, height_m: float) -> Vector:
     """Return the Jacobian (2, 17) of the flow by the 16 errors and the height of the ground.
 
-    The flow about x is v_y R22 / h, that about y is -v_x R22 / h, of the velocity in body axes, the
-    attitude's lowest right element and the height above ground.
+    The flow about x is v_y R22 / h, about y -v_x R22 / h, with the velocity v in body axes, the
+    lower right element R22 of the attitude and the height h above ground.
 
     Args:
         rotation: (3, 3) body -> NED.
         velocity: (3,) NED [m/s].
-        height_m: Of the sensor above the ground [m].
+        height_m: Height of the sensor above ground [m].
     """
     body = rotation.T @ velocity
     scale = rotation.item(2, 2) / height_m
     jacobian = np.zeros((2, es.N_STATES + 1))
     x, y, z = body.tolist()
-    # By a turn t of the body, v_body changes by v_body x t, and R22 by R20 t_y - R21 t_x.
+    # A body rotation t changes v_body by v_body x t, and R22 by R20 t_y - R21 t_x.
     by_turn = np.array([[0.0, -z, y], [z, 0.0, -x]])
     tilt = np.array([-rotation.item(2, 1), rotation.item(2, 0), 0.0]) / height_m
     for axis, (seen, sign) in enumerate(((1, 1.0), (0, -1.0))):

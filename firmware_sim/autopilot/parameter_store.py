@@ -1,4 +1,4 @@
-"""The store of parameters that MAVLink reads and writes, and the bounded view that is flown."""
+"""Parameter store for MAVLink, with a bounded view for flight code."""
 
 from __future__ import annotations
 
@@ -13,26 +13,25 @@ from firmware_sim.autopilot.port import ParameterValue
 
 _INDEX = {spec.name: i for i, spec in enumerate(SPECS)}
 FLOAT32_RELATIVE = 1e-6
-"""Values that differ by no more than this share are the same as MAVLink carries them."""
+"""Relative difference up to which values are equal after float32 transfer over MAVLink."""
 
 _INT32_LOW, _INT32_HIGH = -(2**31), 2**31 - 1
 
 
 class Keeper(Protocol):
-    """Memory of parameters that outlives the flight controller."""
+    """Persistent storage of parameters across flight controllers."""
 
     def read(self) -> Mapping[str, int | float]:
-        """Return what is kept. Raises UsageError when it cannot be read."""
+        """Return the stored parameters. Raises UsageError if reading fails."""
 
     def write(self, values: Mapping[str, int | float]) -> None:
-        """Keep these instead. Raises OSError when they cannot be written."""
+        """Replace the stored parameters. Raises OSError if writing fails."""
 
 
 class Parameters:
-    """A vehicle's parameters. Implements `port.ParameterStore`.
+    """Parameters of a vehicle. Implements `port.ParameterStore`.
 
-    As in PX4, whatever is set is stored as given. Flight code sees it within the bounds that can
-    be flown.
+    As in PX4, values are stored as given. Flight code reads them clipped to supported limits.
     """
 
     def __init__(
@@ -43,26 +42,26 @@ class Parameters:
         """Start from the defaults.
 
         Args:
-            overrides: Those of a vehicle profile, checked; see `parameter_values`. They are this
-                vehicle's defaults.
-            keeper: Has what users have set before, and keeps what they set; None: nobody does.
-                Unknown names, and what does not fit a parameter's type, are left out.
+            overrides: Values of a vehicle profile, checked by `parameter_values`; this vehicle's
+                defaults.
+            keeper: Persistent storage of the user's values; None: no storage. Unknown names and
+                values of the wrong type are ignored.
 
         Raises:
-            UsageError: An override is unknown or out of range, or what is kept cannot be read.
+            UsageError: An override is unknown or out of range, or the storage cannot be read.
         """
         values = parameter_values(overrides or {})
         self._defaults = dict(values)
         self._values = list(values.values())
         self._flown = flown_values(overrides or {})
         self.value: Callable[[str], float] = self._flown.__getitem__
-        """Returns a value as it is flown; fast enough for flight code that asks at every tick.
-        Raises KeyError if the name is unknown."""
+        """Look-up of values clipped for flight, fast enough for a call in every tick. Raises
+        KeyError if the name is unknown."""
         self.revision = 0
-        """Another number after each change of a value, the same until then."""
+        """Counter that increases with each change of a value."""
         self._listeners: list[Callable[[], None]] = []
         self._bounded: set[str] = {name for name in overrides or () if self._is_bounded(name)}
-        """Parameters whose stored value is flown bounded, and said to be."""
+        """Parameters whose value is clipped for flight, and reported as such."""
         self._texts: list[Message] = [self._bounded_text(name) for name in sorted(self._bounded)]
         self._keeper = keeper
         if keeper is not None:
@@ -70,14 +69,14 @@ class Parameters:
                 self._store(name, value)
 
     def on_change(self, listener: Callable[[], None]) -> Callable[[], None]:
-        """Call `listener` after every change; return what ends that, to be called once."""
+        """Call `listener` after every change; return a function to unregister it once."""
         self._listeners.append(listener)
         return lambda: self._listeners.remove(listener)
 
     def take_texts(self) -> list[Message]:
-        """Return what is to be told of values that are not flown as stored, since the last call.
+        """Return new texts about clipped values since the last call.
 
-        Each is told once, and again only after it was flown as stored.
+        Each is reported once, and again only after an unclipped value.
         """
         taken, self._texts = self._texts, []
         return taken
@@ -87,39 +86,39 @@ class Parameters:
         return len(SPECS)
 
     def __getitem__(self, name: str) -> float:
-        """Return a value as it is flown. Raises KeyError for an unknown name."""
+        """Return a value clipped for flight. Raises KeyError for an unknown name."""
         return self._flown[name]
 
     def by_name(self, name: str) -> ParameterValue | None:
-        """Return a parameter as stored, or None when there is no such name."""
+        """Return a parameter as stored, or None if the name is unknown."""
         index = _INDEX.get(name)
         return None if index is None else self.by_index(index)
 
     def by_index(self, index: int) -> ParameterValue | None:
-        """Return a parameter as stored, or None when the index is out of range."""
+        """Return a parameter as stored, or None if the index is out of range."""
         if not 0 <= index < len(SPECS):
             return None
         return ParameterValue(SPECS[index].name, self._values[index], index)
 
     def set(self, name: str, value: int | float) -> ParameterValue | None:
-        """Store a value as given, and return what is stored now; None when there is no such name.
+        """Store a value as given; return the stored parameter, or None if the name is unknown.
 
-        What is no number of the parameter's type (NaN, infinite, beyond an INT32) changes nothing.
+        Values outside the parameter's type (NaN, infinite, beyond INT32) have no effect.
         """
         if self._store(name, value):
             self._changed()
         return self.by_name(name)
 
     def reset(self) -> None:
-        """Return to the defaults, a vehicle profile's overrides included."""
+        """Return to the defaults, including a vehicle profile's overrides."""
         for name, value in self._defaults.items():
             self._store(name, value)
         self._changed()
 
     def load(self) -> bool:
-        """Return to what is kept, to the defaults where nothing is; return whether that went well.
+        """Reload the stored values and defaults; return success.
 
-        Without a keeper there is nothing to return to: nothing changes.
+        Without storage nothing changes.
         """
         if self._keeper is not None:
             try:
@@ -132,9 +131,9 @@ class Parameters:
         return True
 
     def save(self) -> bool:
-        """Keep what differs from the defaults; return whether that went well.
+        """Store the values that differ from the defaults; return success.
 
-        Without a keeper there is nothing to do, and so nothing that could fail.
+        Without storage there is nothing to do, so the call succeeds.
         """
         if self._keeper is not None:
             try:

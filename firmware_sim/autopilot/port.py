@@ -1,4 +1,4 @@
-"""The interface through which the MAVLink services use the autopilot."""
+"""Interface of the autopilot for the MAVLink services."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from firmware_sim.interfaces import DistanceReading, FlowReading, Odometry, Sens
 
 @dataclass(frozen=True, slots=True)
 class ParameterValue:
-    """One parameter as stored."""
+    """Parameter as stored."""
 
     name: str
     value: int | float
-    """int for INT32 parameters, float for REAL32."""
+    """Value: int for INT32 parameters, float for REAL32."""
     index: int
 
 
@@ -40,94 +40,94 @@ class ParameterStore(Protocol):
     """PX4-named parameters."""
 
     def __hash__(self) -> int:
-        """Tell it from others: two stores are never the same."""
+        """Return an identity hash: two stores are never equal."""
 
     @property
     def value(self) -> Callable[[str], float]:
-        """Looks a value up as it is flown: within bounds. Raises KeyError for an unknown name."""
+        """Look-up of values clipped for flight. Raises KeyError for an unknown name."""
 
     @property
     def revision(self) -> int:
-        """Another number after each change of a value, the same until then."""
+        """Number that changes with each change of a value."""
 
     def __len__(self) -> int:
         """Return the number of parameters."""
 
     def by_name(self, name: str) -> ParameterValue | None:
-        """Return a parameter, or None when there is no such name."""
+        """Return a parameter, or None if the name is unknown."""
 
     def by_index(self, index: int) -> ParameterValue | None:
-        """Return a parameter, or None when the index is out of range."""
+        """Return a parameter, or None if the index is out of range."""
 
     def set(self, name: str, value: int | float) -> ParameterValue | None:
-        """Store a value as given, and return what is stored now."""
+        """Store a value as given; return the stored parameter."""
 
     def reset(self) -> None:
         """Return to the defaults."""
 
     def load(self) -> bool:
-        """Return to what is kept, where something is kept; return whether that went well."""
+        """Reload the stored values, if there is a storage; return success."""
 
     def save(self) -> bool:
-        """Keep what differs from the defaults; return whether that went well."""
+        """Store the values that differ from the defaults; return success."""
 
 
 class Failures(Protocol):
-    """Makes parts of the simulated vehicle fail at a client's word."""
+    """Failure injection into the simulated vehicle for client requests."""
 
     def inject(self, fault: Fault) -> None:
-        """Let a part fail from now on."""
+        """Start a fault of a component."""
 
     def clear(self, part: Part) -> None:
-        """End all that acts on a part."""
+        """End all faults of a component."""
 
 
 class LogEntry(NamedTuple):
-    """One flight log aboard."""
+    """Flight log on board."""
 
     utc_s: int
-    """When it began, or was completed [s since 1970]."""
+    """Start or completion time of the log [s since 1970]."""
     size_bytes: int
 
 
 class OpenLog(NamedTuple):
-    """The log that is being written."""
+    """Log currently being written."""
 
     number: int
-    """Its place in `LogStore.entries`."""
+    """Index in `LogStore.entries`."""
     head_bytes: int
-    """Size of what describes the log: format, parameters."""
+    """Size of the log header: format, parameters."""
     size_bytes: int
-    """Size by now; a message ends here."""
+    """Current size, at a message boundary."""
 
 
 class LogStore(Protocol):
-    """The flight logs aboard; a log's number is its place in `entries`."""
+    """Flight logs on board; a log's number is its index in `entries`."""
 
     def entries(self) -> Sequence[LogEntry]:
         """Return the logs, oldest first."""
 
     def read(self, number: int, offset: int, count: int) -> bytes:
-        """Return up to `count` bytes of a log, fewer at its end; none when there is no such log."""
+        """Return up to `count` bytes of a log, fewer at its end; none if the log does not exist."""
 
     def open_log(self) -> OpenLog | None:
-        """Return the log that is being written, None when there is none."""
+        """Return the log currently being written, or None."""
 
 
 class NoLogs:
-    """A vehicle that keeps no logs. Implements `LogStore`."""
+    """Empty log store. Implements `LogStore`."""
 
     def entries(self) -> Sequence[LogEntry]:
-        """Return nothing."""
+        """Return no logs."""
         return ()
 
     def read(self, number: int, offset: int, count: int) -> bytes:
-        """Return nothing."""
+        """Return no data."""
         del number, offset, count
         return b""
 
     def open_log(self) -> None:
-        """Return nothing."""
+        """Return None."""
         return
 
 
@@ -136,117 +136,117 @@ class AutopilotPort(Protocol):
 
     @property
     def parameters(self) -> ParameterStore:
-        """The parameter store."""
+        """Parameter store."""
 
     @property
     def plans(self) -> Plans:
-        """The mission, the geofence and the rally points that are stored aboard."""
+        """Mission, geofence and rally points stored on board."""
 
     @property
     def failures(self) -> Failures | None:
-        """What makes parts fail; None: nobody simulates them."""
+        """Failure injection; None: not supported."""
 
     @property
     def logs(self) -> LogStore:
-        """The flight logs aboard."""
+        """Flight logs on board."""
 
     @property
     def sample(self) -> SensorSample | None:
-        """The newest tick's sensors; None before the first. Cheap: may be read every tick."""
+        """Sensors of the newest tick; None before the first. Cheap enough to read in every tick."""
 
     def state(self) -> AutopilotState:
         """Return the snapshot after the newest tick."""
 
     @property
     def attitude(self) -> Vector:
-        """Estimate (4,) body -> NED."""
+        """Estimated attitude quaternion (4,) body -> NED."""
         ...
 
     def take_messages(self) -> list[Message]:
         """Return texts for the operator since the last call."""
 
     def take_events(self) -> list[Event]:
-        """Return events since the last call: texts that are events, too, and reports."""
+        """Return events since the last call: operator texts with events, and reports."""
 
     def tell_checks(self) -> None:
-        """Tell all failing pre-arm checks anew."""
+        """Report all failing pre-arm checks again."""
 
     def arm(self, *, force: bool) -> Result:
-        """Ask to arm."""
+        """Request arming."""
 
     def disarm(self, *, force: bool) -> Result:
-        """Ask to disarm; force = kill, also in the air."""
+        """Request disarming; force = kill, also in the air."""
 
     def terminate(self) -> Result:
-        """Ask to stop the motors for good; DENIED while disarmed."""
+        """Request permanent motor stop; DENIED while disarmed."""
 
     def takeoff(self, altitude_m: float | None, place: tuple[float, float] | None = None) -> Result:
-        """Ask to climb to a height above home [m], and to a place, local NED north and east [m].
+        """Request a take-off to a height above home [m] and a place, local NED north, east [m].
 
-        No height = MIS_TAKEOFF_ALT; no place = straight up.
+        Default height: MIS_TAKEOFF_ALT; default place: straight up.
         """
 
     def set_mode(
         self, mode: Mode, request: Request | None = None, *, commanded: bool = False
     ) -> Result:
-        """Ask for a mode.
+        """Request a mode.
 
         Args:
-            mode: Which one.
-            request: What it takes beyond its name.
-            commanded: By a command of its own (NAV_LAND), whose grant is told.
+            mode: Requested mode.
+            request: Optional arguments of the mode.
+            commanded: True for a specific command (NAV_LAND), whose acceptance is reported.
         """
 
     def change_speed(self, speed_m_s: float) -> None:
-        """Set the horizontal speed of the present automatic mode [m/s]."""
+        """Set the horizontal speed of the active automatic mode [m/s]."""
 
     def start_mission(self, index: int) -> Result:
-        """Arm and fly the mission from an item on; -1 = as it stands."""
+        """Arm and fly the mission from an item; -1 = current item."""
 
     def look_at(self, place: Geodetic | None) -> None:
-        """Turn to a place while a mission is flown; None = to none."""
+        """Turn the nose to a place during a mission; None = cancel."""
 
     def set_home(self, place: Geodetic | None) -> Result:
-        """Move home; None = to the present place."""
+        """Move home; None = the current position."""
 
     def set_origin(self, place: Geodetic) -> Result:
-        """Let local NED be zero at another place of the globe."""
+        """Move the geodetic origin of local NED."""
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
-        """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""
+        """Pass on a valid offboard setpoint, received at `time_us` of simulated time."""
 
     def offer_attitude(
         self, demand: AttitudeDemand | RateDemand, time_us: int, wire: Wire = UNTOLD
     ) -> None:
-        """Hand over an offboard setpoint of attitude or body rates, received at `time_us`.
+        """Pass on an offboard setpoint of attitude or body rates, received at `time_us`.
 
-        `wire` is what latency analysis recognises it by: roll, pitch, yaw [rad] or their rates
-        [rad/s], and the thrust.
+        `wire` identifies it in latency analysis: roll, pitch, yaw [rad] or their rates [rad/s], and
+        thrust.
         """
 
     def refuse_setpoint(self, reason: str, time_us: int) -> None:
-        """Note why an offboard setpoint was refused: the failsafe that follows names it."""
+        """Record the reason of a rejected offboard setpoint, which the next failsafe names."""
 
     def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
-        """Hand over the pilot's sticks, received at `time_us` of simulated time."""
+        """Pass on the pilot's sticks, received at `time_us` of simulated time."""
 
     def see(self, odometry: Odometry) -> None:
-        """Hand over a pose that something else has estimated, received now."""
+        """Pass on a pose from an external estimator, received now."""
 
     def measure_distance(self, reading: DistanceReading) -> None:
-        """Hand over what a client's distance sensor measures, received now."""
+        """Pass on a range from a client's distance sensor, received now."""
 
     def look_down(self, reading: FlowReading) -> None:
-        """Hand over what a client's optical flow sensor measures, received now."""
+        """Pass on a reading from a client's optical flow sensor, received now."""
 
     def see_obstacles(self, obstacles: Obstacles) -> None:
-        """Hand over how far obstacles are."""
+        """Pass on the distances to obstacles."""
 
     def follow(self, target: FollowedTarget) -> None:
-        """Hand over where the target is that Follow follows."""
+        """Pass on the position of the Follow target."""
 
     def landing_target(self, target: LandingTarget) -> None:
-        """Hand over where the target of a precision landing is."""
+        """Pass on the position of the precision landing target."""
 
     def gcs_heartbeat(self, time_us: int) -> None:
-        """A ground station was heard."""
+        """Record a heartbeat from a ground station."""

@@ -1,7 +1,7 @@
-"""Pre-arm checks: what keeps a vehicle from arming, and says so. One row a check, pure.
+"""Pre-arm checks with their texts, one row per check, pure.
 
-The same rows tell a client which part of the vehicle is unhealthy (SYS_STATUS). Source: PX4 1.16,
-commander/HealthAndArmingChecks; a check of what this vehicle does not have is left out.
+The rows also define component health for clients (SYS_STATUS). Source: PX4 1.16,
+commander/HealthAndArmingChecks, without checks of components that this vehicle lacks.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from firmware_sim.autopilot.readiness import SUPPLY_CHECK_OFF, Part, Readiness
 
 
 class Check(NamedTuple):
-    """One check."""
+    """Pre-arm check."""
 
     part: Part
     fails: Callable[[Readiness], bool]
     event: CheckEvent
-    """Its event for ground stations."""
+    """Event for ground stations."""
     told: str = ""
-    """Text for the operator; "" = `prefix` and the words of the event."""
+    """Text for the operator; "" = `prefix` and the event's message."""
     prefix: str = "Preflight Fail: "
     said: bool = True
-    """Whether PX4 says it by itself when it begins to fail; else only when arming is refused."""
+    """True if PX4 reports the check as soon as it fails; False: only when arming is rejected."""
     blocks: Callable[[Readiness], bool] | None = None
-    """Whether it keeps the vehicle from arming; None = always."""
+    """Condition under which the check prevents arming; None = always."""
     severity: Severity = Severity.CRITICAL
     level: Callable[[Readiness], Level] | None = None
-    """Level of the event; None = its definition's."""
+    """Level of the event; None = the definition's level."""
     shown: Callable[[Readiness], Need] | None = None
-    """Ground stations show it in modes that need one of these, too; None: where it blocks alone,
-    in all modes if it blocks nowhere."""
+    """Requirements that select further modes in which ground stations show the check; None: only
+    the blocked modes, or all modes if it blocks none."""
     of_present_mode: bool = False
-    """Whether it is told only while the vehicle is in a mode in which it fails."""
+    """True if the check is reported only while the current mode fails it."""
 
     @property
     def text(self) -> str:
@@ -48,7 +48,7 @@ class Check(NamedTuple):
 
 
 def never(_readiness: Readiness) -> bool:
-    """Return that a check keeps no vehicle from arming."""
+    """Return False: the check never prevents arming."""
     return False
 
 
@@ -109,7 +109,7 @@ def _charge_required(r: Readiness) -> bool:
 
 
 def _battery_level(r: Readiness) -> BatteryWarning:
-    """Return the warning. A charge below COM_ARM_BAT_MIN counts as low at least."""
+    """Return the warning; a charge below COM_ARM_BAT_MIN is at least LOW."""
     warning = r.conditions.battery_warning
     if _charge_required(r) and r.charge_short:
         return max(warning, BatteryWarning.LOW)
@@ -117,7 +117,7 @@ def _battery_level(r: Readiness) -> BatteryWarning:
 
 
 def _battery_blocks(r: Readiness) -> bool:
-    """Return whether the charge forbids arming: below COM_ARM_BAT_MIN, without it critical."""
+    """Return whether the charge prevents arming: below COM_ARM_BAT_MIN, else critical."""
     if _charge_required(r):
         return r.charge_short
     return r.conditions.battery_warning >= BatteryWarning.CRITICAL
@@ -129,15 +129,15 @@ def _battery_urgency(r: Readiness) -> Level:
 
 
 _FIELD_REQUIRED, _FIELD_WARNED = 1, 2
-"""COM_ARM_MAG_STR: 1 refuses to arm in a disturbed magnetic field, 2 warns, 0 says nothing."""
+"""COM_ARM_MAG_STR: 1 rejects arming in a disturbed magnetic field, 2 warns, 0 is off."""
 _GLOBAL_REQUIRED = 0
-"""COM_ARM_WO_GPS: 0 refuses to arm without a global position, 1 warns, 2 says nothing."""
+"""COM_ARM_WO_GPS: 0 rejects arming without a global position, 1 warns, 2 is off."""
 _FENCE_RETURN = 3
 _STICKS_DISABLED = 4
-"""COM_RC_IN_MODE: 4 listens to no sticks at all."""
+"""COM_RC_IN_MODE: 4 disables stick input."""
 _POSITION = Need.LOCAL_POSITION | Need.LOCAL_POSITION_RELAXED | Need.GLOBAL_POSITION
 _ANYTHING = Need.ANGULAR_VELOCITY | Need.MANUAL_CONTROL | Need.NOT_ARMING
-"""Every mode needs one of these."""
+"""Needs that together cover every mode."""
 
 
 def _no_sticks_wanted(r: Readiness) -> bool:
@@ -225,7 +225,7 @@ CHECKS: tuple[Check, ...] = (
         lambda r: _field_fails(r, _FIELD_WARNED),
         events.MAG_INTERFERENCE,
         prefix="Preflight: ",
-        # Before the estimator has a heading, that field is what it waits for the end of.
+        # The estimator starts only after the disturbance has ended.
         blocks=lambda r: not r.converged,
         severity=Severity.WARNING,
     ),
@@ -287,7 +287,7 @@ CHECKS: tuple[Check, ...] = (
         lambda r: _global_required(r) and r.conditions.home_position_invalid,
         events.NO_HOME,
     ),
-    # What a mode needs. PX4 tells it by events alone, and so do we until arming is refused.
+    # Mode requirements. Like PX4, reported by events only until arming is rejected.
     Check(
         Part.SYSTEM,
         lambda r: _needs(r, Need.NOT_ARMING) and not r.terminated and not r.armed,
@@ -339,20 +339,20 @@ CHECKS: tuple[Check, ...] = (
         shown=lambda r: Need.MANUAL_CONTROL if _no_sticks_wanted(r) else _ANYTHING,
     ),
 )
-"""In the order in which they are told."""
+"""Checks in reporting order."""
 
 
 @lru_cache(maxsize=256)
 def failing(readiness: Readiness) -> tuple[Check, ...]:
-    """Return the checks that fail."""
+    """Return the failing checks."""
     return tuple(check for check in CHECKS if check.fails(readiness))
 
 
 def blocking(checks: tuple[Check, ...], readiness: Readiness) -> tuple[Check, ...]:
-    """Return those of the failing checks that keep the vehicle from arming in its mode."""
+    """Return the failing checks that prevent arming in the mode."""
     return tuple(check for check in checks if check.blocks is None or check.blocks(readiness))
 
 
 def can_arm(readiness: Readiness) -> tuple[Check, ...]:
-    """Return the checks that keep the vehicle from arming in a mode; none = it may."""
+    """Return the checks that prevent arming in a mode; empty = armable."""
     return blocking(failing(readiness), readiness)

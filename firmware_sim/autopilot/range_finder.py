@@ -1,10 +1,10 @@
-"""A rangefinder that looks down: where the ground is, and how high the vehicle is above it.
+"""Downward range finder: terrain height and height above ground.
 
-EKF2_RNG_CTRL says whether it also tells the height: 0 never, 1 while low and slow, 2 always; where
-the ground is it tells anyway. With EKF2_HGT_REF = 2 the ground is where height is counted from.
-Source: PX4 1.16, EKF/aid_sources/range_finder/range_height_control.cpp, terrain_control.cpp.
-Not taken over: limits of what is flown by a vehicle whose height nothing else tells (there is
-always a barometer), and the wider gate while vertical acceleration is known to be wrong.
+EKF2_RNG_CTRL enables range height: 0 never, 1 at low height and speed, 2 always; ranges always
+update the terrain. With EKF2_HGT_REF = 2 the ground is the height reference. Source: PX4 1.16,
+EKF/aid_sources/range_finder/range_height_control.cpp, terrain_control.cpp. Not implemented: flight
+limits for vehicles without another height source (there is always a barometer), and the wider gate
+during known vertical acceleration errors.
 """
 
 from __future__ import annotations
@@ -25,32 +25,32 @@ from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.interfaces import DOWNWARD, DistanceReading
 
 HEIGHT_BY_RANGE = 2
-"""EKF2_HGT_REF."""
+"""EKF2_HGT_REF value for range height."""
 
 STEP_US = 10_000
-"""PX4's filter looks at the sensor a hundred times a second [µs]."""
+"""Period of PX4's sensor check, 100 Hz [µs]."""
 
 TIMEOUT_US = 5 * US_PER_S
-"""Refused for so long, it is taken over (hgt_fusion_timeout_max) [µs]."""
+"""Time of rejection after which a reset follows (hgt_fusion_timeout_max) [µs]."""
 
 _LEAST_VARIANCE = 1e-3
-"""Of a range, where its changes are looked at [m²]."""
+"""Minimum variance of a range in the consistency check [m²]."""
 _STANDING = 0.1
-"""Below this square of its speed a vehicle does not move sideways [m²/s²]."""
+"""Squared speed below which a vehicle does not move sideways [m²/s²]."""
 
 _TO_BEGIN = 0.7
-"""Share of the limits of EKF2_RNG_A_* within which conditional fusion begins."""
+"""Share of the EKF2_RNG_A_* limits within which conditional fusion starts."""
 _STEADY = 0.01
-"""Test ratio within which it begins."""
+"""Test ratio below which conditional fusion starts."""
 
 _UNUSED_US = US_PER_S
-"""On the ground: after so long without ranges the ground is taken to be EKF2_MIN_RNG below."""
+"""Time without ranges on the ground after which terrain is assumed EKF2_MIN_RNG below [µs]."""
 
 _FILTERED_TAU_S, _GREATEST_RATIO = 0.5, 4.0
 
 
 class RangeControl(IntEnum):
-    """EKF2_RNG_CTRL."""
+    """Values of EKF2_RNG_CTRL."""
 
     OFF = 0
     CONDITIONAL = 1
@@ -58,65 +58,65 @@ class RangeControl(IntEnum):
 
 
 class Aids(NamedTuple):
-    """What else tells the vehicle's motion."""
+    """Other aids for the vehicle's motion."""
 
     horizontal: bool
-    """Whether anything measures horizontal motion."""
+    """True if a sensor measures horizontal motion."""
     vertical_speed: bool
-    """Whether anything measures vertical speed."""
+    """True if a sensor measures vertical speed."""
     height_us: int
-    """When anything but ranges has told the height last [µs]."""
+    """Time of the last height fusion from a sensor other than ranges [µs]."""
 
 
 class RangeFinder:
-    """Takes the ranges of one sensor and has the filter fuse what of them is asked for."""
+    """Fusion of one range sensor for height and terrain."""
 
     def __init__(
         self, value: Callable[[str], float], state: Vector, terrain: TerrainFilter, now_us: int
     ) -> None:
-        """Begin without any.
+        """Start without ranges.
 
         Args:
-            value: Looks up EKF2_* parameters by name.
-            state: The nominal state, by `error_state`'s layout; updated.
-            terrain: The filter.
-            now_us: Now.
+            value: Look-up for EKF2_* parameters by name.
+            state: Nominal state in the layout of `error_state`; updated.
+            terrain: Terrain filter.
+            now_us: Current time [µs].
         """
         self._value, self._state, self.terrain = value, state, terrain
         self.sensor, self.consistency = RangeSensor(), RangeConsistency()
         self.tells_height, self.tells_ground = False, False
-        """What is being fused."""
+        """Fusion of ranges into height and terrain."""
         self.is_reference = False
-        """Whether height is counted from the ground that ranges tell."""
+        """True if the ground, measured by ranges, is the height reference."""
         self.fused_us: int | None = None
-        """When a range was last within the gate; None = never."""
+        """Time of the newest range within the gate [µs]; None = never."""
         self.innovation, self.ratio = 0.0, 0.0
-        """Of the newest range [m]; test ratio, 1 = at the gate."""
+        """Innovation [m] and test ratio of the newest range; 1 = at the gate."""
         self._filtered_ratio = 0.0
         self._tested_us = 0
         self._ground_us: int | None = None
-        """When ranges, or something else, last said where the ground is."""
+        """Time of the last terrain update from any source [µs]."""
         self._seen_us: int | None = None
-        """When something else than ranges did; None = never."""
+        """Time of the last terrain update from another source than ranges [µs]; None = never."""
         self._valid = False
         self._resets = 0
         self._flying = False
         self._waiting: DistanceReading | None = None
         self._source: int | None = None
-        """Whose ranges are taken; None = of whoever sends the first."""
+        """Id of the selected sensor; None = the first to send a range."""
         self._last_us = now_us
-        """When one of these came last."""
+        """Time of the newest range of the selected sensor [µs]."""
         self.reading: DistanceReading | None = None
-        """The newest of any distance sensor, wherever it looks."""
+        """Newest reading of any distance sensor, in any direction."""
         self.reading_us = 0
-        """When it came [µs]."""
+        """Time of arrival of the reading [µs]."""
         self._step = -1
         self._begin_ground()
 
     def take(self, reading: DistanceReading, now_us: int, source: int) -> None:
-        """Take a range, fused in the next step where the sensor looks down.
+        """Store a range of a downward sensor for fusion in the next step.
 
-        Of several such sensors the first is taken, until it has been silent for a second (PX4:
+        The first of several such sensors is selected until it has been silent for 1 s (PX4:
         EKF2::UpdateRangeSample).
         """
         self.reading, self.reading_us = reading, now_us
@@ -129,12 +129,12 @@ class RangeFinder:
         self._waiting, self._last_us = reading, now_us
 
     def step(self, now_us: int, aids: Callable[[], Aids], *, flying: bool) -> None:
-        """Fuse a range that has come, and look whether they still come; once a tick.
+        """Fuse a received range and check for timeouts; call once per tick.
 
         Args:
-            now_us: Now.
-            aids: Tells what else measures the vehicle's motion.
-            flying: Whether the vehicle is in the air.
+            now_us: Current time [µs].
+            aids: Returns the other aids for the vehicle's motion.
+            flying: True if the vehicle is in the air.
         """
         step = now_us // STEP_US
         if self._waiting is None and step == self._step:
@@ -153,7 +153,7 @@ class RangeFinder:
         terrain.slope = value("EKF2_TERR_GRAD")
 
     def clearance(self) -> Clearance:
-        """Return how far the ground is below."""
+        """Return the height above ground."""
         ratio = math.sqrt(abs(self._filtered_ratio)) if self.tells_ground else math.nan
         return Clearance(
             max(self._clearance_m, 0.0),
@@ -165,22 +165,22 @@ class RangeFinder:
         )
 
     def moved(self, down_m: float) -> None:
-        """Note that all heights are counted from elsewhere: down is this much more [m]."""
+        """Shift the terrain by a change of the height origin, positive down [m]."""
         self.terrain.down += down_m
         self._resets += 1
 
     def ground_seen(self, now_us: int) -> None:
-        """Note that something else than a range has told the filter where the ground is."""
+        """Record a terrain update from another source than ranges."""
         self._ground_us = self._seen_us = now_us
 
     def told_height_since(self, since_us: float) -> bool:
-        """Return whether a range has told how high the vehicle is since then [µs]."""
+        """Return whether a range has updated the height since then [µs]."""
         return self.tells_height and self.fused_us is not None and self.fused_us >= since_us
 
     def correct(self, baro: Measurement, now_us: int) -> None:
-        """Take a barometer for offset that has been refused for long, where the ground counts.
+        """Correct the offset of a long-rejected barometer if the ground is the reference.
 
-        Source: PX4 1.16, EKF/aid_sources/barometer: it is stopped, and begins with a new bias.
+        Source: PX4 1.16, EKF/aid_sources/barometer, which stops it and restarts with a new bias.
         """
         refused_us = now_us - (baro.fused_us or 0)
         if not (self.is_reference and refused_us > TIMEOUT_US):
@@ -217,11 +217,11 @@ class RangeFinder:
             if flying:
                 self._compare(now_us)
         elif not flying and sensor.is_regular and sensor.is_new:
-            # Too near to be measured: as far as it is known to be on the ground.
+            # Below the minimum range: use the known height on the ground.
             sensor.range_m, sensor.is_valid = value("EKF2_MIN_RNG"), True
 
     def _compare(self, now_us: int) -> None:
-        """Hold a range against the vertical speed."""
+        """Check a range against the vertical speed."""
         value, sensor, p = self._value, self.sensor, self.terrain.covariance
         north, east, down = self._state[es.V : es.Q].tolist()
         spread = float(p[es.VEL, es.VEL] + p[es.VEL + 1, es.VEL + 1])
@@ -268,11 +268,11 @@ class RangeFinder:
             self._stop()
 
     def _measure(self, now_us: int) -> tuple[float, float]:
-        """Return the newest height above ground [m] and its variance; note how it fits."""
+        """Return the newest height above ground [m] and its variance; update the test ratio."""
         value, sensor, p = self._value, self.sensor, self.terrain.covariance
         measured = max(sensor.dist_bottom_m, value("EKF2_MIN_RNG"))
         scaled = value("EKF2_RNG_SFE") * sensor.range_m
-        # PX4 adds the variance of the vehicle's height to that of the sensor.
+        # PX4 adds the variance of the vehicle's height to the sensor's.
         variance = float(p[es.POS + 2, es.POS + 2]) + value("EKF2_RNG_NOISE") ** 2 + scaled**2
         state, horizon = self._state, self.terrain.horizon
         then = horizon.seen_from(state).item(2) if horizon.is_past else state.item(es.P + 2)
@@ -284,7 +284,7 @@ class RangeFinder:
         return measured, variance
 
     def _filter_ratio(self, now_us: int) -> None:
-        """Take the newest test ratio into their mean (updateAidSourceStatus)."""
+        """Add the newest test ratio to the mean (updateAidSourceStatus)."""
         dt = min(1.0, max(0.001, (now_us - self._tested_us) / US_PER_S))
         signed = math.copysign(self.ratio, -self.innovation)
         if self._tested_us == 0:
@@ -296,7 +296,7 @@ class RangeFinder:
         self._tested_us = now_us
 
     def _is_suitable(self, aids: Aids) -> bool:
-        """Return whether the vehicle is so low and slow that ranges may tell its height."""
+        """Return whether height and speed are low enough for conditional range height."""
         value, (north, east) = self._value, self._state[es.V : es.V + 2].tolist()
         share, steady = (1.0, 1.0) if self.tells_height else (_TO_BEGIN, _STEADY)
         slow = math.hypot(north, east) <= share * value("EKF2_RNG_A_VMAX")
@@ -311,7 +311,7 @@ class RangeFinder:
             return
         self.is_reference = True
         if always:
-            # From here on height is counted from the ground.
+            # From here on the ground is the height reference.
             self._put_height(measured, variance)
             self.terrain.down = 0.0
             self._agree(now_us)
@@ -333,7 +333,7 @@ class RangeFinder:
                 self._ground_us = now_us
         alone = now_us - aids.height_us > TIMEOUT_US
         if alone and self.tells_height and self.is_reference:
-            # PX4 moves the ground with the vehicle here, which then wanders with every range.
+            # PX4 moves the ground with the vehicle here, so that it drifts with every range.
             ground = self.terrain.down
             self._put_height(measured - ground, None)
             self.terrain.down = ground
@@ -344,22 +344,22 @@ class RangeFinder:
             self._put_ground(variance, now_us)
 
     def _agree(self, now_us: int) -> None:
-        """Note that what is estimated has been made what was measured."""
+        """Record that the estimate has been reset to the measurement."""
         self.innovation = self.ratio = self._filtered_ratio = 0.0
         self.fused_us = now_us
 
     def _put_ground(self, variance: float, now_us: int) -> None:
-        """Put the ground where the newest range says."""
+        """Reset the terrain height to the newest range."""
         self.terrain.put_by_range(self.innovation, variance)
         self._resets += 1
         self._agree(now_us)
 
     def _put_height(self, height_m: float, variance: float | None) -> None:
-        """Put the vehicle elsewhere; the barometer's offset and the ground go with it.
+        """Reset the vehicle's height; barometer offset and terrain shift with it.
 
         Args:
-            height_m: Above z = 0.
-            variance: Of that [m²]; None = as it was.
+            height_m: Height above z = 0.
+            variance: Variance of the height [m²]; None = unchanged.
         """
         state, p = self._state, self.terrain.covariance
         moved = -height_m - state.item(es.P + 2)
@@ -382,12 +382,12 @@ class RangeFinder:
     # --- the ground
 
     def _begin_ground(self) -> None:
-        """Take the ground to be as far below as it is known to be on the ground."""
+        """Reset the terrain to the known height on the ground."""
         least = self._value("EKF2_MIN_RNG")
         self.terrain.put(self._state.item(es.P + 2) + least, least**2)
 
     def _follow_ground(self, now_us: int, *, flying: bool) -> None:
-        """Keep the ground known where nothing measures it, and judge what is known of it."""
+        """Maintain the terrain without measurements, and update its validity."""
         unused = self._ground_us is None or now_us - self._ground_us > _UNUSED_US
         if flying:
             if not self._flying:

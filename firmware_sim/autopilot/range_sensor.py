@@ -1,4 +1,4 @@
-"""Which ranges of a rangefinder can be believed.
+"""Validity checks for the ranges of a range finder.
 
 Source: PX4 1.16, EKF/aid_sources/range_finder: SensorRangeFinder and RangeFinderConsistencyCheck.
 """
@@ -12,44 +12,44 @@ from airl_mav.core.constants import US_PER_S
 from firmware_sim.interfaces import DistanceReading
 
 LONGEST_INTERVAL_US = 200_000
-"""Ranges have to come at least so often (RNG_MAX_INTERVAL) [µs]."""
+"""Maximum interval of ranges (RNG_MAX_INTERVAL) [µs]."""
 
 GREATEST_TILT_COSINE = 0.7071
-"""Tilted further than this cosine, the ray is not taken for one to the ground."""
+"""Cosine of the maximum tilt at which the ray measures the ground."""
 
 _AGE_SHARE = 0.005
-"""Share of a new age in the mean one: PX4 takes it a hundred times a second, over 2 s."""
+"""Weight of a new age in the mean: PX4 updates at 100 Hz, over 2 s."""
 _GREATEST_AGE_US = 4_000_000.0
 _DISCONTINUOUS_US = 2_000_000.0
 
 _STUCK_AFTER_US = 10 * US_PER_S
 _MOVES_M = 0.1
-"""After so long without a valid range the sensor has to show that its ranges change by so much."""
+"""Time without a valid range [µs] after which the ranges must change by `_MOVES_M` [m]."""
 
 _MEDIAN = 5
-"""Distances of which fog is told."""
+"""Number of distances in the median for fog detection."""
 _FOG_FACTOR = 2.0
 
 
 class RangeSensor:
-    """The newest range, whether it is valid, and how far below the sensor it says the ground is."""
+    """Newest range, its validity and the resulting height of the sensor above ground."""
 
     def __init__(self) -> None:
-        """Begin without any."""
+        """Start without ranges."""
         self.range_m = 0.0
-        """The newest range; corrected by whoever knows where the sensor is."""
+        """Newest range; corrected by the caller for the sensor's mounting position."""
         self.range_us = 0
-        """When it was measured [µs]."""
+        """Time of the measurement [µs]."""
         self.is_new = False
-        """Whether it came in this step."""
+        """True if the range arrived in this step."""
         self.is_valid = False
         self.is_regular = False
-        """Whether ranges come, and often enough."""
+        """True if ranges arrive at a sufficient rate."""
         self.least_m, self.greatest_m = 0.0, 0.0
         self.cos_tilt = 1.0
         """Cosine of the angle between the ray and straight down."""
         self.quality_s, self.fog_m = 0.0, 0.0
-        """EKF2_RNG_QLTY_T, EKF2_RNG_FOG."""
+        """Values of EKF2_RNG_QLTY_T, EKF2_RNG_FOG."""
         self._quality = -1
         self._age_us = 0.0
         self._valid_us = self._bad_us = 0
@@ -60,25 +60,25 @@ class RangeSensor:
 
     @property
     def dist_bottom_m(self) -> float:
-        """How far below the sensor the ground is, by the newest range."""
+        """Height of the sensor above ground by the newest range."""
         return self.range_m * self.cos_tilt
 
     @property
     def is_healthy(self) -> bool:
-        """Whether a new range can be fused."""
+        """True if a new range can be fused."""
         return self.is_new and self.is_valid
 
     def take(self, reading: DistanceReading, now_us: int) -> None:
-        """Take a range."""
+        """Store a range."""
         self.range_m, self.range_us, self._quality = reading.distance_m, now_us, reading.quality
         self.least_m, self.greatest_m = reading.least_m, reading.greatest_m
         self.is_new = True
 
     def check(self, now_us: int, cos_tilt: float) -> None:
-        """Look at the newest range; once a step, after `take` where there is a new one.
+        """Check the newest range; once per step, after `take` if there is a new range.
 
         Args:
-            now_us: Now.
+            now_us: Current time [µs].
             cos_tilt: Cosine of the angle between the ray and straight down.
         """
         self.cos_tilt = cos_tilt
@@ -117,7 +117,7 @@ class RangeSensor:
         self._stuck = True
 
     def _look_for_fog(self) -> None:
-        """Refuse a ground that comes near at once: fog, rain or dirt before the sensor."""
+        """Reject a sudden decrease of the range: fog, rain or dirt on the sensor."""
         fog = self.fog_m
         if fog <= 0.0:
             return
@@ -131,20 +131,20 @@ class RangeSensor:
 
 
 class RangeConsistency:
-    """Whether ranges change as the vehicle climbs and sinks."""
+    """Consistency check of ranges against vertical speed."""
 
     _TAU_S = 2.0
     _FAST_M_S = 0.5
-    """Consistent again only where the vehicle climbs or sinks faster than this."""
+    """Minimum vertical speed to become consistent again."""
     _PROBATION_US = US_PER_S
 
     def __init__(self) -> None:
-        """Begin: it is."""
+        """Start as consistent."""
         self.is_consistent = True
         self.ratio = 0.0
         """Newest test ratio: 1 = at the gate."""
         self.mean_ratio = 0.0
-        """Its mean, with the sign of the innovation."""
+        """Mean test ratio with the sign of the innovation."""
         self._before_us = 0
         self._before_m = 0.0
         self._inconsistent_us = 0
@@ -161,16 +161,16 @@ class RangeConsistency:
         *,
         sideways: bool,
     ) -> None:
-        """Take a range in flight.
+        """Check a range in flight.
 
         Args:
-            dist_bottom_m: How far the ground is below.
-            variance: Of that [m²].
-            down_m_s: The estimated velocity downward.
-            down_variance: Of that [m²/s²].
+            dist_bottom_m: Height above ground.
+            variance: Variance of the height [m²].
+            down_m_s: Estimated downward velocity.
+            down_variance: Variance of the velocity [m²/s²].
             gate: EKF2_RNG_K_GATE.
-            now_us: Now.
-            sideways: Whether the vehicle moves over the ground, which need not be flat.
+            now_us: Current time [µs].
+            sideways: True if the vehicle moves horizontally over possibly uneven ground.
         """
         if sideways:
             self._moved_us = now_us
@@ -180,13 +180,13 @@ class RangeConsistency:
         if not (known and 0.001 <= dt <= 0.5):
             return
         innovation = -(dist_bottom_m - before) / dt - down_m_s
-        # Of a difference of two ranges, divided by the time between them.
+        # Variance of the difference of two ranges, divided by the time between them.
         spread = 2.0 * variance / dt**2 + down_variance
         self.ratio = innovation**2 / spread / gate**2
         share = dt / (dt + self._TAU_S)
         self.mean_ratio += share * (math.copysign(self.ratio, innovation) - self.mean_ratio)
         if abs(self.mean_ratio) >= 1.0:
-            # PX4 compares microseconds with 2 here: moving now alone counts.
+            # PX4 compares microseconds with 2 here: only current motion counts.
             if now_us - self._moved_us > self._TAU_S:
                 self.is_consistent, self._inconsistent_us = False, now_us
         elif (

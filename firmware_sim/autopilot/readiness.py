@@ -1,4 +1,4 @@
-"""Input of the pre-arm checks: sensors, estimator, battery and parameters, as plain facts."""
+"""Input of the pre-arm checks: sensors, estimator, battery and parameters as plain data."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.failsafes.conditions import Conditions
 
 SUPPLY_CHECK_OFF = 894281
-"""CBRK_SUPPLY_CHK at this value switches the checks of the battery off."""
+"""Value of CBRK_SUPPLY_CHK that disables the battery checks."""
 
 
 class Part(IntFlag):
-    """Parts of the vehicle that a check is about."""
+    """Vehicle components of the checks."""
 
     GYRO = auto()
     ACCEL = auto()
@@ -30,7 +30,7 @@ class Part(IntFlag):
 
 
 class ArmingSettings(NamedTuple):
-    """Each field is the parameter of that name in capitals; the numbers are PX4's defaults."""
+    """Arming parameters: the field name in capitals; defaults are PX4's."""
 
     com_arm_bat_min: float = -1.0
     com_arm_mag_str: int = 2
@@ -47,7 +47,7 @@ class ArmingSettings(NamedTuple):
 
     @classmethod
     def read(cls, value: Callable[[str], float]) -> ArmingSettings:
-        """Read them by a lookup of PX4 parameter names."""
+        """Read the parameters with a look-up by PX4 name."""
         defaults = cls._field_defaults.values()
         return cls(
             *(
@@ -58,29 +58,29 @@ class ArmingSettings(NamedTuple):
 
 
 class Readiness(NamedTuple):
-    """Input of the checks. No measured number: it is the same until something has changed."""
+    """Input of the checks, without measured values, so that equal inputs can be cached."""
 
     mode: Mode
     conditions: Conditions
     settings: ArmingSettings
     converged: bool = True
-    """The estimator knows well enough where the vehicle is and how it points."""
+    """True if the estimator has converged."""
     compass_agrees: bool = True
-    """The estimator has not given up the compass."""
+    """True if the estimator has not disabled the compass."""
     field_disturbed: bool = False
-    """The compass measures something else than the earth's field."""
+    """True if the compass measures a field other than the earth's."""
     gyro: bool = True
-    """Whether its data are valid, as of all sensors here."""
+    """True if the sensor's data are valid; the same applies to the sensors below."""
     accel: bool = True
     mag: bool = True
     baro: bool = True
     gps: bool = True
     distance: bool | None = None
-    """Of the distance sensor; None: there is none."""
+    """Validity of the distance sensor; None: there is no sensor."""
     rolled: bool = False
-    """Roll is beyond FD_FAIL_R."""
+    """True if roll exceeds FD_FAIL_R."""
     pitched: bool = False
     charge_short: bool = False
-    """The battery's charge is below COM_ARM_BAT_MIN."""
+    """True if the battery's charge is below COM_ARM_BAT_MIN."""
     terminated: bool = False
     armed: bool = False

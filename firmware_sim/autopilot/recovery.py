@@ -1,7 +1,7 @@
-"""What the estimator does about inertial sensors and a heading that have gone wrong.
+"""Recovery of the estimator from inertial sensor and heading faults.
 
-`consistency` tells them from noise, `emergency_yaw` which of them it is; here the filter is told to
-learn anew, or is turned to the yaw estimator's heading.
+`consistency` distinguishes faults from noise, and `emergency_yaw` identifies a heading fault. This
+module restarts the filter's variances, or resets the heading to the yaw estimator's.
 """
 
 from __future__ import annotations
@@ -20,82 +20,82 @@ from firmware_sim.autopilot.error_filter import ErrorFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 
 PROBATION_US = 10 * US_PER_S
-"""Inertial sensors that were wrong are doubted for so long (EKF2: BADACC_PROBATION) [µs]."""
+"""Time for which a faulty inertial sensor is doubted (EKF2: BADACC_PROBATION) [µs]."""
 
 
 class Moment(NamedTuple):
-    """Moment of a decision."""
+    """Time and flight state of a decision."""
 
     time_us: int
     flying: bool
-    """Whether the vehicle is in the air."""
+    """True if the vehicle is in the air."""
     gps_us: int | None
-    """When GPS was last within the gate; None = never."""
+    """Time of the last GPS fusion within the gate [µs]; None = never."""
 
 
 class Recovery:
-    """Watches velocities and headings, and restarts the filter with what they say is wrong."""
+    """Monitor of velocities and headings that restarts the filter after faults."""
 
     def __init__(
         self, state: Vector, error_filter: ErrorFilter, yaw: YawEstimator, record: Any = None
     ) -> None:
-        """Take the nominal state and its filter, which are changed, and the yaw estimator.
+        """Store the nominal state, its filter (both updated), and the yaw estimator.
 
-        `record` is that of the flight controller; None = a new one.
+        `record` is the flight controller's record; None = a new one.
         """
         self._state, self._filter, self._yaw = state, error_filter, yaw
         self.consistency = Consistency(record)
-        """Sees inertial sensors that have gone wrong."""
+        """Detector of inertial sensor faults."""
         self.compass = Compass()
-        """Whether the compass is believed."""
+        """Compass monitor."""
         self.emergency = EmergencyYaw()
-        """When the yaw estimator's heading is taken over."""
+        """Emergency yaw reset."""
         self._biases_before = state[es.GYRO_BIAS : es.BARO_OFFSET].copy()
-        """Of gyro and accelerometer (6,), before these were doubted."""
+        """Biases of gyro and accelerometer (6,) before the fault."""
 
     def use(self, error_filter: ErrorFilter) -> None:
-        """Go on with another filter, which carries the same errors."""
+        """Continue with another filter that carries the same errors."""
         self._filter = error_filter
 
     def doubts_inertial(self, now_us: int) -> bool:
-        """Return whether inertial data disagreed with what measures velocity lately."""
+        """Return whether inertial data recently disagreed with measured velocity."""
         restarted = self.consistency.restarted_us
         return restarted is not None and now_us - restarted < PROBATION_US
 
     def take_velocity(self, innovation: Vector, variance: float | Vector, now: Moment) -> None:
-        """Take a velocity that was measured with some variance: its innovation (3,) NED."""
+        """Check the innovation (3,) NED of a velocity with a variance."""
         sigma = np.sqrt(self._filter.covariance.diagonal()[es.VEL : es.ATT] + variance)
         acceleration = self._state[es.ACCELERATION : es.SIGMA]
         self._answer(self.consistency.velocity(innovation, sigma, acceleration, now.time_us), now)
 
     def take_heading(self, innovation: float, ratio: float, now: Moment) -> None:
-        """Take the innovation of a heading and its test ratio: beyond 1 it was refused."""
+        """Check the innovation of a heading and its test ratio: above 1 it was rejected."""
         self.compass.tested(innovation, ratio, now.time_us)
         deviations = math.copysign(es.GATE * ratio, innovation)
         self._answer(self.consistency.heading(deviations, now.time_us, within=ratio <= 1.0), now)
 
     def heading_is_wrong(self, now: Moment) -> bool:
-        """Return whether the heading is given up now."""
+        """Return whether the heading must be reset now."""
         return self._is_due(now) and self._is_suspected(now)
 
     def turn(
         self, place: Vector, velocity: Vector, then: Vector, r_p: float, r_v: float, now: Moment
     ) -> None:
-        """Take over the yaw estimator's heading and the GPS's motion, and give up the compass.
+        """Reset heading to the yaw estimator and motion to GPS, and disable the compass.
 
-        What a restart has let the filter learn meanwhile, in tilt and biases, goes with it.
+        Tilt and biases learned since a restart are discarded.
 
         Args:
             place: Measured position (3,) NED [m].
-            velocity: Measured (3,) NED [m/s].
-            then: Position and velocity (6,) by the filter when they were measured.
-            r_p: Variance of the place [m²].
+            velocity: Measured velocity (3,) NED [m/s].
+            then: Filter's position and velocity (6,) at the time of the measurement.
+            r_p: Variance of the position [m²].
             r_v: Variance of the velocity [m²/s²].
-            now: When.
+            now: Time and flight state.
         """
         state = self._state
         if self.doubts_inertial(now.time_us):
-            # The inertial sensors were doubted for what the heading did.
+            # The heading error had been attributed to the inertial sensors.
             state[es.GYRO_BIAS : es.BARO_OFFSET] = self._biases_before
             state[es.Q : es.RATES] = self._yaw.attitude
         covariance = turn_to(state, self._filter.covariance, self._yaw.yaw, self._yaw.variance)
@@ -116,7 +116,7 @@ class Recovery:
         return now.flying and self.emergency.is_suspected(self._state, self._yaw)
 
     def _answer(self, restart: Restart | None, now: Moment) -> None:
-        """Restart the filter, unless the heading is given up for the same reason."""
+        """Restart the filter, unless the heading is reset for the same reason."""
         if restart is None:
             return
         if self._is_suspected(now):
@@ -126,7 +126,7 @@ class Recovery:
         self._restart(restart, now.time_us)
 
     def _restart(self, restart: Restart, time_us: int) -> None:
-        """Let the filter learn anew what inertial sensors make wrong."""
+        """Increase the filter's variances for the effects of faulty inertial sensors."""
         if not self.doubts_inertial(time_us):
             self._biases_before = self._state[es.GYRO_BIAS : es.BARO_OFFSET].copy()
         self.consistency.restarted(time_us)

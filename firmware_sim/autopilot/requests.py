@@ -1,4 +1,4 @@
-"""What modes are asked for beyond their names: places, speeds, circles."""
+"""Arguments of mode requests: places, speeds, circles."""
 
 from __future__ import annotations
 
@@ -12,82 +12,82 @@ NAN = math.nan
 
 
 class Place(NamedTuple):
-    """A place and the heading that is kept there."""
+    """Position with a heading."""
 
     position: Vec
-    """Local NED [m]."""
+    """Position, local NED [m]."""
     yaw: float
-    """Heading [rad]; where a request allows it, NaN = towards the place."""
+    """Heading [rad]; in some requests NaN = towards the place."""
 
 
 class Request:
-    """What a mode is entered with, beyond its name: the base of such data, one class a kind."""
+    """Base class for the arguments of a mode request, one subclass per type."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClimbOn(Request):
-    """Hold: climb the rest of a take-off that has ended near its altitude."""
+    """Hold: finish the climb of a take-off that has ended near its altitude."""
 
     place: Place
 
 
 @dataclass(frozen=True, slots=True)
 class Reposition(Request):
-    """Hold: go to a place first (MAV_CMD_DO_REPOSITION). NaN on an axis = stay there."""
+    """Hold: fly to a place first (MAV_CMD_DO_REPOSITION). NaN on an axis = unchanged."""
 
     place: Place
     speed_m_s: float = NAN
-    """NaN = as fast as before."""
+    """Speed [m/s]; NaN = unchanged."""
     altitude_alone: bool = False
-    """Whether that is all that was asked for (MAV_CMD_DO_CHANGE_ALTITUDE)."""
+    """True if only the altitude was requested (MAV_CMD_DO_CHANGE_ALTITUDE)."""
 
 
 @dataclass(frozen=True, slots=True)
 class OrbitRequest(Request):
-    """Orbit: the circle (MAV_CMD_DO_ORBIT). NaN = as it is."""
+    """Orbit: circle parameters (MAV_CMD_DO_ORBIT). NaN = unchanged."""
 
     centre: Vec = (NAN, NAN, NAN)
-    """Local NED [m]."""
+    """Centre, local NED [m]."""
     radius_m: float = NAN
-    """Positive clockwise, negative counter-clockwise."""
+    """Radius, positive clockwise, negative counter-clockwise."""
     speed_m_s: float = NAN
     facing: int | None = None
-    """ORBIT_YAW_BEHAVIOUR; None = as it is."""
+    """ORBIT_YAW_BEHAVIOUR; None = unchanged."""
 
 
 class LandingTarget(NamedTuple):
     """Target of a precision landing."""
 
     position: Vec
-    """Local NED [m]."""
+    """Position, local NED [m]."""
     time_us: int
-    """When it was heard, in simulated time."""
+    """Time of arrival, in simulated time."""
 
 
 class Obstacles(NamedTuple):
-    """How far the nearest obstacle is in bins around the vehicle, as OBSTACLE_DISTANCE has it."""
+    """Distances to the nearest obstacle in bins around the vehicle, as in OBSTACLE_DISTANCE."""
 
     distances_cm: tuple[int, ...]
-    """Clockwise; beyond the range: none there; 65535: not known."""
+    """Distances clockwise; beyond the range: no obstacle; 65535: unknown."""
     increment_deg: float
     """Width of a bin."""
     offset_deg: float
-    """Direction of the middle of the first."""
+    """Direction of the centre of the first bin."""
     nearest_cm: int
-    """Range of the sensor."""
+    """Minimum range of the sensor; the maximum follows."""
     farthest_cm: int
     in_world: bool
-    """Whether directions are counted from north, not from straight ahead."""
+    """True if directions are relative to north instead of straight ahead."""
     time_us: int
-    """When it was heard, in simulated time."""
+    """Time of arrival, in simulated time."""
 
 
 class FollowedTarget(NamedTuple):
     """Target of Follow."""
 
     position: Vec
-    """Local NED [m]."""
+    """Position, local NED [m]."""
     velocity: Vec
-    """NED [m/s]."""
+    """Velocity NED [m/s]."""
     time_us: int
-    """When it was heard, in simulated time."""
+    """Time of arrival, in simulated time."""

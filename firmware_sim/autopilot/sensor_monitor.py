@@ -1,10 +1,10 @@
-"""Which sensors can be believed: silent ones, and those that repeat themselves.
+"""Sensor validity: detects silent and frozen sensors.
 
-Source: PX4 1.16, DataValidator and the preflight checks of each sensor. PX4 goes on with a sensor
-that repeats itself; here the estimator is spared it, as a real sensor's noise never repeats.
+Source: PX4 1.16, DataValidator and the preflight checks of each sensor. PX4 continues with a frozen
+sensor. Here the estimator ignores the sensor, as a real sensor's noise never repeats.
 
-In flight no sensor repeats itself, not even a perfect one. At rest a perfect one does: whether a
-sensor has noise is learnt at rest, from its first second.
+In flight no sensor repeats its values, not even a noise-free one. At rest a noise-free one does.
+The monitor learns from the first second at rest whether a sensor has noise.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ from firmware_sim.engine.record import PRESSURE as PRESSURE_BIT
 from firmware_sim.interfaces import SensorSample
 
 NO_DATA_US = US_PER_S
-"""A sensor that has been silent for so long has no valid data [µs]."""
+"""Timeout after which a silent sensor has no valid data [µs]."""
 
 LEARN_US = US_PER_S
-"""A sensor that never repeated itself for so long, at rest, has noise [µs]."""
+"""Time at rest without repetition after which a sensor counts as noisy [µs]."""
 
 
 CALM_US = 300_000
-"""No kind of sensor fails before its newest sample is as old as this [µs]."""
+"""Age of the newest sample below which no sensor type can fail [µs]."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorKind:
-    """One sensor, and when it is given up."""
+    """Sensor type with its failure criteria."""
 
     name: str
-    """As PX4's texts have it."""
+    """Name in PX4's texts."""
     title: str
-    """As the pre-flight checks have it."""
+    """Name in the pre-flight checks."""
     read: Callable[[SensorSample], Any]
-    """What must differ from sample to sample; None where the sample has nothing of it."""
+    """Value that must differ from sample to sample; None if the sample lacks this sensor."""
     timeout_us: int
-    """Silence after which it has failed."""
+    """Silence after which the sensor has failed."""
     stale_us: int
-    """Time of repeating itself in flight after which it has failed."""
+    """Time of repeated values in flight after which the sensor has failed."""
     event: Callable[[int], Event] | None = None
-    """Makes an event of a reason (`SensorFailure`); None = PX4 has none."""
+    """Returns the event for a reason (`SensorFailure`); None = no event in PX4."""
 
 
 def _mag(sample: SensorSample) -> Any:
@@ -95,23 +95,23 @@ GPS = SensorKind("GPS", "GPS 0", _gps, 1_000_000, 1_000_000)
 
 
 class SensorWatch:
-    """One sensor under watch; looked at whenever it may have measured."""
+    """Monitor of one sensor, updated with each of its samples."""
 
     def __init__(self, kind: SensorKind, times: NDArray[np.int64]) -> None:
-        """Begin without a sample; `times` (3,) is its row of `watch` (`engine.record`)."""
+        """Start without samples; `times` (3,) is the sensor's row of `watch` (`engine.record`)."""
         self.kind = kind
         self.value: Any = None
-        """The newest sample's."""
+        """Value of the newest sample."""
         self._times = times
         self.noisy: bool | None = None
-        """Whether its samples differ at rest, too; None = not known yet."""
+        """True if samples differ even at rest; None = not known yet."""
         self.repeats = False
-        """Whether its newest sample is exactly the one before."""
+        """True if the newest sample equals the one before."""
         self.failed = ""
-        """Why it has failed: TIMEOUT or STALE; empty = it has not."""
+        """Failure reason: TIMEOUT or STALE; empty = healthy."""
 
     def take(self, sample: SensorSample) -> None:
-        """Take a sample in which it has measured."""
+        """Process a sample that contains this sensor."""
         value, now_us = self.kind.read(sample), sample.time_us
         self.repeats = value == self.value
         times = self._times
@@ -124,14 +124,14 @@ class SensorWatch:
             times[FIRST] = now_us
 
     def repeat(self, now_us: int) -> None:
-        """Note that its newest sample, which a compiled tick took, is that before."""
+        """Record that the newest sample, from a compiled tick, is a repetition."""
         self.repeats, self._times[SEEN] = True, now_us
         self.noisy = self.noisy or False
 
     def judge(self, now_us: int, times_us: Sequence[int], *, flying: bool) -> Message | None:
-        """Return a text when it fails now; `times_us` is its row of `watch`.
+        """Return a text if the sensor fails now; `times_us` is its row of `watch`.
 
-        Standing still, a perfect sensor may repeat itself.
+        At rest a noise-free sensor may repeat its values.
         """
         seen_us, changed_us, first_us = times_us
         if seen_us < 0:
@@ -153,7 +153,7 @@ class SensorWatch:
 
 
 class Valid(NamedTuple):
-    """Whether the data of each sensor are valid for flight."""
+    """Validity of each sensor's data for flight."""
 
     gyro: bool
     accel: bool
@@ -163,25 +163,25 @@ class Valid(NamedTuple):
 
 
 class SensorMonitor:
-    """Watches all sensors of the vehicle."""
+    """Monitor of all sensors of the vehicle."""
 
     def __init__(self, watch: NDArray[np.int64] | None = None) -> None:
-        """Begin without a sample, in `watch` (`engine.record`); None = a new one."""
+        """Start without samples, in `watch` (`engine.record`); None = a new array."""
         self._times = times = np.full((WATCHES, 3), -1) if watch is None else watch
         self.gyro, self.accel, self.mag, self.baro, self.gps = self.all = tuple(
             SensorWatch(kind, row)
             for kind, row in zip((GYRO, ACCEL, MAG, BARO, GPS), times, strict=True)
         )
         self.distrusted = False
-        """Whether `trusted` leaves something out of the newest sample."""
+        """True if `trusted` removes data from the newest sample."""
         self._flying = False
 
     def looked_at(self, accel: NDArray[np.float64], gyro: NDArray[np.float64]) -> None:
-        """Take what the inertial sensors measured at the newest look."""
+        """Store the inertial measurements of the newest check."""
         self.accel.value, self.gyro.value = tuple(accel.tolist()), tuple(gyro.tolist())
 
     def take(self, sample: SensorSample) -> None:
-        """Take a tick's sample: which of the slower sensors have measured."""
+        """Process the slow sensors in a tick's sample."""
         self.distrusted = False
         if sample.mag is not None:
             self._take(self.mag, sample)
@@ -191,12 +191,12 @@ class SensorMonitor:
             self._take(self.gps, sample)
 
     def repeated(self, time_us: int, measured: int, repeated: int) -> None:
-        """Note which sensors measured in a compiled tick, and which of them repeat themselves.
+        """Process the slow sensors of a compiled tick, including repeated values.
 
         Args:
-            time_us: Of the tick [µs].
-            measured: Bits as `engine.record` has them.
-            repeated: The same.
+            time_us: Time of the tick [µs].
+            measured: Bits of the sensors with data, as in `engine.record`.
+            repeated: Bits of the sensors with repeated data.
         """
         self.distrusted = False
         for bit, watch in ((MAG_BIT, self.mag), (PRESSURE_BIT, self.baro), (GPS_BIT, self.gps)):
@@ -213,30 +213,30 @@ class SensorMonitor:
             self.distrusted = True
 
     def _doubtful(self, watch: SensorWatch) -> bool:
-        """Return whether its newest sample must not be fused: not even the first repetition."""
+        """Return whether the newest sample must not be fused, from the first repetition."""
         return watch.failed == "STALE" or (watch.repeats and self._flying)
 
     def judge(self, sample: SensorSample, *, flying: bool) -> list[Message]:
-        """Look at the inertial sensors too, and return what has failed since the last call."""
+        """Check all sensors, including inertial ones; return new failures."""
         now_us, self._flying = sample.time_us, flying
         self.gyro.take(sample)
         self.accel.take(sample)
         texts: list[Message] = []
         for watch, times_us in zip(self.all, self._times.tolist(), strict=True):
             if watch.noisy and not watch.failed and now_us - times_us[CHANGED] < CALM_US:
-                continue  # Most of the time: it has measured something new.
+                continue  # usual case: new data
             text = watch.judge(now_us, times_us, flying=flying)
             if text is not None:
                 texts.append(text)
         return texts
 
     def are_calm(self, now_us: int) -> bool:
-        """Return whether each of them has lately measured something new."""
+        """Return whether every sensor has recently delivered new data."""
         times = zip(self.all, self._times[:, CHANGED].tolist(), strict=True)
         return all(w.noisy and not w.failed and now_us - us < CALM_US for w, us in times)
 
     def valid(self, now_us: int) -> Valid:
-        """Return which sensors have measured lately, and not only repeated themselves."""
+        """Return the sensors with recent data; frozen sensors do not count."""
         data = []
         for watch, (seen_us, changed_us, _) in zip(self.all, self._times.tolist(), strict=True):
             newest_us = changed_us if watch.failed == "STALE" else seen_us
@@ -244,7 +244,7 @@ class SensorMonitor:
         return Valid._make(data)
 
     def trusted(self, sample: SensorSample) -> SensorSample:
-        """Return a sample without what must not be fused."""
+        """Return a sample without data that must not be fused."""
         return sample._replace(
             mag=None if self._doubtful(self.mag) else sample.mag,
             pressure_hpa=None if self._doubtful(self.baro) else sample.pressure_hpa,

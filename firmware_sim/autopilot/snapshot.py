@@ -1,6 +1,6 @@
-"""What clients, the recorder and tests get of the built-in autopilot."""
+"""State of the built-in autopilot for clients, the recorder and tests."""
 
-# ruff: noqa: D102 (what the properties are says `AutopilotState`)
+# ruff: noqa: D102 (properties are documented in `AutopilotState`)
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from firmware_sim.interfaces import SensorSample
 
 
 def setpoint_of(tick: Any, velocity: Vector) -> Setpoint:
-    """Return what the controller tracks in a tick.
+    """Return the controller's setpoint in a tick.
 
     Args:
-        tick: Record of the flight controller or of its log (`engine.record`), an element.
+        tick: Element of the record of the flight controller or of its log (`engine.record`).
         velocity: Setpoint of the velocity loop (3,) NED [m/s].
     """
     kind, demand = tick["demand_kind"], tick["demand"].copy()
@@ -48,7 +48,7 @@ def setpoint_of(tick: Any, velocity: Vector) -> Setpoint:
 
 
 class Parts(NamedTuple):
-    """What of the autopilot the snapshot is taken of."""
+    """Components of the autopilot that the snapshot reads."""
 
     estimator: Estimator
     commander: FlightCommander
@@ -60,11 +60,11 @@ class Parts(NamedTuple):
     home: Home
     plans: Plans
     value: Callable[[str], float]
-    """Looks up a parameter by its name."""
+    """Look-up for parameters by name."""
 
 
 class Snapshot:
-    """Implements `AutopilotState` by asking the parts, each when somebody asks for it."""
+    """Implementation of `AutopilotState` that reads components on access."""
 
     load = 0.0
 
@@ -73,13 +73,13 @@ class Snapshot:
     def __init__(
         self, parts: Parts, time_us: int, demand: AnyDemand | None, revision: object
     ) -> None:
-        """Take it after a tick.
+        """Take a snapshot after a tick.
 
         Args:
-            parts: Of the autopilot.
-            time_us: Of the tick [µs].
-            demand: What is flown; None = the motors are stopped.
-            revision: As `AutopilotState`.
+            parts: Components of the autopilot.
+            time_us: Time of the tick [µs].
+            demand: Active demand; None = the motors are stopped.
+            revision: See `AutopilotState`.
         """
         self._parts, self.time_us, self._demand = parts, time_us, demand
         self.revision = revision

@@ -1,12 +1,11 @@
-"""A filter that knows the height of the ground, too: one more state around any other filter.
+"""Terrain filter: adds the terrain height as a state to any error filter.
 
-PX4's EKF has the terrain among its states. Here it is added when the first range comes, so that
-nothing is spent on it before. The filter of the 16 errors is another one's (`ErrorFilter`); this
-carries the ground's height, its variance and its covariance with the 16 errors. Nothing but a range
-measures the ground, so that the 16 errors are corrected by all else as if there were no such state.
-The whole equals one filter of 17 states (Simon, Optimal State Estimation, ch. 5 and 7).
-Source of the process noise and of how a range is fused: PX4 1.16, EKF/covariance.cpp,
-terrain_control.cpp and range_height_fusion.cpp.
+PX4's EKF always has a terrain state. Here it is added with the first range, at no cost before. An
+inner filter (`ErrorFilter`) carries the 16 errors; this class carries the terrain height, its
+variance and its covariance with the 16 errors. Only ranges measure the ground, so all other
+measurements correct the 16 errors as without it. The result equals one filter of 17 states (Simon,
+Optimal State Estimation, ch. 5 and 7). Source of the process noise and of the range fusion: PX4
+1.16, EKF/covariance.cpp, terrain_control.cpp and range_height_fusion.cpp.
 """
 
 from __future__ import annotations
@@ -20,45 +19,45 @@ from firmware_sim.autopilot.error_filter import ErrorFilter
 from firmware_sim.autopilot.fusion_horizon import FusionHorizon
 
 STEP_S = 0.01
-"""PX4's filter runs at 100 Hz: its noises of the ground are per such a step [s]."""
+"""Time step of PX4's filter, 100 Hz [s]; its terrain noises are per step."""
 
 SIMULATED_MS = 5.0
-"""EKF2_RNG_DELAY by default: what a range takes on its way through PX4's simulators. Here it takes
-nothing, so that only what is assumed beyond it counts [ms]."""
+"""EKF2_RNG_DELAY by default: latency of a range in PX4's simulators. Here a range has no latency,
+so only the assumed delay beyond this value counts [ms]."""
 
 GROUND = es.N_STATES
-"""Index of the ground among 17 states."""
+"""Index of the terrain among the 17 states."""
 
 _OF_RANGE = np.zeros(es.N_STATES + 1)
 _OF_RANGE[es.POS + 2], _OF_RANGE[GROUND] = -1.0, 1.0
 _OF_RANGE.setflags(write=False)
-"""How the height above ground depends on the errors: the ground's z less the vehicle's."""
+"""Jacobian of the height above ground by the errors: terrain z minus vehicle z."""
 
 
 class TerrainFilter:
-    """Implements `error_filter.ErrorFilter`, and estimates where the ground is."""
+    """Implementation of `error_filter.ErrorFilter` with a terrain estimate."""
 
     def __init__(self, inner: ErrorFilter) -> None:
-        """Begin with the ground at z = 0; see `put`."""
+        """Start with the terrain at z = 0; see `put`."""
         self._inner = inner
         self._transition = np.eye(es.N_STATES)
         self.down = 0.0
-        """Where the ground is, local NED [m]."""
+        """Terrain height, local NED [m]."""
         self.variance = 0.0
-        """Of that [m²]."""
+        """Variance of the terrain height [m²]."""
         self.cross = np.zeros(es.N_STATES)
-        """Covariance (16,) of that with the errors."""
+        """Covariance (16,) of the terrain height with the errors."""
         self.horizon = FusionHorizon(SIMULATED_MS)
-        """Where the vehicle was when a range that comes now was measured (EKF2_RNG_DELAY)."""
+        """Vehicle motion since the measurement time of current ranges (EKF2_RNG_DELAY)."""
         self.walk_m_s, self.slope = 0.0, 0.0
-        """EKF2_TERR_NOISE and EKF2_TERR_GRAD; both 0 while the ground is the height's reference."""
+        """EKF2_TERR_NOISE and EKF2_TERR_GRAD; both 0 while the ground is the height reference."""
 
     covariance = property(lambda self: self._inner.covariance)
-    """Of the 16 errors, (16, 16)."""
+    """Covariance of the 16 errors, (16, 16)."""
 
     def predict(self, state: Vector, gyro: Vector, accel: Vector) -> None:
-        """Move the nominal state and all covariances by one tick."""
-        # What the errors become is found on a copy: no filter needs to tell its matrices.
+        """Advance the nominal state and all covariances by one tick."""
+        # A copy yields the transition matrix, so filters need not expose theirs.
         es.propagate(state.copy(), gyro, accel, self._transition, TICK_S)
         horizon = self.horizon
         before = state[es.P : es.Q].copy() if horizon.is_past else None
@@ -72,7 +71,7 @@ class TerrainFilter:
             self.variance += rate * STEP_S * TICK_S
 
     def restart(self, covariance: Vector) -> None:
-        """Continue with another covariance. Uncorrelated states lose that with the ground."""
+        """Continue with another covariance; uncorrelated states lose the terrain correlation."""
         self._inner.restart(covariance)
         alone = np.count_nonzero(covariance, axis=1) <= 1
         self.cross[alone] = 0.0
@@ -81,10 +80,10 @@ class TerrainFilter:
             self.cross[:] = 0.0
 
     def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
-        """Correct the state by a measurement that is none of the ground, unless it fails."""
+        """Correct the state by a measurement without terrain, unless it fails the gate."""
         p = self._inner.covariance
         if len(h) == 1:
-            # Most are: the same without what arrays cost.
+            # Most measurements are scalar: the same without array overhead.
             row = h[0]
             before = p @ row
             total = float(row @ before) + variance.item(0)
@@ -113,7 +112,7 @@ class TerrainFilter:
     # --- the ground
 
     def put(self, down: float, variance: float) -> None:
-        """Say where the ground is; nothing else tells of it."""
+        """Reset the terrain height and its covariance."""
         self.down, self.variance = down, variance
         self.cross[:] = 0.0
 
@@ -126,14 +125,14 @@ class TerrainFilter:
     def fuse_range(
         self, state: Vector, innovation: float, variance: float, *, height: bool, ground: bool
     ) -> None:
-        """Correct by a height above ground.
+        """Correct by a measured height above ground.
 
         Args:
             state: Nominal state, updated.
-            innovation: Measured less expected [m].
-            variance: Of the measurement [m²].
-            height: Whether it says how high the vehicle is.
-            ground: Whether it says where the ground is.
+            innovation: Measured minus expected [m].
+            variance: Variance of the measurement [m²].
+            height: True to correct the vehicle.
+            ground: True to correct the terrain.
         """
         self.fuse_with_ground(state, innovation, _OF_RANGE, variance, vehicle=height, ground=ground)
 
@@ -147,15 +146,15 @@ class TerrainFilter:
         vehicle: bool,
         ground: bool,
     ) -> None:
-        """Correct by a measurement that the ground has a part in; there is no gate.
+        """Correct by a measurement that depends on the terrain, without a gate.
 
         Args:
             state: Nominal state, updated.
-            innovation: Measured less expected.
-            row: How it changes by the 16 errors and the ground (17,).
-            variance: Of the measurement.
-            vehicle: Whether it tells of the vehicle.
-            ground: Whether it says where the ground is.
+            innovation: Measured minus expected.
+            row: Jacobian by the 16 errors and the terrain (17,).
+            variance: Variance of the measurement.
+            vehicle: True to correct the vehicle.
+            ground: True to correct the terrain.
         """
         p = self._joint()
         spread = p @ row
@@ -164,7 +163,7 @@ class TerrainFilter:
             gain[GROUND] = 0.0
         if not vehicle:
             gain[:GROUND] = 0.0
-        # Joseph's form: right for any gain.
+        # Joseph form: valid for any gain.
         p -= np.outer(gain, spread)
         p += np.outer(gain * variance - p @ row, gain)
         p = 0.5 * (p + p.T)
@@ -175,11 +174,11 @@ class TerrainFilter:
             es.inject(state, gain[:GROUND] * innovation)
 
     def spread(self, row: Vector) -> float:
-        """Return the variance that errors and ground give a measurement, by its Jacobian (17,)."""
+        """Return the variance of an expected measurement by its Jacobian (17,)."""
         return float(row @ self._joint() @ row)
 
     def _joint(self) -> Vector:
-        """Return the covariance of the errors and the ground (17, 17)."""
+        """Return the covariance of the errors and the terrain (17, 17)."""
         p = np.empty((es.N_STATES + 1, es.N_STATES + 1))
         p[:GROUND, :GROUND] = self._inner.covariance
         p[:GROUND, GROUND] = p[GROUND, :GROUND] = self.cross
@@ -187,7 +186,7 @@ class TerrainFilter:
         return p
 
     def put_by_range(self, innovation: float, variance: float) -> None:
-        """Put the ground where a height above ground says, as uncertain as the vehicle's height."""
+        """Reset the terrain to a height above ground, as uncertain as the vehicle's height."""
         p, z = self._inner.covariance, es.POS + 2
         self.down += innovation
         self.variance, self.cross = float(p[z, z]) + variance, p[:, z].copy()
@@ -196,7 +195,7 @@ class TerrainFilter:
 def _solved(matrix: Vector, right: Vector) -> Vector | None:
     """Return x of matrix x = right; None: the matrix is singular.
 
-    Variances that a client has stated may lie further apart than numbers are exact.
+    Variances stated by clients may differ by more than the floating-point precision.
     """
     try:
         return np.asarray(np.linalg.solve(matrix, right), np.float64)

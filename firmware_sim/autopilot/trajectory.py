@@ -1,4 +1,4 @@
-"""Smooth trajectories: jerk-limited velocity on each axis, and ways through waypoints.
+"""Smooth trajectories: jerk-limited velocity per axis, and paths through waypoints.
 
 Source: PX4 1.16, `VelocitySmoothing`, `PositionSmoothing`, `TrajectoryConstraints` and `TrajMath`
 (lib/motion_planning, lib/mathlib): the motion of Hold, Return, missions and repositioning.
@@ -16,17 +16,17 @@ _TINY = 1e-9
 
 TURNING_M_S = 0.2
 TURNING_COSINE = 0.98
-"""The vehicle turns if it moves faster than this, and further than this from its target's
-direction (PositionSmoothing::_isTurning)."""
+"""Minimum speed and maximum cosine of the angle to the target's direction in a turn
+(PositionSmoothing::_isTurning)."""
 
 LEAST_L1_M = 5.0
-"""Least distance at which a turning vehicle aims ahead on its leg [m]."""
+"""Minimum look-ahead distance of a turning vehicle on its leg [m]."""
 
 
 class Axis:
-    """The motion along one axis: acceleration changes with limited jerk.
+    """Jerk-limited motion along one axis.
 
-    `plan` chooses three phases (jerk, constant acceleration, opposite jerk) to a velocity;
+    `plan` computes three phases (jerk, constant acceleration, opposite jerk) to a velocity;
     `advance` moves along them.
     """
 
@@ -36,14 +36,14 @@ class Axis:
         self.acceleration = 0.0
         self._wanted = 0.0
         self._jerk = 0.0
-        """Of the first phase, signed."""
+        """Jerk of the first phase, signed."""
         self._limit = 0.0
-        """Greatest acceleration."""
+        """Maximum acceleration."""
         self._phases = (0.0, 0.0, 0.0)
-        """Durations [s]."""
+        """Durations of the phases [s]."""
 
     def restart(self, position: float, velocity: float) -> None:
-        """Go on from a position and a velocity, without acceleration and without a plan."""
+        """Continue from a position and velocity, without acceleration and plan."""
         self.position, self.velocity, self.acceleration = position, velocity, 0.0
         self._jerk, self._phases = 0.0, (0.0, 0.0, 0.0)
 
@@ -53,7 +53,7 @@ class Axis:
         return sum(self._phases)
 
     def plan(self, velocity: float, limit: float, jerk: float) -> None:
-        """Plan the fastest way to a velocity [m/s], within an acceleration and a jerk > 0."""
+        """Plan the fastest change to a velocity [m/s] within an acceleration and a jerk > 0."""
         a0 = self.acceleration
         coasting = self.velocity + 0.5 * a0 * abs(a0) / jerk
         sign = _sign(velocity - coasting) or _sign(a0)
@@ -65,7 +65,7 @@ class Axis:
         self._ramp_to(sign * math.sqrt(max(0.0, square)), None)
 
     def stretch(self, duration_s: float) -> None:
-        """Take this long to the planned velocity, if there is such a way without more jerk [s]."""
+        """Extend the plan to a duration [s], if possible without more jerk."""
         if self._jerk == 0.0:
             return
         a0, jerk = self.acceleration, self._jerk
@@ -76,7 +76,7 @@ class Axis:
         self._ramp_to(0.5 * (b - root), duration_s)
 
     def _ramp_to(self, peak: float, duration_s: float | None) -> None:
-        """Choose the phases by the acceleration of the second one."""
+        """Compute the phases from the acceleration of the second phase."""
         a0, jerk = self.acceleration, self._jerk
         peak = min(self._limit, max(-self._limit, peak))
         up = max(0.0, (peak - a0) / jerk)
@@ -92,7 +92,7 @@ class Axis:
         self._phases = (up, flat, down)
 
     def advance(self, seconds: float) -> None:
-        """Move on along the plan, and beyond its end with constant velocity."""
+        """Advance along the plan, and beyond its end at constant velocity."""
         left, rests = seconds, []
         for duration, jerk in zip(self._phases, (self._jerk, 0.0, -self._jerk), strict=True):
             step = min(left, duration)
@@ -113,7 +113,7 @@ class Axis:
 
 
 def synchronise(axes: Sequence[Axis]) -> None:
-    """Let all axes take as long as the slowest one, so that the way is straight."""
+    """Stretch all axes to the duration of the slowest, for a straight path."""
     longest = max(axis.duration_s for axis in axes)
     for axis in axes:
         if axis.duration_s < longest:
@@ -121,76 +121,76 @@ def synchronise(axes: Sequence[Axis]) -> None:
 
 
 class PathLimits(NamedTuple):
-    """Limits of a way, by PX4's parameters."""
+    """Limits of a path, from PX4's parameters."""
 
     cruise_m_s: float
     """Horizontal speed (MPC_XY_CRUISE, MAV_CMD_DO_CHANGE_SPEED)."""
     up_m_s: float
     down_m_s: float
     acceleration_m_s2: float
-    """Horizontal."""
+    """Horizontal acceleration."""
     up_m_s2: float
     down_m_s2: float
     jerk_m_s3: float
     acceptance_m: float
-    """A waypoint is rounded within this horizontal distance."""
+    """Horizontal distance within which a waypoint is rounded."""
     vertical_acceptance_m: float
     error_m: float
-    """The trajectory waits for a vehicle that is this far behind it (MPC_XY_ERR_MAX)."""
+    """Tracking error at which the trajectory waits for the vehicle (MPC_XY_ERR_MAX)."""
     turn_share: float
-    """Share of the acceleration that a turn at a waypoint takes (MPC_XY_TRAJ_P)."""
+    """Share of the acceleration used for a turn at a waypoint (MPC_XY_TRAJ_P)."""
 
 
 class Leg(NamedTuple):
-    """A way to a target. What lies before and behind it shapes the turns."""
+    """Path to a target. Previous and following waypoint shape the turns."""
 
     target: Vec
-    """NED [m]."""
+    """Target, NED [m]."""
     previous: Vec | None = None
-    """Where the leg began; None = anywhere."""
+    """Start of the leg; None = undefined."""
     following: Vec | None = None
-    """The waypoint after the target; None = the vehicle comes to rest at the target."""
+    """Waypoint after the target; None = the vehicle stops at the target."""
     vertical_m_s: float = math.nan
-    """NED: a vertical speed that is flown whatever the target's height; NaN = to that height."""
+    """Fixed vertical speed NED, which overrides the target's height; NaN = fly to that height."""
     velocity: Vec = (0.0, 0.0, 0.0)
-    """Of a target that moves, NED [m/s]."""
+    """Velocity of a moving target, NED [m/s]."""
 
 
 class Trajectory:
-    """A setpoint that moves smoothly to a target."""
+    """Setpoint that moves smoothly to a target."""
 
     def __init__(self) -> None:
         self.axes = (Axis(), Axis(), Axis())
-        """NED."""
+        """Axes in NED order."""
         self._turn_speed = 0.0
-        """The speed at which the present turn began."""
+        """Speed at the start of the current turn."""
         self._climbing = False
 
     def restart(self, position: Vec, velocity: Vec) -> None:
-        """Go on from a position and a velocity NED, without acceleration."""
+        """Continue from a position and velocity NED, without acceleration."""
         for axis, p, v in zip(self.axes, position, velocity, strict=True):
             axis.restart(p, v)
 
     @property
     def position(self) -> Vec:
-        """NED [m]."""
+        """Position NED [m]."""
         x, y, z = self.axes
         return x.position, y.position, z.position
 
     @property
     def velocity(self) -> Vec:
-        """NED [m/s]."""
+        """Velocity NED [m/s]."""
         x, y, z = self.axes
         return x.velocity, y.velocity, z.velocity
 
     @property
     def acceleration(self) -> Vec:
-        """NED [m/s²]."""
+        """Acceleration NED [m/s²]."""
         x, y, z = self.axes
         return x.acceleration, y.acceleration, z.acceleration
 
     def advance(self, vehicle: Vec, leg: Leg, limits: PathLimits, seconds: float) -> None:
-        """Move on for some time [s] while the vehicle is at a place NED [m]."""
+        """Advance by a time [s] with the vehicle at a position NED [m]."""
         wanted = self._wanted(leg, limits)
         share = self._waiting(vehicle, limits.error_m)
         for axis in self.axes:
@@ -198,7 +198,7 @@ class Trajectory:
         self.follow(wanted, limits)
 
     def follow(self, velocity: Vec, limits: PathLimits) -> None:
-        """Plan towards a velocity NED [m/s]."""
+        """Plan a change to a velocity NED [m/s]."""
         x, y, z = self.axes
         self._climbing = velocity[2] < 0.0
         vertical = limits.up_m_s2 if self._climbing else limits.down_m_s2
@@ -208,7 +208,7 @@ class Trajectory:
         synchronise(self.axes)
 
     def _wanted(self, leg: Leg, limits: PathLimits) -> Vec:
-        """Return the velocity NED that leads to the target."""
+        """Return the velocity NED towards the target."""
         here, target = self.position, leg.target
         turning = leg.previous is not None and self._is_turning(target, limits.acceptance_m)
         aim = target
@@ -240,7 +240,7 @@ class Trajectory:
         return (vx * north + vy * east) / (speed * distance) < TURNING_COSINE
 
     def _vertical_speed(self, leg: Leg, limits: PathLimits) -> float:
-        """Return the greatest vertical speed now [m/s]."""
+        """Return the maximum vertical speed now [m/s]."""
         here, target, after = self.position, leg.target, leg.following
         climbing = target[2] < here[2]
         most = limits.up_m_s if climbing else limits.down_m_s
@@ -255,7 +255,7 @@ class Trajectory:
         return min(most, braking_speed(distance, acceleration, limits.jerk_m_s3, arrival))
 
     def _waiting(self, vehicle: Vec, error_m: float) -> float:
-        """Return how fast time passes for the trajectory: slowly while the vehicle is behind."""
+        """Return the time scale of the trajectory, reduced while the vehicle lags behind."""
         (x, y, _), (vx, vy, _) = self.position, self.velocity
         north, east = x - vehicle[0], y - vehicle[1]
         if error_m <= 0.0 or north * vx + east * vy < 0.0:
@@ -266,10 +266,10 @@ class Trajectory:
 def braking_speed(
     distance_m: float, acceleration: float, jerk: float, final_m_s: float = 0.0
 ) -> float:
-    """Return the greatest speed [m/s] that can be braked to another one within a distance [m].
+    """Return the maximum initial speed [m/s] for braking to a final speed in a distance [m].
 
-    Source: PX4 1.16, computeMaxSpeedFromDistance: constant deceleration after the time
-    2 acceleration / jerk.
+    Source: PX4 1.16, computeMaxSpeedFromDistance: constant deceleration, which starts after the
+    time 2 acceleration / jerk.
     """
     b = 4.0 * acceleration * acceleration / jerk
     c = 2.0 * acceleration * distance_m + final_m_s * final_m_s
@@ -277,7 +277,7 @@ def braking_speed(
 
 
 def _horizontal_speed(here: Vec, leg: Leg, limits: PathLimits) -> float:
-    """Return the greatest horizontal speed now [m/s]."""
+    """Return the maximum horizontal speed now [m/s]."""
     target, after = leg.target, leg.following
     acceleration, jerk = limits.acceleration_m_s2, limits.jerk_m_s3
     arrival = 0.0
@@ -301,9 +301,9 @@ def _turn_speed(angle: float, acceleration: float, radius_m: float) -> float:
 
 
 def _angle(a: Sequence[float], b: Sequence[float], c: Sequence[float]) -> float:
-    """Return the angle [rad] at corner b between the ways to a and c; 0 and pi / 2 if one is none.
+    """Return the angle [rad] at corner b between the lines to a and c; pi / 2 if undefined.
 
-    A straight way on has pi.
+    A straight path has pi.
     """
     ax, ay, cx, cy = a[0] - b[0], a[1] - b[1], c[0] - b[0], c[1] - b[1]
     lengths = math.hypot(ax, ay) * math.hypot(cx, cy)
@@ -313,7 +313,7 @@ def _angle(a: Sequence[float], b: Sequence[float], c: Sequence[float]) -> float:
 
 
 def _aim_ahead(here: Vec, start: Vec, target: Vec, acceptance_m: float) -> Vec:
-    """Return the point of the leg that lies an L1 distance ahead of a vehicle beside it."""
+    """Return the point of the leg at the L1 look-ahead distance of a vehicle beside it."""
     along = [t - s for t, s in zip(target, start, strict=True)]
     length = math.sqrt(sum(a * a for a in along))
     if length < _TINY:
@@ -327,13 +327,13 @@ def _aim_ahead(here: Vec, start: Vec, target: Vec, acceptance_m: float) -> Vec:
 
 
 def _scaled(north: float, east: float, length: float) -> tuple[float, float]:
-    """Return a horizontal vector with another length; none where it has no direction."""
+    """Return a horizontal vector scaled to a length; zero if it has no direction."""
     norm = math.hypot(north, east)
     return (0.0, 0.0) if norm < _TINY else (north * length / norm, east * length / norm)
 
 
 def _clamped(velocity: Vec, horizontal: float, vertical: float) -> Vec:
-    """Scale a velocity down to both limits; one that is next to nothing scales its axes alone."""
+    """Clip a velocity to both limits; a very small velocity is clipped per axis."""
     vx, vy, vz = velocity
     norm = math.hypot(vx, vy)
     if norm > horizontal:

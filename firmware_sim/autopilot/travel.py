@@ -1,4 +1,4 @@
-"""How the automatic modes move: smoothly from waypoint to waypoint, with PX4's limits and heading.
+"""Motion of the automatic modes: smooth paths with PX4's limits and heading.
 
 Source: PX4 1.16, FlightTaskAuto.
 """
@@ -16,17 +16,17 @@ from firmware_sim.autopilot.error_state import RATES, P, Q, V
 from firmware_sim.autopilot.trajectory import Leg, PathLimits, Trajectory
 
 PAUSE_US = 100_000
-"""After so long without being flown, the trajectory starts anew where the vehicle is [µs]."""
+"""Pause after which the trajectory restarts at the vehicle [µs]."""
 
 YAW_RATE_TAU_S = 0.2
-"""Time constant of the yaw rate that is fed forward [s]."""
+"""Time constant of the feed-forward yaw rate [s]."""
 
 
 class Travel:
-    """A trajectory that the automatic modes share: one goes on where another ended."""
+    """Trajectory shared by the automatic modes: each mode continues the previous one's."""
 
     def __init__(self, value: Callable[[str], float]) -> None:
-        """Take a lookup of PX4 parameter names."""
+        """Store the look-up for PX4 parameters."""
         self._value = value
         self._trajectory = Trajectory()
         self._time_us: int | None = None
@@ -34,16 +34,16 @@ class Travel:
         """Heading setpoint [rad]."""
         self._yaw_rate = 0.0
         self._wanted_yaw: float | None = None
-        """Where the vehicle looks while nobody says; None = as it does when the leg begins."""
+        """Heading without a requested one; None = the heading at the start of the leg."""
         self.speed_m_s = math.nan
-        """Horizontal speed by MAV_CMD_DO_CHANGE_SPEED or the like; NaN = MPC_XY_CRUISE."""
+        """Horizontal speed by MAV_CMD_DO_CHANGE_SPEED or similar; NaN = MPC_XY_CRUISE."""
 
     def stop(self) -> None:
-        """Begin anew at the vehicle when the next leg is flown."""
+        """Restart the trajectory at the vehicle with the next leg."""
         self._time_us = None
 
     def launch(self, state: Vector, time_us: int, climb_m_s: float) -> None:
-        """Begin at the vehicle, which is about to leave the ground at a climb rate [m/s]."""
+        """Start at a vehicle about to leave the ground with a climb rate [m/s]."""
         self._trajectory.restart(_three(state, P), (0.0, 0.0, -climb_m_s))
         self._yaw, self._yaw_rate, self._wanted_yaw = quat_yaw(state[Q:RATES]), 0.0, None
         self._time_us = time_us
@@ -57,10 +57,10 @@ class Travel:
         yaw: float = math.nan,
         limits: PathLimits | None = None,
     ) -> TrajectoryDemand:
-        """Return the demand at a time [µs] on the way along a leg.
+        """Return the demand at a time [µs] along a leg.
 
-        `yaw`: heading [rad]; NaN = towards the target, and at the target as before. `limits`: None
-        = those of the parameters.
+        `yaw`: heading [rad]; NaN = towards the target, constant near it. `limits`: None = limits of
+        the parameters.
         """
         position, velocity = _three(state, P), _three(state, V)
         now = quat_yaw(state[Q:RATES])
@@ -79,7 +79,7 @@ class Travel:
         )
 
     def limits(self) -> PathLimits:
-        """Return the limits that the parameters give."""
+        """Return the limits of the parameters."""
         value = self._value
         speed = self.speed_m_s
         cruise = value("MPC_XY_CRUISE") if math.isnan(speed) else speed
@@ -98,7 +98,7 @@ class Travel:
         )
 
     def _heading(self, position: Vec, now: float, target: Vec) -> float:
-        """Return PX4's heading towards the waypoint (MPC_YAW_MODE 0); near it, that is kept."""
+        """Return PX4's heading towards the waypoint (MPC_YAW_MODE 0), kept near the waypoint."""
         north, east = target[0] - position[0], target[1] - position[1]
         if math.hypot(north, east) > self._value("NAV_ACC_RAD"):
             self._wanted_yaw = math.atan2(east, north)
@@ -107,7 +107,7 @@ class Travel:
         return self._wanted_yaw
 
     def _turn(self, yaw: float, elapsed_s: float) -> None:
-        """Turn the heading setpoint, no faster than MPC_YAWRAUTO_MAX."""
+        """Turn the heading setpoint, limited to MPC_YAWRAUTO_MAX."""
         limit = self._value("MPC_YAWRAUTO_MAX") * DEG
         most = limit * elapsed_s
         step = min(most, max(-most, wrap_pi(yaw - self._yaw)))
@@ -119,14 +119,14 @@ class Travel:
 
 
 def stopping_place(state: Vector, value: Callable[[str], float]) -> Vec:
-    """Return where the vehicle can come to rest by braking NED [m], at its present height.
+    """Return the stopping point NED [m] at the current height.
 
     Source: PX4 1.16, Navigator::preproject_stop_point.
     """
     north, east, down = _three(state, P)
     vn, ve, _ = _three(state, V)
     speed = math.hypot(vn, ve)
-    # The delay of the deceleration: 0.6 s, as PX4 passes 0.6 of the jerk for an acceleration.
+    # Deceleration delay of 0.6 s, as PX4 passes 0.6 of the jerk as an acceleration.
     distance_per_speed = speed / (2.0 * value("MPC_ACC_HOR")) + 0.6
     return north + vn * distance_per_speed, east + ve * distance_per_speed, down
 

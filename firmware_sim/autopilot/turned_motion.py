@@ -1,13 +1,13 @@
-"""Whether GPS sees the motion that the IMU feels, only in another direction.
+"""Comparison of GPS and IMU motion: detects equal motion with a rotated heading.
 
-Under a wrong heading the velocity by the IMU is that by GPS, turned about the vertical: equally
-large, at an angle that stays. A wrong tilt or gyro gives the two nothing in common.
+With a wrong heading, the IMU velocity is the GPS velocity rotated about the vertical: equal in
+magnitude, at a constant angle. A wrong tilt or gyro leaves no such relation.
 
-Over a window of fixes velocities are complex numbers less their means, u as the IMU felt them under
-a heading and w as GPS saw them:
+Over a window of fixes, velocities are complex numbers minus their means, u from the IMU under a
+heading and w from GPS:
 
-    as they are  sum |w - u|^2             = |w|^2 + |u|^2 - 2 Re(u* w)
-    best turned  min sum |w - e^(i a) u|^2 = |w|^2 + |u|^2 - 2 |u* w|
+    unrotated     sum |w - u|^2             = |w|^2 + |u|^2 - 2 Re(u* w)
+    best rotation min sum |w - e^(i a) u|^2 = |w|^2 + |u|^2 - 2 |u* w|
 
 Source: G. Wahba, A Least Squares Estimate of Satellite Attitude (SIAM Review 7(3), 1965), whose
 solution in the plane is the angle of u* w.
@@ -24,24 +24,24 @@ from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 
 WINDOW = 20
-"""Fixes: 2 s at 10 Hz."""
+"""Window length in fixes: 2 s at 10 Hz."""
 
 FELT = 7
-"""Where the yaw estimator has the velocity by the IMU alone (`yaw_estimator.SHARED_SIZE`)."""
+"""Index of the IMU-only velocity in the yaw estimator (`yaw_estimator.SHARED_SIZE`)."""
 
 EXCUSED = 2.0
-"""This many times what the noise of GPS does is no disagreement: what is felt drifts, too."""
+"""Factor on the GPS noise up to which there is no disagreement, as IMU velocity drifts."""
 
 
 @kernel
 def note_motion(record: Any, north: float, east: float, accuracy: float) -> None:
-    """Note a fix in the record of a flight controller.
+    """Record a fix in the record of a flight controller.
 
     Args:
-        record: Updated; its yaw estimator has the velocity by the IMU alone, but for a constant.
-        north: Velocity by GPS [m/s].
-        east: Velocity by GPS [m/s].
-        accuracy: Standard deviation of each of them [m/s].
+        record: Updated; its yaw estimator holds the IMU-only velocity up to a constant.
+        north: GPS velocity [m/s].
+        east: GPS velocity [m/s].
+        accuracy: Standard deviation of each component [m/s].
     """
     slot = record.motions % WINDOW
     record.felt_motion[slot, 0] = record.yaw_shared[FELT]
@@ -52,14 +52,14 @@ def note_motion(record: Any, north: float, east: float, accuracy: float) -> None
 
 
 class TurnedMotion:
-    """The newest velocities by IMU and by GPS."""
+    """Newest velocities from IMU and GPS."""
 
     def __init__(self, record: Any) -> None:
-        """Take the record of a flight controller."""
+        """Use the record of a flight controller."""
         self._record = record
 
     def restart(self) -> None:
-        """Forget all."""
+        """Discard all velocities."""
         self._record["motions"] = 0
 
     @property
@@ -77,10 +77,10 @@ class TurnedMotion:
         """Return the share of the disagreement that another heading would explain.
 
         Args:
-            turn: From the axes of what is felt to a heading that is asked about [rad].
+            turn: Angle from the IMU velocity's axes to the tested heading [rad].
 
         Returns:
-            0 to 1; 0 where the two do not disagree.
+            0 to 1; 0 if there is no disagreement.
         """
         w = self._seen
         if not len(w):

@@ -1,17 +1,16 @@
-"""The yaw estimator: what heading the IMU and GPS velocities alone say, without a compass.
+"""Yaw estimator: heading from IMU and GPS velocity without a compass.
 
-A Gaussian sum of five small filters whose headings begin evenly spread around the circle. Each has
-an attitude of its own by the IMU (a complementary filter levels it), and three states: velocity
-north and east, and heading. GPS velocities correct them, and weigh them by how well each foretold
-them. Nothing is known of the heading until the vehicle accelerates; then one hypothesis outlives
-the others.
+A Gaussian sum of five small filters with initial headings evenly spaced around the circle. Each
+filter has an attitude from the IMU (levelled by a complementary filter) and three states: velocity
+north and east, and heading. GPS velocities correct the filters and weight them by their prediction
+errors. The heading is unknown until the vehicle accelerates; then one hypothesis prevails.
 
-It runs beside the estimator's filter, corrects nothing there, and is asked only where the two no
-longer agree with the GPS (`estimator`).
+It runs beside the estimator's filter without correcting it, and is used only when that filter
+disagrees with GPS (`estimator`).
 
 Source: PX4 1.16, src/modules/ekf2/EKF/yaw_estimator/EKFGSF_yaw.cpp, and its constants. The airspeed
-by which it corrects a fixed wing's turns (EKF2_GSF_TAS) has no place on a multicopter. PX4 hands it
-the variance of the velocity where it takes a standard deviation; here it is given the latter.
+correction of a fixed wing's turns (EKF2_GSF_TAS) does not apply to a multicopter. PX4 passes the
+variance of the velocity where a standard deviation is expected; here it is the latter.
 """
 
 from __future__ import annotations
@@ -39,29 +38,29 @@ from firmware_sim.autopilot.turned_motion import FELT, TurnedMotion, note_motion
 
 N_MODELS = 5
 TILT_GAIN = 0.2
-"""From the tilt's error to the correction of the rates [1/s]."""
+"""Gain from tilt error to rate correction [1/s]."""
 GYRO_BIAS_GAIN = 0.04
-"""From the tilt's correction to the gyro's bias [1/s]."""
+"""Gain from tilt correction to gyro bias [1/s]."""
 ACCEL_NOISE = 2.0
 """[m/s²]"""
 GYRO_NOISE = 0.1
 """[rad/s]"""
 BIAS_LIMIT = 0.05
-"""Greatest bias of a gyro [rad/s]."""
+"""Maximum gyro bias [rad/s]."""
 SLOW_TURN = math.radians(10.0)
-"""The gyro's bias is learnt while the vehicle turns more slowly [rad/s]."""
+"""Maximum turn rate for gyro bias learning [rad/s]."""
 ACCEL_FILTER = 10.0
-"""How much faster than the tilt's correction the accelerometer is smoothed."""
+"""Ratio of the accelerometer filter's bandwidth to the tilt correction's."""
 ALIGN_SHARE = 0.1
-"""The tilt is aligned while the specific force differs by less than this share from gravity."""
+"""Maximum relative difference between specific force and gravity for tilt alignment."""
 LEAST_ACCURACY_M_S = 0.01
 LEAST_VARIANCE = 1e-6
 LEAST_WEIGHT = 1e-5
 NIS_LIMIT = 25.0
-"""Innovations count as no more than five standard deviations."""
+"""Limit of the normalised innovation squared: five standard deviations."""
 
-# A model's row: velocity north, east, heading; their covariance's upper triangle; attitude body to
-# world; gyro bias; weight.
+# Layout of a model's row: velocity north, east, heading; upper triangle of their covariance;
+# attitude body to world; gyro bias; weight.
 X, YAW, P_NN, P_NE, P_NY, P_EE, P_EY, P_YY, ATTITUDE, BIAS, WEIGHT = (
     0,
     2,
@@ -77,19 +76,19 @@ X, YAW, P_NN, P_NE, P_NY, P_EE, P_EY, P_YY, ATTITUDE, BIAS, WEIGHT = (
 )
 MODEL_SIZE = 17
 
-# What the models share: smoothed specific force (3) [m/s²], whether the tilt is aligned, whether
-# velocities are fused, the result: heading [rad] and its variance [rad²]; and the velocity by the
-# IMU alone (2) [m/s], along a heading that differs from the first model's by what GPS turned that.
+# Shared layout: smoothed specific force (3) [m/s²], tilt aligned, velocity fusion started, result:
+# heading [rad] and its variance [rad²]; IMU-only velocity (2) [m/s], relative to the first model's
+# heading minus the rotation from GPS corrections.
 FORCE, ALIGNED, STARTED, RESULT, VARIANCE, TURNED = 0, 3, 4, 5, 6, 9
 SHARED_SIZE = 10
 
 LONGEST = 64
-"""Samples of the IMU that are kept until they are predicted: 0.25 s."""
+"""Maximum number of IMU samples buffered before prediction: 0.25 s."""
 
 
 @kernel
 def _accel_gain(force_norm: float) -> float:
-    """Return the gain of the tilt's correction [1/s]: none where the vehicle accelerates."""
+    """Return the gain of the tilt correction [1/s], zero while the vehicle accelerates."""
     off = abs(force_norm - GRAVITY_M_S2) / GRAVITY_M_S2
     rest = 1.0 - min(2.0 * off, 1.0)
     return TILT_GAIN * rest * rest
@@ -107,13 +106,13 @@ def _put(m: Vector, q: Quat) -> None:
 
 @kernel
 def _turn(m: Vector, angle: float) -> None:
-    """Turn a model's attitude about the world's down axis."""
+    """Rotate a model's attitude about the world's down axis."""
     _put(m, multiply((math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle)), _quat(m)))
 
 
 @kernel
 def _level(m: Vector, gyro: Vec, force: Vec, dt: float) -> None:
-    """Move a model's attitude by the gyro, and its tilt towards the smoothed specific force."""
+    """Advance a model's attitude by the gyro; correct its tilt to the smoothed specific force."""
     norm = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
     gain = _accel_gain(norm)
     down = rotate(conjugate(_quat(m)), (0.0, 0.0, 1.0))
@@ -142,10 +141,10 @@ def _level(m: Vector, gyro: Vec, force: Vec, dt: float) -> None:
 
 @kernel
 def _predict(m: Vector, accel: Vec, dt: float) -> tuple[float, float]:
-    """Move a model's velocity, and its covariance P = F P F' + Q with the heading's.
+    """Advance a model's velocity, and its covariance with the heading, P = F P F' + Q.
 
-    Of F only the column of the heading differs from the identity's: a heading error turns the
-    change of velocity, which is returned (north, east).
+    Only the heading column of F differs from the identity: a heading error rotates the velocity
+    change, which is returned (north, east).
     """
     north, east, _ = rotate(_quat(m), (accel[0] * dt, accel[1] * dt, accel[2] * dt))
     by_n, by_e = -east, north
@@ -164,7 +163,7 @@ def _predict(m: Vector, accel: Vec, dt: float) -> tuple[float, float]:
 
 @kernel
 def _add_change(shared: Vector, north: float, east: float) -> None:
-    """Add a change of the first model's velocity, turned back by what GPS has turned the model."""
+    """Add a velocity change of the first model, without the rotation from GPS corrections."""
     c, s = math.cos(shared[TURNED]), math.sin(shared[TURNED])
     shared[FELT] += c * north + s * east
     shared[FELT + 1] += c * east - s * north
@@ -172,7 +171,7 @@ def _add_change(shared: Vector, north: float, east: float) -> None:
 
 @large_kernel
 def advance(models: Vector, shared: Vector, gyro: Vector, accel: Vector, dt: float) -> None:
-    """Move all models by samples of the IMU.
+    """Advance all models by IMU samples.
 
     Args:
         models: (N_MODELS, MODEL_SIZE), updated.
@@ -213,7 +212,7 @@ def advance(models: Vector, shared: Vector, gyro: Vector, accel: Vector, dt: flo
 
 @kernel
 def _start(models: Vector, shared: Vector, north: float, east: float, variance: float) -> None:
-    """Spread the headings around the circle, all as probable."""
+    """Initialize evenly spaced headings with equal weights."""
     step = 2.0 * math.pi / N_MODELS
     for j in range(N_MODELS):
         m = models[j]
@@ -266,7 +265,7 @@ def fuse(models: Vector, shared: Vector, north: float, east: float, accuracy: fl
         shared: (SHARED_SIZE,), updated.
         north: Velocity [m/s].
         east: Velocity [m/s].
-        accuracy: Standard deviation of each [m/s].
+        accuracy: Standard deviation of each component [m/s].
     """
     if shared[ALIGNED] == 0.0:
         return
@@ -298,7 +297,7 @@ def fuse(models: Vector, shared: Vector, north: float, east: float, accuracy: fl
 
 @kernel
 def feel(record: Any) -> None:
-    """Keep the IMU's sample in the record of a flight controller; predict when many are kept."""
+    """Buffer an IMU sample in the record of a flight controller; predict if the buffer is full."""
     at = 3 * record.yaw_count
     for i in range(3):
         record.yaw_gyro[at + i], record.yaw_accel[at + i] = record.gyro[i], record.accel[i]
@@ -309,7 +308,7 @@ def feel(record: Any) -> None:
 
 @kernel
 def predict_kept(record: Any) -> None:
-    """Move all models by the kept samples."""
+    """Advance all models by the buffered samples."""
     n = 3 * record.yaw_count
     advance(record.yaw_models, record.yaw_shared, record.yaw_gyro[:n], record.yaw_accel[:n], TICK_S)
     record.yaw_count = 0
@@ -317,7 +316,7 @@ def predict_kept(record: Any) -> None:
 
 @kernel
 def observe(record: Any, north: float, east: float, accuracy: float) -> None:
-    """Take a GPS velocity into the record of a flight controller; as `YawEstimator.observe`."""
+    """Process a GPS velocity in a flight controller's record, like `YawEstimator.observe`."""
     predict_kept(record)
     if record.flying != 0:
         fuse(record.yaw_models, record.yaw_shared, north, east, accuracy)
@@ -342,14 +341,14 @@ def _feel(records: Any) -> None:
 
 
 class YawEstimator:
-    """Heading by IMU and GPS velocity.
+    """Heading estimator from IMU and GPS velocity.
 
-    Samples of the IMU are kept until a fix needs them: predicting them together costs a tenth of
-    predicting each at its time, and comes to the same.
+    IMU samples are buffered until a fix needs them: joint prediction takes a tenth of the time of
+    separate predictions, with the same result.
     """
 
     def __init__(self, record: Any = None) -> None:
-        """Begin without a tilt, in the record of a flight controller; None = in a new one."""
+        """Start without a tilt, in the record of a flight controller; None = a new record."""
         if record is None:
             from firmware_sim.engine.record import new_controller
 
@@ -357,50 +356,50 @@ class YawEstimator:
         self._record = record
         self._motion = TurnedMotion(record)
         self.models = record["yaw_models"][0]
-        """(N_MODELS, MODEL_SIZE)"""
+        """Models (N_MODELS, MODEL_SIZE)."""
         self.models[:, ATTITUDE] = 1.0
         self._shared = record["yaw_shared"][0]
         self._shared[VARIANCE] = math.inf
 
     @property
     def yaw(self) -> float:
-        """Heading [rad]; means something where the variance is small."""
+        """Heading [rad]; valid if the variance is small."""
         return self._shared.item(RESULT)
 
     @property
     def variance(self) -> float:
-        """Of the heading [rad²]; infinite before velocities are fused."""
+        """Variance of the heading [rad²]; infinite before velocities are fused."""
         return self._shared.item(VARIANCE)
 
     @property
     def attitude(self) -> Vector:
-        """Of the likeliest model (4,), body to world, wxyz. Its tilt is that of all of them."""
+        """Attitude of the most likely model (4,), body to world, wxyz. All share its tilt."""
         return self.models[int(np.argmax(self.models[:, WEIGHT])), ATTITUDE:BIAS].copy()
 
     def feel(self, gyro: Vector, accel: Vector) -> None:
-        """Take a tick's sample of the IMU, each (3,) FRD [rad/s], [m/s²]."""
+        """Process a tick's IMU sample, each (3,) FRD [rad/s], [m/s²]."""
         self._record["gyro"], self._record["accel"] = gyro, accel
         _feel(self._record)
 
     def observe(
         self, velocity: Vector, accuracy: float, gyro_bias: Vector, *, flying: bool
     ) -> None:
-        """Take a GPS velocity; on the ground, where it says nothing, begin anew.
+        """Process a GPS velocity; on the ground, without information on heading, restart.
 
         Args:
             velocity: NED (3,) [m/s].
             accuracy: Standard deviation of an axis [m/s].
-            gyro_bias: What the estimator knows of it (3,) [rad/s], taken over on the ground.
-            flying: Whether the vehicle is in the air.
+            gyro_bias: Estimated gyro bias (3,) [rad/s], copied on the ground.
+            flying: True if the vehicle is in the air.
         """
         self._record["flying"] = flying
         self._record["state"][0, _GYRO_BIAS : _GYRO_BIAS + 3] = gyro_bias
         _observe(self._record, velocity.item(0), velocity.item(1), accuracy)
 
     def explained(self, yaw: float) -> float:
-        """Return how much of what GPS and a heading [rad] disagree in another explains, 0 to 1.
+        """Return the share of the disagreement of GPS and a heading [rad] that another explains.
 
-        See `turned_motion`.
+        The range is 0 to 1; see `turned_motion`.
         """
         along = self.models.item(0, YAW) - self._shared.item(TURNED)
         return self._motion.explained(yaw - along)

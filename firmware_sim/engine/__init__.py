@@ -1,1 +1,1 @@
-"""One vehicle as two records, and the compiled ticks that advance them."""
+"""State of one vehicle as records, and the compiled ticks that advance them."""

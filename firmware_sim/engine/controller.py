@@ -1,4 +1,4 @@
-"""The control loops of a flight controller's record."""
+"""Control loops on a flight controller's record."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from firmware_sim.engine.record import (
 from firmware_sim.engine.ticks import control_record
 
 _ATTITUDE, _RATES, _VELOCITY, _THRUST = 0, 4, 7, 10
-"""Layout of `output`."""
+"""Offsets of the setpoints in `output`."""
 
 
 class ControlSetpoints(NamedTuple):
-    """The setpoints of the cascade's loops."""
+    """Setpoints of the cascade's loops."""
 
     attitude: Vector
     """(4,) body -> NED."""
@@ -43,7 +43,7 @@ class Controller:
     """Gains, demand and setpoints of the cascade in a flight controller's record."""
 
     def __init__(self, gains: Gains, record: Record | None = None) -> None:
-        """Start at rest, in the record of a flight controller; None = in a new one."""
+        """Start at rest, on a flight controller's record; None = on a new record."""
         self._record = record = new_controller() if record is None else record
         self._demand: AnyDemand | None = None
         self._wanted, self._output = record["demand"][0], record["output"][0]
@@ -56,8 +56,8 @@ class Controller:
         """Change the gains in flight."""
         cutoff_hz = gains.gyro_cutoff_hz
         if cutoff_hz != self._gyro_cutoff_hz:
-            # The delay elements are scaled by the cut-off: left as they are, a much higher one
-            # would multiply the measured rates.
+            # Filter states scale with the cutoff: unchanged states would multiply the measured
+            # rates at a much higher cutoff.
             settle_gyro_filter(self._memory, filters(gains, TICK_S).gyro)
             self._gyro_cutoff_hz = cutoff_hz
         self._keep(gains)
@@ -67,7 +67,7 @@ class Controller:
         self._record["gains"], self._record["filters"] = tuple(gains), (velocity, *gyro, dgyro, yaw)
 
     def command(self, demand: AnyDemand | None) -> None:
-        """Take what the coming ticks fly; None = stop the motors."""
+        """Set the demand of the coming ticks; None = stop the motors."""
         if demand is self._demand:
             return
         self._demand, record, wanted = demand, self._record, self._wanted
@@ -100,7 +100,7 @@ class Controller:
         return self.motors
 
     def rest(self) -> None:
-        """Reset while the motors are stopped: no integrator may wind up, and there is no output."""
+        """Reset while the motors are stopped: no integrator windup, zero output."""
         reset_integrals(self._memory)
         self._output[:] = 0.0
         self._output[_ATTITUDE] = 1.0
@@ -113,7 +113,7 @@ class Controller:
 
     @property
     def thrust(self) -> float:
-        """Collective that is commanded, 0..1."""
+        """Commanded collective 0..1."""
         return self._output.item(_THRUST)
 
     def setpoints(self) -> ControlSetpoints:

@@ -1,4 +1,4 @@
-"""Forces, power and battery of the vehicle, computed around the body's step: compiled."""
+"""Forces, power and battery of the vehicle, computed around the body's step in compiled code."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from airl_mav.vehicle.rotor import settle, wrench
 from firmware_sim.engine.kinematics import quaternion, rates, velocity
 
 Speeds = tuple[float, float, float, float]
-"""Of the rotors, as fractions of the speed at full command."""
+"""Rotor speeds, as fractions of the speed at full command."""
 
 Supply = tuple[float, float, float, float]
-"""Voltage [V], current [A], charge used [mAh], share of it that is left; as `BatterySample`."""
+"""Voltage [V], current [A], charge used [mAh], fraction left; as in `BatterySample`."""
 
 
 def pack_row(battery: Battery) -> tuple[float, ...]:
@@ -43,19 +43,19 @@ def pack_row(battery: Battery) -> tuple[float, ...]:
 def actuate(
     speeds: Speeds, motors: Speeds, row: Vector, wind: Vector, airframe: Vector, left: float
 ) -> tuple[Speeds, Vec, Vec, Vec]:
-    """Turn motor commands into the force and torque that act on the body for one tick.
+    """Convert motor commands to the force and torque on the body for one tick.
 
     Args:
-        speeds: Of the rotors.
+        speeds: Rotor speeds.
         motors: Commands, 0..1.
-        row: (16,) the vehicle's motion.
+        row: (16,) motion of the vehicle.
         wind: (3,) NED [m/s].
-        airframe: (15,) as `Airframe`.
-        left: Share of a speed error that a tick leaves (`rotor.lag`).
+        airframe: (15,) fields of `Airframe`.
+        left: Fraction of a speed error that remains after a tick (`rotor.lag`).
 
     Returns:
         Rotor speeds after the tick; in NED the centre of mass [m], the force without gravity [N]
-        and the torque [N m].
+            and the torque [N m].
     """
     a = airframe_of(airframe)
     s = (
@@ -96,25 +96,25 @@ def absorb(
     computer_w: float,
     tick_s: float,
 ) -> tuple[float, Vec, Supply, float]:
-    """Work out the power used in a tick and the charge that is left.
+    """Compute the power used in a tick and the remaining charge.
 
     Args:
-        before: (16,) the motion before the tick.
-        row: (16,) the motion after it.
+        before: (16,) motion before the tick.
+        row: (16,) motion after the tick.
         wind: (3,) NED [m/s].
-        speeds: Of the rotors.
-        standing: In touch with something.
-        acceleration: As the power model takes it, before the tick (`power.felt`) [m/s²].
+        speeds: Rotor speeds.
+        standing: True in contact with anything.
+        acceleration: Acceleration in the power model before the tick (`power.felt`) [m/s²].
         charge: State of charge before the tick, 0..1.
-        airframe: (15,) as `Airframe`.
-        power: (17,) as `PowerModel`.
-        pack: (4,) as `pack_row`.
-        computer_w: What the onboard computer draws from the pack [W].
+        airframe: (15,) fields of `Airframe`.
+        power: (17,) fields of `PowerModel`.
+        pack: (4,) values of `pack_row`.
+        computer_w: Power of the onboard computer from the pack [W].
         tick_s: Length of the tick [s].
 
     Returns:
-        Power over the tick [W], without the computer's; the acceleration after it; the battery
-        monitor's reading; the state of charge after it.
+        Power over the tick [W], without the computer; the acceleration, the battery monitor's
+            reading and the state of charge after the tick.
     """
     m, a = power_model_of(power), airframe_of(airframe)
     thrust, _ = wrench(speeds[0], speeds[1], speeds[2], speeds[3], a)
@@ -122,7 +122,7 @@ def absorb(
         acceleration = (0.0, 0.0, 0.0)
         used = standing_power_w(thrust, a, m)
     else:
-        # Of the state in which the tick's forces acted, as the drag.
+        # Uses the state before the tick, in which the forces acted, as for the drag.
         older, air = velocity(before), (wind[0], wind[1], wind[2])
         used = flight_power_w(thrust, older, quaternion(before), air, acceleration, a, m)
         kept = felt_share(m, tick_s)

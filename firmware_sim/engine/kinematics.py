@@ -1,4 +1,4 @@
-"""The vehicle's motion as one row of numbers, for kernels and sensors."""
+"""Motion of the vehicle as one row of numbers, for kernels and sensors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
 
 WIDTH = 16
-"""Numbers in a row."""
+"""Number of values in a row."""
 
 POSITION = slice(0, 3)
 """NED [m]."""
@@ -21,10 +21,10 @@ QUATERNION = slice(6, 10)
 RATES = slice(10, 13)
 """Angular velocity FRD [rad/s]."""
 FORCE = slice(13, 16)
-"""Specific force FRD [m/s²]: what an accelerometer feels."""
+"""Specific force FRD [m/s²], as measured by an accelerometer."""
 
 POSE = slice(0, 10)
-"""Position, velocity and attitude, as a trajectory keeps them."""
+"""Position, velocity and attitude, as stored in a trajectory."""
 
 
 @kernel
@@ -60,9 +60,9 @@ def write(p: Vec, v: Vec, q: Quat, omega: Vec, before: Vector, tick_s: float, ro
         v: Velocity NED [m/s].
         q: Attitude body -> NED.
         omega: Angular velocity FRD [rad/s].
-        before: (16,) the motion a tick before: the acceleration is the velocity's change.
+        before: (16,) previous motion, from which the acceleration is differenced.
         tick_s: Length of the tick [s].
-        row: (16,) overwritten.
+        row: (16,) output.
     """
     accel = (
         (v[0] - before[3]) / tick_s,
@@ -87,19 +87,19 @@ def from_bullet(
     tick_s: float,
     row: Vector,
 ) -> None:
-    """Write pybullet's state as a row: NED / FRD.
+    """Write pybullet's state as a row, in NED / FRD.
 
     The attitude NED <- FRD is (half a turn about (1,1,0)) q_enu_flu (half a turn about x); the
-    products are written out.
+    products are expanded.
 
     Args:
         at: Position ENU [m].
         orientation: FLU -> ENU, xyzw.
         linear: Velocity ENU [m/s].
         angular: Angular velocity ENU [rad/s].
-        before: (16,) the motion a tick before.
+        before: (16,) previous motion.
         tick_s: Length of the tick [s].
-        row: (16,) overwritten.
+        row: (16,) output.
     """
     x, y, z, w = orientation
     h = math.sqrt(0.5)

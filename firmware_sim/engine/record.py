@@ -1,8 +1,8 @@
-"""The state of one vehicle as records: aircraft, sample of its sensors, flight controller.
+"""State of one vehicle as records: aircraft, sensor sample, flight controller.
 
-A record is an array of one element of a structured dtype. Compiled code takes it in one argument;
-Python reads and writes its fields as views. A copy of the records is a snapshot of the vehicle.
-The flight controller sees the sample alone, never the true state.
+A record is an array with one element of a structured dtype. Compiled code receives it as one
+argument; Python reads and writes its fields as views. A copy of the records is a snapshot of the
+vehicle. The flight controller reads only the sample, never the true state.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from firmware_sim.autopilot.turned_motion import WINDOW
 from firmware_sim.autopilot.yaw_estimator import LONGEST, MODEL_SIZE, N_MODELS, SHARED_SIZE
 from firmware_sim.engine.kinematics import WIDTH
 
-# So that kernels can call them, as Python can.
+# Makes these functions callable from kernels, as from Python.
 _CALLED: tuple[Any, ...] = (
     *(geodetic_to_local, local_to_geodetic),
     *(atmosphere.pressure_hpa, atmosphere.altitude_m, atmosphere.temperature_c),
@@ -34,39 +34,39 @@ for _function in _CALLED:
     register_jitable(_function)
 
 Record = NDArray[Any]
-"""(1,) of a structured dtype."""
+"""Array (1,) of a structured dtype."""
 
 Fields: TypeAlias = Any
-"""The element of a record in compiled code, with a name for each field."""
+"""Element of a record in compiled code, with named fields."""
 
 MAG, PRESSURE, GPS = 1, 2, 4
-"""Bits of `measured`: which of the slower sensors have a new sample in this tick."""
+"""Bits of `measured`: slower sensors with a new sample in this tick."""
 
 IDLE, POSITION, TRAJECTORY, ATTITUDE, RATES = -1, 0, 1, 2, 3
-"""Values of `demand_kind`: motors stopped, or the kind of demand (`control.demand`)."""
+"""Values of `demand_kind`: motors stopped, or the type of demand (`control.demand`)."""
 
 NO_CLIMB, RAMPING, RISING, SETTLING, CLIMB_ENDED = range(5)
-"""Values of `climbs`: the ramp of a take-off on the ground, its climb up to near its altitude, or
-the rest of it in hold."""
+"""Values of `climbs`: none, the takeoff ramp on the ground, the climb to near the target altitude,
+the rest of the climb in hold, or its end."""
 
 OFF, TRUSTED, SUSPECT = 0, 1, 2
-"""Values of `compass` and `gps`; Python judges every sample of a suspect one."""
+"""Values of `compass` and `gps`; Python checks every sample of a suspect sensor."""
 
 NOTHING, LIFT_OFF, LANDING = 0, 1, 2
 """Values of `detecting`."""
 
 DEMAND_SIZE = 11
-"""Numbers in the largest demand."""
+"""Number of values in the largest demand."""
 
 FILTERS_SIZE = 8
-"""Numbers in the low-pass filters of the control loops."""
+"""Number of values in the low-pass filters of the control loops."""
 
 OUTPUT_SIZE = 11
-"""Setpoints of the control loops: attitude (4), rates (3), velocity (3), thrust."""
+"""Number of setpoints of the control loops: attitude (4), rates (3), velocity (3), thrust."""
 
 SEEN, CHANGED, FIRST, WATCHES = 0, 1, 2, 5
-"""Columns of `watch`, and its rows: gyro, accelerometer, compass, barometer, GPS. Times [µs] of the
-newest sample, of the newest that differs from the one before, of the first; -1 = none."""
+"""Columns of `watch`, and the number of its rows: gyro, accelerometer, compass, barometer, GPS.
+Times [µs] of the newest sample, the newest change, the first sample; -1 = none yet."""
 
 GYRO_ROW, ACCEL_ROW, MAG_ROW, BARO_ROW, GPS_ROW = range(WATCHES)
 
@@ -84,22 +84,22 @@ AIRCRAFT = np.dtype(
         ("rate_hz", _I),
         ("start_us", _I),
         ("moves_us", _I),
-        ("closing_m_s", _F),  # greatest speed of an obstacle
-        ("reach_m", _F),  # from the centre to its farthest part
-        ("clear_m", _F),  # contacts are impossible beyond
-        ("footing_m", _F),  # from the centre to the nearest edge that it may tip over
+        ("closing_m_s", _F),  # maximum speed of an obstacle
+        ("reach_m", _F),  # from the centre to the outermost point
+        ("clear_m", _F),  # contacts are impossible beyond this
+        ("footing_m", _F),  # from the centre to the nearest tipping edge
         # True state.
         ("ticks", _I),
         ("time_us", _I),
         ("motion", _F, WIDTH),
         ("speeds", _F, 4),
-        ("acceleration", _F, 3),  # as the power model takes it
+        ("acceleration", _F, 3),  # as in the power model
         ("charge", _F),
         ("power_w", _F),
         ("battery", _F, 4),  # voltage [V], current [A], charge used [mAh], charge left 0..1
-        ("room_m", _F),  # nothing that can be touched is nearer, but for the floor at rest
-        ("held", _I),  # 1 = the floor would hold it against rotors and wind of the newest tick
-        ("resting", _I),  # 1 = stands on the floor, and stays there while it is held
+        ("room_m", _F),  # distance within which nothing can be hit, except the floor at rest
+        ("held", _I),  # 1 = the floor can hold it against rotors and wind of the newest tick
+        ("resting", _I),  # 1 = rests on the floor, and stays there while held
         # Sensors: noise, biases, schedules.
         ("imu_sigma", _F, 12),
         ("accel_bias", _F, 3),
@@ -114,10 +114,10 @@ AIRCRAFT = np.dtype(
         ("gps_error", _F, 3),
         ("gps_noise_m", _F, 3),
         ("gps_noise_m_s", _F),
-        ("mag_rate", _F, 3),  # rate [Hz], next sample [µs], number of its period; as those below
+        ("mag_rate", _F, 3),  # rate [Hz], next sample [µs], period number; the same below
         ("baro_rate", _F, 3),
         ("gps_rate", _F, 3),
-        ("noise_at", _I, 5),  # next unused row of each block of noise
+        ("noise_at", _I, 5),  # next unused row of each noise block
     ],
     align=True,
 )
@@ -139,13 +139,13 @@ SAMPLE = np.dtype(
     ],
     align=True,
 )
-"""The newest sample of each sensor: all that a flight controller learns of the aircraft."""
+"""Newest sample of each sensor, the only input of a flight controller from the aircraft."""
 
 CONTROLLER = np.dtype(
     [
         # The newest samples.
         ("time_us", _I),
-        ("left", _I),  # what of the newest tick is left to fuse, as `ticks.estimate` returns it
+        ("left", _I),  # measurements of the newest tick left to fuse, from `ticks.estimate`
         ("accel", _F, 3),
         ("gyro", _F, 3),
         ("mag", _F, 3),
@@ -155,11 +155,11 @@ CONTROLLER = np.dtype(
         ("gps_velocity", _F, 3),
         ("battery_left", _F),
         ("watch", _I, (WATCHES, 3)),
-        ("looked_at", _F, 6),  # accelerometer and gyro at the newest look of the failsafes
+        ("looked_at", _F, 6),  # accelerometer and gyro at the last failsafe check
         # Alignment at rest: sums of accelerometer, compass, barometric altitude, fix.
         ("aligned", _I),
         ("rest_since_us", _I),  # -1 = no sample yet
-        ("rest_count", _I, 4),  # as `alignment.IMU` and so on
+        ("rest_count", _I, 4),  # indices as in `alignment.IMU` etc.
         ("rest_sum", _F, 10),
         # Estimator.
         ("state", _F, ROW_SIZE),
@@ -174,8 +174,8 @@ CONTROLLER = np.dtype(
         ("heading_fused_us", _I),
         ("flying", _I),
         ("compass", _I),  # OFF, TRUSTED or SUSPECT
-        ("gps", _I),  # the same
-        ("origin", _F, 3),  # latitude, longitude [deg], altitude [m]; NaN = not known
+        ("gps", _I),  # same values as `compass`
+        ("origin", _F, 3),  # latitude, longitude [deg], altitude [m]; NaN = unknown
         ("gps_variance", _F, 2),  # position, velocity
         ("gps_horizontal_us", _I),
         ("gps_vertical_us", _I),
@@ -185,11 +185,11 @@ CONTROLLER = np.dtype(
         ("variance4", _F, 4),
         ("innovation2", _F, 2),
         ("variance2", _F, 2),
-        ("velocity_noise", _F),  # variance of GPS velocities, as a share of what it should be
-        ("velocity_before", _F, 3),  # deviations of the newest fix; NaN = none
+        ("velocity_noise", _F),  # variance of GPS velocities, relative to the nominal one
+        ("velocity_before", _F, 3),  # deviations of the newest fix; NaN = none yet
         ("accelerations", _F, (LOOK_BACK, 3)),  # of the newest fixes
         ("fixes", _I),
-        ("felt_motion", _F, (WINDOW, 2)),  # as `turned_motion`
+        ("felt_motion", _F, (WINDOW, 2)),  # see `turned_motion`
         ("seen_motion", _F, (WINDOW, 2)),
         ("motions", _I),
         ("motion_variance", _F),
@@ -210,18 +210,18 @@ CONTROLLER = np.dtype(
         ("demand", _F, DEMAND_SIZE),
         ("output", _F, OUTPUT_SIZE),
         ("motors", _F, 4),
-        # Climb of a take-off, as `autopilot.climb`.
+        # Climb of a takeoff, see `autopilot.climb`.
         ("climbs", _I),
-        ("climb_us", _I),  # when it moved on last; -1 = it begins
+        ("climb_us", _I),  # time of the last update; -1 = not started
         ("climb_due_us", _I),
         ("climb", _F, 6),
         ("climb_limits", _F, (3, 3)),
         ("ramp", _F, 5),
         # Land detector.
         ("detecting", _I),  # NOTHING, LIFT_OFF or LANDING
-        ("detected", _I),  # 1 = it was detected in the newest tick
-        ("land", _F, 7),  # thresholds, as `land_detector.thresholds`
-        ("still_since_us", _I),  # -1 = the vehicle moves
+        ("detected", _I),  # 1 = detected in the newest tick
+        ("land", _F, 7),  # thresholds of `land_detector.thresholds`
+        ("still_since_us", _I),  # -1 = the vehicle is moving
     ],
     align=True,
 )
@@ -230,7 +230,7 @@ CONTROLLER = np.dtype(
 TRUE_TICK = np.dtype(
     [("time_us", _I), ("motion", _F, WIDTH), ("power_w", _F), ("charge", _F)], align=True
 )
-"""The aircraft after a tick."""
+"""State of the aircraft after a tick."""
 
 FLOWN_TICK = np.dtype(
     [
@@ -252,23 +252,23 @@ FLOWN_TICK = np.dtype(
     ],
     align=True,
 )
-"""The flight controller in a tick: the sample that it took, its estimate, what it commanded."""
+"""State of the flight controller in a tick: sample, estimate, commands."""
 
 
 def new_aircraft() -> Record:
-    """Return a record of an aircraft without constants, all zero."""
+    """Return an aircraft record without constants, all zero."""
     record = np.zeros(1, AIRCRAFT)
     record["motion"][0, 6] = 1.0
     return record
 
 
 def new_sample() -> Record:
-    """Return a record of sensors that have not measured yet."""
+    """Return a record of sensors without measurements."""
     return np.zeros(1, SAMPLE)
 
 
 def new_controller() -> Record:
-    """Return a record of a flight controller that has just booted."""
+    """Return a record of a flight controller after boot."""
     record = np.zeros(1, CONTROLLER)
     never = ("baro_fused_us", "heading_fused_us", "gps_horizontal_us", "gps_vertical_us")
     for name in (*never, "watch", "still_since_us", "rest_since_us", "climb_us"):

@@ -1,10 +1,10 @@
-"""The compiled ticks of one vehicle: control, free flight, sensors, estimator.
+"""Compiled ticks of one vehicle: control, free flight, sensors, estimator.
 
-A tick begins with the newest sample already in the estimate: the loops turn it and the demand into
-motor commands, the aircraft moves, its sensors measure, and the estimator takes the new sample.
-`stretch` flies many ticks at a constant demand and returns as soon as Python has to act; `command`,
-`sense` and `estimate` are its parts, for ticks in which Python moves the body (contacts), changes
-the sample (faults) or fuses what is measured.
+A tick starts with the newest sample already fused into the estimate. The control loops compute
+motor commands from estimate and demand, the aircraft moves, its sensors measure, and the estimator
+fuses the new sample. `stretch` flies many ticks at a constant demand and returns when Python must
+act. Its parts `command`, `sense` and `estimate` are for ticks in which Python moves the body
+(contacts), changes the sample (faults) or fuses measurements.
 """
 
 from __future__ import annotations
@@ -72,50 +72,49 @@ from firmware_sim.engine.record import (
 )
 
 NONE, NOISE, ROOM, FUSE, HEALTH, DETECTED, COLLIDED, ALIGN, EMPTY, CLIMBED = range(10)
-"""Why `stretch` returned: all ticks are flown; a block of noise is used up; a contact is possible
-in the coming tick; Python has to fuse what the newest tick measured; the estimator has converged,
-or no longer is; the land detector has detected lift-off or landing; the vehicle has hit something
-(`Plant.touch`); the estimator may be aligned, or has its first fix; the battery is empty; the
-take-off has come near its altitude."""
+"""Events returned by `stretch`: all ticks are flown; a noise block is used up; a contact is
+possible in the coming tick; Python must fuse the newest measurements; the estimator's convergence
+has changed; the land detector has detected lift-off or landing; the vehicle has hit something
+(`Plant.touch`); the estimator can be aligned, or has its first fix; the battery is empty; the
+takeoff is near its target altitude."""
 
 REPEATED_BITS = 3
-"""`estimate` returns bits of `measured`; shifted by so many, which sensors repeated their last
-sample."""
+"""Shift of the repeated-sample bits in the result of `estimate`; lower bits as in `measured`."""
 
 EVENT_BITS = 4
-"""`stretch` returns the number of complete ticks, shifted by these bits, and the event."""
+"""Shift of the tick count in the result of `stretch`; the lower bits are the event."""
 
 EVENT_MASK = (1 << EVENT_BITS) - 1
 
 FRICTION = 0.8
-"""Of the body on the floor, as `plant.bullet_body` has it."""
+"""Friction coefficient of the body on the floor, as in `plant.bullet_body`."""
 
 HOLD_SHARE = 0.5
-"""The floor holds a vehicle against forces and torques up to this share of what friction and weight
-can bear."""
+"""Fraction of the friction and tipping limits up to which the floor holds a vehicle at rest."""
 
 LIGHT_SHARE = 0.1
-"""A vehicle that presses on the floor with less of its weight is about to lift off."""
+"""Fraction of the weight on the floor below which the vehicle is about to lift off."""
 
 CALM_RATIO = 0.6
-"""Headings within this test ratio (3 standard deviations) are fused without further judgement; see
+"""Maximum test ratio (3 standard deviations) of headings that are fused without further checks; see
 `consistency.FAR`."""
 
 PA_PER_HPA = 100.0
 
 _INERTIAL, _COMPASS, _BAROMETER, _GPS, _WIND = range(5)
-"""Places in `noise_at`."""
+"""Indices in `noise_at`."""
 
 _NORTH, _EAST, _DOWN = MAGNETIC_FIELD_NED
 HEADING_BY_TURN_NED = np.array([-_DOWN * _NORTH, -_DOWN * _EAST, _NORTH**2 + _EAST**2]) / (
     _NORTH**2 + _EAST**2
 )
-"""The field dips, so a tilt error turns the measured heading: seen from the world's axes,
-d innovation / d phi = (-tan(dip) cos(declination), -tan(dip) sin(declination), 1)."""
+"""Sensitivity of the heading to tilt, in world axes. The field dips, so a tilt error rotates the
+measured heading: d innovation / d phi = (-tan(dip) cos(declination), -tan(dip) sin(declination),
+1)."""
 
 _HOME_M = HOME.altitude_m
 _ATTITUDE, _RATES, _VELOCITY, _THRUST = 0, 4, 7, 10
-"""Layout of `output`."""
+"""Offsets of the setpoints in `output`."""
 
 
 # --- control
@@ -134,7 +133,7 @@ def _store(out: Output, c: Fields) -> None:
 
 @large_kernel
 def control(c: Fields) -> None:
-    """Turn estimate and demand into motor commands: one tick of the cascade.
+    """Compute motor commands from estimate and demand: one tick of the cascade.
 
     Args:
         c: Fields of a flight controller; `output`, `motors` and `memory` are updated.
@@ -166,13 +165,13 @@ def control(c: Fields) -> None:
 
 @kernel
 def control_record(controller: Record) -> None:
-    """Turn estimate and demand of a record (1,) into motor commands."""
+    """Compute motor commands from estimate and demand of a record (1,)."""
     control(controller[0])
 
 
 @kernel
 def _detect(c: Fields) -> bool:
-    """Return whether the vehicle has just left the ground, or has come to rest on it."""
+    """Return True if the vehicle has just lifted off, or has come to rest on the ground."""
     thrust, down_m_s = c.output[_THRUST], c.output[_VELOCITY + 2]
     if c.detecting == LIFT_OFF:
         c.still_since_us = -1
@@ -189,17 +188,17 @@ def _detect(c: Fields) -> bool:
 
 @kernel
 def detect_record(controller: Record) -> bool:
-    """Return whether the vehicle of a record (1,) has just left the ground, or come to rest."""
+    """Return True if the vehicle of a record (1,) has just lifted off, or come to rest."""
     return _detect(controller[0])
 
 
 @kernel
 def command(c: Fields, flown: Fields) -> None:
-    """Compute the motor commands of a tick and log it; note what is detected of the ground.
+    """Compute and log the motor commands of a tick, and update the land detector.
 
     Args:
         c: Fields of a flight controller, updated.
-        flown: Row of the log (`record.FLOWN_TICK`), written; its battery is that of the aircraft.
+        flown: Row of the log (`record.FLOWN_TICK`), written except for the aircraft's battery.
     """
     control(c)
     log_flown(c, flown)
@@ -208,7 +207,7 @@ def command(c: Fields, flown: Fields) -> None:
 
 @kernel
 def log_flown(c: Fields, flown: Fields) -> None:
-    """Log a flight controller in a tick (`record.FLOWN_TICK`), but for the battery."""
+    """Log a flight controller in a tick (`record.FLOWN_TICK`), except for the battery."""
     flown.time_us, flown.healthy = c.time_us, c.healthy
     for i in range(es.ROW_SIZE):
         flown.state[i] = c.state[i]
@@ -249,7 +248,7 @@ def push(a: Fields, motors: Speeds, wind: Vector) -> tuple[Vec, Vec, Vec]:
 
 @kernel
 def finish(a: Fields, after: Vector, wind: Vector, standing: bool) -> None:
-    """Take the motion after a tick (16,): time moves on, the battery drains."""
+    """Apply the motion after a tick (16,): advance time and drain the battery."""
     f, s = a.acceleration, a.speeds
     a.power_w, felt, reading, a.charge = absorb(
         a.motion,
@@ -272,13 +271,13 @@ def finish(a: Fields, after: Vector, wind: Vector, standing: bool) -> None:
     for i in range(WIDTH):
         a.motion[i] = after[i]
     a.ticks += 1
-    # Of the count: not every rate has a period of whole microseconds.
+    # From the tick count: periods of some rates are not whole microseconds.
     a.time_us = a.start_us + a.ticks * US_PER_S // a.rate_hz
 
 
 @kernel
 def _turning(a: Fields, c: Fields) -> Speeds:
-    """Return the motor commands; an empty battery turns no motor."""
+    """Return the motor commands; zero with an empty battery."""
     if a.charge <= 0.0:
         return 0.0, 0.0, 0.0, 0.0
     return c.motors[0], c.motors[1], c.motors[2], c.motors[3]
@@ -286,7 +285,7 @@ def _turning(a: Fields, c: Fields) -> Speeds:
 
 @kernel
 def _nearing_m(a: Fields) -> float:
-    """Return how much nearer any of its parts may come to anything in a tick [m]."""
+    """Return the maximum approach of any part to any object in a tick [m]."""
     v, w = velocity(a.motion), rates(a.motion)
     speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     spin = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
@@ -296,19 +295,19 @@ def _nearing_m(a: Fields) -> float:
 
 @kernel
 def _is_clear(a: Fields) -> bool:
-    """Return whether contacts are impossible in the coming tick."""
+    """Return True if contacts are impossible in the coming tick."""
     return bool(a.room_m > a.clear_m + _nearing_m(a))
 
 
 @kernel
 def is_clear_record(aircraft: Record) -> bool:
-    """Return whether contacts are impossible in the coming tick of a record (1,)."""
+    """Return True if contacts are impossible in the coming tick of a record (1,)."""
     return _is_clear(aircraft[0])
 
 
 @kernel
 def _glide(a: Fields, c: Fields, wind: Vector, after: Vector) -> None:
-    """Move an aircraft that touches nothing by one tick; `after` (16,) is scratch."""
+    """Move an aircraft without contact by one tick; `after` (16,) is scratch."""
     before, dt = a.motion, a.tick_s
     here, thrust, torque = push(a, _turning(a, c), wind)
     q, airframe = quaternion(before), airframe_of(a.airframe)
@@ -332,7 +331,7 @@ def log(a: Fields, truth: Fields) -> None:
 
 @kernel
 def _rest(a: Fields, motors: Speeds, wind: Vector, after: Vector) -> None:
-    """Let an aircraft stand where it is for one tick; `after` (16,) is scratch."""
+    """Keep an aircraft at rest for one tick; `after` (16,) is scratch."""
     push(a, motors, wind)
     row = a.motion
     for i in range(WIDTH):
@@ -344,19 +343,19 @@ def _rest(a: Fields, motors: Speeds, wind: Vector, after: Vector) -> None:
 
 @kernel
 def rest_record(aircraft: Record, motors: Speeds, wind: Vector) -> None:
-    """Let the aircraft of a record (1,) stand where it is for one tick."""
+    """Keep the aircraft of a record (1,) at rest for one tick."""
     _rest(aircraft[0], motors, wind, np.empty(WIDTH))
 
 
 @kernel
 def push_record(aircraft: Record, motors: Speeds, wind: Vector) -> tuple[Vec, Vec, Vec]:
-    """Advance the rotors of a record (1,) by a tick; return what `actuate` says of the body."""
+    """Advance the rotors of a record (1,) by a tick; return the results of `actuate`."""
     return push(aircraft[0], motors, wind)
 
 
 @kernel
 def finish_record(aircraft: Record, after: Vector, wind: Vector, standing: bool) -> None:
-    """Take the motion after a tick (16,) into a record (1,); as `finish`."""
+    """Apply the motion after a tick (16,) to a record (1,); see `finish`."""
     finish(aircraft[0], after, wind, standing)
 
 
@@ -365,12 +364,12 @@ def finish_record(aircraft: Record, after: Vector, wind: Vector, standing: bool)
 
 @kernel
 def is_due(schedule: Vector, time_us: int) -> bool:
-    """Return True once for every period of a sensor: rate [Hz], next sample [µs], its period."""
+    """Return True once per period of a sensor, given (rate [Hz], next sample [µs], period)."""
     if time_us < schedule[1]:
         return False
     rate = schedule[0]
     period = int(time_us * rate / US_PER_S)
-    # Rounding may put a time that lies on a boundary into the period before it.
+    # Rounding may assign a time on a boundary to the period before.
     if (period + 1) * US_PER_S / rate <= time_us:
         period += 1
     schedule[2], schedule[1] = period, (period + 1) * US_PER_S / rate
@@ -381,7 +380,7 @@ def is_due(schedule: Vector, time_us: int) -> bool:
 def sense(
     a: Fields, sample: Fields, inertial: Vector, compass: Vector, barometer: Vector, gps: Vector
 ) -> None:
-    """Measure: accelerometer and gyro, and the slower sensors that are due.
+    """Sample the accelerometer, the gyro, and the slower sensors that are due.
 
     Args:
         a: Fields of an aircraft; biases, drifts and schedules are updated.
@@ -389,7 +388,7 @@ def sense(
         inertial: (n, 12) white noise: accelerometer, gyro, their biases.
         compass: (n, 3) white noise.
         barometer: (n, 2) white noise: drift, sample.
-        gps: (n, 9) white noise: wandering error, position, velocity.
+        gps: (n, 9) white noise: correlated error, position, velocity.
     """
     row, sigma, now_us = a.motion, a.imu_sigma, a.time_us
     white = inertial[a.noise_at[_INERTIAL]]
@@ -436,7 +435,7 @@ def sense_record(
     barometer: Vector,
     gps: Vector,
 ) -> None:
-    """Measure by records (1,); as `sense`."""
+    """Sample the sensors of records (1,); see `sense`."""
     sense(aircraft[0], sample[0], inertial, compass, barometer, gps)
 
 
@@ -445,7 +444,7 @@ def sense_record(
 
 @kernel
 def _watch(c: Fields, row: int) -> None:
-    """Note that a sensor has measured something new."""
+    """Store the time of a new measurement of a sensor."""
     c.watch[row, SEEN] = c.watch[row, CHANGED] = c.time_us
     if c.watch[row, FIRST] < 0:
         c.watch[row, FIRST] = c.time_us
@@ -453,7 +452,7 @@ def _watch(c: Fields, row: int) -> None:
 
 @kernel
 def _copied(new: Vector, old: Vector) -> bool:
-    """Copy a sample (3,); return whether it differs from the one before."""
+    """Copy a sample (3,); return True if it differs from the previous sample."""
     changed = False
     for i in range(3):
         changed = changed or new[i] != old[i]
@@ -463,7 +462,7 @@ def _copied(new: Vector, old: Vector) -> bool:
 
 @kernel
 def _take_inertial(c: Fields, sample: Fields) -> None:
-    """Take what is measured at every tick."""
+    """Read the measurements of every tick."""
     c.time_us, c.temperature_c = sample.time_us, sample.temperature_c
     c.battery_left = sample.battery_left
     for i in range(3):
@@ -472,7 +471,7 @@ def _take_inertial(c: Fields, sample: Fields) -> None:
 
 @kernel
 def _take(c: Fields, sample: Fields) -> int:
-    """Take the slower sensors' samples; return which of them repeat themselves."""
+    """Read the samples of the slower sensors; return the bits of repeated samples."""
     repeated = 0
     if sample.measured & MAG:
         if _copied(sample.mag, c.mag):
@@ -496,7 +495,7 @@ def _take(c: Fields, sample: Fields) -> int:
 
 @kernel
 def fuse_gps(c: Fields, sample: Fields) -> bool:
-    """Fuse a fix; return False, and leave all as it is, where it has to be judged first."""
+    """Fuse a fix. Return False, without changes, if Python must check it first."""
     if c.gps == OFF:
         return True
     known = not math.isnan(c.origin[0])
@@ -526,7 +525,7 @@ def fuse_gps(c: Fields, sample: Fields) -> bool:
         c.gps_horizontal_us = c.time_us
     z, r = c.innovation2, c.variance2
     z[0], z[1] = place[2] - s[2], down - s[es.V + 2]
-    # A receiver's height is about half as good as its horizontal position.
+    # A receiver's vertical accuracy is about half its horizontal accuracy.
     r[0], r[1] = max(sample.gps_epv_m, math.sqrt(r_p)) ** 2, r_v
     ratio = fuse(s, p, z, c.gps_vertical_h, r)
     s[es.RATIO + 3] = ratio
@@ -549,7 +548,7 @@ def fuse_pressure(c: Fields) -> None:
 
 @kernel
 def fuse_heading(c: Fields) -> bool:
-    """Fuse the compass's sample; return False where its innovation has to be judged first."""
+    """Fuse the compass's sample; return False if Python must check its innovation first."""
     if c.compass == OFF:
         return True
     if c.compass == SUSPECT:
@@ -570,7 +569,7 @@ def fuse_heading(c: Fields) -> bool:
 
 @kernel
 def _await_alignment(c: Fields, sample: Fields) -> bool:
-    """Add a sample at rest to the sums; return whether Python has to look at them."""
+    """Add a sample at rest to the sums; return True if Python must evaluate the sums."""
     _take_inertial(c, sample)
     _take(c, sample)
     add(c, sample.measured)
@@ -580,14 +579,14 @@ def _await_alignment(c: Fields, sample: Fields) -> bool:
 
 @large_kernel
 def estimate(c: Fields, sample: Fields) -> int:
-    """Predict by the IMU's newest sample, and fuse what was measured with it.
+    """Predict with the newest IMU sample, and fuse the other measurements of the tick.
 
     Args:
         c: Fields of an aligned flight controller, updated.
-        sample: Fields of the aircraft, whose samples are taken.
+        sample: Fields of the aircraft's sensors, read.
 
     Returns:
-        Bits of the measurements that Python has to fuse, as in `measured`, and of repeated samples.
+        Bits of the measurements that Python must fuse, as in `measured`, and of repeated samples.
     """
     _take_inertial(c, sample)
     predict(c.state, c.covariance, c.process_noise, c.transition, c.gyro, c.accel, TICK_S)
@@ -608,7 +607,7 @@ def estimate(c: Fields, sample: Fields) -> int:
 
 @kernel
 def settle(c: Fields) -> bool:
-    """Judge the estimate after all of a tick is fused; return whether its health has changed."""
+    """Update the estimator's health after all fusion of a tick; return True if it has changed."""
     healthy = 1 if es.converged(c.state, c.covariance) else 0
     changed: bool = healthy != c.healthy
     c.healthy = healthy
@@ -619,7 +618,7 @@ def settle(c: Fields) -> bool:
 def begin_touch(
     controller: Record, aircraft: Record, flown: Record, wind: Vector
 ) -> tuple[Vec, Vec, Vec]:
-    """Begin a tick of records (1,) in which something else moves the body.
+    """Start a tick of records (1,) in which another engine moves the body.
 
     Returns centre of mass, force and torque as `actuate`.
     """
@@ -644,9 +643,9 @@ def end_touch(
     gps: Vector,
     truth: Record,
 ) -> int:
-    """End a tick of records (1,) with the motion after it (16,): measure and estimate.
+    """End a tick of records (1,), given the motion (16,) after it: measure and estimate.
 
-    Returns the event: `FUSE`, `HEALTH` or `NONE`.
+    Returns the event: `ALIGN`, `FUSE`, `HEALTH` or `NONE`.
     """
     a, c = aircraft[0], controller[0]
     finish(a, after, wind, standing)
@@ -662,19 +661,19 @@ def end_touch(
 
 @kernel
 def log_flown_record(controller: Record, flown: Record) -> None:
-    """Log a record (1,) of a flight controller in a tick; as `log_flown`."""
+    """Log a flight controller's record (1,) in a tick; see `log_flown`."""
     log_flown(controller[0], flown[0])
 
 
 @kernel
 def log_record(aircraft: Record, truth: Record) -> None:
-    """Log a record (1,) of an aircraft after a tick; as `log`."""
+    """Log an aircraft's record (1,) after a tick; see `log`."""
     log(aircraft[0], truth[0])
 
 
 @kernel
 def settle_record(controller: Record) -> bool:
-    """Judge the estimate of a record (1,); return whether its health has changed."""
+    """Update the estimator's health in a record (1,); return True if it has changed."""
     return settle(controller[0])
 
 
@@ -695,24 +694,24 @@ def stretch(
     truths: Record,
     flown: Record,
 ) -> int:
-    """Fly up to so many ticks at a constant demand.
+    """Fly up to `ticks` ticks at a constant demand.
 
     Args:
-        aircraft: (1,) its record, updated.
-        sample: (1,) of its sensors, updated.
-        controller: (1,) of an aligned flight controller, updated.
-        ticks: How many, at least 1.
-        inertial: As `sense`, and so the next three.
+        aircraft: (1,) aircraft, updated.
+        sample: (1,) sensors, updated.
+        controller: (1,) aligned flight controller, updated.
+        ticks: Maximum number of ticks, at least 1.
+        inertial: Noise, see `sense`, as for the next three.
         compass: (n, 3).
         barometer: (n, 2).
         gps: (n, 9).
-        wind: (n, 3) NED [m/s] of the coming ticks; a single row does not change.
+        wind: (n, 3) NED [m/s] of the coming ticks; a single row is constant wind.
         truths: (ticks,) log of the aircraft, written.
         flown: (ticks,) log of the flight controller, written.
 
     Returns:
-        Complete ticks and event: `ticks << EVENT_BITS | event`. After `FUSE` one more tick is
-        flown and logged, whose measurements wait in the sample.
+        Complete ticks and event: `ticks << EVENT_BITS | event`. After `FUSE` one more tick is flown
+            and logged, and its measurements wait in the sample.
     """
     a, seen, c = aircraft[0], sample[0], controller[0]
     after, at, steady = np.empty(WIDTH), a.noise_at, len(wind) == 1

@@ -1,1 +1,1 @@
-"""Real firmware in place of the built-in autopilot: one bridge for each simulator interface."""
+"""Real firmware in place of the built-in autopilot: one bridge per simulator interface."""

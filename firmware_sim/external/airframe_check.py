@@ -13,10 +13,10 @@ from firmware_sim.flight_controller import FirmwareMissingError
 MOTORS = range(4)
 
 SITL_OUTPUT, HITL_OUTPUT = "PWM_MAIN_FUNC{}", "HIL_ACT_FUNC{}"
-"""PX4's parameter of the function of output {}."""
+"""PX4's parameter for the function of output {}."""
 
 GROUND_LOSS = "NAV_DLL_ACT"
-"""PX4's parameter of the action on ground station loss; 0 = none."""
+"""PX4's parameter for the action on ground station loss; 0 = disabled."""
 
 _PX4_MOTOR_1 = 101
 """PX4's output function of motor 1 (docs: Actuator Configuration)."""
@@ -37,15 +37,15 @@ class Airframe:
     firmware: str
     """Name of the firmware in messages: PX4."""
     motors: Sequence[Corner]
-    """Corner of the motor on each of its outputs."""
+    """Corner of the motor on each output."""
     frame: Mapping[str, Value]
     """Parameters that select the frame and the motors' outputs: only checked, never set."""
     settings: Mapping[str, Value]
-    """Parameters and their required values: set where that is allowed, checked otherwise."""
+    """Parameters and their required values: set if allowed, checked otherwise."""
     problem: Callable[[Mapping[str, Value]], str | None]
-    """Says what is wrong with the frame that the parameters configure; None = nothing."""
+    """Return the problem of the frame that the parameters configure; None = no problem."""
     also_read: tuple[str, ...] = ()
-    """Further parameters that must be known."""
+    """Additional parameters that must be known."""
     autostart: int = 0
 
     def names(self) -> list[str]:
@@ -123,7 +123,7 @@ def ardupilot_airframe(vehicle: VehicleProfile) -> Airframe:
 
 
 def refuse_untold(vehicle: VehicleProfile, firmware: str) -> None:
-    """Raise FirmwareMissingError for a vehicle with sensors that no such firmware is told of."""
+    """Raise FirmwareMissingError for a vehicle with sensors not supported by the firmware."""
     for name in ("vision", "rangefinder", "optical_flow"):
         if getattr(vehicle.sensors, name) is not None:
             raise FirmwareMissingError(

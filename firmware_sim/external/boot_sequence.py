@@ -1,4 +1,4 @@
-"""The boot sequence of external firmware: started, frame checked, parameters set, ready to arm."""
+"""Boot sequence of external firmware: start, frame check, parameters, ready to arm."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.simulation import EpisodeSetup
 
 ASK_EVERY_S = 0.25
-"""Interval at which missing parameters are requested again [wall s]."""
+"""Interval of repeated requests for missing parameters [wall s]."""
 
 FAREWELL_S = 1.5
-"""Time that firmware is simulated on after it is told to end: PX4 takes 0.4 s [simulated s]."""
+"""Simulated time after the shutdown command [simulated s]; PX4 needs 0.4 s."""
 
 SHOWN = 4
-"""Most parameters that a message names."""
+"""Maximum number of parameters named in a message."""
 
 LEAST_WAIT_S = 2.0
-"""No answer of its is missed sooner, however long that took by the wall clock [simulated s]."""
+"""Minimum wait for a reply before the wall-clock timeout applies [simulated s]."""
 
 READY_LIMIT_S = 120.0
-"""Longest time from power-up until it may be armed: ArduPilot's EKF takes 40 [simulated s]."""
+"""Maximum wait of a boot step [simulated s]; ArduPilot's EKF is ready to arm after 40 s."""
 
 
 class ExternalFlightController:
@@ -42,7 +42,7 @@ class ExternalFlightController:
     internals = None
 
     def __init__(self, launcher: Launcher, observer: Observer) -> None:
-        """Start the firmware, or wait for it; see `Launcher.launch`. `observer`: of its MAVLink."""
+        """Start or await the firmware, see `Launcher.launch`; `observer` watches its MAVLink."""
         self._bridge = bridge = launcher.launch()
         self._observer = observer
         self._launcher = launcher
@@ -53,7 +53,7 @@ class ExternalFlightController:
 
     @property
     def on_message(self) -> Callable[[Message], None] | None:
-        """Called with every text for the operator, if set."""
+        """Callback for every operator text; None = no callback."""
         return self._observer.on_message
 
     @on_message.setter
@@ -62,11 +62,11 @@ class ExternalFlightController:
 
     @property
     def flight(self) -> Flight:
-        """Phase and mode by its heartbeat. The bridge knows sooner whether it is armed."""
+        """Phase and mode from the heartbeat, with the armed state from the faster bridge."""
         return self._observer.flight(armed=self._bridge.armed)
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Advance it to the sample's time. Raises FirmwareLostError."""
+        """Advance the firmware to the sample's time. Raises FirmwareLostError."""
         self._sample = sample
         controls = self._bridge.step(sample)
         m = controls.motors
@@ -74,13 +74,13 @@ class ExternalFlightController:
         return ActuatorControls(controls.time_us, (m[a], m[b], m[c], m[d]), armed=controls.armed)
 
     def close(self) -> None:
-        """End it if it was started here; otherwise tell it to reboot or shut down."""
+        """Stop firmware started here; otherwise command it to reboot or shut down."""
         if not self._launcher.may_set:
             self._send_shutdown()
         self._launcher.stop()
 
     def _send_shutdown(self) -> None:
-        """Send the command, and simulate on until it has taken effect."""
+        """Send the command and continue to simulate until it has taken effect."""
         sample, self._sample = self._sample, None
         if sample is None:
             return
@@ -106,55 +106,55 @@ class ExternalFlightStack:
     ) -> None:
         """Compose the stack without starting it.
 
-        `timeout_s` is that of each answer during the boot sequence [wall s]. The observer's link is
-        read in flight at least `look_every_us` apart, where it cannot signal.
+        `timeout_s` is the timeout of each boot step [wall s]. `look_every_us` is the minimum
+        interval at which the observer's link is read [simulated µs].
         """
         self._on_close = on_close
         self._launcher = launcher
         self._observer = observer
         self._timeout_s = timeout_s
         self._missing: list[str] = []
-        """Parameters that are still missing."""
+        """Names of parameters still missing."""
         self.filenos = observer.filenos
         self._look_every_us, self._look_us = look_every_us, 0
         self.send = observer.send
         self.counters: Callable[[], dict[str, LinkCounters]] = observer.counters
 
     def next_send_us(self) -> float:
-        """Return 0: its observer is called after every tick."""
+        """Return 0: `send` is called after every tick."""
         return 0.0
 
     def receive(self, now_us: int) -> int:
-        """Take what has come at simulated `now_us` [µs]; return how many messages counted."""
+        """Handle messages received by simulated `now_us` [µs]; return the number accepted."""
         if now_us < self._look_us:
             return 0
         self._look_us = now_us + self._look_every_us
         return self._observer.receive(now_us)
 
     def log_to(self, tlog: TlogWriter | None) -> None:
-        """Write the observer's link to a tlog. The firmware's own log of the flight goes beside."""
+        """Log the observer's link to a tlog. The firmware's flight log is copied beside it."""
         self._observer.log_to(tlog)
         if tlog is not None:
             self._launcher.flight_log = tlog.path.with_suffix(ULOG_SUFFIX)
 
     def strangers(self) -> tuple[str, ...]:
-        """Return nobody: the firmware has links of its own, into which only it looks."""
+        """Return an empty tuple: traffic on the firmware's links is not inspected."""
         return ()
 
     def boot(self, setup: EpisodeSetup) -> ExternalFlightController:
         """Start the firmware of an episode, or wait for it; see `Launcher.launch`."""
-        del setup  # Each start is a power-up: it knows nothing of the last flight.
+        del setup  # Each start is a power-up without state of an earlier flight.
         self._observer.restart()
         return ExternalFlightController(self._launcher, self._observer)
 
     def connect(self, tick: Callable[[], int], truth: Callable[[], Truth]) -> None:
-        """Run the boot sequence on the ground until the frame is checked and it may be armed.
+        """Run the boot sequence on the ground until the frame is checked and arming is possible.
 
         `tick` flies a tick and returns its simulated time [µs].
 
         Raises:
-            FirmwareMissingError: It is silent, has another frame, or never gets ready to arm.
-            FirmwareLostError: It died.
+            FirmwareMissingError: The firmware is silent, has another frame, or cannot be armed.
+            FirmwareLostError: The firmware died.
         """
         del truth
         airframe, observer = self._launcher.airframe, self._observer
@@ -162,7 +162,7 @@ class ExternalFlightStack:
         self._until(tick, lambda: observer.heard, "a MAVLink heartbeat")
         names = airframe.names()
         self._until(tick, self._asking(lambda: parameters.ask(names)), "the parameters")
-        # Where a lost ground station has consequences, a rehearsal without one must have them too.
+        # If the loss of a ground station triggers an action, it must do so in a rehearsal too.
         observer.acts_as_ground_station = not parameters.values.get(GROUND_LOSS, 0)
         problem = airframe.problem(parameters.values)
         if problem is not None:
@@ -175,13 +175,13 @@ class ExternalFlightStack:
         self._until(tick, lambda: observer.ready, "its report that it may be armed")
 
     def close(self) -> None:
-        """End the firmware, if we started it, and stop listening."""
+        """Stop the firmware if it was started here, and close the observer."""
         self._launcher.close()
         self._observer.close()
         self._on_close()
 
     def _asking(self, ask: Callable[[], Iterable[str]]) -> Callable[[], bool]:
-        """Return a function that asks at intervals, and returns whether nothing is missing."""
+        """Return a function that repeats a request at intervals; True once nothing is missing."""
         clock, due_us = WallClock(), 0
 
         def asked() -> bool:
@@ -205,7 +205,7 @@ class ExternalFlightStack:
             start_us = now_us if start_us is None else start_us
             simulated_us = now_us - start_us
             late = simulated_us > READY_LIMIT_S * US_PER_S
-            # A host that is busy simulates little in that time: what is due may still come.
+            # A busy host simulates little time within the wall-clock timeout.
             silent = simulated_us > LEAST_WAIT_S * US_PER_S
             if late or (silent and clock.time_us() > self._timeout_s * US_PER_S):
                 left = f" ({_some(self._missing)})" if self._missing else ""

@@ -1,4 +1,4 @@
-"""Real firmware as it is asked for: put together, found, and explained to who starts it."""
+"""Composition of real firmware from its options: launcher, observer and links."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ class Wanted:
     aircraft: Aircraft
     vehicle: VehicleProfile
     log: Path | None
-    """What it prints goes here; None = a file in its folder."""
+    """Log file for the firmware's output; None = a file in its folder."""
     bind_ends: Callable[[], UdpLinks]
-    """Binds the vehicle's ends of the links, where they are ours."""
+    """Bind the vehicle's ends of the links, if not bound by the firmware."""
 
 
 def real_firmware(wanted: Wanted) -> ExternalFlightStack:
@@ -52,7 +52,7 @@ def real_firmware(wanted: Wanted) -> ExternalFlightStack:
 def _px4(wanted: Wanted) -> tuple[Launcher, Endpoint]:
     real = wanted.aircraft.real
     if real.px4_dir is not None:
-        # Otherwise PX4 would come up without its links, or not at all, flight after flight.
+        # With a taken port, PX4 would start without its links, or not at all, in every flight.
         px4_program.check_free(real.instance)
     return px4_parts(wanted, real.instance, Px4Bridge)
 
@@ -60,9 +60,9 @@ def _px4(wanted: Wanted) -> tuple[Launcher, Endpoint]:
 def px4_parts(
     wanted: Wanted, instance: int, bridge: Callable[[int], Px4Bridge]
 ) -> tuple[Launcher, Endpoint]:
-    """Bind the observer's end of PX4's payload link. Return PX4's launcher and that end.
+    """Bind the observer's end of PX4's payload link. Return PX4's launcher and this endpoint.
 
-    `instance` moves the ports; `bridge` opens the simulator interface on one.
+    `instance` shifts the ports; `bridge` opens the simulator interface on a port.
     """
     options = wanted.aircraft.real
     airframe = airframe_check.px4_airframe(wanted.vehicle, airframe_check.SITL_OUTPUT)
@@ -91,7 +91,7 @@ def _ardupilot(wanted: Wanted) -> tuple[Launcher, Endpoint]:
     airframe_check.refuse_untold(wanted.vehicle, "ardupilot")
     where = options.ardupilot_dir
     program = None if where is None else find_arducopter(where)
-    # Who is started by us can be told any port.
+    # A program started here accepts any port.
     port = ardupilot_program.OBSERVER_PORT + instance if program is None else 0
     endpoint = UdpEndpoint(
         (LOOPBACK, port), None, local_option="--instance", remote_option="--instance"

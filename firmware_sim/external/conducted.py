@@ -1,4 +1,4 @@
-"""PX4 SITL for a conducted companion: the companion's link, and its own instance.
+"""PX4 SITL for a companion in lockstep: a PX4 instance and the companion's link.
 
 Only PX4's boot runs by the wall clock. A busy host slows a flight down but never ends it.
 """
@@ -23,35 +23,35 @@ from firmware_sim.external.px4.sitl import Px4Bridge
 from firmware_sim.mavlink.udp_links import UdpLinks
 
 ANSWER_S = 60.0
-"""Longest wait for PX4's answer to a sample [wall s, while this process runs]."""
+"""Timeout of PX4's reply to a sample [wall s, while this process runs]."""
 
 
 STATE_US = US_PER_S // 5
-"""The true state is sent no more often [µs]. PX4 asks for it every 5 ms, only to log it."""
+"""Minimum interval of the true state [µs]. PX4 requests 5 ms, only for its log."""
 
 
 LOOK_US = US_PER_S // 50
-"""The observer's link is looked at so often [µs]: nothing on it comes faster."""
+"""Interval at which the observer's link is read [µs]; no message on it is faster."""
 
 
 @dataclass(frozen=True)
 class ConductedPx4:
-    """PX4 and what a conductor needs of it."""
+    """PX4 with its links and functions for a lockstep scheduler."""
 
     stack: ExternalFlightStack
     link: OnboardLink
-    """The companion's; closed with the stack."""
+    """Companion's link; closed with the stack."""
     settle: Callable[[], None]
-    """Returns when PX4 has done all that is due by its clock."""
+    """Wait until PX4 has done all work due by its clock."""
     instance: int
 
 
 def conducted_px4(aircraft: Aircraft, vehicle: VehicleProfile, log: Path | None) -> ConductedPx4:
     """Bind the ports of an instance of PX4 and return it, not yet started.
 
-    PX4 started here gets the first free instance from the requested one on, so that parallel
-    flights find different ones. `log` takes its output; None: a file in its folder. Raises
-    UsageError: no instance is free, or the program is not there.
+    PX4 started here gets the first free instance from the requested instance on, so that parallel
+    flights use different instances. `log` receives PX4's output; None = a file in its folder.
+    Raises UsageError if no instance is free or the program does not exist.
     """
     ask_for_short_slices()
     real = aircraft.real
@@ -61,7 +61,7 @@ def conducted_px4(aircraft: Aircraft, vehicle: VehicleProfile, log: Path | None)
     find_px4(real.px4_dir)
     taken: UsageError | None = None
     for instance in range(real.instance, GREATEST_INSTANCE + 1):
-        # Bound first: two processes that look at the same time do not take the same one.
+        # Bind first, so that two concurrent processes do not take the same instance.
         try:
             found = _instance(wanted, instance)
         except UsageError as error:

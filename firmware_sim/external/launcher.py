@@ -1,4 +1,4 @@
-"""Simulator interface of external firmware; starts it for each flight, or waits for the user's."""
+"""Launcher of external firmware: starts it for each flight, or waits for the user's firmware."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 
 
 def no_process() -> None:
-    """Check nothing: firmware that the user started has no process of ours."""
+    """Check nothing: firmware started by the user has no child process here."""
 
 
 class Bridge(Protocol):
-    """One flight's simulator interface of one firmware, without its MAVLink."""
+    """Simulator interface of one firmware for one flight, without its MAVLink."""
 
     rate_hz: int
-    """Sensor samples that the firmware needs per second of simulated time."""
+    """Required sensor samples per second of simulated time [Hz]."""
     armed: bool
-    """Whether the simulator interface last reported it armed; False before the first report."""
+    """True if the simulator interface last reported armed; False before the first report."""
     time_us: int
-    """The firmware's own time of the newest exchange [µs]; 0 before the first."""
+    """Firmware's time of the newest exchange [µs]; 0 before the first exchange."""
 
     def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
         """Wait until the firmware has connected, at most `timeout_s` [wall s].
 
-        `alive` is polled here and by every later `step` that waits, and raises when the process has
+        `alive` is polled here and by every later `step` that waits, and raises if the process has
         died.
 
         Raises:
-            FirmwareMissingError: It did not connect in time.
-            FirmwareLostError: From `alive`.
+            FirmwareMissingError: The firmware did not connect in time.
+            FirmwareLostError: Raised by `alive`.
         """
 
     def step(self, sample: SensorSample) -> ActuatorControls:
@@ -45,18 +45,18 @@ class Bridge(Protocol):
 
         Raises:
             FirmwareLostError: The firmware died, hangs, or sends invalid data.
-            FirmwareMissingError: It is connected, but cannot be flown.
+            FirmwareMissingError: The firmware is connected, but cannot be flown.
         """
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
-        """Accept a source of the true state."""
+        """Set the source of the true state."""
 
     def close(self) -> None:
-        """Release what it holds; harmless when called again."""
+        """Release all resources. Idempotent."""
 
 
 class Launcher:
-    """One kind of firmware, flight after flight: its bridge, and its process where it is ours."""
+    """Launcher of one kind of firmware for each flight: bridge, and process if started here."""
 
     def __init__(
         self,
@@ -68,31 +68,31 @@ class Launcher:
         program: Callable[[Path], StartCommand] | None = None,
         folders: WorkingFolders | None = None,
     ) -> None:
-        """Configure the launch; the bridge opens the simulator interface for one flight.
+        """Configure the launch; `bridge` opens the simulator interface for one flight.
 
-        `timeout_s` is that of connecting [wall s]; the firmware `reboots` by itself on command.
-        `program` writes files to an empty working folder and returns the command to run there; None
-        = the user starts it.
+        `timeout_s` is the connection timeout [wall s]; `reboots`: the firmware reboots on command.
+        `program` writes files to an empty working folder and returns the command to run there;
+        None = the user starts the firmware.
         """
         self.airframe = airframe
         self.may_set = program is not None
-        """Whether its parameters may be changed: it was started here, for this flight alone."""
+        """True if parameters may be changed: the firmware was started here for this flight."""
         self.reboots = reboots
         self._open_bridge = bridge
         self._program, self._folders = program, folders
         self._timeout_s = timeout_s
         self.flight_log: Path | None = None
-        """Where the log that it writes of this flight goes once it has ended; None = nowhere."""
+        """Destination of the firmware's flight log after the flight; None = not copied."""
         self._bridge: Bridge | None = None
         self._child: FirmwareProcess | None = None
 
     def launch(self) -> Bridge:
-        """Start it, or wait for it, and return the bridge, connected.
+        """Start the firmware, or wait for it, and return the connected bridge.
 
         Raises:
             UsageError: A port or device cannot be opened.
-            FirmwareMissingError: It cannot be started, ends at once, or never connects.
-            FirmwareLostError: It died while it started.
+            FirmwareMissingError: The firmware cannot be started, exits early or never connects.
+            FirmwareLostError: The firmware died during start-up.
         """
         self.stop()
         alive = no_process
@@ -111,7 +111,7 @@ class Launcher:
         return bridge
 
     def _await(self, bridge: Bridge, alive: Callable[[], None]) -> None:
-        """Wait for the connection; FirmwareMissingError also if the program ends before."""
+        """Wait for the connection; FirmwareMissingError also if the program exits first."""
         try:
             bridge.wait_connected(self._timeout_s, alive)
         except FirmwareLostError as error:
@@ -126,7 +126,7 @@ class Launcher:
             ) from error
 
     def stop(self) -> None:
-        """Release the bridge and end what was started; harmless when nothing was."""
+        """Close the bridge and stop the process started here, if any. Idempotent."""
         if self._bridge is not None:
             self._bridge.close()
         child, self._child = self._child, None
@@ -144,11 +144,11 @@ class Launcher:
             shutil.copyfile(written, partial)
             partial.replace(path)
         except OSError:
-            # A full disk: the flight counts without this log.
+            # Disk full: the flight is valid without this log.
             partial.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """End it for good: nothing temporary is left."""
+        """Stop the firmware and remove temporary folders."""
         self.stop()
         if self._folders is not None:
             self._folders.close()

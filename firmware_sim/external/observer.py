@@ -43,10 +43,10 @@ _IN_AIR = (
 def flight_of(
     autopilot: int, custom_mode: int, landed_state: int, *, armed: bool, ready: bool
 ) -> Flight:
-    """Return phase and mode by HEARTBEAT and EXTENDED_SYS_STATE; `ready` = it may be armed."""
+    """Return phase and mode from HEARTBEAT and EXTENDED_SYS_STATE; `ready` = ready to arm."""
     if autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
         mode = _ARDUCOPTER_MODES.get(custom_mode, Mode.POSITION)
-        # GUIDED takes off as well: coming from the ground is no flight by setpoints.
+        # GUIDED includes the take-off, which is not flown by setpoints.
         if mode is Mode.OFFBOARD and landed_state == dialect.MAV_LANDED_STATE_TAKEOFF:
             mode = Mode.TAKEOFF
     else:
@@ -59,7 +59,7 @@ def flight_of(
 
 
 SYSTEM_ID = 254
-"""MAVLink system id of the observer: neither the vehicle's nor a ground station's (255)."""
+"""MAVLink system id of the observer, different from the vehicle's and a ground station's (255)."""
 
 INTERVALS_US: Mapping[str, int] = {
     "SYS_STATUS": 500_000,
@@ -69,7 +69,7 @@ INTERVALS_US: Mapping[str, int] = {
     "GLOBAL_POSITION_INT": 200_000,
     "GPS_RAW_INT": 200_000,
 }
-"""Messages that it requests, and their intervals [µs]: few, as the link may be slow."""
+"""Requested messages and their intervals [µs]; few, as the link may be slow."""
 
 WITHOUT_GPS: Mapping[str, int] = {
     **{name: us for name, us in INTERVALS_US.items() if name != "GPS_RAW_INT"},
@@ -77,13 +77,13 @@ WITHOUT_GPS: Mapping[str, int] = {
 }
 
 ASK_EVERY_US = 1_000_000
-"""Interval at which messages that have not arrived are requested again [µs]."""
+"""Interval of repeated requests for missing messages [µs]."""
 
 BEAT_EVERY_US = 1_000_000
-"""Interval of its heartbeat [µs]."""
+"""Interval of the observer's heartbeat [µs]."""
 
 FORCE = 21196
-"""Second parameter of COMPONENT_ARM_DISARM that disarms in any state (MAVLink, common.xml)."""
+"""Second parameter of COMPONENT_ARM_DISARM: disarm in any state (MAVLink, common.xml)."""
 
 REBOOT, SHUT_DOWN = 1, 2
 """First parameter of PREFLIGHT_REBOOT_SHUTDOWN."""
@@ -102,7 +102,7 @@ _PREARM = dialect.MAV_SYS_STATUS_PREARM_CHECK
 
 
 class Observer:
-    """One link to external firmware. Nothing blocks, and no received message raises."""
+    """Link to external firmware. Non-blocking; no received message raises."""
 
     def __init__(self, endpoint: Endpoint, name: str, origin: Geodetic | None = None) -> None:
         """Observe a named link; `origin` is sent to firmware without GPS."""
@@ -114,43 +114,43 @@ class Observer:
         self._tlog: TlogWriter | None = None
         self._rx = self._tx = self._ignored = 0
         self.on_message: Callable[[Message], None] | None = None
-        """Called with every text for the operator, if set."""
+        """Callback for every operator text; None = no callback."""
         self.restart()
 
     def restart(self) -> None:
-        """Forget the firmware: another one is about to start."""
+        """Reset all state before another firmware starts."""
         self._now_us = 0
         self._heard: WireMessage | None = None
         self._landed = int(dialect.MAV_LANDED_STATE_UNDEFINED)
         self._ready = False
         self._located = False
-        """Whether it says that its position is good; told of firmware without GPS."""
+        """True if firmware without GPS reports a valid position."""
         self._asked_us = -ASK_EVERY_US
         self._came: set[str] = set()
         self._text = ""
         self.last_text = ""
         self._beat_us = -BEAT_EVERY_US
         self.acts_as_ground_station = True
-        """Whether it sends the heartbeat of a ground station: PX4 sends texts only to such."""
+        """True to send a ground station's heartbeat, which PX4 requires to send texts."""
         self.parameters = ParameterClient(self._send)
 
     @property
     def heard(self) -> bool:
-        """Whether a heartbeat was received."""
+        """True once a heartbeat was received."""
         return self._heard is not None
 
     @property
     def autopilot(self) -> int | None:
-        """MAV_AUTOPILOT of its heartbeat; None before the first."""
+        """MAV_AUTOPILOT of the heartbeat; None before the first heartbeat."""
         return None if self._heard is None else int(self._heard.autopilot)
 
     @property
     def ready(self) -> bool:
-        """Whether it may be armed and sends its position, which ArduPilot needs to be flown."""
+        """True if ready to arm and sending a position, which flying ArduPilot requires."""
         return self._ready and "LOCAL_POSITION_NED" in self._came
 
     def flight(self, *, armed: bool) -> Flight:
-        """Return phase and mode; `armed` is whether motors may turn."""
+        """Return phase and mode; `armed` = the motors may turn."""
         beat = self._heard
         if beat is None:
             return Flight()
@@ -158,15 +158,15 @@ class Observer:
             beat.autopilot, beat.custom_mode, self._landed, armed=armed, ready=self._ready
         )
 
-    # --- as the firmware process's MAVLink side
+    # --- MAVLink side of the firmware process
 
     def filenos(self) -> list[int]:
-        """Return the descriptors that become readable when something arrives."""
+        """Return the descriptors that become readable when data arrive."""
         number = self._endpoint.fileno()
         return [] if number is None else [number]
 
     def receive(self, now_us: int) -> int:
-        """Take what has arrived at simulated `now_us` [µs]; return how many messages counted."""
+        """Handle messages received by simulated `now_us` [µs]; return the number accepted."""
         self._now_us = now_us
         counted = 0
         for chunk in self._endpoint.receive():
@@ -180,8 +180,8 @@ class Observer:
         return counted
 
     def send(self, now_us: int, flown: object = None) -> None:
-        """Send the heartbeat and pending requests; once a tick, at simulated `now_us` [µs]."""
-        del flown  # external firmware packs its own telemetry
+        """Send the heartbeat and pending requests; once per tick, at simulated `now_us` [µs]."""
+        del flown  # external firmware sends its telemetry
         self._now_us = now_us
         if self._heard is None:
             return
@@ -196,24 +196,24 @@ class Observer:
             return
         self._asked_us = now_us
         if self._origin is not None and self._located and not self._ready:
-            # Without it PX4 cannot be armed in Hold, which it boots into. Before it has a position
-            # of its own, an origin would move it away.
+            # PX4 boots into Hold and cannot arm there without an origin. An origin sent before PX4
+            # has estimated a position would shift that position.
             self._send(_origin_message(self._origin, self._heard.get_srcSystem()))
         for name, interval_us in (INTERVALS_US if self._origin is None else WITHOUT_GPS).items():
             if name not in self._came:
                 self._command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id(name), interval_us)
 
     def end(self, *, reboot: bool) -> None:
-        """Command the firmware to stop its motors, then to reboot or to shut down."""
+        """Command the firmware to stop the motors, then to reboot or shut down."""
         self._command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE)
         self._command(dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, REBOOT if reboot else SHUT_DOWN)
 
     def log_to(self, tlog: TlogWriter | None) -> None:
-        """Write both directions to a tlog from now on; None ends it."""
+        """Start to log both directions to a tlog; None stops logging."""
         self._tlog = tlog
 
     def counters(self) -> dict[str, LinkCounters]:
-        """Return the traffic."""
+        """Return the traffic counters."""
         return {
             self._name: LinkCounters(
                 self._rx,
@@ -255,10 +255,10 @@ class Observer:
         return True
 
     def _say(self, message: WireMessage) -> None:
-        """Pass on a text; one sent in chunks (`id` not 0) once its last chunk has arrived."""
+        """Pass on a text; a text in chunks (`id` not 0) is passed on after the last chunk."""
         number, chunk = getattr(message, "id", 0), getattr(message, "chunk_seq", 0)
         text = str(message.text)
-        # A chunk that fills its field is followed by another one.
+        # A full chunk is followed by another chunk.
         whole = number == 0 or len(text) < TEXT_LENGTH
         self._text = text if number == 0 or chunk == 0 else self._text + text
         if not whole:

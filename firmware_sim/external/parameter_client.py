@@ -1,4 +1,4 @@
-"""Reads and sets parameters of external firmware over MAVLink."""
+"""Client that reads and sets parameters of external firmware over MAVLink."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from firmware_sim.mavlink.codec import WireMessage, dialect, payload
 
 BURST = 10
-"""Most requests sent at once: the link may be slow."""
+"""Maximum number of requests sent at once, as the link may be slow."""
 
 Value = int | float
 
@@ -27,10 +27,10 @@ _VALUE_BYTES = 4
 
 
 class ParameterClient:
-    """The known parameters of a vehicle. The caller decides when requests are repeated."""
+    """Known parameters of a vehicle. The caller repeats requests."""
 
     def __init__(self, send: Callable[[WireMessage], None]) -> None:
-        """Take the function that sends a message."""
+        """Set the function that sends a message."""
         self._send = send
         self._target: tuple[int, int] | None = None
         self._bytewise = True
@@ -38,7 +38,7 @@ class ParameterClient:
         self._kinds: dict[str, int] = {}
 
     values = property(lambda self: self._values)
-    """The values received so far."""
+    """Values received so far, by name."""
 
     def address(self, system: int, component: int, autopilot: int) -> None:
         """Set the target. PX4 encodes integers bytewise, ArduPilot casts them to a float."""
@@ -46,7 +46,7 @@ class ParameterClient:
         self._bytewise = autopilot != dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
 
     def take(self, message: WireMessage) -> None:
-        """Take a PARAM_VALUE."""
+        """Store the value of a PARAM_VALUE message."""
         name, kind = str(message.param_id), int(message.param_type)
         self._kinds[name] = kind
         if kind not in _INTEGERS:
@@ -58,7 +58,7 @@ class ParameterClient:
             self._values[name] = int(message.param_value)
 
     def ask(self, names: Iterable[str]) -> list[str]:
-        """Request a burst of the unknown ones; return the names of all that are unknown."""
+        """Request up to `BURST` unknown parameters; return the names of all unknown ones."""
         missing = [name for name in names if name not in self._values]
         if self._target is not None:
             for name in missing[:BURST]:
@@ -70,7 +70,7 @@ class ParameterClient:
         return missing
 
     def set(self, wanted: Mapping[str, Value]) -> list[str]:
-        """Set those that differ and return their names; known types determine the encoding."""
+        """Set differing parameters and return their names; known types determine the encoding."""
         differing = [name for name in wanted if not same(self._values[name], wanted[name])]
         if self._target is not None:
             for name in differing[:BURST]:
@@ -90,7 +90,7 @@ class ParameterClient:
 
 
 def same(held: Value, wanted: Value) -> bool:
-    """Return whether a parameter holds a value: to the precision of a 32-bit float."""
+    """Return True if a parameter has a value, to the precision of a 32-bit float."""
     if isinstance(held, int):
         return held == wanted
     (rounded,) = _FLOAT.unpack(_FLOAT.pack(wanted))

@@ -1,4 +1,4 @@
-"""Parameters as files: for the tools of users of external firmware, and kept for the next start."""
+"""Parameter files: for the tools of external firmware, and to keep parameters between starts."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from airl_mav.core.files import replace_file
 from airl_mav.profiles.parameters import SPEC_BY_NAME
 
 _INT32, _REAL32 = 6, 9
-"""MAV_PARAM_TYPE, as QGroundControl writes it."""
+"""MAV_PARAM_TYPE in QGroundControl's files."""
 
 
 def ardupilot_file(settings: Mapping[str, Value]) -> str:
-    """Return a file of ArduPilot's: `--defaults` of its SITL, Mission Planner, MAVProxy."""
+    """Return a file in ArduPilot's format: `--defaults` of its SITL, Mission Planner, MAVProxy."""
     return "".join(f"{name} {value:g}\n" for name, value in settings.items())
 
 
 def qgroundcontrol_file(settings: Mapping[str, Value]) -> str:
     """Return a file for QGroundControl (Vehicle Setup > Parameters > Tools), format "Parameters".
 
-    Lines hold vehicle id, component id, name, value and type, between tabs.
+    Lines contain vehicle id, component id, name, value and type, separated by tabs.
     """
     head = "# Vehicle-Id Component-Id Name Value Type\n"
     return head + "".join(
@@ -37,23 +37,23 @@ def qgroundcontrol_file(settings: Mapping[str, Value]) -> str:
 
 
 _COLUMNS = 5
-"""Vehicle id, component id, name, value, type: between tabs."""
+"""Number of columns, separated by tabs: vehicle id, component id, name, value, type."""
 
 
 class KeptParameters:
-    """Parameters that users have set, by name. Implements `parameter_store.Keeper`."""
+    """Stored user parameters, by name. Implements `parameter_store.Keeper`."""
 
     def __init__(self, path: Path) -> None:
-        """Keep them in a file that may not exist yet, in a folder that does."""
+        """Set the file, which may not exist yet, in an existing folder."""
         self._path = path
 
     def read(self) -> dict[str, int | float]:
-        """Return what is kept; nothing when there is no file yet.
+        """Return the stored parameters; {} without a file.
 
-        Parameters that PX4 has and this flight controller has not are left out.
+        PX4 parameters that the built-in flight controller lacks are omitted.
 
         Raises:
-            UsageError: The file cannot be read, or is no file of parameters.
+            UsageError: The file cannot be read, or is not a parameter file.
         """
         try:
             lines = self._path.read_text(encoding="utf-8").splitlines()
@@ -80,5 +80,5 @@ class KeptParameters:
         return values
 
     def write(self, values: Mapping[str, int | float]) -> None:
-        """Keep these instead. Raises OSError when they cannot be written."""
+        """Replace the stored parameters. Raises OSError if the file cannot be written."""
         replace_file(self._path, qgroundcontrol_file(values).encode())

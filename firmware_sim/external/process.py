@@ -1,6 +1,6 @@
 """Process of external firmware, its working folders, and the parent-death guard.
 
-PX4 and ArduPilot do not end with their simulator. Process states are known on Linux only (/proc).
+PX4 and ArduPilot do not exit with their simulator. Process states are known on Linux only (/proc).
 """
 
 from __future__ import annotations
@@ -21,39 +21,39 @@ from airl_mav.core.clock import Patience
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 
 REST_LIMIT_S = 1.0
-"""Longest wait for all threads to be at rest [wall s]: one that never is must not stop a flight."""
+"""Timeout until all threads sleep [wall s]; a thread that never sleeps must not stop a flight."""
 
 LOOKS = 2
-"""So many looks in a row find all threads asleep before they are taken to be: between the looks at
-two threads one may have woken the other."""
+"""Consecutive samples with all threads asleep before the program counts as idle: a thread may wake
+another between the reads of their states."""
 
 PAUSE_S = 1e-4
-"""Between two looks while a thread is at work [wall s]: it may need the core that we are on."""
+"""Pause between samples while a thread is busy [wall s]; the thread may need this core."""
 
 _STATE_BYTES = 80
-"""Of a thread's `stat`, enough to hold its number, name and state."""
+"""Bytes read of a thread's `stat`, enough for number, name and state."""
 
 
 class RunningProgram:
-    """One process."""
+    """Running process, with a check for idle threads."""
 
     def __init__(self, pid: int, watched: Collection[bytes]) -> None:
-        """Take its process id, and the names of the threads that `settle` waits for."""
+        """Set the process id, and the names of the threads that `settle` waits for."""
         self.pid = pid
         self._watched = frozenset(watched)
         self._threads: list[int] | None = None
-        """Descriptor of the `stat` of each thread that is waited for; None: not looked for yet."""
+        """Descriptor of the `stat` of each watched thread; None = threads not searched yet."""
 
     @property
     def stopped(self) -> bool:
-        """Whether it was stopped by a signal: SIGSTOP, SIGTSTP."""
+        """True if stopped by a signal: SIGSTOP, SIGTSTP."""
         try:
             return bool(psutil.Process(self.pid).status() == psutil.STATUS_STOPPED)
         except psutil.Error:
             return False
 
     def settle(self) -> bool:
-        """Return once all threads, found at the first call, sleep; False if unknown or too late."""
+        """Wait until the threads found at the first call sleep; False if unknown or timed out."""
         patience, looks = Patience(), 0
         while looks < LOOKS:
             asleep = self._all_asleep()
@@ -69,25 +69,25 @@ class RunningProgram:
         return True
 
     def close(self) -> None:
-        """Forget it; harmless when called again."""
+        """Close the descriptors. Idempotent."""
         for descriptor in self._threads or ():
             os.close(descriptor)
         self._threads = []
 
     def _all_asleep(self) -> bool | None:
-        """Return whether none of the threads is at work right now; None where nobody knows."""
+        """Return True if all watched threads are asleep; None = unknown."""
         try:
             if self._threads is None:
                 self._threads = self._found()
             for descriptor in self._threads:
                 if _state(os.pread(descriptor, _STATE_BYTES, 0)) != b"S":
                     return False
-        except OSError:  # There is no /proc, or the program has ended.
+        except OSError:  # no /proc, or the program has ended
             return None
         return True
 
     def _found(self) -> list[int]:
-        """Return what tells of each thread that is waited for."""
+        """Return the descriptors of the `stat` files of the watched threads."""
         found = []
         for thread in Path(f"/proc/{self.pid}/task").iterdir():
             descriptor = os.open(thread / "stat", os.O_RDONLY | os.O_CLOEXEC)
@@ -99,9 +99,9 @@ class RunningProgram:
 
 
 def program_at(host: str, port: int, to_port: int) -> int | None:
-    """Return the process id of a TCP connection's client, None if unknown or of another user.
+    """Return the process id of a TCP connection's client; None if unknown or of another user.
 
-    `to_port` is the server's port: the client's own may also connect elsewhere.
+    `to_port` is the server's port: the client's port may also be connected elsewhere.
     """
     with suppress(psutil.Error, OSError):
         for connection in psutil.net_connections("tcp4"):
@@ -123,18 +123,18 @@ def _name(stat: bytes) -> bytes:
 
 @dataclass(frozen=True)
 class StartCommand:
-    """How a program is started in a folder of its own."""
+    """Command that starts a program in a working folder."""
 
     argv: Sequence[str]
     environment: Mapping[str, str]
-    """Added to our own environment."""
+    """Variables added to the environment of this process."""
 
 
 class FirmwareProcess(ChildProcess):
-    """One process of external firmware. It ends with us, also when we are killed."""
+    """Process of external firmware. It ends with this process, even if killed."""
 
     def __init__(self, name: str, command: StartCommand, cwd: Path, log: Path) -> None:
-        """Start a program in a folder, output appended to `log`, or raise FirmwareMissingError."""
+        """Start a program in a folder, appending output to `log`, or raise FirmwareMissingError."""
         self.name = name
         program = Path(command.argv[0])
         if not os.access(program, os.X_OK) or not program.is_file():
@@ -152,13 +152,13 @@ class FirmwareProcess(ChildProcess):
 
 
 class WorkingFolders:
-    """One working folder after the other; firmware keeps parameters and flight logs there."""
+    """Working folders, one per flight, for the firmware's parameters and flight logs."""
 
     def __init__(self, name: str, kept: Path | None, log: Path | None) -> None:
         """Choose the folders of a firmware, such as px4.
 
-        `kept` keeps the working folders, None = temporary ones, one at a time; `log` holds its
-        output, None = a file beside the working folders.
+        `kept` is the parent of kept working folders, None = one temporary folder at a time; `log`
+        receives the firmware's output, None = a file beside the working folders.
         """
         self._name = name
         self._flights = 0
@@ -169,23 +169,23 @@ class WorkingFolders:
         self.log = (log or root / f"{name}.log").absolute()
 
     def fresh(self) -> Path:
-        """Return a new, empty working folder: nothing carries over from an earlier flight."""
+        """Return a new, empty working folder, without files of an earlier flight."""
         if self._temporary:
             shutil.rmtree(self._path, ignore_errors=True)
         while True:
             self._flights += 1
-            # Processes that fly side by side may keep their folders in the same place.
+            # Parallel processes may use the same parent folder.
             with suppress(FileExistsError):
                 self._path.mkdir()
                 return self._path
 
     def newest(self, suffix: str) -> Path | None:
-        """Return the file with a suffix that was written last in the present folder, if any."""
+        """Return the most recently written file with a suffix in the present folder, if any."""
         found = self._path.rglob(f"*{suffix}")
         return max(found, key=lambda path: path.stat().st_mtime_ns, default=None)
 
     def close(self) -> None:
-        """Remove what is temporary; harmless when called again."""
+        """Remove temporary folders. Idempotent."""
         if self._temporary:
             shutil.rmtree(self._root, ignore_errors=True)
 

@@ -13,7 +13,7 @@ from firmware_sim.external.px4.program import find_px4
 
 
 def check_program(real: RealFirmware) -> None:
-    """Look for the program that is to be started. Raises UsageError if it is not there."""
+    """Find the program to start. Raises UsageError if it does not exist."""
     if real.px4_dir is not None:
         find_px4(real.px4_dir)
     if real.ardupilot_dir is not None:
@@ -21,9 +21,9 @@ def check_program(real: RealFirmware) -> None:
 
 
 def load_timeout_s(aircraft: Aircraft) -> float | None:
-    """Return the start-up timeout [wall s], None = as for any answer.
+    """Return the start-up timeout [wall s]; None = the timeout of any reply.
 
-    It covers connection, heartbeat, parameters read and set, and ready to arm, a timeout each.
+    It covers connection, heartbeat, parameters read and set, and ready to arm, one timeout each.
     """
     if aircraft.firmware == "builtin":
         return None
@@ -31,7 +31,7 @@ def load_timeout_s(aircraft: Aircraft) -> float | None:
 
 
 def how_to_start(aircraft: Aircraft, vehicle: VehicleProfile) -> str | None:
-    """Return the command with which the user starts what is waited for; None: nothing is."""
+    """Return the user's command to start the awaited firmware; None = no firmware is awaited."""
     real, ports = aircraft.real, aircraft.ports
     if real.px4_connect and vehicle.px4 is not None:
         return px4_program.how_to_start(real.instance, vehicle.px4.airframe)

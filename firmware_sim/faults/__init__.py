@@ -1,1 +1,1 @@
-"""Faults at work: between plant and flight controller, on the camera and on the links."""
+"""Fault injection between plant and flight controller, in the camera and on the links."""

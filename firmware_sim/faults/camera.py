@@ -1,4 +1,4 @@
-"""A camera that fails: no frames, always the same picture, noise, frames that come late."""
+"""Camera faults: no frames, a frozen image, depth noise, delayed frames."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from firmware_sim.plant.onboard_camera import OnboardCamera
 
 
 class FailingCamera:
-    """A camera as the simulation asks for its frames: there only where faults are asked for."""
+    """Camera with faults, inserted only in episodes with faults."""
 
     def __init__(self, camera: OnboardCamera, timeline: FaultTimeline, seed: int) -> None:
-        """Take the healthy camera, the faults of the episode, and its seed."""
+        """Wrap a healthy camera, with the faults and the seed of the episode."""
         self._camera = camera
         self._timeline = timeline
         self._seed = seed
@@ -33,7 +33,7 @@ class FailingCamera:
 
     @property
     def next_us(self) -> int:
-        """Simulated time from which on there is something to do [µs]."""
+        """Simulated time of the next exposure or delayed frame [µs]."""
         next_us = self._camera.next_us
         return min(next_us, self._late[0][0]) if self._late else next_us
 
@@ -43,7 +43,7 @@ class FailingCamera:
         self._camera.restart(time_us)
 
     def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
-        """Hand the frames that are due to `publish`; see `OnboardCamera.offer`."""
+        """Pass due frames to `publish`; see `OnboardCamera.offer`."""
         if time_us >= self._camera.next_us:
             self._camera.offer(time_us, motion, lambda frame: self._take(frame, publish))
         while self._late and self._late[0][0] <= time_us:
@@ -67,7 +67,7 @@ class FailingCamera:
                     self._frozen = frame
                 frame = _showing(frame, self._frozen.image, self._frozen.jpeg)
         if delay_us or self._late:
-            # A frame that was taken later must not overtake: a camera's frames come in order.
+            # A camera's frames arrive in order: a later frame must not overtake.
             due_us = frame.capture_time_us + delay_us
             self._late.append((max(due_us, self._late[-1][0]) if self._late else due_us, frame))
         else:
@@ -80,6 +80,6 @@ class FailingCamera:
 
 
 def _showing(frame: Frame, image: NDArray[Any], jpeg: bytes | None) -> Frame:
-    """Return a frame with another image of the main camera."""
+    """Return a copy of a frame with another image of the main camera."""
     shown = image, frame.intrinsics, jpeg, frame.further
     return Frame(frame.sequence, frame.capture_time_us, *shown)

@@ -1,8 +1,8 @@
-"""A flight controller behind failing sensors and motors: there only where faults are asked for.
+"""Sensor, motor, battery and wind faults, inserted only in episodes with faults.
 
-A sensor that is off is None in the sample. Accelerometer and gyro are never None: flight
-controllers count time by their samples, so that one which is off repeats its last sample, as one
-that is stuck.
+A sensor that is off has None in the sample. Accelerometer and gyro are never None: flight
+controllers count time by their samples. If one is off, it repeats its last sample like a stuck
+sensor.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from firmware_sim.plant.plant import Blowing, Plant
 
 
 def thrust_left(acting: Sequence[Acting]) -> dict[int, float]:
-    """Return the share of its thrust that each failing motor has left, by its index from 0."""
+    """Return the remaining share of thrust of each failing motor, by index from 0."""
     left: dict[int, float] = {}
     for _, fault, *_ in acting:
         if fault.kind == "slow":
@@ -57,7 +57,7 @@ def _share(fault: Fault) -> float:
 
 
 def slowness(acting: Sequence[Acting]) -> dict[int, float]:
-    """Return the factor of its time constant of each motor that is slow, by its index from 0."""
+    """Return the factor on the time constant of each slow motor, by index from 0."""
     slow: dict[int, float] = {}
     for _, fault, *_ in acting:
         if fault.kind == "slow":
@@ -69,10 +69,10 @@ def slowness(acting: Sequence[Acting]) -> dict[int, float]:
 def weakened(
     controls: ActuatorControls, left: Mapping[int, float], thrust_curve: float
 ) -> ActuatorControls:
-    """Return commands that give healthy motors the thrust of failing ones.
+    """Return commands that give healthy motors the thrust of failing motors.
 
-    `left` is the share of its thrust that each failing motor has, by its index. More than 1 is more
-    than it should be, up to its greatest thrust.
+    `left` is the remaining share of thrust of each failing motor, by index. A share above 1 raises
+    the thrust, up to the motor's maximum.
     """
     motors = list(controls.motors)
     for index, share in left.items():
@@ -89,12 +89,12 @@ def slowed(
     lag: float,
     thrust_curve: float,
 ) -> ActuatorControls:
-    """Return the commands after which healthy motors have the speeds that slow ones would have.
+    """Return commands that give healthy motors the speeds of slow motors.
 
-    A motor of time constant `k tau` keeps the share `lag^(1/k)` of its speed's error over a tick, a
-    healthy one `lag` = exp(-dt / tau). It gets as far in that tick where it is told to go a share
-    of the way: exactly (1 - lag^(1/k)) / (1 - lag) of it. `slow` has the factor k of each slow
-    motor by its index, `speeds` the rotors' now, as shares of that at full command.
+    Over a tick, a motor of time constant `k tau` keeps the share `lag^(1/k)` of its speed error, a
+    healthy motor `lag` = exp(-dt / tau). The healthy motor reaches the same speed when commanded
+    exactly the share (1 - lag^(1/k)) / (1 - lag) of the change. `slow` is the factor k of each slow
+    motor by index; `speeds` are the present rotor speeds as shares of the speed at full command.
     """
     motors = list(controls.motors)
     for index, factor in slow.items():
@@ -106,7 +106,7 @@ def slowed(
 
 
 def misread(reading: BatterySample, acting: Sequence[Acting], battery: Battery) -> BatterySample:
-    """Return a power module's reading: of a failing battery, empty when `off`, lower by `sag`."""
+    """Return the reading of a failing battery: empty if `off`, a lower voltage by `sag`."""
     for _, fault, *_ in acting:
         if fault.kind == "off":
             empty_v = battery.cells * battery.cell_empty_v
@@ -127,28 +127,28 @@ FIELDS = {
     "rangefinder": "distance",
     "flow": "flow",
 }
-"""Field of a sample, by the sensor's name."""
+"""Fields of `SensorSample` by sensor name."""
 
 INERTIAL = ("accel", "gyro")
 
 
 Effect = Callable[[Any, int], Any]
-"""Effect of a fault on one sensor, by value and time [µs]: the measured value; None: there is none,
-in this tick. It may have a memory of its own."""
+"""Effect of a fault on one sensor: maps value and time [µs] to the measured value; None = no sample
+in this tick. May be stateful."""
 
 
 def _off(value: Any, time_us: int) -> None:
-    """Return nothing."""
+    """Return no sample."""
 
 
 class Stuck:
-    """The sample that it has when the fault begins, again and again, at the sensor's rate."""
+    """Stuck sensor: repeats the first sample of the fault at the sensor's rate."""
 
     def __init__(self) -> None:
         self._held: Any = None
 
     def __call__(self, value: Any, time_us: int) -> Any:
-        """Return the held sample wherever there is one."""
+        """Return the held sample, or None without a sample in this tick."""
         del time_us
         if self._held is None:
             self._held = value
@@ -156,7 +156,7 @@ class Stuck:
 
 
 class Late:
-    """Samples that come later. A sensor that must give something gives its oldest one meanwhile."""
+    """Delay of samples. With `always`, the newest delivered sample is repeated in between."""
 
     def __init__(self, delay_s: float, *, always: bool) -> None:
         self._delay_us = round(delay_s * US_PER_S)
@@ -165,7 +165,7 @@ class Late:
         self._newest: Any = None
 
     def __call__(self, value: Any, time_us: int) -> Any:
-        """Return what is due now."""
+        """Return the sample that is due now."""
         queue = self._queue
         if value is not None:
             queue.append((time_us + self._delay_us, value))
@@ -178,38 +178,38 @@ class Late:
 
 
 class Biased:
-    """A constant error."""
+    """Constant error."""
 
     def __init__(self, offset: Vector) -> None:
         self._offset = offset
 
     def __call__(self, value: Any, time_us: int) -> Any:
-        """Return the value with its error."""
+        """Return the value with the error."""
         del time_us
         return None if value is None else shifted(value, self._offset)
 
 
 class Drifting:
-    """A position that moves away."""
+    """Position error that grows at a constant velocity."""
 
     def __init__(self, velocity: Vector, since_us: int) -> None:
         self._velocity, self._since_us = velocity, since_us
 
     def __call__(self, value: Any, time_us: int) -> Any:
-        """Return the fix with its error."""
+        """Return the fix with the error."""
         if value is None:
             return None
         return shifted(value, self._velocity * ((time_us - self._since_us) / US_PER_S))
 
 
 class Noisy:
-    """White noise on top of what the sensor has."""
+    """White noise in addition to the sensor's noise."""
 
     def __init__(self, sd: Vector, rng: np.random.Generator) -> None:
         self._sd, self._rng = sd, rng
 
     def __call__(self, value: Any, time_us: int) -> Any:
-        """Return the value with more noise."""
+        """Return the value with additional noise."""
         del time_us
         if value is None:
             return None
@@ -223,7 +223,7 @@ class Noisy:
 
 
 def shifted(value: Any, offset: Vector) -> Any:
-    """Return a measured value with an error: of a fix, its position NED; of a pose, its own."""
+    """Return a measured value with an error: NED for a fix, the pose's frame for a pose."""
     if isinstance(value, GpsFix):
         return value._replace(position=local_to_geodetic(offset, value.position))
     if isinstance(value, Odometry):
@@ -239,7 +239,7 @@ def shifted(value: Any, offset: Vector) -> Any:
 
 
 def farther(told: DistanceReading, error_m: float) -> DistanceReading:
-    """Return a range with an error; beyond what the sensor measures it says so, as any other."""
+    """Return a range with an error, with quality 0 if it is outside the sensor's limits."""
     if told.quality == 0:
         return told
     distance_m = max(0.0, told.distance_m + error_m)
@@ -248,7 +248,7 @@ def farther(told: DistanceReading, error_m: float) -> DistanceReading:
 
 
 def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
-    """Return the sd of a sensor's noise: of a fix or a pose, position (3) and velocity (3)."""
+    """Return the sd of a sensor's noise; for a fix or a pose, position (3) and velocity (3)."""
     white = math.sqrt(TICK_S / tick_s)
     gps = profile.gps
     horizontal, speed = gps.horizontal_noise_m, gps.velocity_noise_m_s
@@ -269,7 +269,7 @@ def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
 
 
 def effect_of(acting: Acting, profile: Sensors, tick_s: float, rng: np.random.Generator) -> Effect:
-    """Return the effect of a sensor's fault; `rng` is the fault's own."""
+    """Return the effect of a sensor fault; `rng` is used by this fault only."""
     fault = acting.fault
     part, kind = fault.part, fault.kind
     if kind == "off" and part not in INERTIAL:
@@ -282,13 +282,13 @@ def effect_of(acting: Acting, profile: Sensors, tick_s: float, rng: np.random.Ge
         return Biased(np.array(fault.value))
     if kind == "drift":
         return Drifting(np.array(fault.value), acting.since_us)
-    # Noise of that many times the sensor's own, together with its own.
+    # `amount` is the ratio of total noise to the sensor's noise; their variances add.
     more = math.sqrt(max(0.0, fault.amount**2 - 1.0))
     return Noisy(more * noise_sd(part, profile, tick_s), rng)
 
 
 def failed(sample: SensorSample, effects: list[tuple[str, Effect]]) -> SensorSample:
-    """Return a sample after all effects, given by the sensor's name, in their order."""
+    """Return a sample with all effects, given with sensor names, applied in order."""
     changed: dict[str, Any] = {}
     for part, effect in effects:
         name = FIELDS[part]
@@ -298,7 +298,7 @@ def failed(sample: SensorSample, effects: list[tuple[str, Effect]]) -> SensorSam
 
 
 def gust_at(acting: Sequence[Acting], time_us: int) -> Vector:
-    """Return the wind (3,) NED [m/s] that faults add at a time [µs]."""
+    """Return the wind (3,) NED [m/s] added by faults at a time [µs]."""
     total = np.zeros(3)
     for each in acting:
         share = 1.0
@@ -310,12 +310,12 @@ def gust_at(acting: Sequence[Acting], time_us: int) -> Vector:
 
 
 class Gusts:
-    """A wind, and what faults add to it."""
+    """Wind with the additional wind of faults."""
 
     def __init__(self, wind: Blowing) -> None:
-        """Take the wind that blows anyway."""
+        """Wrap the wind of the episode."""
         self.more: Vector | None = None
-        """(3,) NED [m/s], set for the tick that comes; None: nothing."""
+        """Additional wind (3,) NED [m/s] in the next tick; None = no additional wind."""
         self._wind = wind
 
     def step(self) -> Vector:
@@ -325,9 +325,9 @@ class Gusts:
 
 
 class FailingParts:
-    """Failing parts between the plant and the flight controller.
+    """Fault layer between the plant and the flight controller.
 
-    It works on any flight controller: the built-in one, or real firmware behind its simulator
+    Works with any flight controller: the built-in autopilot, or real firmware behind its simulator
     interface.
     """
 
@@ -338,10 +338,10 @@ class FailingParts:
         vehicle: VehicleProfile,
         timeline: FaultTimeline,
     ) -> None:
-        """Put it between controller and plant; nothing fails yet.
+        """Insert the layer between controller and plant, without active faults.
 
-        Gusts are added to the plant's wind, and its charge drops. The profile has the noise of the
-        sensors, the battery, and the motors' curve.
+        Faults add gusts to the plant's wind and reduce its battery charge. The vehicle profile
+        contains the sensor noise, the battery and the motors' thrust curve.
         """
         self._controller = controller
         self._plant = plant
@@ -355,7 +355,7 @@ class FailingParts:
         self._left: dict[int, float] = {}
         self._slow: dict[int, float] = {}
         self._turning: Speeds | None = None
-        """What the motors were last told in effect; None: what the flight controller told them."""
+        """Latest effective motor commands; None = those of the flight controller."""
         self._gusts = Gusts(plant.wind)
         plant.wind = self._gusts
         self._wind: list[Acting] = []
@@ -363,7 +363,7 @@ class FailingParts:
         timeline.on_change(self._rearrange)
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Advance the flight controller by what it is let to measure; return what motors do."""
+        """Advance the flight controller by the altered sample; return effective motor commands."""
         self._timeline.update(sample.time_us, self._controller.flight)
         if self._effects:
             sample = failed(sample, self._effects)

@@ -1,6 +1,6 @@
-"""A MAVLink link that fails: delay, jitter, loss, duplicates, changed order, nothing at all.
+"""MAVLink link faults: delay, jitter, loss, duplicates, reordering and a cut.
 
-It lies around an endpoint, and is there only where faults of the link are asked for.
+The faults wrap an endpoint, only in episodes with link faults.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import Peer, Sender, SharedEndpoint
 
 UP, DOWN = 0, 1
-"""To the flight controller, and from it."""
+"""Directions: to and from the flight controller."""
 
 PARTS: tuple[tuple[Part, Part], tuple[Part, Part]] = (("link", "uplink"), ("link", "downlink"))
-"""Parts whose faults each direction has."""
+"""Parts whose faults affect each direction."""
 
 MAVLINK_2 = 0xFD
 
@@ -35,14 +35,14 @@ STREAMED_UP = frozenset(
         dialect.MAVLINK_MSG_ID_MANUAL_CONTROL,
     }
 )
-"""Messages that a companion repeats and nobody answers."""
+"""Streamed messages of a companion, which have no acknowledgement."""
 
 
 Frame = TypeVar("Frame")
 
 
 class Lane(Generic[Frame]):
-    """One direction of a link: what is under way, and what becomes of each frame."""
+    """One direction of a link: frames in transit and the faults that affect them."""
 
     def __init__(self) -> None:
         self._acting: list[tuple[Acting, np.random.Generator]] = []
@@ -51,26 +51,26 @@ class Lane(Generic[Frame]):
 
     @property
     def quiet(self) -> bool:
-        """Whether frames pass as on a healthy link."""
+        """True if frames pass as on a healthy link."""
         return not self._acting and not self._under_way and self._held is None
 
     @property
     def cut(self) -> bool:
-        """Whether nothing gets through."""
+        """True if the link is cut."""
         return any(each.fault.kind == "cut" for each, _ in self._acting)
 
     def set(self, acting: list[tuple[Acting, np.random.Generator]]) -> None:
-        """Take the faults that act from now on, each with its randomness."""
+        """Set the active faults, each with its random generator."""
         self._acting = acting
 
     def clear(self) -> None:
-        """Forget what is under way, and the faults."""
+        """Discard all frames in transit and all faults."""
         self._acting = []
         self._under_way.clear()
         self._held = None
 
     def put(self, frame: Frame, now_us: int) -> None:
-        """Send a frame on its way at simulated `now_us` [µs]."""
+        """Send a frame at simulated `now_us` [µs]."""
         due_us, copies, wait = now_us, 1, False
         for each, rng in self._acting:
             kind = each.fault.kind
@@ -97,12 +97,12 @@ class Lane(Generic[Frame]):
             self._held = None
 
     def arrived(self, now_us: int) -> Iterator[Frame]:
-        """Take out what has arrived by simulated `now_us` [µs], in order, one by one."""
+        """Remove and yield the frames that have arrived by simulated `now_us` [µs], in order."""
         while self._under_way and self._under_way[0][0] <= now_us:
             yield self._under_way.popleft()[1]
 
     def hurry(self) -> None:
-        """Let all that is under way arrive at once."""
+        """Make all frames in transit arrive immediately."""
         frames = [frame for _, frame in self._under_way]
         if self._held is not None:
             frames.append(self._held)
@@ -114,16 +114,16 @@ class FailingSender:
     """Sender to one peer over a failing link. Implements `endpoint.Sender`."""
 
     def __init__(self, endpoint: Sender, clock: Clock, *, conducted: bool) -> None:
-        """Take the sender of a healthy link. Other arguments: as `FailingEndpoint`."""
+        """Wrap the sender of a healthy link. Other arguments: see `FailingEndpoint`."""
         self.lane: Lane[bytes] = Lane()
-        """Towards the peer."""
+        """Lane to the peer."""
         self._endpoint, self._clock, self._conducted = endpoint, clock, conducted
 
     send_errors = property(lambda self: self._endpoint.send_errors)
-    """Chunks that could not be sent."""
+    """Number of chunks that could not be sent."""
 
     def send(self, data: bytes) -> None:
-        """Send one frame: an answer."""
+        """Send one frame, such as a reply."""
         lane = self.lane
         if lane.quiet or (self._conducted and not lane.cut):
             self._endpoint.send(data)
@@ -131,7 +131,7 @@ class FailingSender:
         lane.put(data, self._clock.time_us())
 
     def send_streams(self, frames: Sequence[bytes]) -> None:
-        """Send the telemetry of one tick, with what is under way and due."""
+        """Send the telemetry of one tick, with all due frames in transit."""
         lane = self.lane
         if lane.quiet:
             self._endpoint.send_streams(frames)
@@ -144,14 +144,14 @@ class FailingSender:
 
 
 class FailingEndpoint(FailingSender):
-    """An endpoint behind a failing link. Implements `endpoint.SharedEndpoint`."""
+    """Endpoint behind a failing link. Implements `endpoint.SharedEndpoint`."""
 
     def __init__(self, endpoint: SharedEndpoint, clock: Clock, *, conducted: bool = False) -> None:
-        """Take the healthy endpoint and simulated time.
+        """Wrap a healthy endpoint, with the simulated clock.
 
-        If `conducted`, a companion in lockstep is at the other end. A command and its answer are
-        one moment of simulated time then: only a cut stops them, all other faults act on setpoints
-        and telemetry. Frames arrive with a tick, so that the flight is the same every time.
+        If `conducted`, the companion runs in lockstep. A command and its reply then happen at the
+        same simulated time: only a cut stops them, other faults affect setpoints and telemetry.
+        Frames arrive at ticks, so that flights are reproducible.
         """
         super().__init__(endpoint, clock, conducted=conducted)
         self._shared, self.datagrams = endpoint, endpoint.datagrams
@@ -159,13 +159,13 @@ class FailingEndpoint(FailingSender):
         self._timeline: FaultTimeline | None = None
         self._up: Lane[tuple[Peer, bytes]] = Lane()
         self._senders: WeakValueDictionary[int, FailingSender] = WeakValueDictionary({0: self})
-        """Those that somebody still holds, by the number of their lane."""
+        """Senders still in use, by lane number."""
         self._lanes = 1
-        """How many there have been: a number is never given again."""
+        """Number of lanes created so far; lane numbers are never reused."""
         self._generators: dict[tuple[int, int, int], np.random.Generator] = {}
 
     def begin(self, timeline: FaultTimeline | None) -> None:
-        """Begin an episode with these faults, once for each. What was under way is lost."""
+        """Begin an episode with these faults, once per episode. Frames in transit are lost."""
         self._timeline = timeline
         self._generators.clear()
         self._up.clear()
@@ -177,7 +177,7 @@ class FailingEndpoint(FailingSender):
 
     @property
     def is_polled(self) -> bool:
-        """Whether something may have arrived although its descriptor is not readable."""
+        """True if frames may have arrived although the descriptor is not readable."""
         return not self._up.quiet or self._shared.is_polled
 
     def receive(self) -> list[bytes]:
@@ -185,7 +185,7 @@ class FailingEndpoint(FailingSender):
         return [chunk for _, chunk in self.arrivals()]
 
     def arrivals(self) -> Iterator[tuple[Peer, bytes]]:
-        """Yield what has arrived and from whom, oldest first; see `SharedEndpoint`."""
+        """Yield received chunks with their peers, oldest first; see `SharedEndpoint`."""
         lane = self._up
         if lane.quiet:
             yield from self._shared.arrivals()
@@ -193,7 +193,7 @@ class FailingEndpoint(FailingSender):
         now_us = self._clock.time_us()
         for peer, chunk in self._shared.arrivals():
             if self._conducted and not lane.cut and not _is_streamed(chunk):
-                # Nothing overtakes: what was sent before a command hurries along with it.
+                # Keep the order: frames sent before a command arrive with it.
                 lane.hurry()
                 yield from lane.arrived(now_us)
                 yield peer, chunk
@@ -203,7 +203,7 @@ class FailingEndpoint(FailingSender):
             yield from lane.arrived(now_us)
 
     def towards(self, peer: Peer) -> Sender | None:
-        """Return what sends to one peer; None for a preset remote that is not set."""
+        """Return the sender to one peer; None for a preset remote that is not set."""
         healthy = self._shared.towards(peer)
         if healthy is None:
             return None
@@ -223,7 +223,7 @@ class FailingEndpoint(FailingSender):
             sender.lane.set(self._acting(DOWN, number))
 
     def _acting(self, direction: int, lane: int) -> list[tuple[Acting, np.random.Generator]]:
-        """Return the faults of a direction, each with the randomness that a lane of it has."""
+        """Return the faults of a direction, each with its random generator for a lane."""
         timeline = self._timeline
         if timeline is None:
             return []
@@ -237,7 +237,7 @@ class FailingEndpoint(FailingSender):
 
 
 def _is_streamed(frame: bytes) -> bool:
-    """Return whether a chunk begins with a setpoint, which nobody answers."""
+    """Return True if a chunk begins with a streamed message (`STREAMED_UP`)."""
     if not frame or frame[0] != MAVLINK_2:
         return False
     return int.from_bytes(frame[7:10], "little") in STREAMED_UP

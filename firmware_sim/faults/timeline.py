@@ -1,4 +1,4 @@
-"""Faults of an episode that act now or have acted. Clients may add some."""
+"""Timeline of the faults of an episode, to which clients can add faults."""
 
 from __future__ import annotations
 
@@ -24,53 +24,53 @@ PHASE_OF_MODE: Mapping[Mode, str] = {
     Mode.LAND: "landing",
     Mode.PRECISION_LAND: "landing",
 }
-"""Phase of a flight in the air, by the mode that is flown."""
+"""Flight phase in the air, by flight mode."""
 
 
 class Acting(NamedTuple):
-    """A fault that acts now."""
+    """Active fault."""
 
     number: int
-    """Number in the episode, from 0."""
+    """Index in the episode, from 0."""
     fault: Fault
     since_us: int
     until_us: int
-    """`FOREVER_US` for never."""
+    """Simulated time of the end [µs]; `FOREVER_US` = no end."""
 
 
 class Acted(NamedTuple):
-    """A fault that has acted."""
+    """Past or present activity of a fault."""
 
     fault: str
-    """In words."""
+    """Fault as text."""
     from_us: int
     to_us: int
 
 
 def phase_of(flight: Flight) -> str | None:
-    """Return the phase of a flight, as faults name it; None for one that sets nothing off."""
+    """Return the flight phase by the name used in faults; None = no fault starts in it."""
     if flight.phase is Phase.AIR:
         return PHASE_OF_MODE.get(flight.mode)
     return None if flight.phase is Phase.BOOT else "ground"
 
 
 class FaultTimeline:
-    """The faults of one episode. Asked once a tick; everything else only when something changes."""
+    """Faults of one episode. Updated once per tick; listeners are called only on a change."""
 
     def __init__(self, faults: Sequence[Fault], seed: int, start_us: int) -> None:
-        """Begin an episode with these faults at `start_us`."""
+        """Begin an episode with these faults at `start_us` [µs]."""
         self._faults = list(faults)
         self._seed = seed
         self._entered: dict[str, int] = {}
         self._acting: dict[int, tuple[int, int]] = {}
-        """From when to when those that act now do [µs since the start], by their index."""
+        """Begin and end of the active faults [µs since the start], by index."""
         self._spans: list[Acted] = []
         self._open: dict[int, int] = {}
         self._listeners: list[Callable[[], None]] = []
         self.begin(start_us)
 
     def begin(self, start_us: int) -> None:
-        """Say that the episode begins at `start_us` [µs]. What acted before is forgotten."""
+        """Start the episode at `start_us` [µs]: discard earlier activity."""
         self._start_us = start_us
         self._entered.clear()
         self._spans.clear()
@@ -82,11 +82,11 @@ class FaultTimeline:
         self._tell()
 
     def on_change(self, listener: Callable[[], None]) -> None:
-        """Have `listener` called whenever a fault begins or ends."""
+        """Call `listener` whenever a fault begins or ends."""
         self._listeners.append(listener)
 
     def update(self, time_us: int, flight: Flight) -> None:
-        """Look what begins or ends at simulated `time_us` [µs], in this state of the flight."""
+        """Begin and end faults at simulated `time_us` [µs], for this flight phase and mode."""
         phase, since_us = phase_of(flight), time_us - self._start_us
         self._now_us = time_us
         if phase is not self._phase:
@@ -98,23 +98,23 @@ class FaultTimeline:
             self._renew(since_us)
 
     def acting(self, *parts: Part) -> list[Acting]:
-        """Return the faults of these parts that act now, in the order of the episode's faults."""
+        """Return the active faults of these parts, in the order of the episode's faults."""
         return [
             self._acting_at(index) for index in self._acting if self._faults[index].part in parts
         ]
 
     def generator(self, index: int, *more: int) -> np.random.Generator:
-        """Return the randomness of a fault: of the episode's seed, of no other's draws."""
+        """Return the random generator of a fault, derived from the seed, independent of others."""
         return stream(self._seed, Stream.FAULTS, index, *more)
 
     def inject(self, fault: Fault) -> None:
-        """Let a fault act from now on, whatever it says of its beginning."""
+        """Start a fault now, regardless of its configured start."""
         at_s = max(0, self._now_us - self._start_us) / US_PER_S
         self._faults.append(fault.model_copy(update={"phase": None, "at_s": at_s}))
         self._renew(self._now_us - self._start_us)
 
     def clear(self, *parts: Part) -> None:
-        """End all that acts on these parts, as if its time were over."""
+        """End all active faults of these parts, as if their duration were over."""
         since_us = self._now_us - self._start_us
         for index, (begin_us, _) in self._acting.items():
             fault = self._faults[index]
@@ -124,7 +124,7 @@ class FaultTimeline:
         self._renew(since_us)
 
     def acted(self, now_us: int) -> list[Acted]:
-        """Return all that has acted by `now_us` [µs], in the order of its beginning."""
+        """Return all fault activity up to `now_us` [µs], sorted by start."""
         open_ = [
             Acted(str(self._faults[index]), from_us, now_us)
             for index, from_us in self._open.items()
@@ -156,23 +156,23 @@ class FaultTimeline:
 
 
 class ClientFaults:
-    """Puts what clients inject among the faults of an episode. Implements `port.Failures`."""
+    """Fault injection by clients into the faults of an episode. Implements `port.Failures`."""
 
     def __init__(self, timeline: Callable[[], FaultTimeline]) -> None:
-        """Take what returns the faults of the episode, at the present time.
+        """Set the function that returns the episode's faults, at the present time.
 
-        It is asked first when something is injected. Until then nothing lies between the plant and
-        the flight controller.
+        The first injection calls it first, and only then is the fault layer inserted between the
+        plant and the flight controller.
         """
         self._timeline = timeline
         self._injected = False
 
     def inject(self, fault: Fault) -> None:
-        """Let a part fail from now on."""
+        """Start a fault now."""
         self._injected = True
         self._timeline().inject(fault)
 
     def clear(self, part: Part) -> None:
-        """End all that acts on a part."""
+        """End all active faults of a part."""
         if self._injected:
             self._timeline().clear(part)

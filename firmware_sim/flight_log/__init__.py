@@ -1,1 +1,1 @@
-"""The flight log of the vehicle: ULog (.ulg), as PX4 writes it."""
+"""Flight log of the vehicle: ULog (.ulg), PX4's log format."""

@@ -1,6 +1,6 @@
-"""One vehicle's log: what is due after each tick goes to the file."""
+"""ULog flight log of one vehicle, written after each tick."""
 
-# ruff: noqa: D102 (what the properties of `FlownState` are says `AutopilotState`)
+# ruff: noqa: D102 (`AutopilotState` documents the properties of `FlownState`)
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def truth_of(tick: Any) -> Truth:
 
 
 class FlownState:
-    """Implements `AutopilotState`: what changes from tick to tick by its log, the rest by another.
+    """Autopilot state of one tick, from the log of the tick. Implements `AutopilotState`.
 
-    That other state is of the end of the ticks: status, home, parameters.
+    Status, home and parameters are not in the log: they are from the end of the ticks.
     """
 
     def __init__(self, state: AutopilotState, tick: Any) -> None:
-        """Take the state after the ticks, and one of them (`engine.record.FLOWN_TICK`)."""
+        """Combine the state after all ticks with one tick's log (`engine.record.FLOWN_TICK`)."""
         self._state, self._tick = state, tick
 
     def __getattr__(self, name: str) -> Any:
@@ -84,27 +84,27 @@ class FlownState:
 
 
 GRID_US = 5 * TICK_US
-"""How often is looked for what is due [µs]: all intervals are multiples of it."""
+"""Interval of checks for due topics [µs]; all topic intervals are multiples of it."""
 
 _PX4_RELEASE = 1 << 24 | 16 << 16 | 0 << 8 | 255
-"""ver_sw_release: the PX4 whose behaviour is emulated, 1.16.0."""
+"""ver_sw_release: emulated PX4 release, 1.16.0."""
 
 _DATA_FORMAT = 2
-"""ver_data_format: by it Flight Review knows the names of fields, here those of PX4 1.16."""
+"""ver_data_format: selects the field names in Flight Review, here for PX4 1.16."""
 
 DESCRIBED = (
     ("ver_hw", "PX4_SITL"),
     ("ver_sw_release", _PX4_RELEASE),
     ("ver_data_format", _DATA_FORMAT),
 )
-"""Facts of the vehicle by ULog's keys, beside its name."""
+"""Vehicle information by ULog key, in addition to the name."""
 
 _SAMPLES = 0
-"""Number of `SENSOR_COMBINED` in the file. The other topics follow in their order."""
+"""Number of `SENSOR_COMBINED` in the file, before the topics of `TOPICS` in order."""
 
 
 class FlightLog:
-    """Writes what a vehicle does to a .ulg, tick after tick."""
+    """Flight log of a vehicle in a .ulg file."""
 
     def __init__(
         self,
@@ -116,16 +116,16 @@ class FlightLog:
     ) -> None:
         """Open the log; see `UlogWriter`.
 
-        `path` is its final name, given on closing; `boot_unix_us` is the calendar time of simulated
+        `path` is the final name, set on closing; `boot_unix_us` is the calendar time of simulated
         time 0 [µs since 1970].
         """
         self._boot_unix_us = boot_unix_us
         self.began_unix_us = boot_unix_us + start_us
-        """Calendar time of its beginning [µs since 1970]."""
+        """Calendar time of the start of the log [µs since 1970]."""
         self._due_us = [start_us] * len(TOPICS)
         self._last: list[Values | None] = [None] * len(TOPICS)
         self._truth: Any = None
-        """The aircraft after the newest tick (`engine.record.TRUE_TICK`)."""
+        """True state after the newest tick (`engine.record.TRUE_TICK`)."""
         self._parameters = parameters
         self._known = dict(_values(parameters))
         self.writer = UlogWriter(
@@ -138,7 +138,7 @@ class FlightLog:
         )
 
     def after_ticks(self, flown: Record, truths: Record, state: AutopilotState) -> None:
-        """Log what is due in n ticks, given their logs and the autopilot's state after the last."""
+        """Log the due topics of n ticks, from their logs and the final autopilot state."""
         if self.writer.lost:
             return
         rows = (flown[name].tolist() for name in ("time_us", "gyro", "accel"))
@@ -153,18 +153,18 @@ class FlightLog:
         self._truth = truths[-1].copy()
 
     def text(self, message: Message, time_us: int) -> None:
-        """Log a text for the operator."""
+        """Log an operator text."""
         self.writer.text(time_us, message.severity, message.text)
 
     def parameters_changed(self) -> None:
-        """Log the parameters that have other values than before."""
+        """Log the parameters with changed values."""
         for name, value in _values(self._parameters):
             if self._known[name] != value:
                 self._known[name] = value
                 self.writer.parameter(name, value)
 
     def close(self) -> None:
-        """Complete the log and give it its final name; harmless when called again."""
+        """Complete the log and rename it to the final name. Idempotent."""
         self.writer.close()
 
     def _log(self, moment: Moment, now_us: int) -> None:

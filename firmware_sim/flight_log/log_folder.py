@@ -1,4 +1,4 @@
-"""The logs of a folder, as clients list and download them."""
+"""Flight logs of a folder, for clients to list and download."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from firmware_sim.flight_log.flight_log import FlightLog
 ULOG_SUFFIX = ".ulg"
 
 OPEN_FILES = 8
-"""Logs that are kept open for those who download them, in every tick a little."""
+"""Maximum number of log files kept open for downloads, which read a few bytes per tick."""
 
 
 class LogFolder:
-    """Complete logs by name, then the open one; rescans changed folders. Implements `LogStore`."""
+    """Complete logs by name, then the open log; rescans changed folders. Implements `LogStore`."""
 
     def __init__(self, folder: Path, current: FlightLog) -> None:
-        """Take the folder, and the log that is being written in it."""
+        """Set the folder and the log currently written in it."""
         self._folder = folder
         self._current = current
         self._complete: Sequence[Path] = ()
         self._seen: tuple[int, bool] | None = None
-        """When the folder was last changed [ns], and whether the log was closed: of `_complete`."""
+        """Folder change time [ns] and closed flag of the log when `_complete` was scanned."""
         self._files: OrderedDict[Path, BinaryIO] = OrderedDict()
-        """The one that was read last at the end."""
+        """Open files; the most recently read file is last."""
 
     def entries(self) -> Sequence[LogEntry]:
-        """Return the logs, the one that is being written last."""
+        """Return the logs; the log currently written is last."""
         entries = [_entry(path) for path in self._completed()]
         if not self._current.writer.closed:
             began_s = self._current.began_unix_us // US_PER_S
@@ -39,7 +39,7 @@ class LogFolder:
         return entries
 
     def read(self, number: int, offset: int, count: int) -> bytes:
-        """Return up to `count` bytes of a log, fewer at its end; none when there is no such log."""
+        """Return up to `count` bytes of a log, fewer at the end; b"" for a missing log."""
         complete = self._completed()
         if 0 <= number < len(complete):
             path = complete[number]
@@ -54,17 +54,17 @@ class LogFolder:
             file.seek(offset)
             return file.read(count)
         except OSError:
-            return b""  # somebody has removed it
+            return b""  # removed by another program
 
     def open_log(self) -> OpenLog | None:
-        """Return the log that is being written, None when there is none."""
+        """Return the log currently written; None = no open log."""
         log = self._current.writer
         if log.closed:
             return None
         return OpenLog(len(self._completed()), log.head_bytes, log.size_bytes)
 
     def close(self) -> None:
-        """Close what is open for downloads; harmless when called again."""
+        """Close all files open for downloads. Idempotent."""
         while self._files:
             self._files.popitem()[1].close()
 
@@ -90,5 +90,5 @@ def _entry(path: Path) -> LogEntry:
     try:
         stat = path.stat()
     except OSError:
-        return LogEntry(0, 0)  # somebody removes it just now
+        return LogEntry(0, 0)  # removed by another program
     return LogEntry(int(stat.st_mtime), stat.st_size)

@@ -1,7 +1,7 @@
-"""Logged uORB topics of PX4 1.16, with its names, units and intervals.
+"""Logged uORB topics of PX4 1.16, with PX4's names, units and intervals.
 
-A topic has those of PX4's fields that mean something here; a log describes itself, so readers find
-fields by name. Intervals: PX4's default profile (SDLOG_PROFILE), src/modules/logger.
+A topic contains the PX4 fields that apply to the simulator; logs are self-describing, so readers
+find fields by name. Intervals: PX4's default profile (SDLOG_PROFILE), src/modules/logger.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from firmware_sim.flight_log.ulog import Topic, Values
 from firmware_sim.interfaces import PoseFrame, Truth, VelocityFrame
 
 ON_CHANGE_US = 500 * US_PER_MS
-"""A state is logged when it changes, and this often anyway [µs]."""
+"""Maximum interval of topics that are logged on change [µs]."""
 
 DISARMED, ARMED = 1, 2
 """VehicleStatus.arming_state."""
@@ -43,7 +43,7 @@ DIST_BOTTOM_SENSOR_RANGE = 1
 """VehicleLocalPosition.dist_bottom_sensor_bitfield."""
 
 MOTORS = 12
-"""ActuatorMotors.NUM_CONTROLS: those that do not exist are NaN."""
+"""ActuatorMotors.NUM_CONTROLS; absent motors are NaN."""
 
 _UNUSED_MOTORS = (math.nan,) * (MOTORS - 4)
 _NO_VECTOR = (math.nan, math.nan, math.nan)
@@ -61,13 +61,13 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True)
 class Logged:
-    """A topic, how often it is logged, and its fields' values (None = there is nothing to log)."""
+    """Logged topic: interval and function of the field values (None = nothing to log)."""
 
     topic: Topic
     interval_us: int
     values: Callable[[Moment], Values | None]
     on_change: bool = False
-    """Whether a change is logged at once; otherwise the interval alone decides."""
+    """True to log a change immediately; otherwise only the interval applies."""
 
 
 def _topic(name: str, fields: str) -> Topic:
@@ -82,16 +82,16 @@ SENSOR_COMBINED = _topic(
     "float[3] accelerometer_m_s2; uint32_t accelerometer_integral_dt; "
     "uint8_t accelerometer_clipping gyro_clipping",
 )
-"""Logged at every tick, from the sample itself: see `sensor_combined`."""
+"""Topic logged at every tick; see `sensor_combined`."""
 
 TOPICS: list[Logged] = []
-"""In the order in which they are below."""
+"""Logged topics, in the order of definition below."""
 
 _Values = TypeVar("_Values", bound=Callable[[Moment], "Values | None"])
 
 
 def _logged(name: str, interval_ms: int | None, fields: str) -> Callable[[_Values], _Values]:
-    """Log a function's values as a topic; with an interval of None, when they change."""
+    """Log a function's values as a topic; an interval of None = on change."""
     interval_us = ON_CHANGE_US if interval_ms is None else interval_ms * US_PER_MS
 
     def register(values: _Values) -> _Values:
@@ -102,7 +102,7 @@ def _logged(name: str, interval_ms: int | None, fields: str) -> Callable[[_Value
 
 
 def sensor_combined(gyro: Sequence[float], accel: Sequence[float]) -> Values:
-    """Return an IMU sample, raw: FRD [rad/s], [m/s²]."""
+    """Return a raw IMU sample: FRD [rad/s], [m/s²]."""
     offset_us, clipping = 0, (0, 0)
     return (*gyro, TICK_US, offset_us, *accel, TICK_US, *clipping)
 
@@ -116,7 +116,7 @@ def angular_velocity(moment: Moment) -> Values:
 
 @_logged("vehicle_rates_setpoint", 20, "float roll pitch yaw; float[3] thrust_body")
 def rates_setpoint(moment: Moment) -> Values:
-    """Return the wanted body rates FRD [rad/s] and thrust, body -1..0."""
+    """Return the body rate setpoint FRD [rad/s] and the thrust setpoint, body -1..0."""
     state = moment.state
     return *state.rate_setpoint.tolist(), 0.0, 0.0, -state.thrust_setpoint
 
@@ -138,7 +138,7 @@ def true_attitude(moment: Moment) -> Values:
     "vehicle_attitude_setpoint", 40, "float yaw_sp_move_rate; float[4] q_d; float[3] thrust_body"
 )
 def attitude_setpoint(moment: Moment) -> Values:
-    """Return the wanted yaw rate [rad/s], attitude and thrust."""
+    """Return the setpoints of yaw rate [rad/s], attitude and thrust."""
     state = moment.state
     yaw_rate = state.setpoint.yaw_rate
     moved = 0.0 if math.isnan(yaw_rate) else yaw_rate
@@ -147,7 +147,7 @@ def attitude_setpoint(moment: Moment) -> Values:
 
 @_logged("vehicle_acceleration", 40, "uint64_t timestamp_sample; float[3] xyz")
 def acceleration(moment: Moment) -> Values:
-    """Return the specific force without its estimated bias, FRD [m/s²]."""
+    """Return the specific force minus the estimated bias, FRD [m/s²]."""
     state = moment.state
     return state.time_us, *(state.accel - state.estimate.accel_bias).tolist()
 
@@ -162,7 +162,7 @@ def acceleration(moment: Moment) -> Values:
     "uint8_t dist_bottom_reset_counter dist_bottom_sensor_bitfield",
 )
 def local_position(moment: Moment) -> Values:
-    """Return the estimated position [m] and velocity [m/s], NED, and how sure they are."""
+    """Return the estimated position [m] and velocity [m/s], NED, with accuracy and validity."""
     state = moment.state
     estimate, origin = state.estimate, state.origin
     sigma = estimate.sigma.tolist()
@@ -189,7 +189,7 @@ def local_position(moment: Moment) -> Values:
 
 
 def _clearance(state: AutopilotState) -> Values:
-    """Return how far the ground is below [m], how sure that is, and what says so."""
+    """Return the distance to the ground [m], variance [m²], validity, resets and sensor."""
     ground = state.clearance
     if ground is None:
         return _UNKNOWN, _UNKNOWN, False, 0, 0
@@ -222,7 +222,7 @@ def true_local_position(moment: Moment) -> Values:
     "float x y z vx vy vz; float[3] acceleration thrust; float yaw yawspeed",
 )
 def local_position_setpoint(moment: Moment) -> Values:
-    """Return what the controller tracks, NED."""
+    """Return the setpoint of the position controller, NED."""
     setpoint = moment.state.setpoint
     position, velocity = setpoint.position.tolist(), setpoint.velocity.tolist()
     return (*position, *velocity, *_NO_VECTOR, *_NO_VECTOR, setpoint.yaw, setpoint.yaw_rate)
@@ -285,7 +285,7 @@ def gps(moment: Moment) -> Values | None:
     "velocity_variance; uint8_t reset_counter; int8_t quality",
 )
 def visual_odometry(moment: Moment) -> Values | None:
-    """Return the newest pose that something other than the flight controller has estimated."""
+    """Return the newest external pose estimate."""
     state = moment.state
     told = state.odometry
     if told is None:
@@ -318,7 +318,7 @@ def visual_odometry(moment: Moment) -> Values | None:
     "uint8_t orientation mode",
 )
 def distance_sensor(moment: Moment) -> Values | None:
-    """Return the newest range [m], of the first sensor."""
+    """Return the newest range [m] of the first sensor."""
     told = moment.state.distance
     if told is None:
         return None
@@ -346,7 +346,7 @@ def distance_sensor(moment: Moment) -> Values | None:
     "uint8_t quality; float max_flow_rate min_ground_distance max_ground_distance",
 )
 def optical_flow(moment: Moment) -> Values | None:
-    """Return the newest optical flow and turn [rad], of the first sensor, and its limits."""
+    """Return the newest optical flow and gyro angle [rad] of the first sensor, with its limits."""
     told, time_us = moment.state.flow, moment.state.flow_us
     if told is None:
         return None
@@ -372,7 +372,7 @@ def optical_flow(moment: Moment) -> Values | None:
     "bool lat_lon_valid alt_valid",
 )
 def global_position(moment: Moment) -> Values | None:
-    """Return the estimated position on the globe."""
+    """Return the estimated global position."""
     state = moment.state
     estimate, origin = state.estimate, state.origin
     if origin is None or not estimate.healthy:
@@ -389,7 +389,7 @@ def global_position(moment: Moment) -> Values | None:
     "uint64_t timestamp_sample; float baro_alt_meter baro_temp_celcius baro_pressure_pa",
 )
 def air_data(moment: Moment) -> Values | None:
-    """Return the pressure [Pa] and the altitude that it means [m]."""
+    """Return the pressure [Pa] and the pressure altitude [m]."""
     state = moment.state
     if not math.isfinite(state.pressure_hpa):
         return None
@@ -411,7 +411,7 @@ def magnetometer(moment: Moment) -> Values:
     "uint8_t id",
 )
 def battery(moment: Moment) -> Values:
-    """Return the battery as its power module tells it."""
+    """Return the battery status reported by the power module."""
     voltage, current, consumed, remaining = moment.state.battery
     connected, number = True, 1
     return voltage, current, consumed, remaining, 1.0, _UNKNOWN, connected, number
@@ -430,7 +430,7 @@ def estimator_status(moment: Moment) -> Values:
     sigma, ratio = estimate.sigma.tolist(), estimate.innovation_ratio.tolist()
     horizontal, height, heading, vertical = ratio
     accuracy = math.hypot(*sigma[0:2]), sigma[2]
-    # PX4's EKF leaves the last two at 0, too.
+    # PX4's EKF also leaves the last two at 0.
     health, timeouts = 0, 0
     tests = heading, max(horizontal, vertical), horizontal, height
     return estimate.time_us, *accuracy, *tests, health, timeouts
@@ -457,14 +457,14 @@ def status(moment: Moment) -> Values:
 
 @_logged("actuator_armed", None, "bool armed ready_to_arm")
 def armed(moment: Moment) -> Values:
-    """Return whether the vehicle is armed, and may be."""
+    """Return the armed flag and the ready-to-arm flag."""
     arming = moment.state.status.arming
     return arming is Arming.ARMED, arming is not Arming.BOOT
 
 
 @_logged("vehicle_land_detected", None, "bool ground_contact maybe_landed landed")
 def land_detected(moment: Moment) -> Values:
-    """Return whether the vehicle stands on the ground."""
+    """Return the landed flags."""
     landed = moment.state.status.landed is Landed.ON_GROUND
     return landed, landed, landed
 

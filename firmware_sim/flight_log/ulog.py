@@ -1,7 +1,7 @@
-"""ULog, PX4's log format: what a file consists of, and a writer that keeps nothing in memory.
+"""ULog, PX4's log format: topic definitions and a streaming writer.
 
 Format: https://docs.px4.io/main/en/dev_log/ulog_file_format.html, version 1. Little endian; every
-message is the length of its content, its type, and its content.
+message consists of content length, type and content.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ _CODES = {
 
 @dataclass(frozen=True)
 class Topic:
-    """A uORB topic: its name and its fields, each "type name" or "type[n] name"."""
+    """Topic of uORB: name and fields, each "type name" or "type[n] name"."""
 
     name: str
     fields: tuple[str, ...]
-    """Behind the timestamp, which every topic begins with."""
+    """Fields after the timestamp, the first field of every topic."""
 
     @cached_property
     def definition(self) -> bytes:
-        """The content of its format message."""
+        """Content of the format message."""
         return f"{self.name}:{';'.join(('uint64_t timestamp', *self.fields))};".encode("ascii")
 
     @cached_property
     def sample(self) -> struct.Struct:
-        """The layout of one sample: number of the topic, timestamp and fields."""
+        """Layout of one sample: topic number, timestamp and fields."""
         return struct.Struct("<HQ" + "".join(_code(field.split()[0]) for field in self.fields))
 
 
@@ -66,7 +66,7 @@ def _code(kind: str) -> str:
 
 
 class UlogWriter(LogFile):
-    """Writes a log of samples, texts and parameters."""
+    """Writer of a log of samples, texts and parameters."""
 
     def __init__(
         self,
@@ -77,10 +77,10 @@ class UlogWriter(LogFile):
         parameters: Iterable[tuple[str, int | float]],
         on_lost: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """Open the file, whose final name is `path`, and write its head; `on_lost` as of `LogFile`.
+        """Open the file with final name `path` and write the head; for `on_lost` see `LogFile`.
 
-        Topics come in the order of `sample`'s numbers. Info has ULog keys, numbers as uint32_t. An
-        int parameter is written as int32_t.
+        The index of a topic is the number for `sample`. Info has ULog keys, numbers as uint32_t.
+        An int parameter is written as int32_t.
         """
         super().__init__(path, on_lost)
         topics = tuple(topics)
@@ -104,12 +104,12 @@ class UlogWriter(LogFile):
             self._message(b"A", struct.pack("<BH", multi_id, number) + topic.name.encode("ascii"))
         self.flush()
         self.head_bytes = self.size_bytes
-        """Size of all that stands before the first sample."""
+        """Size of the file before the first sample [bytes]."""
 
     def sample(self, number: int, time_us: int, values: Values) -> None:
-        """Add a sample of topic `number` at simulated `time_us` [µs]; check its fields.
+        """Add a sample of topic `number` at simulated `time_us` [µs]; check the fields.
 
-        Values beyond single precision become infinite, as on the aircraft.
+        Values beyond single precision become infinite, as on real hardware.
         """
         layout = self._samples[number]
         self._now_us = time_us
@@ -121,13 +121,13 @@ class UlogWriter(LogFile):
         self.add(time_us, head, data)
 
     def text(self, time_us: int, severity: int, text: str) -> None:
-        """Add a text of simulated `time_us` [µs], of severity 0 (emergency) to 7 (debug)."""
+        """Add a text at simulated `time_us` [µs], with severity 0 (emergency) to 7 (debug)."""
         self._now_us = time_us
         head = struct.pack("<BQ", ord("0") + severity, time_us)
         self._message(b"L", head + text.encode("utf-8", errors="replace"))
 
     def parameter(self, name: str, value: int | float) -> None:
-        """Add a parameter's value, from now on."""
+        """Add the value of a parameter, valid from now on."""
         kind, code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
         self._message(b"P", _keyed(kind, name, struct.pack(code, value)))
 
@@ -146,7 +146,7 @@ def _keyed(kind: str, key: str, data: bytes) -> bytes:
 
 
 def _single(value: Any) -> Any:
-    """Return a number as single precision has it, if it is one with a fraction."""
+    """Return a float beyond single precision as infinity; other values unchanged."""
     if not isinstance(value, float) or abs(value) <= _GREATEST_SINGLE:
         return value
     return math.copysign(math.inf, value)

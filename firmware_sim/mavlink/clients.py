@@ -1,9 +1,9 @@
-"""Who is at the other end of a link: several clients, each with its streams and its answers.
+"""Clients of a link, each with separate streams and answers.
 
-PX4 SITL has a preset remote on each link (14540, 14550), which hears it before it has said
-anything. Whoever else sends a valid frame becomes a client: it begins with the link's default
-streams, and gets its own answers and parameter lists. What one client asks for changes nothing for
-another.
+PX4 SITL has a preset remote on each link (14540, 14550), which receives data before it sends any.
+Every other sender of a valid frame becomes a client. A client starts with the link's default
+streams and receives separate answers and parameter lists. Requests of one client do not affect the
+others.
 """
 
 from __future__ import annotations
@@ -24,47 +24,47 @@ from firmware_sim.mavlink.link import Link, LinkCounters
 from firmware_sim.mavlink.services.context import Context
 
 MAX_CLIENTS = 32
-"""Clients of a link at a time, the preset remote not counted."""
+"""Maximum number of clients of a link, without the preset remote."""
 
 MAX_COMPONENTS = 64
-"""Systems and components behind one client, as behind a router."""
+"""Maximum number of systems and components behind one client, for example a router."""
 
 FORWARDS_PER_S = 250
-"""Frames of one client that are passed on to others for long. A flood must not reach them."""
+"""Sustained rate of frames forwarded for one client [1/s]. Keeps a flood from the other clients."""
 
 SILENT_US = 600 * US_PER_S
-"""A client that has said nothing for so long in simulated time is forgotten [µs]."""
+"""Simulated time without a message after which a client is removed [µs]."""
 
 GONE_US = 5 * US_PER_S
-"""Where a link has all its clients, one that was silent for so long makes room for another [µs].
-Heartbeats come every second."""
+"""Silence after which a client is replaced when the link is full [µs]. Heartbeats come every
+second."""
 
 
 @dataclass(slots=True, eq=False)
 class Client:
-    """One other end of a link."""
+    """Client of a link: peer, streams, and rate limits."""
 
     peer: Peer
     link: Link
     texts: TextEncoder
     reply_texts: TextEncoder
     events: EventSender | None = None
-    """As `context`."""
+    """Event sender; None without an autopilot."""
     context: Context | None = None
-    """None while there is no autopilot."""
+    """Context of the handlers; None without an autopilot."""
     announced_origin: Geodetic | None = None
     heard_us: int = 0
-    """When it last sent a valid frame, in simulated time [µs]."""
+    """Simulated time of the last valid frame [µs]."""
     allowance: Allowance = field(default_factory=Allowance)
     forwards: Allowance = field(default_factory=lambda: Allowance(FORWARDS_PER_S, FORWARDS_PER_S))
-    """Limits the frames that are passed on to others."""
+    """Limit on the frames forwarded to other clients."""
     late: list[str] = field(default_factory=list)
-    """Streams that have found no room in their tick."""
+    """Streams deferred from an earlier tick, because the tick was full."""
     components: set[tuple[int, int]] = field(default_factory=set)
-    """System and component ids of who has been heard from its side."""
+    """System and component ids of all senders seen through this client."""
 
     def wakes(self, now_us: int, texts: Sequence[Message]) -> bool:
-        """Return whether anything may have to be sent to it at simulated time [µs]."""
+        """Return True if anything may be due for this client at simulated time [µs]."""
         events = self.events
         return bool(
             self.link.scheduler.wake_us <= now_us
@@ -76,7 +76,7 @@ class Client:
         )
 
     def next_us(self, now_us: int) -> float:
-        """Return when anything but fast streams is sent to it next, `now_us` = at any time [µs]."""
+        """Return the next due time of all but the fast streams [µs]; `now_us` = immediately."""
         events, context, plan = self.events, self.context, self.link.scheduler
         if self.late or self.link.pending or (context is not None and context.is_busy):
             return now_us
@@ -86,7 +86,7 @@ class Client:
         return slow_us if events is None else min(slow_us, events.next_us)
 
     def due(self, now_us: int) -> list[str]:
-        """Return the streams to send now, at simulated time [µs]: first what is late."""
+        """Return the streams due at simulated time [µs], deferred ones first."""
         due = self.link.scheduler.due(now_us)
         if self.late:
             late, self.late = self.late, []
@@ -94,18 +94,18 @@ class Client:
         return due
 
     def close(self) -> None:
-        """Release what is held for it."""
+        """Release the client's resources."""
         if self.context is not None:
             self.context.close()
 
     def hear(self, source: tuple[int, int]) -> None:
-        """Note whose message has come from this client: its system and component."""
+        """Add the system and component id of a received message."""
         if len(self.components) < MAX_COMPONENTS:
             self.components.add(source)
 
 
 class Clients:
-    """The clients of one link."""
+    """Clients of one link."""
 
     def __init__(
         self,
@@ -115,14 +115,14 @@ class Clients:
         tick_time: TickTime,
         signing: Signing | None = None,
     ) -> None:
-        """Begin with the preset remote, where there is one.
+        """Start with the preset remote, if the endpoint has one.
 
         Args:
-            name: Of the link.
-            endpoint: Where its clients are.
-            welcome: Makes a client of who is heard for the first time.
-            tick_time: Bounds the time that what arrives takes out of a tick.
-            signing: Checks what strangers send; None: there is no key.
+            name: Name of the link.
+            endpoint: Endpoint that all clients share.
+            welcome: Creates a client for a new peer.
+            tick_time: Limit on the processing time of received data per tick.
+            signing: Checks frames of unknown peers; None = no key.
         """
         self.name = name
         self.endpoint = endpoint
@@ -131,10 +131,10 @@ class Clients:
         self._listening = ListeningTime(tick_time)
         self._signing = signing
         self._backlog: deque[tuple[Client, WireMessage]] = deque()
-        """Decoded messages that wait for the next tick."""
+        """Decoded messages deferred to the next tick."""
         self._clients: dict[Peer, Client] = {}
         self._doorkeeper = Decoder(datagrams=endpoint.datagrams)
-        """Reads what nobody known has sent."""
+        """Decoder for data from unknown peers."""
         self._strangers = Allowance()
         self._dropped = 0
         self._gone = LinkCounters(0, 0, 0, 0, 0)
@@ -143,16 +143,16 @@ class Clients:
             self._clients[None] = welcome(None, preset)
 
     def __iter__(self) -> Iterator[Client]:
-        """Iterate over the clients: the preset remote, then by when they came."""
+        """Iterate over the clients: the preset remote, then in order of arrival."""
         return iter(tuple(self._clients.values()))
 
     def preset(self) -> Client | None:
-        """Return the preset remote."""
+        """Return the preset remote; None if the link has none."""
         return self._clients.get(None)
 
     @property
     def counters(self) -> LinkCounters:
-        """Traffic so far, of clients that are gone too."""
+        """Traffic since the start, including removed clients."""
         total = self._gone + LinkCounters(
             0, 0, self._doorkeeper.malformed, self._doorkeeper.unknown, 0, self._dropped
         )
@@ -161,15 +161,15 @@ class Clients:
         return total
 
     def may_receive(self, readable: Collection[int]) -> bool:
-        """Return whether something may have arrived: which descriptors are readable."""
+        """Return True if data may have arrived, given the readable descriptors."""
         return bool(self._backlog) or self._fileno in readable or self.endpoint.is_polled
 
     def renew(self) -> None:
-        """Begin another tick: what arrives may take its time again."""
+        """Reset the processing time of received data for a new tick."""
         self._listening.renew()
 
     def restart(self, now_us: int) -> None:
-        """Take simulated `now_us` [µs] as the present, whatever it was before."""
+        """Restart at simulated `now_us` [µs], which may be earlier than before."""
         self._backlog.clear()
         self._strangers.renew()
         for client in self._clients.values():
@@ -178,10 +178,10 @@ class Clients:
             client.heard_us = now_us
 
     def receive(self, now_us: int) -> Iterator[tuple[Client, WireMessage]]:
-        """Yield what has arrived by simulated `now_us` [µs], and from whom, oldest first.
+        """Yield messages received by simulated `now_us` [µs] with their clients, oldest first.
 
-        What exceeds the allowance of its sender is dropped and counted; when the link's time of the
-        tick is spent, the rest waits.
+        Data over a sender's rate limit is dropped and counted. When the link's share of the tick is
+        used up, the rest waits for the next tick.
         """
         backlog, listening = self._backlog, self._listening
         arrivals = self.endpoint.arrivals()
@@ -196,7 +196,7 @@ class Clients:
             backlog.extend(self._heard(*arrived, now_us))
 
     def _heard(self, peer: Peer, chunk: bytes, now_us: int) -> Iterator[tuple[Client, WireMessage]]:
-        """Yield the messages of a chunk with their client. Excess over an allowance is dropped."""
+        """Yield the messages of a chunk with their client. Drops data over the rate limit."""
         client = self._clients.get(peer)
         if client is None:
             client, messages = self._meet(peer, chunk, now_us)
@@ -212,7 +212,7 @@ class Clients:
                 yield client, message
 
     def forget_silent(self, now_us: int, silent_us: int = SILENT_US) -> None:
-        """Forget who has said nothing for long before simulated `now_us` [µs]."""
+        """Remove clients without a message for `silent_us` before simulated `now_us` [µs]."""
         for peer, client in tuple(self._clients.items()):
             if peer is not None and now_us - client.heard_us >= silent_us:
                 self._gone += client.link.counters
@@ -220,7 +220,7 @@ class Clients:
                 del self._clients[peer]
 
     def close(self) -> None:
-        """Close the endpoint, and release what is held for the clients."""
+        """Close the endpoint and release the resources of all clients."""
         for client in self:
             client.close()
         self.endpoint.close()
@@ -228,7 +228,7 @@ class Clients:
     def _meet(
         self, peer: Peer, chunk: bytes, now_us: int
     ) -> tuple[Client | None, list[WireMessage]]:
-        """Return the client that a stranger becomes by a valid frame, and what it said."""
+        """Return the client created by a valid frame from a new peer, and its messages."""
         if not self._strangers.left(now_us):
             self._dropped += 1
             return None, []
@@ -239,8 +239,8 @@ class Clients:
             messages = [m for m in messages if self._signing.accepts(bytes(m.get_msgbuf()))]
             self._gone += LinkCounters(0, 0, 0, 0, 0, refused=heard - len(messages))
             if not any(is_signed(m) for m in messages):
-                # What passes unsigned makes nobody a client: else one heartbeat with a false
-                # address would send that address telemetry for minutes.
+                # An accepted unsigned frame creates no client. Otherwise one heartbeat with a
+                # spoofed source address would direct minutes of telemetry to that address.
                 return None, []
         if not messages:
             return None, []
@@ -255,7 +255,7 @@ class Clients:
         return client, messages
 
     def _room(self, now_us: int) -> bool:
-        """Return whether another client can be taken. Who has gone silent makes room."""
+        """Return True if the link accepts another client. Removes silent clients if necessary."""
         learned = [client for peer, client in self._clients.items() if peer is not None]
         if len(learned) < MAX_CLIENTS:
             return True
@@ -283,31 +283,31 @@ COMMANDS = frozenset(
         "SETUP_SIGNING",
     )
 )
-"""Messages that change what the vehicle does."""
+"""Messages that change the vehicle's behaviour."""
 
 ANNOUNCED = (dialect.MAV_TYPE_GCS, dialect.MAV_TYPE_ONBOARD_CONTROLLER)
-"""Types in the heartbeat of a ground station and of a companion computer."""
+"""MAV_TYPE values in the heartbeat of a ground station and of a companion computer."""
 
 
 class Senders:
-    """Notes who commands, and whose heartbeat calls them a companion or a ground station."""
+    """Record of the systems that send commands and of those announced by a heartbeat."""
 
     def __init__(self) -> None:
         self._announced: set[tuple[int, int]] = set()
-        """System and component ids. They hold for as long as the links are open."""
+        """Announced system and component ids, kept while the links are open."""
         self._commands: Counter[tuple[int, int, str]] = Counter()
 
     def note(self, message: WireMessage, kind: str, source: tuple[int, int]) -> None:
-        """Take a message of a sender that was for this vehicle and did something."""
+        """Count a message from a sender if the message had an effect on this vehicle."""
         if kind in COMMANDS:
             self._commands[(*source, kind)] += 1
         elif kind == "HEARTBEAT" and message.type in ANNOUNCED:
             self._announced.add(source)
 
     def strangers(self) -> tuple[str, ...]:
-        """Return a line for each stranger and kind of message since the last `forget`.
+        """Return a line per unannounced sender and message type since the last `forget`.
 
-        A stranger has not announced itself by now: MAVSDK commands before its first heartbeat.
+        A heartbeat after a command also announces its sender: MAVSDK starts with commands.
         """
         return tuple(
             f"system {system} component {component}, {kind} ({count} times)"
@@ -316,5 +316,5 @@ class Senders:
         )
 
     def forget(self) -> None:
-        """Begin anew: another episode."""
+        """Reset the counts for a new episode."""
         self._commands.clear()

@@ -1,10 +1,9 @@
-"""The MAVLink 2 codec: the only module that touches pymavlink.
+"""MAVLink 2 codec. Only this module and `dialect` import pymavlink.
 
-Of pymavlink only the generated dialect (`dialect`) is used: message classes, constants and the
-decoder of one whole frame. Framing is done here. When receiving, because pymavlink's own parser
-discards everything that a damaged header claims as its payload, and waits for it to arrive. When
-streaming, because creating and packing a message object costs several times as much as `Layout`
-and `Encoder.frame`, which take the layout of a message from pymavlink's classes.
+pymavlink provides only the generated dialect (`dialect`): message classes, constants and the
+decoder of one whole frame. Framing is implemented here. On reception, pymavlink's parser waits for
+the full payload that a damaged header announces, and discards it. For streams, creating and packing
+a message object takes several times as long as `Layout` and `Encoder.frame`.
 """
 
 from __future__ import annotations
@@ -49,11 +48,11 @@ __all__ = [
 ]
 
 WireMessage: TypeAlias = dialect.MAVLink_message
-"""A decoded message, or one to be packed."""
+"""Received message, or a message to pack."""
 
 Values: TypeAlias = Sequence[float]
-"""The fields of a message in the order of their definition, ints where a field is one. Arrays are
-unrolled; extension fields (the last ones) may be left out and are zero then."""
+"""Fields of a message in order of definition, with int values for integer fields. Arrays are
+unrolled. Extension fields (the last ones) are optional and default to zero."""
 
 SYSTEM_ID = 1
 """MAVLink system id of the vehicle (PX4's MAV_SYS_ID default)."""
@@ -66,15 +65,15 @@ _CHECKSUM, _SIGNATURE = 2, 13
 _FLAG_SIGNED = 0x01
 
 MOST_DAMAGED = 64
-"""Damaged frames in one chunk after which the rest of it is dropped: each costs as much as a valid
-one, and a hostile chunk can seem to begin one at every byte."""
+"""Maximum number of damaged frames in a chunk; the rest of the chunk is then dropped. Each one
+costs as much as a valid frame, and a hostile chunk can contain one at every byte."""
 
 _MARK_V2 = bytes([_MARKER_V2])
 _HEADER_PACK = struct.Struct("<BBBB2s3s").pack
-"""The MAVLink 2 header behind its marker: length, flags (two), sequence, sender, message id."""
+"""MAVLink 2 header after its marker: length, flags (two), sequence, sender, message id."""
 
 _FIELD_FORMAT = re.compile(r"\d*[a-zA-Z]")
-"""One field in a struct format: 21f, 50s, B."""
+"""Pattern of one field in a struct format: 21f, 50s, B."""
 
 _Sort: TypeAlias = Callable[[Sequence[float]], Sequence[float]]
 _Packer: TypeAlias = tuple[_Sort | None, Callable[..., bytes]]
@@ -102,7 +101,7 @@ def payload(message: WireMessage) -> bytes:
 
 
 def is_signed(message: WireMessage) -> bool:
-    """Return whether a received message has a signature, right or wrong."""
+    """Return True if a received message has a signature, valid or not."""
     frame: bytearray = message.get_msgbuf()
     return frame[0] == _MARKER_V2 and bool(frame[2] & _FLAG_SIGNED)
 
@@ -110,17 +109,17 @@ def is_signed(message: WireMessage) -> bool:
 def param_value(name: str, raw: bytes, kind: int, count: int, index: int) -> bytes:
     """Return the payload of a PARAM_VALUE.
 
-    An INT32 parameter travels as the bytes of a float (PX4's bytewise encoding). Integers whose
-    bits form a signalling NaN would change on their way through a Python float.
+    An INT32 parameter is sent as the bytes of a float (PX4's bytewise encoding). A Python float
+    would change integers whose bits form a signalling NaN.
 
-    The name has at most 16 characters; `raw` is the value's four bytes, little endian, and `kind`
-    their MAV_PARAM_TYPE; `count` is the number of parameters; index 65535 = it has none.
+    The name has at most 16 characters. `raw` is the value's four bytes, little endian; `kind` is
+    their MAV_PARAM_TYPE. `count` is the number of parameters; index 65535 = not in the list.
     """
     return _PARAM_VALUE.pack(raw, count, index, name.encode("ascii"), kind)
 
 
 class Layout:
-    """The wire layout of one message, taken from pymavlink's class."""
+    """Wire layout of one message, from pymavlink's message class."""
 
     def __init__(self, kind: type[WireMessage]) -> None:
         self.id_bytes: bytes = kind.id.to_bytes(3, "little")
@@ -131,11 +130,11 @@ class Layout:
         starts = accumulate((sizes[n] for n in kind.fieldnames), initial=0)
         firsts = dict(zip(kind.fieldnames, starts, strict=False))  # the last one is the end
         self._packers: dict[int, _Packer] = {}
-        # Extension fields come last on the wire too: without them a payload is a shorter one.
+        # Extension fields are last on the wire too: omitting them shortens the payload.
         for end in range(len(names) - len(_extension_fields(kind)), len(names) + 1):
             slots = [firsts[n] + i for n in names[:end] for i in range(sizes[n])]
             pack = struct.Struct("<" + "".join(formats[n] for n in names[:end])).pack
-            # Many messages are defined in the order of the wire: nothing to sort there.
+            # Many messages are defined in wire order and need no sorting.
             in_order = slots == sorted(slots)
             self._packers[len(slots)] = (None if in_order else itemgetter(*slots), pack)
 
@@ -168,19 +167,19 @@ def _x25(data: bytes) -> int:
     return crc
 
 
-# CRC-16/MCRF4XX. pymavlink's x25crc is a class around fastcrc's function (which a platform may
-# lack): making its object would cost more than the checksum.
+# CRC-16/MCRF4XX. pymavlink's x25crc is a class around fastcrc's function (not available on every
+# platform). Creating an x25crc object takes longer than the checksum.
 _checksum: Callable[[bytes], int] = _x25 if mavcrc.mcrf4xx is None else mavcrc.mcrf4xx
 
 
 def _extension_fields(kind: type[WireMessage]) -> list[str]:
-    """Return the extension fields: pymavlink gives them, and only them, a default."""
+    """Return the names of extension fields: the parameters with a default in pymavlink."""
     parameters = inspect.signature(kind).parameters.values()
     return [p.name for p in parameters if p.default is not inspect.Parameter.empty]
 
 
 class Encoder:
-    """Packs the messages of one link: the vehicle's ids and the link's own sequence numbers."""
+    """Message packer of one link, with the vehicle's ids and the link's sequence numbers."""
 
     def __init__(self, system_id: int = SYSTEM_ID, component_id: int = COMPONENT_ID) -> None:
         self._mav = dialect.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
@@ -190,12 +189,12 @@ class Encoder:
         self.identify(system_id)
 
     def identify(self, system_id: int) -> None:
-        """Send as another system from now on. The sequence goes on."""
+        """Change the system id of the sender. Sequence numbers continue."""
         self._mav.srcSystem = self.system_id = system_id
         self._ids = bytes([system_id, self._component_id])
 
     def skip(self, frames: int) -> None:
-        """Count frames that something else has packed."""
+        """Advance the sequence number by frames packed elsewhere."""
         self.sequence = (self.sequence + frames) & 0xFF
 
     def pack(self, message: WireMessage) -> bytes:
@@ -209,7 +208,7 @@ class Encoder:
         return frame
 
     def frame(self, layout: Layout, payload: bytes) -> bytes:
-        """Return the frame around a payload of that layout: what `pack` makes of the message."""
+        """Return a frame for a payload of this layout, identical to the result of `pack`."""
         seq = self.sequence
         self.sequence = (seq + 1) & 0xFF
         covered = _HEADER_PACK(len(payload), 0, 0, seq, self._ids, layout.id_bytes) + payload
@@ -217,24 +216,24 @@ class Encoder:
 
 
 class Reader:
-    """Reads one kind of message where a chunk of bytes is one whole frame of it.
+    """Fast decoder for chunks that contain exactly one frame of one message type.
 
-    That takes a tenth of what `Decoder` does, which everything else is left to.
+    `read` takes a tenth of the time of `Decoder`, which handles all other input.
     """
 
     def __init__(self, name: str) -> None:
-        """Take a name such as "ATTITUDE". Raises AttributeError when unknown."""
+        """Prepare to decode a message such as "ATTITUDE". Raises AttributeError when unknown."""
         kind = dialect.mavlink_map[message_id(name)]
         self.names: tuple[str, ...] = tuple(kind.ordered_fieldnames)
-        """The fields in the order in which they are sent; an array has its name once."""
+        """Field names in wire order; one name per array."""
         self._wire: struct.Struct = kind.unpacker
         self._id: bytes = kind.id.to_bytes(3, "little")
         self._crc_extra = bytes([kind.crc_extra])
 
     def read(self, chunk: bytes) -> tuple[float, ...] | None:
-        """Return the values in the order in which they are sent, arrays unrolled.
+        """Return the values in wire order, arrays unrolled.
 
-        None where the chunk is anything but one valid, unsigned MAVLink 2 frame of this message.
+        None unless the chunk is exactly one valid, unsigned MAVLink 2 frame of this message.
         """
         if len(chunk) < _HEADER_V2 + _CHECKSUM or chunk[0] != _MARKER_V2 or chunk[2] != 0:
             return None
@@ -243,28 +242,28 @@ class Reader:
             return None
         if _checksum(chunk[1:end] + self._crc_extra) != int.from_bytes(chunk[end:], "little"):
             return None
-        # Zeros at its end are not sent.
+        # MAVLink 2 omits trailing zeros.
         size = self._wire.size
         return self._wire.unpack(chunk[_HEADER_V2:end][:size].ljust(size, b"\0"))
 
 
 class Decoder:
-    """Finds MAVLink 1 and 2 frames in arbitrary bytes. Never raises, never grows.
+    """Parser for MAVLink 1 and 2 frames in arbitrary bytes. Never raises; memory is bounded.
 
-    After a damaged frame the search goes on at its second byte, so a valid frame hidden behind a
-    false or cut header is not lost. Signatures are not checked: there is no key.
+    After a damaged frame the search resumes at its second byte, so a valid frame behind a false or
+    truncated header is not lost. Signatures are not checked, because this class has no key.
     """
 
     def __init__(self, *, datagrams: bool) -> None:
         """Start empty.
 
-        `datagrams`: every chunk holds whole frames (UDP); else it is a byte stream (serial), where
-        a frame may be continued in the next chunk.
+        `datagrams`: True if every chunk holds whole frames (UDP). False for a byte stream (serial),
+        where a frame may continue in the next chunk.
         """
         self.malformed = 0
-        """Runs of bytes that belong to no valid frame."""
+        """Number of byte runs that belong to no valid frame."""
         self.unknown = 0
-        """Frames whose message the dialect lacks, so that their checksum cannot be checked."""
+        """Number of frames with an unknown message, whose checksum cannot be checked."""
         self._datagrams = datagrams
         self._rest = b""
         self._in_garbage = False
@@ -272,7 +271,7 @@ class Decoder:
 
     @property
     def between_frames(self) -> bool:
-        """Whether the next chunk begins a frame, as far as is known."""
+        """True if the next chunk is expected to start a frame."""
         return not self._rest and not self._in_garbage
 
     def feed(self, data: bytes) -> list[WireMessage]:
@@ -316,14 +315,14 @@ class Decoder:
         except (dialect.MAVError, struct.error):
             return None
         if isinstance(message, dialect.MAVLink_unknown):
-            # No checksum to trust: believe it only where a frame may really end.
+            # The checksum cannot be checked: accept the frame only where one may end.
             fits = end == len(buffer) or buffer[end] in (_MARKER_V1, _MARKER_V2)
             return message if fits else None
         return message
 
 
 def _frame_end(buffer: bytes, start: int) -> int | None:
-    """Return where the frame at `start` ends (maybe past the buffer), None if there is none."""
+    """Return the end of the frame at `start` (possibly past the buffer), None if not a frame."""
     marker, left = buffer[start], len(buffer) - start
     if marker == _MARKER_V1:
         length = buffer[start + 1] if left > 1 else 0
@@ -333,7 +332,7 @@ def _frame_end(buffer: bytes, start: int) -> int | None:
     length = buffer[start + 1] if left > 1 else 0
     flags = buffer[start + 2] if left > 2 else 0
     if flags & ~_FLAG_SIGNED:
-        return None  # incompatible with anything known: the specification says to drop it
+        return None  # unsupported flag: the specification requires dropping the frame
     signature = _SIGNATURE if flags & _FLAG_SIGNED else 0
     return start + _HEADER_V2 + length + _CHECKSUM + signature
 
@@ -344,26 +343,27 @@ CHUNK_BYTES = 50
 _LAST_ID = 65_535
 
 SAID_BY_EVENT = b"\t"
-"""Ends a text that is an event, too, as PX4's do: ground stations that know events pass it over."""
+"""Suffix of a text that is also sent as an event, as in PX4. Ground stations with event support
+skip such texts."""
 
 REPLY_IDS = 32_768
-"""First id of answers that are counted apart from the autopilot's texts: the ids of two consecutive
-long texts must differ."""
+"""First id of replies if they are numbered separately from the autopilot's texts. The ids of two
+consecutive long texts must differ."""
 
 
 class TextEncoder:
-    """Turns texts into STATUSTEXT messages, with the ids that tie the chunks together."""
+    """Encoder of texts as STATUSTEXT messages, with the ids that link the chunks."""
 
     def __init__(self, last_id: int = 0) -> None:
-        """Give the first long text the id after `last_id`."""
+        """Number long texts from the id after `last_id`."""
         self._id = last_id
 
     def encode(self, message: Message) -> list[WireMessage]:
         """Return the messages of one text, in order.
 
-        A text of up to 50 characters is one message with id 0. A longer one is chunks with one id.
-        A chunk with a NUL in it is the last, so a text that fills its last chunk to the brim is
-        followed by an empty one.
+        A text of up to 50 characters is one message with id 0. A longer text is split into chunks
+        with a common id. A chunk with a NUL is the last, so an empty chunk follows a full last
+        chunk.
         """
         text = message.text.encode("ascii", errors="replace")
         if message.event is not None:

@@ -1,10 +1,9 @@
-"""The MAVLink messages that are spoken here, as a module made by pymavlink's own generator.
+"""MAVLink dialect module, built by pymavlink's generator.
 
-pymavlink's `development` set has all of `common`, but not the newest messages that PX4 sends:
-EVENT, COMPONENT_METADATA, TIME_ESTIMATE_TO_TARGET and others. Those stand in
-`newer_messages.xml`, and both together are generated at the first import after an install (a
-fraction of a second) and kept beside the compiled kernels. A later start imports the module as it
-would import pymavlink's own.
+pymavlink's `development` set includes all of `common`, but lacks the newest messages of PX4: EVENT,
+COMPONENT_METADATA, TIME_ESTIMATE_TO_TARGET and others. `newer_messages.xml` defines these messages.
+The first import after an install generates a module from both (a fraction of a second) and caches
+it beside the compiled kernels. Later imports load the cached module.
 """
 
 from __future__ import annotations
@@ -24,17 +23,17 @@ import pymavlink
 from airl_mav.core.cache import writable_folder
 
 NEWER = Path(__file__).with_name("newer_messages.xml")
-"""Messages that pymavlink's definitions lack."""
+"""Messages missing from pymavlink's definitions."""
 
 DEFINITIONS = Path(pymavlink.__file__).parent / "dialects" / "v20"
 INCLUDED = ("minimal", "standard", "common", "development")
-"""pymavlink's definitions that `development` consists of, each including the one before."""
+"""pymavlink's definitions included in `development`, each including the one before."""
 
 _NAME = "airl_mavlink_dialect"
 
 
 def load() -> ModuleType:
-    """Return the module of the dialect: what `pymavlink.dialects.v20.common` is for `common`.
+    """Return the dialect module, the counterpart of `pymavlink.dialects.v20.common`.
 
     Raises:
         ImportError: pymavlink is installed without its message definitions.
@@ -50,10 +49,10 @@ def load() -> ModuleType:
 
 
 def _digest() -> str:
-    """Return a digest of what the module is made from."""
+    """Return a digest of the module's source definitions."""
     digest = hashlib.sha256(NEWER.read_bytes())
     for name in INCLUDED:
-        # Size and time tell an upgrade of pymavlink as well as half a megabyte of text would.
+        # Size and time reveal an upgrade of pymavlink without reading half a megabyte of text.
         try:
             seen = (DEFINITIONS / f"{name}.xml").stat()
         except OSError as error:
@@ -63,13 +62,13 @@ def _digest() -> str:
 
 
 def generated(folder: Path) -> Path:
-    """Return the module's file in a folder. It is made if it is not there."""
+    """Return the path of the module in a folder. Generates a missing module."""
     path = folder / f"{_NAME}.py"
     if not path.is_file():
         with tempfile.TemporaryDirectory(dir=folder) as temporary:
             made = Path(temporary) / path.name
             generate(NEWER, DEFINITIONS, INCLUDED, made)
-            made.replace(path)  # whole, also where several processes make it at once
+            made.replace(path)  # atomic, for several processes at once
     return path
 
 
@@ -91,15 +90,15 @@ def generate(newer: Path, definitions: Path, included: tuple[str, ...], module: 
     """Write the Python module of a dialect.
 
     Args:
-        newer: Definitions of our own; they take the place of messages with the same number.
+        newer: Additional definitions; they replace messages with the same number.
         definitions: Folder of pymavlink's definitions.
-        included: Those of them that belong to the dialect, each including the one before.
-        module: The file to write. The folder must be empty: definitions are put there, too.
+        included: Definitions of the dialect, each including the one before.
+        module: File to write, in an empty folder. Definitions are written there, too.
 
     Raises:
-        ImportError: The generator refuses the definitions.
+        ImportError: The generator rejects the definitions.
     """
-    # Only here: a start that finds the module must not wait for the generator's import.
+    # Imported here because loading an existing module does not need the generator.
     from pymavlink.generator import mavgen
 
     folder = module.parent
@@ -121,7 +120,7 @@ def generate(newer: Path, definitions: Path, included: tuple[str, ...], module: 
         str(module.with_suffix("")), wire_protocol="2.0", language="Python3", validate=False
     )
     said = io.StringIO()
-    # Standard output of a process of a rehearsal is its channel to the harness.
+    # In a rehearsal, a process's standard output is its channel to the harness.
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         made = mavgen.mavgen(options, [str(source)])
     if not made:

@@ -1,4 +1,4 @@
-"""Endpoints of MAVLink links: UDP as PX4 uses it, or queues in memory."""
+"""Endpoints of MAVLink links: UDP sockets as in PX4, or queues in memory."""
 
 from __future__ import annotations
 
@@ -12,38 +12,38 @@ from typing import Protocol, TypeAlias
 from airl_mav.core.errors import UsageError
 
 Address = tuple[str, int]
-"""IPv4 host (name or number) and UDP port."""
+"""IPv4 host (name or address) and UDP port."""
 
 Peer: TypeAlias = "Address | None"
-"""Who is at the other end: the preset remote, or the only one in memory (None), or an address."""
+"""Address of a peer; None = the preset remote, or the only peer in memory."""
 
 MAX_DATAGRAM = 4096
-"""Longest datagram read; MAVLink frames are at most 280 bytes, some senders join several."""
+"""Maximum datagram size [bytes]. A MAVLink frame has at most 280; some senders join several."""
 
 MAX_DATAGRAMS_PER_CALL = 256
-"""Datagrams read per `receive`: a flood must not delay the flight controller."""
+"""Maximum number of datagrams per `receive`, so that a flood cannot delay the flight controller."""
 
 RECEIVE_BUFFER_BYTES = 1 << 20
-"""What a socket may hold while the host lets the simulator wait: some 2,500 short datagrams, or as
-many as Linux allows (net.core.rmem_max: 500 by default)."""
+"""Receive buffer of a socket [bytes], for pauses of the simulator: about 2,500 short datagrams, or
+the maximum that Linux allows (net.core.rmem_max: 500 by default)."""
 
 _MARKERS = (0xFD, 0xFE)
 
 
 class PortTakenError(UsageError):
-    """A port that another program has bound."""
+    """Error for a port that another program has bound."""
 
 
 class Sender(Protocol):
-    """Sends to one other end of a MAVLink link. Nothing blocks and nothing raises while flying."""
+    """Sender to one peer of a MAVLink link. Never blocks or raises during a flight."""
 
     @property
     def send_errors(self) -> int:
-        """Chunks that could not be sent."""
+        """Number of chunks that could not be sent."""
         ...
 
     def send(self, data: bytes) -> None:
-        """Send one frame: an answer, now."""
+        """Send one frame immediately, as a reply."""
         ...
 
     def send_streams(self, frames: Sequence[bytes]) -> None:
@@ -52,73 +52,73 @@ class Sender(Protocol):
 
 
 class Endpoint(Sender, Protocol):
-    """One end of a MAVLink link, which receives as well."""
+    """Endpoint of a MAVLink link that also receives."""
 
     datagrams: bool
-    """True when each chunk from `receive` holds whole frames."""
+    """True if each chunk from `receive` holds whole frames."""
 
     def receive(self) -> list[bytes]:
         """Return all chunks that have arrived, oldest first."""
         ...
 
     def fileno(self) -> int | None:
-        """Return the descriptor to wait on, or None when there is none."""
+        """Return the descriptor to wait on, or None if the endpoint has no descriptor."""
         ...
 
     def close(self) -> None:
-        """Release the resources; harmless when called again."""
+        """Release the resources. Repeated calls have no effect."""
         ...
 
 
 class SharedEndpoint(Endpoint, Protocol):
-    """An endpoint that tells its peers apart."""
+    """Endpoint that distinguishes its peers."""
 
     @property
     def is_polled(self) -> bool:
-        """Whether something may have arrived although its descriptor is not readable."""
+        """True if data may have arrived although the descriptor is not readable."""
         ...
 
     def arrivals(self) -> Iterator[tuple[Peer, bytes]]:
-        """Yield what has arrived and from whom, oldest first; a bounded number of chunks.
+        """Yield received chunks with their peers, oldest first, up to a maximum number.
 
-        What is not taken out of the iterator waits for the next call.
+        Chunks not taken from the iterator remain for the next call.
         """
         ...
 
     def towards(self, peer: Peer) -> Sender | None:
-        """Return what sends to one peer; None for a preset remote that is not set."""
+        """Return a sender to one peer; None if the preset remote is not set."""
         ...
 
 
 class MemoryEndpoint:
-    """Two queues in one process: for lockstep and tests."""
+    """Pair of in-process queues, for lockstep and tests."""
 
     datagrams = True
     is_polled = True
 
     def __init__(self) -> None:
         self.inbox: deque[bytes] = deque()
-        """Chunks for the vehicle. The other side appends."""
+        """Chunks to the vehicle. The other side appends."""
         self.outbox: deque[bytes] = deque()
-        """Frames from the vehicle. The other side takes from the left."""
+        """Frames from the vehicle. The other side removes from the left."""
         self.send_errors = 0
 
     def receive(self) -> list[bytes]:
-        """Return all chunks put into `inbox`, oldest first."""
+        """Return all chunks in `inbox`, oldest first."""
         chunks: list[bytes] = []
         inbox = self.inbox
-        while inbox:  # one by one: another thread may be appending
+        while inbox:  # one by one: another thread may append
             chunks.append(inbox.popleft())
         return chunks
 
     def arrivals(self) -> Iterator[tuple[Peer, bytes]]:
-        """Yield the chunks put into `inbox`, oldest first."""
+        """Yield the chunks in `inbox`, oldest first."""
         inbox = self.inbox
         while inbox:
             yield None, inbox.popleft()
 
     def towards(self, peer: Peer) -> Sender | None:
-        """Return this endpoint: there is one other end."""
+        """Return this endpoint, which has exactly one peer."""
         return self if peer is None else None
 
     def send(self, data: bytes) -> None:
@@ -130,23 +130,23 @@ class MemoryEndpoint:
         self.outbox.extend(frames)
 
     def take(self) -> list[bytes]:
-        """Return and forget all frames sent so far, oldest first; `b"".join` makes them one chunk.
+        """Return and remove all frames sent so far, oldest first; `b"".join` merges them.
 
-        A subclass that tells answers from telemetry overrides `send` and `send_streams`.
+        A subclass can override `send` and `send_streams` to separate replies from telemetry.
         """
         frames = list(self.outbox)
         self.outbox.clear()
         return frames
 
     def fileno(self) -> None:
-        """Return None: there is nothing to wait on."""
+        """Return None: the endpoint has no descriptor."""
 
     def close(self) -> None:
         """Do nothing."""
 
 
 class UdpPeer:
-    """One address that a bound UDP socket sends to. Implements `Sender`."""
+    """Destination address of a bound UDP socket. Implements `Sender`."""
 
     def __init__(self, bound: socket.socket, address: Address) -> None:
         self.send_errors = 0
@@ -161,7 +161,7 @@ class UdpPeer:
             self.send_errors += 1
 
     def send_streams(self, frames: Sequence[bytes]) -> None:
-        """Send each frame as a datagram of its own, as PX4: some clients decode no other."""
+        """Send each frame as a separate datagram, as PX4 does: some clients require it."""
         send, address = self._socket.sendto, self._address
         for frame in frames:
             try:
@@ -171,11 +171,11 @@ class UdpPeer:
 
 
 class UdpEndpoint:
-    """A bound UDP socket with a preset remote, like a PX4 SITL link.
+    """Bound UDP socket with a preset remote, like a PX4 SITL link.
 
-    Frames are sent to the preset remote from the first tick, before anything was received.
-    `arrivals` and `towards` distinguish peers. `receive` and `send` do not: the newest peer at
-    another address gets all frames, too.
+    The preset remote receives frames from the first tick, before it has sent any. `arrivals` and
+    `towards` distinguish peers. `receive` and `send` do not: the most recent peer at another
+    address also receives all frames.
     """
 
     datagrams = True
@@ -190,26 +190,25 @@ class UdpEndpoint:
         remote_option: str,
         insecure: bool = False,
     ) -> None:
-        """Bind.
+        """Bind the socket.
 
         Args:
-            local: Address to bind; port 0 = any free one.
-            remote: Where to send from the first tick; None = only to peers that sent something.
-            local_option: The command line option that moves the local port, for messages.
-            remote_option: The command line option that moves the remote, for messages.
-            insecure: Allow addresses that other machines can reach: frames are signed, or the
-                network is trusted.
+            local: Address to bind; port 0 = any free port.
+            remote: Destination from the first tick; None = only peers that have sent data.
+            local_option: Command line option for the local port, for error messages.
+            remote_option: Command line option for the remote, for error messages.
+            insecure: Allow addresses that other machines can reach. Requires signed frames or a
+                trusted network.
 
         Raises:
-            UsageError: An address is unusable, taken, or reachable from outside without
-                `insecure`.
+            UsageError: An address is invalid, in use, or reachable from outside without `insecure`.
         """
         local = _usable(local, local_option, lowest_port=0, insecure=insecure)
         if remote is not None:
             remote = _usable(remote, remote_option, lowest_port=1, insecure=insecure)
         self._remote = remote
         self.peer: Address | None = None
-        """The newest sender that is not the preset remote, None before any."""
+        """Most recent sender other than the preset remote; None until the first."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
@@ -227,15 +226,15 @@ class UdpEndpoint:
         self._preset = None if remote is None else UdpPeer(self._socket, remote)
         self._learned: UdpPeer | None = None
         self._lost = 0
-        """Datagrams that could not be sent to peers before the newest."""
+        """Number of datagrams that could not be sent to earlier peers."""
 
     @property
     def send_errors(self) -> int:
-        """Datagrams that could not be sent."""
+        """Number of datagrams that could not be sent."""
         return self._lost + sum(end.send_errors for end in self._ends())
 
     def receive(self) -> list[bytes]:
-        """Return the datagrams that have arrived, oldest first, and note their sender."""
+        """Return the datagrams received, oldest first, and store their sender."""
         chunks: list[bytes] = []
         for peer, data in self.arrivals():
             if peer is not None and peer != self.peer and data and data[0] in _MARKERS:
@@ -245,28 +244,28 @@ class UdpEndpoint:
         return chunks
 
     def arrivals(self) -> Iterator[tuple[Peer, bytes]]:
-        """Yield the datagrams that have arrived and who sent each, oldest first."""
+        """Yield received datagrams with their senders, oldest first."""
         for _ in range(MAX_DATAGRAMS_PER_CALL):
             try:
                 data, address = self._socket.recvfrom(MAX_DATAGRAM)
             except BlockingIOError:
                 return
             except OSError:
-                continue  # an earlier send was refused (ICMP): nothing arrived
+                continue  # ICMP error from an earlier send; nothing arrived
             yield (None if address == self._remote else address), data
 
     def towards(self, peer: Peer) -> Sender | None:
-        """Return what sends to one address; None: to the preset remote."""
+        """Return a sender to one address; None = to the preset remote."""
         address = self._remote if peer is None else peer
         return None if address is None else UdpPeer(self._socket, address)
 
     def send(self, data: bytes) -> None:
-        """Send one frame to the preset remote and to the learned peer."""
+        """Send one frame to the preset remote and to the most recent peer."""
         for end in self._ends():
             end.send(data)
 
     def send_streams(self, frames: Sequence[bytes]) -> None:
-        """Send frames to both."""
+        """Send frames to the preset remote and to the most recent peer."""
         for end in self._ends():
             end.send_streams(frames)
 
@@ -274,7 +273,7 @@ class UdpEndpoint:
         return (end for end in (self._preset, self._learned) if end is not None)
 
     def fileno(self) -> int | None:
-        """Return the socket's descriptor, None once closed."""
+        """Return the socket's descriptor; None when closed."""
         number = self._socket.fileno()
         return None if number < 0 else number
 
@@ -284,7 +283,7 @@ class UdpEndpoint:
 
 
 def _usable(address: Address, option: str, *, lowest_port: int, insecure: bool) -> Address:
-    """Return the address with its host name resolved. Raises UsageError if it cannot be used."""
+    """Return the address with its host name resolved. Raises UsageError if it is unusable."""
     host, port = address
     if not lowest_port <= port <= 65_535:
         raise UsageError(f"{option}: port {port}: must be in {lowest_port}..65535")

@@ -1,4 +1,4 @@
-"""MAVLink events: sent in order to everybody, and again to who has missed one.
+"""MAVLink events: sent in order to all clients, and again on request.
 
 Source: https://mavlink.io/en/services/events.html, and PX4 1.16, mavlink/mavlink_events.cpp.
 """
@@ -15,21 +15,21 @@ from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.streams.units import boot_ms
 
 FIRST_SEQUENCE = 65_526
-"""Of the first event after boot: PX4 begins high, so that the number soon wraps around."""
+"""Sequence number of the first event after boot. PX4 starts high to wrap around early."""
 
 KEPT = 20
-"""Events that can be asked for again (PX4's buffer)."""
+"""Number of events kept for repeated requests (PX4's buffer)."""
 
 ANNOUNCED_US = 3 * US_PER_S
-"""Time between two CURRENT_EVENT_SEQUENCE to one client [µs]."""
+"""Interval of CURRENT_EVENT_SEQUENCE per client [µs]."""
 
 NUMBERS = 65_536
-"""Sequence numbers that there are."""
+"""Number of distinct sequence numbers."""
 _ARGUMENT_BYTES = 40
 
 
 class SentEvent(NamedTuple):
-    """An event with its number, as it is sent."""
+    """Event with its sequence number."""
 
     sequence: int
     time_us: int
@@ -37,60 +37,60 @@ class SentEvent(NamedTuple):
 
 
 class EventBuffer:
-    """The newest events of a vehicle since boot."""
+    """Most recent events of a vehicle since boot."""
 
     def __init__(self) -> None:
         self._kept: deque[SentEvent] = deque(maxlen=KEPT)
         self.latest = FIRST_SEQUENCE - 1
-        """Number of the newest event; one less than the first as long as there is none."""
+        """Sequence number of the newest event; `FIRST_SEQUENCE - 1` before the first event."""
 
     def __len__(self) -> int:
-        """Return how many can be asked for."""
+        """Return the number of stored events."""
         return len(self._kept)
 
     def add(self, event: Event, time_us: int) -> None:
-        """Take an event that happened at simulated `time_us` [µs]."""
+        """Add an event that occurred at simulated `time_us` [µs]."""
         self.latest = (self.latest + 1) % NUMBERS
         self._kept.append(SentEvent(self.latest, time_us, event))
 
     def get(self, sequence: int) -> SentEvent | None:
-        """Return an event by its number; None = it is gone, or has not happened."""
+        """Return the event with a sequence number; None = expired or not yet occurred."""
         for sent in self._kept:
             if sent.sequence == sequence:
                 return sent
         return None
 
     def after(self, sequence: int) -> int:
-        """Return the number of the first event kept that comes after one."""
+        """Return the sequence number of the first stored event after another event."""
         following = [s.sequence for s in self._kept if s.sequence != sequence]
         return min(following, key=lambda s: (s - sequence) % NUMBERS, default=self.latest)
 
 
 class EventSender:
-    """One client's part: what it has been sent."""
+    """Event transmission state of one client."""
 
     def __init__(self, buffer: EventBuffer) -> None:
-        """Begin with the next event: what happened before is to be asked for."""
+        """Start with the next event. Earlier events are sent on request only."""
         self._buffer = buffer
         self._sent = buffer.latest
         self._announced_us = 0
         self._first = len(buffer) == 0
 
     def has_news(self, now_us: int) -> bool:
-        """Return whether anything is to be sent at simulated `now_us` [µs]: mostly there is not."""
+        """Return True if anything is due at simulated `now_us` [µs]. Usually False."""
         return now_us >= self.next_us
 
     @property
     def next_us(self) -> int:
-        """When anything is sent next [µs]; 0 = now."""
+        """Time of the next message [µs]; 0 = now."""
         news = self._sent != self._buffer.latest
         return 0 if news else self._announced_us + ANNOUNCED_US + 1
 
     def due(self, now_us: int) -> Iterator[WireMessage]:
-        """Yield what is to be sent at simulated `now_us` [µs]."""
+        """Yield the messages due at simulated `now_us` [µs]."""
         latest = self._buffer.latest
         if self._first and latest != self._sent:
-            # The numbers begin anew with this boot: whoever has heard others forgets them.
+            # Numbering restarts with this boot: clients must drop the numbers of earlier boots.
             self._first = False
             yield self._current(now_us, reset=True)
         while self._sent != latest:
@@ -109,7 +109,7 @@ class EventSender:
 
 
 def message(sent: SentEvent) -> WireMessage:
-    """Return EVENT, for everybody."""
+    """Return EVENT, addressed to all systems."""
     event = sent.event
     arguments = event.arguments.ljust(_ARGUMENT_BYTES, b"\0")
     everybody = 0

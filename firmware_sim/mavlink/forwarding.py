@@ -1,7 +1,7 @@
-"""Messages for others are passed on between clients, as PX4 passes them on between its links.
+"""Forwarding of messages between clients, as PX4 forwards messages between its links.
 
-Source: PX4 1.16, Mavlink::forward_message. A message goes to every other client from whose side its
-addressee has been heard; a broadcast goes to every other client that has said anything.
+Source: PX4 1.16, Mavlink::forward_message. A message goes to every other client through which its
+target has been seen; a broadcast goes to every other client that has sent a message.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
 from firmware_sim.mavlink.services.context import ANY, sender
 
 REMEMBERED_FRAMES = 128
-"""Newest frames of each sender that are not passed on twice. Fewer than a sender has sequence
-numbers (256): who only sends heartbeats sends the very same frame again after so many."""
+"""Number of recent frames per sender that are not forwarded again. Below 256, the number of
+sequence numbers: a sender of heartbeats alone repeats its frames after that."""
 
 REMEMBERED_SENDERS = 256
 
 NEVER = frozenset((dialect.MAVLINK_MSG_ID_SETUP_SIGNING,))
-"""A key is for the one to whom it is told."""
+"""Messages that are never forwarded. A signing key is for its recipient only."""
 
 
 class Forwarder:
-    """Passes messages on, each once: a program that joins two links makes no loop."""
+    """Message forwarder. Sends each frame once: programs that join two links cause no loop."""
 
     def __init__(self, everybody: Callable[[], Iterable[Client]]) -> None:
-        """Take what returns all clients of all links."""
+        """Store the callable that returns all clients of all links."""
         self._everybody = everybody
         self._seen: OrderedDict[tuple[int, int], deque[bytes]] = OrderedDict()
 
     def forward(self, message: WireMessage, origin: Client, system_id: int, now_us: int) -> bool:
-        """Pass a message on to whom it concerns; return whether there was anybody.
+        """Forward a message to the clients concerned; return True if any received it.
 
         Args:
-            message: As received.
-            origin: The client that sent it.
-            system_id: Of this vehicle.
+            message: Received message.
+            origin: Client that sent the message.
+            system_id: System id of this vehicle.
             now_us: Simulated time [µs].
         """
         target = getattr(message, "target_system", ANY), getattr(message, "target_component", ANY)

@@ -1,7 +1,7 @@
-"""Limits on received MAVLink: frames per client, time per tick, and the warnings to operators.
+"""Limits on received MAVLink data: frames per client, time per tick, and operator warnings.
 
-A tick is late where MAVLink takes too long. In the time that is left before the next tick it makes
-nothing late, so there is more room for it there.
+Too much MAVLink processing delays a tick. The idle time before the next tick delays nothing, so the
+limit there is higher.
 """
 
 from __future__ import annotations
@@ -11,76 +11,75 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 
 FRAMES_PER_S = 2_000
-"""Frames that one client may send for long: eight times what a setpoint in every tick takes."""
+"""Sustained frame rate of one client [1/s]: eight times the rate of a setpoint per tick."""
 
 BURST_FRAMES = 500
-"""Frames that it may send at once: a ground station asks for that many parameters."""
+"""Maximum burst of one client [frames]: a ground station requests up to 500 parameters at once."""
 
 
 class Allowance:
-    """A generic cell rate algorithm (ITU-T I.371) in integer microseconds of simulated time.
+    """Generic cell rate algorithm (ITU-T I.371) in integer microseconds of simulated time.
 
-    It counts, and reads no clock, so the same frames at the same simulated times are always
-    treated alike.
+    Counts frames and reads no clock: the result depends only on frames and their simulated times.
     """
 
     def __init__(self, per_s: int = FRAMES_PER_S, burst: int = BURST_FRAMES) -> None:
-        """Allow `per_s` frames a second for long, and `burst` at once."""
+        """Allow a sustained rate of `per_s` frames per second, and bursts of `burst` frames."""
         self._each_us = US_PER_S // per_s
         self._ahead_us = self._each_us * burst
         self._until_us = 0
-        """When everything that was taken is paid for."""
+        """Simulated time at which the counted frames no longer limit the rate [µs]."""
 
     def left(self, now_us: int) -> bool:
-        """Return whether another frame is allowed at simulated `now_us` [µs]."""
+        """Return True if another frame is allowed at simulated `now_us` [µs]."""
         return self._until_us - now_us < self._ahead_us
 
     def take(self, frames: int, now_us: int) -> None:
-        """Count frames that came at simulated `now_us` [µs]."""
+        """Count frames received at simulated `now_us` [µs]."""
         self._until_us = max(self._until_us, now_us) + self._each_us * frames
 
     def renew(self) -> None:
-        """Forget what was taken: simulated time may start anew."""
+        """Reset the counted frames, because simulated time may restart."""
         self._until_us = 0
 
 
 LISTEN_US = TICK_US // 8
-"""Longest time of a tick that goes into what arrives on one link [µs of the pacing clock]. What is
-left waits for the next tick."""
+"""Maximum time per tick for received data of one link [µs of the pacing clock]. The rest waits for
+the next tick."""
 
 IDLE_LISTEN_US = TICK_US // 4
-"""Longest time that goes, beside that, into what arrives on all links while nothing else is to do
-before the next tick [µs of the pacing clock]. A flood must leave the companion, on the same host,
-some of the processor."""
+"""Maximum additional time for received data of all links while the simulator is idle before the
+next tick [µs of the pacing clock]. During a flood the companion, on the same host, needs part of
+the processor."""
 
 BULK_RESERVE_US = TICK_US // 8
-"""Bulk transfers stop so long before the next tick [µs of the pacing clock]: what arrives is read
-then."""
+"""Time before the next tick at which bulk transfers stop, to read received data [µs of the pacing
+clock]."""
 
 
 class TickTime:
-    """The time before the next tick, for all links together."""
+    """Time before the next tick, common to all links."""
 
     def __init__(self, clock: Clock | None) -> None:
-        """Take the pacing clock; None: nobody waits for a tick, and all may take any time."""
+        """Store the pacing clock; None = no pacing, so time is unlimited."""
         self.clock = clock
         self.next_us = 0
-        """When the next tick begins, in simulated time [µs]."""
+        """Simulated time at which the next tick starts [µs]."""
         self.idle_us = IDLE_LISTEN_US
-        """What may still go into listening before that [µs]."""
+        """Remaining idle time for received data before the next tick [µs]."""
 
     def renew(self, next_us: int) -> None:
-        """Begin another tick's time, which ends with the tick at simulated `next_us` [µs]."""
+        """Start the time budget that ends with the tick at simulated `next_us` [µs]."""
         self.next_us = next_us
         self.idle_us = IDLE_LISTEN_US
 
     def is_short(self) -> bool:
-        """Return whether the next tick is so near that bulk transfers have to wait."""
+        """Return True if bulk transfers must wait because the next tick is near."""
         return self.clock is not None and self.clock.time_us() > self.next_us - BULK_RESERVE_US
 
 
 class ListeningTime:
-    """The part of a tick's time that goes into what arrives on one link."""
+    """Time budget per tick for the received data of one link."""
 
     def __init__(self, tick: TickTime) -> None:
         self._tick = tick
@@ -89,11 +88,11 @@ class ListeningTime:
         self._looked_us = 0
 
     def renew(self) -> None:
-        """Begin another tick: what arrives may take its time again."""
+        """Reset the budget for a new tick."""
         self._left_us = LISTEN_US
 
     def begin(self) -> bool:
-        """Begin to listen, in another tick with its own time; return whether that is bounded."""
+        """Start reading, with a new budget in a new tick; return True if time is limited."""
         tick = self._tick
         if tick.clock is None:
             return False
@@ -103,7 +102,7 @@ class ListeningTime:
         return True
 
     def left(self) -> bool:
-        """Count the time since the last look; return whether there is time for more."""
+        """Charge the time since the last call; return True if time remains."""
         tick = self._tick
         if tick.clock is None:
             return True
@@ -118,22 +117,22 @@ class ListeningTime:
 
 
 EVERY_US = 10 * US_PER_S
-"""Shortest time between two texts of one kind [µs]."""
+"""Minimum interval between two warnings of one type [µs]."""
 
 
 class Complaints:
-    """Turns counters into texts, now and then."""
+    """Operator warnings about rejected and dropped data, at a limited rate."""
 
     def __init__(self) -> None:
         self._told: dict[tuple[str, str], tuple[int, int]] = {}
-        """By link and kind: when [µs], and how many there were."""
+        """Last warning by link and type: time [µs], counter value."""
 
     def restart(self) -> None:
-        """Simulated time may start anew: what was counted is told from now on."""
+        """Restart the intervals, because simulated time may restart. Keeps reported counts."""
         self._told = {key: (-EVERY_US, count) for key, (_, count) in self._told.items()}
 
     def due(self, name: str, refused: int, dropped: int, now_us: int) -> list[Message]:
-        """Return the texts that are due on a link at `now_us` [µs]: of frames not taken."""
+        """Return the warnings due on a link at `now_us` [µs] about rejected and dropped data."""
         texts: list[Message] = []
         for kind, count, problem in (
             ("refused", refused, "frames refused: bad signature"),

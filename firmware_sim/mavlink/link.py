@@ -1,4 +1,4 @@
-"""One client of a MAVLink link: an endpoint, its codec, its streams and its counters."""
+"""Client link: an endpoint with codec, streams and counters."""
 
 from __future__ import annotations
 
@@ -34,44 +34,44 @@ from firmware_sim.mavlink.telemetry import NUMBERS, Packer
 from firmware_sim.mavlink.telemetry import payload as fast_payload
 
 Payloads = dict[Builder, "bytes | None"]
-"""What has been built and packed in one tick, for all links together: None = nothing to send,
-empty = the values do not fit."""
+"""Payloads built and packed in one tick, common to all links; None = nothing to send, empty =
+values out of range."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkConfig:
-    """Endpoint and streams of a link."""
+    """Configuration of a link: endpoint and streams."""
 
     name: str
     endpoint: SharedEndpoint
     rates_hz: Mapping[str, float]
-    """Default rate per stream [Hz]; streams not named are off."""
+    """Default rate per stream [Hz]; other streams are off."""
     separate_replies: bool = False
-    """Whether answers to requests count their own sequence numbers, so that the bytes of the
-    telemetry do not depend on when a client sent a request. Only for a link whose other end does
-    not take a jump in the sequence for lost messages."""
+    """True if replies to requests have separate sequence numbers, which keeps the telemetry bytes
+    independent of the times of requests. Requires a peer that does not count a jump in the sequence
+    as lost messages."""
     slow_every_us: int = 0
-    """Streams that are not packed in compiled code are sent at multiples of this simulated time
-    after the first tick [µs]: they do not depend on how many are flown at a time. 0 = at any."""
+    """Interval of the streams not packed in compiled code [µs], in simulated time from the first
+    tick. Keeps streams independent of the number of ticks per call. 0 = any tick."""
 
 
 def onboard_link(endpoint: SharedEndpoint, *, separate_replies: bool = False) -> LinkConfig:
-    """Return the link for the companion (PX4: 14580 -> 14540)."""
+    """Return the configuration of the companion's link (PX4: 14580 -> 14540)."""
     return LinkConfig("onboard", endpoint, ONBOARD_HZ, separate_replies)
 
 
 def gcs_link(endpoint: SharedEndpoint, *, separate_replies: bool = False) -> LinkConfig:
-    """Return the link for a ground station (PX4: 18570 -> 14550)."""
+    """Return the configuration of a ground station's link (PX4: 18570 -> 14550)."""
     return LinkConfig("gcs", endpoint, GCS_HZ, separate_replies)
 
 
 def payload_link(endpoint: SharedEndpoint) -> LinkConfig:
-    """Return the link for a camera or another payload (PX4: 14280 -> 14030)."""
+    """Return the configuration of a link to a camera or another payload (PX4: 14280 -> 14030)."""
     return LinkConfig("payload", endpoint, PAYLOAD_HZ)
 
 
 def gimbal_link(endpoint: SharedEndpoint) -> LinkConfig:
-    """Return the link for a gimbal (PX4: 13030 -> 13280)."""
+    """Return the configuration of a gimbal's link (PX4: 13030 -> 13280)."""
     return LinkConfig("gimbal", endpoint, GIMBAL_HZ)
 
 
@@ -80,24 +80,22 @@ class LinkCounters:
     """Traffic of one link since the start."""
 
     rx: int
-    """Valid frames of known messages received."""
+    """Number of valid frames of known messages received."""
     tx: int
-    """Frames sent."""
+    """Number of frames sent."""
     malformed: int
-    """Runs of received bytes that are no valid frame."""
+    """Number of received byte runs that are not a valid frame."""
     ignored: int
-    """Received frames that were valid and had no effect: unknown message, other addressee, no
-    handler."""
+    """Number of valid frames received without effect: unknown message, other target, no handler."""
     send_errors: int
-    """Messages that could not be packed or sent."""
+    """Number of messages that could not be packed or sent."""
     dropped: int = 0
-    """Received datagrams that exceeded what their sender may send, or came from one client too
-    many."""
+    """Number of datagrams dropped: sender above its rate limit, or too many clients."""
     refused: int = 0
-    """Received frames without a valid signature, where there is a key."""
+    """Number of frames received without a valid signature; 0 without a key."""
 
     def __add__(self, other: LinkCounters) -> LinkCounters:
-        """Return the traffic of both together."""
+        """Return the sum of two counters."""
         return LinkCounters(
             self.rx + other.rx,
             self.tx + other.tx,
@@ -110,9 +108,9 @@ class LinkCounters:
 
 
 class Link:
-    """Receives and sends the messages of one client.
+    """Receiver and sender of the messages of one client.
 
-    Telemetry (`stream`, `stream_due`, then `flush` at the end of the tick) and answers to requests
+    Telemetry (`stream`, `stream_due`, then `flush` at the end of the tick) and replies to requests
     (`send`, `send_payload`, `send_stream`) share one sequence, in the order of sending, unless
     `LinkConfig.separate_replies` is set.
     """
@@ -128,10 +126,10 @@ class Link:
         signing: Signing | None = None,
         link_id: int = 0,
     ) -> None:
-        """Open a link that can stream `builders`, and reply with `replies`; None = the same.
+        """Open a link that streams `builders` and replies with `replies`; None = the same builders.
 
         `endpoint` sends to one client; None = the config's. `system_id` is the vehicle's. `signing`
-        signs what is sent, with `link_id`, and checks what arrives; None = neither.
+        signs sent frames, with `link_id`, and checks received frames; None = neither.
         """
         self.name = config.name
         self.builders = builders
@@ -144,7 +142,7 @@ class Link:
         )
         self._packer = Packer()
         self.tap: Callable[[Sequence[bytes]], None] | None = None
-        """Called with the frames of both directions, if set."""
+        """Callback for the frames of both directions; None = disabled."""
         self.ignored = 0
         self.endpoint: Sender = config.endpoint if endpoint is None else endpoint
         self._streams = {
@@ -161,10 +159,10 @@ class Link:
         self._signing = signing
         self._link_id = link_id
         self.pending: list[bytes] = []
-        """This tick's telemetry."""
+        """Telemetry frames of this tick, not yet sent."""
         self._rx = 0
         self.sent = 0
-        """Frames sent."""
+        """Number of frames sent."""
         self._refused = 0
         self._unsendable = 0
 
@@ -181,7 +179,7 @@ class Link:
         )
 
     def identify(self, system_id: int) -> None:
-        """Send as another system from now on."""
+        """Change the system id of the sender."""
         self._stream_encoder.identify(system_id)
         self._reply_encoder.identify(system_id)
 
@@ -204,17 +202,17 @@ class Link:
     # --- answers
 
     def send(self, message: WireMessage) -> None:
-        """Send a message; one whose values do not fit their fields is dropped and counted."""
+        """Send a message. Drops and counts a message with values out of range."""
         frame = self._packed(self._reply_encoder, message)
         if frame is not None:
             self._reply(frame)
 
     def send_payload(self, name: str, payload: bytes) -> None:
-        """Send a message by its name and its whole payload."""
+        """Send a message given by name and full payload."""
         self._reply(self._reply_encoder.frame(layout(name), trimmed(payload)))
 
     def send_stream(self, name: str, state: AutopilotState) -> bool:
-        """Send one of the streamed messages now; return whether there was something to send."""
+        """Send a streamed message now; return True if it had content."""
         builder = self._replies[name]
         if builder is None:
             payload = fast_payload(name, state)
@@ -229,7 +227,7 @@ class Link:
         return True
 
     def pass_on(self, frame: bytes) -> None:
-        """Send somebody else's frame as it is."""
+        """Send a forwarded frame unchanged."""
         self.endpoint.send(frame)
         self.sent += 1
         if self.tap is not None:
@@ -237,7 +235,7 @@ class Link:
 
     def _reply(self, frame: bytes) -> None:
         if self._reply_encoder is self._stream_encoder:
-            self.flush()  # frames leave in the order of their sequence numbers
+            self.flush()  # keeps frames in the order of their sequence numbers
         frame = self._signed(frame)
         self.endpoint.send(frame)
         self.sent += 1
@@ -247,15 +245,15 @@ class Link:
     # --- telemetry
 
     def stream(self, message: WireMessage) -> None:
-        """Add a message to this tick's telemetry; as `send` when its values do not fit."""
+        """Add a message to this tick's telemetry. Handles values out of range like `send`."""
         frame = self._packed(self._stream_encoder, message)
         if frame is not None:
             self.pending.append(frame)
 
     def stream_due(self, names: Iterable[str], state: AutopilotState, payloads: Payloads) -> None:
-        """Add streams to this tick's telemetry; as `send` when their values do not fit.
+        """Add streams to this tick's telemetry. Handles values out of range like `send`.
 
-        `payloads` is what has been built from this tick's snapshot; gets what is built here.
+        `payloads` holds the payloads already built from this tick's snapshot; new ones are added.
         """
         frames, encoder, quiet = self.pending, self._stream_encoder, self.scheduler.quiet
         for name in names:
@@ -281,8 +279,8 @@ class Link:
         Args:
             flown: (n,) logs of the ticks.
             after_us: Time from the log of a tick to its end [µs].
-            context: As `telemetry.TickContext.of`.
-            most: Frames a tick, at most.
+            context: Values of `telemetry.TickContext.of`.
+            most: Maximum number of frames per tick.
         """
         plan, encoder = self.scheduler, self._stream_encoder
         frames, next_us = self._packer.pack(
@@ -295,7 +293,7 @@ class Link:
             self.pending += frames
 
     def flush(self) -> None:
-        """Send the telemetry that has been added."""
+        """Send the telemetry added in this tick."""
         frames = self.pending
         if not frames:
             return
@@ -319,7 +317,7 @@ class Link:
 
 
 def _payload(shape: Layout, values: Values | None) -> bytes | None:
-    """Return the payload, empty when the values do not fit, None when there are none."""
+    """Return the payload; empty if a value is out of range, None without values."""
     if values is None:
         return None
     try:

@@ -1,4 +1,4 @@
-"""The streams that need more of a vehicle than its autopilot's snapshot.
+"""Streams that need more than the autopilot's snapshot.
 
 RC_CHANNELS echoes the newest RC_CHANNELS_OVERRIDE (PX4 1.16, streams/RC_CHANNELS.hpp and
 MavlinkReceiver::handle_message_rc_channels_override).
@@ -20,13 +20,13 @@ from firmware_sim.mavlink.streams.units import UINT16_MAX, boot_ms
 
 
 class OwnStreams:
-    """Builds them for one server, whatever autopilot is attached to it.
+    """Stream builders of one server, for any attached autopilot.
 
-    The same functions for every link: what two links send in one tick is built once.
+    All links share the builders, so each message is built once per tick.
     """
 
     def __init__(self) -> None:
-        """Begin without an autopilot: there is nothing to say."""
+        """Start without an autopilot: the builders return None."""
         self.vibration = VibrationMeter()
         self._port: AutopilotPort | None = None
         self._truth: Callable[[], Truth] | None = None
@@ -43,7 +43,7 @@ class OwnStreams:
     def attach(
         self, port: AutopilotPort, truth: Callable[[], Truth] | None, system_id: int
     ) -> None:
-        """Speak for another autopilot, and of where its vehicle truly is; None = nobody knows."""
+        """Attach another autopilot, with its vehicle's true state; None = unavailable."""
         self._port, self._truth, self._system_id = port, truth, system_id
         self.vibration = VibrationMeter()
 
@@ -69,21 +69,21 @@ class OwnStreams:
 
 CHANNELS = 18
 _ZERO_SAYS_NOTHING = 8
-"""From this channel on 0 says nothing, as UINT16_MAX does for all of them."""
+"""First channel for which 0 means unused. UINT16_MAX means unused for all channels."""
 _FULL_SIGNAL = 100
 
 
 class Radio:
-    """What the newest RC_CHANNELS_OVERRIDE said. The same for all clients."""
+    """Channel values of the newest RC_CHANNELS_OVERRIDE, common to all clients."""
 
     def __init__(self) -> None:
         self._said: tuple[int, ...] = ()
         self._time_us = 0
         self._count = 0
-        """How many were heard."""
+        """Number of RC_CHANNELS_OVERRIDE messages received."""
 
     def hear(self, message: WireMessage, now_us: int) -> None:
-        """Take an RC_CHANNELS_OVERRIDE at simulated `now_us` [µs]."""
+        """Store an RC_CHANNELS_OVERRIDE received at simulated `now_us` [µs]."""
         said = [getattr(message, f"chan{number}_raw") for number in range(1, CHANNELS + 1)]
         while said and _says_nothing(said[-1], len(said) - 1):
             said.pop()
@@ -91,7 +91,7 @@ class Radio:
         self._count += 1
 
     def updates(self) -> Builder:
-        """Return the builder of one link's RC_CHANNELS: each is sent once."""
+        """Return a builder of RC_CHANNELS for one link. Sends each update once."""
         sent = self._count
 
         def build(_state: AutopilotState) -> Values | None:

@@ -1,4 +1,4 @@
-"""PX4 flight modes on the wire: custom_mode, base_mode and system_status of HEARTBEAT.
+"""PX4 flight modes in MAVLink: custom_mode, base_mode and system_status of HEARTBEAT.
 
 Source: PX4 src/modules/commander/px4_custom_mode.h and Commander.cpp (DO_SET_MODE),
 src/modules/mavlink/streams/HEARTBEAT.hpp, checked against a running PX4 1.16.
@@ -30,14 +30,14 @@ _UNSUPPORTED = Message.of(_CRITICAL, AUTO_MODE_UNSUPPORTED)
 
 
 def _unavailable(name: str, mode: NavigationMode, main: int, sub: int) -> Message:
-    """Return PX4's refusal of a mode that it knows by name."""
+    """Return PX4's rejection of a known but unavailable mode."""
     number = sub << 24 | main << 16
     text = f"Switching to {name} is currently not available"
     return Message.of(_CRITICAL, MODE_NOT_AVAILABLE, number, mode, text=text)
 
 
-# What can be asked for, by main mode, in AUTO and POSCTL by sub mode. The messages: modes of a real
-# PX4 that are known by name and never available.
+# Modes that clients can request, by main mode; in AUTO and POSCTL by sub mode. Messages stand for
+# modes that a real PX4 knows by name but never makes available.
 _MAIN_MODES: dict[int, Mode | Message] = {
     main: mode
     for mode, (main, sub) in MAIN_SUB.items()
@@ -78,8 +78,8 @@ def base_mode(status: CommanderStatus) -> int:
 def system_status(status: CommanderStatus, *, can_arm: bool) -> int:
     """Return the MAV_STATE of HEARTBEAT.
 
-    ACTIVE, or CRITICAL in a failsafe; disarmed STANDBY, or UNINIT while the mode cannot be armed.
-    Once terminated it is FLIGHT_TERMINATION, armed or not.
+    Armed: ACTIVE, or CRITICAL in a failsafe. Disarmed: STANDBY, or UNINIT if the mode cannot be
+    armed. After a termination: FLIGHT_TERMINATION, armed or not.
     """
     if status.mode is Mode.TERMINATION:
         return int(dialect.MAV_STATE_FLIGHT_TERMINATION)
@@ -90,10 +90,10 @@ def system_status(status: CommanderStatus, *, can_arm: bool) -> int:
 
 
 def requested_mode(base: int, main: int, sub: int) -> Mode | Message | None:
-    """Return what DO_SET_MODE's parameters 1..3 (MAV_MODE_FLAG bits, main, sub mode) ask for.
+    """Return the mode requested by DO_SET_MODE, given parameters 1 to 3.
 
-    A message is PX4's for the operator, why the mode cannot be flown. None: PX4 accepts and changes
-    nothing (its answer to an unknown main mode).
+    The parameters are MAV_MODE_FLAG bits, main mode and sub mode. A message is PX4's explanation of
+    an unavailable mode. None: PX4 accepts the request without effect (unknown main mode).
     """
     if not base & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
         return _from_base_mode(base)
@@ -105,7 +105,7 @@ def requested_mode(base: int, main: int, sub: int) -> Mode | Message | None:
 
 
 def _from_base_mode(base: int) -> Mode | Message | None:
-    """PX4's reading of the bits of clients that know no custom modes."""
+    """Return the mode that PX4 derives from the bits of clients without custom modes."""
     if base & dialect.MAV_MODE_FLAG_AUTO_ENABLED:
         return _AUTO_MODES[4]
     if not base & dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED:

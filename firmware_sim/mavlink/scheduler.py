@@ -1,9 +1,8 @@
-"""Streams of a link: PX4's default rates, and when each is due, in integer µs of simulated time.
+"""Stream scheduler: PX4's default rates and due times, in integer µs of simulated time.
 
-The rates are measured on a real PX4 1.16 SITL. Messages that PX4 sends and we do not are left out:
-EVENT and CURRENT_EVENT_SEQUENCE, LINK_NODE_STATUS (its counts depend on when clients speak, and a
-flight's telemetry must not), OPEN_DRONE_ID_*. The tables' order is the order on the wire when
-several messages are due in the same tick.
+The rates are measured on a real PX4 1.16 SITL. The tables omit OPEN_DRONE_ID_*, EVENT and
+CURRENT_EVENT_SEQUENCE (see `event_buffer`), and LINK_NODE_STATUS, whose counts depend on client
+timing and would change a flight's telemetry. Messages due in the same tick are sent in table order.
 """
 
 from __future__ import annotations
@@ -91,7 +90,8 @@ GCS_HZ: Mapping[str, float] = MappingProxyType(
 
 
 PAYLOAD_RATE = 0.1432
-"""PX4 gives the payload link 4,000 bytes a second, and slows its streams down to fit. Measured."""
+"""Rate factor of the payload link, measured. PX4 limits this link to 4,000 bytes/s and slows all
+its streams down."""
 
 PAYLOAD_HZ: Mapping[str, float] = MappingProxyType(
     {
@@ -99,7 +99,7 @@ PAYLOAD_HZ: Mapping[str, float] = MappingProxyType(
         for name, hz, slowed in ((name, hz, hz * PAYLOAD_RATE) for name, hz in ONBOARD_HZ.items())
     }
 )
-"""Payload link, 14280 -> 14030 [Hz]: PX4's onboard mode, slower."""
+"""Payload link, 14280 -> 14030 [Hz]: PX4's onboard mode at reduced rates."""
 
 GIMBAL_HZ: Mapping[str, float] = MappingProxyType(
     {"HEARTBEAT": 1.0, "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE": 20.0, "MISSION_CURRENT": 1.0}
@@ -113,22 +113,20 @@ def interval_us(rate_hz: float) -> int:
 
 
 OFF = 0
-"""Interval of a stream that is not sent."""
+"""Interval of a disabled stream."""
 
 _NEVER = np.iinfo(np.int64).max
 _NONE: Mapping[str, int] = MappingProxyType({})
 
 
 class StreamScheduler:
-    """Intervals and due times of one link's streams.
+    """Scheduler of one link's streams: intervals and due times.
 
-    A stream keeps its phase: the next due time is the last one plus the interval, not the time it
-    was sent, so rates are exact over any span. First due times are staggered by one tick each, so
-    that the slow streams do not all fall into the same tick. A stream is due at most once per
-    call; one that fell behind skips what it missed.
+    A stream keeps its phase: the next due time is the last due time plus the interval, so rates are
+    exact over any span. First due times are staggered by one tick each, which spreads the slow
+    streams over several ticks. A stream is due at most once per call; missed times are skipped.
 
-    Fast streams are packed by compiled code (`telemetry`), which takes the arrays; `due` names the
-    others.
+    Compiled code (`telemetry`) packs the fast streams from the arrays; `due` returns the others.
     """
 
     def __init__(
@@ -142,43 +140,43 @@ class StreamScheduler:
 
         Args:
             names: All streams, in their order within a tick.
-            default_us: Their intervals; one without a default is off.
-            fast: Places of the fast streams in the table of compiled code.
-            every_us: Grid of the others, from the first tick on [µs]; 0 = any tick.
+            default_us: Default intervals; a stream without a default is off.
+            fast: Indices of the fast streams in the table of compiled code.
+            every_us: Time grid of the slow streams from the first tick [µs]; 0 = any tick.
         """
         self._every_us = every_us or 1
         self._names = tuple(names)
         self._index = {name: i for i, name in enumerate(self._names)}
         self._default = [default_us.get(name, OFF) for name in self._names]
         self.numbers = np.array([fast.get(name, -1) for name in self._names], np.int64)
-        """(s,) places of the fast streams in the table; -1 = not a fast stream."""
+        """(s,) indices of the fast streams in the table; -1 = a slow stream."""
         self.intervals_us = np.array(self._default, np.int64)
-        """(s,) intervals [µs]; `OFF` = not sent."""
+        """(s,) intervals [µs]; `OFF` = disabled."""
         self.due_us = np.zeros(len(self._names), np.int64)
-        """(s,) next times of the fast streams [µs]."""
+        """(s,) due times of the fast streams [µs]."""
         self._slow_due_us: dict[int, int] = {}
-        """Next times of the other streams that are sent [µs], by their place."""
+        """Due times of the enabled slow streams [µs], by index."""
         self.fast_us = 0
-        """When the next of the fast streams is due, or earlier [µs]."""
+        """Due time of the next fast stream, or an earlier time [µs]."""
         self._next_us = 0
-        """When the next of the others is due [µs]."""
+        """Due time of the next slow stream [µs]."""
         self.quiet: set[str] = set()
-        """Slow streams that had nothing to send when they were due: no sensor, no radio."""
+        """Slow streams without content when last due: no sensor, no radio."""
         self.wake_us = 0
-        """The earlier of the two [µs]: before, there is nothing to do."""
+        """The earlier of both due times [µs]; nothing is due before."""
         self._rebase_pending = False
         self._rebase(0)
 
     def interval_us(self, name: str) -> int:
-        """Return a stream's interval [µs], `OFF` when it is not sent."""
+        """Return a stream's interval [µs]; `OFF` if disabled."""
         return self.intervals_us.item(self._index[name])
 
     def default_us(self, name: str) -> int:
-        """Return a stream's default interval [µs], `OFF` when it is off by default."""
+        """Return a stream's default interval [µs]; `OFF` if disabled by default."""
         return self._default[self._index[name]]
 
     def set_interval(self, name: str, interval_us: int, now_us: int) -> None:
-        """Send a stream every `interval_us` [µs] from `now_us` on, or stop it (`OFF`)."""
+        """Send a stream every `interval_us` [µs] from `now_us`, or disable it (`OFF`)."""
         if interval_us < 0:
             raise ValueError(f"interval_us={interval_us}: must be >= 0")
         index = self._index[name]
@@ -189,17 +187,17 @@ class StreamScheduler:
         self.wake_us = self._next_us = self.fast_us = min(self.wake_us, now_us)
 
     def restart(self) -> None:
-        """Keep the intervals, take the time base from the next call (it may have jumped)."""
+        """Keep the intervals. The next call sets the time base, which may have jumped."""
         self._rebase_pending = True
         self.wake_us = 0
 
     def packed(self, next_us: int) -> None:
-        """Take note that fast streams were packed. The next of them is due at `next_us` [µs]."""
+        """Store the due time of the next fast stream [µs], after packing."""
         self.fast_us = next_us
         self.wake_us = min(next_us, self._next_us)
 
     def next_slow_us(self, now_us: int) -> float:
-        """Return when slow streams are sent next, at or after `now_us` [µs], but for quiet ones."""
+        """Return the next time of the slow streams, from `now_us` [µs]. Ignores quiet streams."""
         if self._rebase_pending:
             return now_us
         names, quiet = self._names, self.quiet
@@ -207,16 +205,16 @@ class StreamScheduler:
         return self.grid_us(max(now_us, min(due, default=_NEVER)))
 
     def grid_us(self, time_us: int) -> int:
-        """Return the first time of the grid at or after another time [µs]."""
+        """Return the first time on the grid at or after `time_us` [µs]."""
         return TICK_US - (TICK_US - time_us) // self._every_us * self._every_us
 
     def is_time(self, now_us: int) -> bool:
-        """Return whether slow streams may be sent at `now_us` [µs]."""
+        """Return True if slow streams may be sent at `now_us` [µs]."""
         return (now_us - TICK_US) % self._every_us == 0
 
     def due(self, now_us: int) -> list[str]:
-        """Return the streams to send at `now_us` [µs] and plan their next time."""
-        begins = self._rebase_pending  # the first heartbeat does not wait
+        """Return the streams due at `now_us` [µs] and schedule their next time."""
+        begins = self._rebase_pending  # the first heartbeat is sent immediately
         if begins:
             self._rebase(now_us)
         if now_us < self._next_us or not (begins or self.is_time(now_us)):
@@ -231,7 +229,7 @@ class StreamScheduler:
         return names
 
     def _plan(self, index: int, due_us: int) -> None:
-        """Plan the next time of a stream that is sent, or forget one that is not."""
+        """Schedule the next time of an enabled stream, or remove a disabled stream."""
         sent = self.intervals_us.item(index) != OFF
         if self.numbers.item(index) >= 0:
             self.due_us[index] = due_us if sent else _NEVER

@@ -33,35 +33,35 @@ from firmware_sim.mavlink.tlog import TlogWriter, TrafficLog
 from firmware_sim.storage import Storage
 
 _DISCARD_CALLS = 16
-"""Reads that empty a link for sure: so many times 256 datagrams exceed a socket's buffer."""
+"""Number of reads that empty a link: 16 times 256 datagrams exceed a socket's buffer."""
 
 PIECES_PER_TICK = 32
-"""Messages of lists and files that all clients together get per tick: 8,000 a second. One client
-gets less in its turn; many share it, and a tick stays a tick."""
+"""Maximum list and file messages of all clients per tick: 8,000 per second. Bounds the tick when
+many clients take turns; one client receives fewer."""
 
 LEAST_PIECES_PER_TICK = 4
-"""What they get of them in a tick that would be late with more: 1,000 a second."""
+"""Number of list and file messages per tick if the next tick is near: 1,000 per second."""
 
 STREAMS_PER_TICK = 256
-"""Streamed messages of all clients together per tick: 64,000 a second, a hundred times what PX4
-sends by default. Who asks for more gets it later: all clients have equal shares then."""
+"""Maximum streamed messages of all clients per tick: 64,000 per second, a hundred times PX4's
+default. All clients have equal shares; messages beyond a share are delayed."""
 
 TEXTS_PER_TICK = 8
-"""Texts of services that go to all operators per tick."""
+"""Maximum service texts to all operators per tick."""
 
 TEXTS_PER_S, TEXTS_BURST = 20, 50
-"""Texts per second, and in a burst. All clients get each of them. Its event displaces an older one
-in the buffer."""
+"""Service texts per second, and per burst. Every client receives each text, and a text's event
+displaces an older one in the buffer."""
 
 FORGET_EVERY_US = US_PER_S
-"""Silent clients are looked for so often [µs]."""
+"""Interval of the search for silent clients [µs]."""
 
 
 class MavlinkServer:
-    """Speaks MAVLink on all links for one autopilot.
+    """MAVLink server of one autopilot, on all links.
 
     Per tick: `receive`, then the autopilot's step, then `send`, all on one thread and with
-    simulated time passed in. Nothing blocks, and no received message raises. Without an autopilot
+    simulated time passed in. No call blocks, and no received message raises. Without an autopilot
     the vehicle is off: it neither sends nor receives.
     """
 
@@ -75,22 +75,21 @@ class MavlinkServer:
         signing: StoredSigning | None = None,
         storage: Storage | None = None,
     ) -> None:
-        """Open the links: each streams its default rates from the first `send` on.
+        """Open the links. Each streams its default rates from the first `send`.
 
         Args:
-            links: What they are made of.
-            port: The autopilot; None: it comes later (`attach`).
+            links: Configurations of the links.
+            port: Autopilot; None = attached later (`attach`).
             boot_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
-            storage: The vehicle's files, for MAVLink FTP; None: temporary ones. Closed with it.
-            clock: Measures what part of a tick goes into received messages and bulk transfers, and
-                bounds it; None, or a clock that stands still meanwhile: it is bounded by their
-                number only.
-            signing: The key that is asked for on all links; None: there is none until a client
-                sets one, which is forgotten with the server.
+            storage: Vehicle files for MAVLink FTP; None = temporary files. Closed with the server.
+            clock: Limits the time per tick for received messages and bulk transfers. None, or a
+                clock that stops during the tick: only their number is limited.
+            signing: Stored key, required on all links; None = no key until a client sets one, which
+                is lost when the server closes.
         """
         self._port: AutopilotPort | None = None
         self._has_sample = False
-        """Whether the autopilot has had a sample."""
+        """True if the autopilot has received a sample."""
         self._tick_time = TickTime(clock)
         self._stored = signing
         self._signing = (
@@ -106,14 +105,14 @@ class MavlinkServer:
         self._texts: list[Message] = []
         self._announced = Allowance(TEXTS_PER_S, TEXTS_BURST)
         self._answers_apart = any(config.separate_replies for config in links)
-        """Whether answers must leave the telemetry as it is: events are part of that."""
+        """True if replies must not change the telemetry, which includes events."""
         self._events = EventBuffer()
         self._complaints = Complaints()
         self._first_in_turn = 0
-        """Place of the client that is the next to get what it gets piece by piece."""
+        """Index of the first client in the next round of list and file messages."""
         self._senders = Senders()
         self.strangers = self._senders.strangers
-        # The same functions on every link: what two links send in one tick is built once.
+        # All links share these builders, so each message is built once per tick.
         self._builders: dict[str, Builder | None] = {
             **BUILDERS,
             "SYSTEM_TIME": system_time(boot_unix_us),
@@ -127,16 +126,16 @@ class MavlinkServer:
         for number in self.filenos():
             self._arrivals.register(number, select.POLLIN)
         self._is_transferring = True
-        """Whether a client may get something piece by piece: lists, files, logs."""
+        """True if a client may have a transfer in progress: lists, files, logs."""
         self._mission_progress: object = None
         if port is not None:
             self.attach(port)
 
     def attach(self, port: AutopilotPort, truth: Callable[[], Truth] | None = None) -> None:
-        """Replace the autopilot, between two episodes; `truth` is what clients ask for as such.
+        """Replace the autopilot between two episodes; `truth` returns the true state for clients.
 
-        Clients and the rates that they have set are kept; running parameter lists and messages for
-        the old autopilot (stale setpoints) are dropped. Simulated time may start anew.
+        Keeps clients and the rates they have set. Drops running parameter lists and messages for
+        the old autopilot (stale setpoints). Simulated time may restart.
         """
         if self._port is not None:
             self._discard()
@@ -156,9 +155,9 @@ class MavlinkServer:
                 client.link.scheduler.restart()
 
     def receive(self, now_us: int) -> int:
-        """Read and carry out everything that has arrived by simulated `now_us` [µs].
+        """Read and process all data received by simulated `now_us` [µs].
 
-        Returns how many messages took effect.
+        Returns the number of messages with an effect.
         """
         self._now_us = now_us
         effective = 0
@@ -176,17 +175,17 @@ class MavlinkServer:
         return effective
 
     def next_send_us(self) -> float:
-        """Return when `send` has to be called next [µs]: fast streams may wait until then."""
+        """Return the time of the next required `send` [µs]: fast streams can wait until then."""
         now_us = self._now_us + TICK_US
         return min((client.next_us(now_us) for client in self._all()), default=math.inf)
 
     def send(self, now_us: int, flown: Record | None = None) -> None:
-        """Send texts, pending parameters and the streams that are due at simulated `now_us` [µs].
+        """Send texts, pending transfers and the streams due at simulated `now_us` [µs].
 
         Args:
             now_us: Time after the newest tick.
-            flown: (n,) logs of the ticks since the last call; None = of one tick, as the
-                autopilot's state is now.
+            flown: (n,) logs of the ticks since the last call; None = one tick, with the autopilot's
+                current state.
         """
         self._now_us = now_us
         self._tick_time.renew(now_us)
@@ -204,7 +203,7 @@ class MavlinkServer:
         self._streams.vibration.update(flown)
         texts: list[Message] = port.take_messages()
         if texts:
-            texts = list(dict.fromkeys(texts))  # once a tick; as `_announce`
+            texts = list(dict.fromkeys(texts))  # once per tick, like `_announce`
         for event in port.take_events():
             self._events.add(event, now_us)
         everyone = list(self._all())
@@ -228,13 +227,13 @@ class MavlinkServer:
         after_us: int,
         texts: Sequence[Message],
     ) -> None:
-        """Send clients texts, events and the streams that are due.
+        """Send texts, events and due streams to clients.
 
         Args:
-            due: Clients that have something to be sent, and their slow streams.
+            due: Clients with anything to send, and their slow streams.
             flown: (n,) logs of the newest ticks.
             after_us: Time from the log of a tick to its end [µs].
-            texts: For operators.
+            texts: Texts for operators.
         """
         assert self._port is not None  # noqa: S101 (the caller has looked)
         now_us, state = self._now_us, self._port.state()
@@ -242,7 +241,7 @@ class MavlinkServer:
         context = self._context.of(state)
         if context is not before:
             for client in self._all():
-                client.link.scheduler.quiet.clear()  # Home may be known now, or the pilot heard.
+                client.link.scheduler.quiet.clear()  # home or pilot input may be available
         payloads: Payloads = {}
         most = max(1, STREAMS_PER_TICK // (2 * len(due)))
         share = _share([len(names) for _, names in due])
@@ -250,7 +249,7 @@ class MavlinkServer:
             link = client.link
             if link.scheduler.fast_us <= now_us:
                 if context is not before and last > 0:
-                    # A stretch of ticks ends with the first one after a change.
+                    # A sequence of ticks ends with the first tick after a change.
                     link.stream_fast(flown[:last], after_us, before, most)
                     link.stream_fast(flown[last:], after_us, context, most)
                 else:
@@ -268,7 +267,7 @@ class MavlinkServer:
             link.flush()
 
     def _forget(self, now_us: int) -> None:
-        """Forget silent clients, complain of floods, save the newest time stamp of signatures."""
+        """Remove silent clients, warn of floods, save the newest signature time stamp."""
         self._forget_us = now_us + FORGET_EVERY_US
         for clients in self._links:
             clients.forget_silent(now_us)
@@ -279,9 +278,9 @@ class MavlinkServer:
             self._stored.save_due()
 
     def _send_pending(self, clients: Sequence[Client], now_us: int) -> None:
-        """Send clients what is next of what they get piece by piece.
+        """Send each client the next part of its transfers.
 
-        Who comes too late for this tick is first in the next.
+        The first client skipped in this tick is the first in the next tick.
         """
         first = self._first_in_turn
         sent = 0
@@ -301,10 +300,10 @@ class MavlinkServer:
             sent += link.sent - before
 
     def log_to(self, tlog: TlogWriter | None, link: str = "onboard") -> None:
-        """Write both directions of a link's preset remote to a tlog from now on; None ends it.
+        """Write both directions of a link's preset remote to a tlog; None stops logging.
 
-        Every other client that speaks, on any link, has a log of its own beside it. The caller
-        closes the writer. Raises ValueError if there is no such link.
+        Every other client, on any link, gets a separate log next to it. The caller closes the
+        writer. Raises ValueError if the link does not exist.
         """
         (clients,) = (clients for clients in self._links if clients.name == link)
         if tlog is None:
@@ -313,16 +312,16 @@ class MavlinkServer:
             self._traffic.begin(tlog, clients.preset())
 
     def counters(self) -> dict[str, LinkCounters]:
-        """Return the traffic per link name, all its clients together."""
+        """Return the traffic per link name, summed over its clients."""
         return {clients.name: clients.counters for clients in self._links}
 
     def filenos(self) -> list[int]:
-        """Return the descriptors that become readable when something arrives."""
+        """Return the descriptors that become readable when data arrives."""
         numbers = (clients.endpoint.fileno() for clients in self._links)
         return [number for number in numbers if number is not None]
 
     def close(self) -> None:
-        """Close endpoints and storage, and keep the newest time stamp of signatures."""
+        """Close endpoints and storage, and save the newest signature time stamp."""
         if self._stored is not None:
             self._stored.save()
         for clients in self._links:
@@ -332,7 +331,7 @@ class MavlinkServer:
     def _open(self, config: LinkConfig, link_id: int) -> Clients:
         def welcome(peer: Peer, endpoint: Sender) -> Client:
             builders = self._link_builders()
-            # A requested PING must not advance the sequence of those that are streamed.
+            # A requested PING must not advance the sequence of the streamed ones.
             replies = self._link_builders() if config.separate_replies else builders
             link = Link(
                 config,
@@ -374,7 +373,7 @@ class MavlinkServer:
         client.announced_origin = None
 
     def _discard(self) -> None:
-        """Drop what has arrived for the autopilot that goes."""
+        """Drop data received for the previous autopilot."""
         for clients in self._links:
             for _ in range(_DISCARD_CALLS):
                 clients.renew()
@@ -390,11 +389,11 @@ class MavlinkServer:
 
     def _dispatch(self, client: Client, message: WireMessage) -> bool:
         source, context = sender(message), client.context
-        # What comes from the vehicle itself is an echo.
+        # A frame with the vehicle's ids is an echo.
         if source == (self._system_id, COMPONENT_ID) or context is None:
             return False
         context.now_us = self._now_us
-        self._is_transferring = True  # `send` looks whether it does
+        self._is_transferring = True  # cleared by `send` when idle
         client.hear(source)
         self._traffic.heard(client, message)
         kind = message.get_type()
@@ -405,13 +404,13 @@ class MavlinkServer:
         return effective or forwarded
 
     def _send_texts(self) -> None:
-        """Send the texts of the services to the operators."""
+        """Send the texts of the services to all operators."""
         for text in self._texts:
             _tell(self._all(), text)
         self._texts.clear()
 
     def _announce(self, text: Message) -> None:
-        """Tell the operators once a tick: a client that repeats itself must not flood others."""
+        """Queue a text once per tick, so that a repeating client cannot flood the others."""
         if text in self._texts or len(self._texts) >= TEXTS_PER_TICK:
             return
         if not self._announced.left(self._now_us):
@@ -432,7 +431,7 @@ class MavlinkServer:
 
 
 def _stream_news(client: Client, texts: Iterable[Message], now_us: int) -> None:
-    """Add texts, and the events that a client lacks, to its telemetry."""
+    """Add texts and the client's missing events to its telemetry."""
     for text in texts:
         for chunk in client.texts.encode(text):
             client.link.stream(chunk)
@@ -448,13 +447,13 @@ def _tell(clients: Iterable[Client], text: Message) -> None:
 
 
 def _share(asked: Sequence[int]) -> int:
-    """Return how many streamed messages each client may get in a tick, of those it asks for."""
+    """Return the maximum number of streamed messages per client and tick, given their requests."""
     if sum(asked) <= STREAMS_PER_TICK // 2:
         return STREAMS_PER_TICK // 2
     return max(1, STREAMS_PER_TICK // 2 // sum(1 for number in asked if number))
 
 
 def _system_id(port: AutopilotPort) -> int:
-    """Return MAV_SYS_ID, which PX4 reads when it boots."""
+    """Return MAV_SYS_ID, which PX4 reads at boot."""
     stored = port.parameters.by_name("MAV_SYS_ID")
     return SYSTEM_ID if stored is None else int(stored.value)

@@ -1,8 +1,8 @@
-"""The fast streams: packed in compiled code, many ticks at a time, from one table.
+"""Fast streams: packed from one table in compiled code, many ticks at a time.
 
-Each message of `FIELDS` names a source for every field, in the order of its definition; offsets and
-types on the wire are pymavlink's. Sources are computed once for every tick in which a message is
-due. Units and "unknown" values: MAVLink common.xml and PX4 src/modules/mavlink/streams/*.hpp.
+Each message of `FIELDS` lists a source per field, in order of definition; offsets and wire types
+are pymavlink's. Sources are computed once per tick in which a message is due. Units and "unknown"
+values: MAVLink common.xml and PX4 src/modules/mavlink/streams/*.hpp.
 """
 
 from __future__ import annotations
@@ -74,14 +74,14 @@ _PART_OF: Final = {
     _ESC_PART: ("esc_cdeg_1", "rpm_1"),
     _HEALTH: ("parts_present",),
 }
-"""Sources that are computed in parts, and only for the messages that have one of them."""
+"""Groups of sources that are computed only if a message uses one of them."""
 
 _POSE_DIAGONAL = ("var_x", "var_y", "var_z", "var_roll", "var_pitch", "var_yaw")
 _VELOCITY_DIAGONAL = ("var_vx", "var_vy", "var_vz", "nan", "nan", "nan")
 
 
 def _triangle(diagonal: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the sources of a 6 x 6 matrix of which the diagonal is known."""
+    """Return the sources of a 6 x 6 matrix with a known diagonal."""
     places = iter(diagonal)
     return tuple(next(places) if i in units.DIAGONAL else "nan" for i in range(21))
 
@@ -128,20 +128,20 @@ FIELDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
             *(*("zero",) * 8, "parachute"),
         ),
         "VFR_HUD": ("zero", "ground_speed", "heading_deg", "throttle", "hud_alt", "climb"),
-        # Our own request.
+        # TIMESYNC request of the vehicle.
         "TIMESYNC": ("zero", "sync_ns"),
-        # Where an automatic mode is going, and how fast the vehicle shall be now.
+        # Target of an automatic mode, and the current velocity setpoint.
         "POSITION_TARGET_GLOBAL_INT": (
             *("boot_ms", "global_int", "zero", "goal_lat_e7", "goal_lon_e7", "goal_amsl"),
             *("sp_vx", "sp_vy", "sp_vz", "sp_ax", "sp_ay", "sp_az", "goal_yaw", "zero"),
         ),
-        # The newest fix. Dilution of precision is unknown.
+        # Newest fix. Dilution of precision is unknown.
         "GPS_RAW_INT": (
             *("time_us", "fix_type", "fix_lat_e7", "fix_lon_e7", "fix_mm"),
             *("unknown_u16", "unknown_u16", "fix_cm_s", "fix_cdeg", "satellites"),
             *("fix_mm", "eph_mm", "epv_mm"),
         ),
-        # Four speed controllers, all of them on line.
+        # Four speed controllers, all of them online.
         "ESC_INFO": (
             *("zero", "time_us", "zero", "four", "ppm", "all_escs", *("zero",) * 8),
             *("esc_cdeg_1", "esc_cdeg_2", "esc_cdeg_3", "esc_cdeg_4"),
@@ -152,7 +152,7 @@ FIELDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         ),
     }
 )
-"""The messages and the sources of their fields."""
+"""Messages and the sources of their fields."""
 
 NEEDS: Mapping[str, str] = MappingProxyType(
     {
@@ -162,10 +162,10 @@ NEEDS: Mapping[str, str] = MappingProxyType(
         "GPS_RAW_INT": "fix_known",
     }
 )
-"""A source without which there is nothing to say."""
+"""Source that must be nonzero; otherwise the message is not sent."""
 
 _IMU_FIELDS = 0b1_1011_1111_1111
-"""HIGHRES_IMU_UPDATED_FLAGS: all but differential pressure."""
+"""HIGHRES_IMU_UPDATED_FLAGS: all except differential pressure."""
 
 _PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900, 1_000, 1_000
 """Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
@@ -174,13 +174,13 @@ _FLOAT, _SIZES = 0, {"f": 4, "i": 4, "I": 4, "h": 2, "H": 2, "b": 1, "B": 1, "q"
 _FIELD_FORMAT = re.compile(r"(\d*)([a-zA-Z])")
 
 _LARGEST = 280
-"""Bytes of the largest MAVLink 2 frame."""
+"""Size of the largest MAVLink 2 frame [bytes]."""
 
 _NEVER: int = np.iinfo(np.int64).max
 
 
 class _Table(NamedTuple):
-    """The messages as arrays: m messages, f fields of all together."""
+    """Messages as arrays: m messages, f fields in total."""
 
     ids: Ints  # (m,)
     extras: Ints  # (m,) seed of the checksum
@@ -217,7 +217,7 @@ def _table() -> _Table:
             for start, code, count in (wire[field] for field in kind.fieldnames)
             for i in range(count)
         ]
-        # Extension fields come last; those that are not named are zero.
+        # Extension fields come last; omitted ones are zero.
         fields += [(_AT[source], *place) for source, place in zip(sources, places, strict=False)]
         first.append(len(fields))
     ids, extras, sizes_, needs, parts_ = np.array(heads, np.int64).T
@@ -228,11 +228,11 @@ def _table() -> _Table:
 
 _TABLE = _table()
 NUMBERS: Mapping[str, int] = MappingProxyType({name: i for i, name in enumerate(FIELDS)})
-"""Place of each message in the table."""
+"""Index of each message in the table."""
 
 
 def _crc_table() -> Ints:
-    """Return CRC-16/MCRF4XX by byte (MAVLink's X.25 checksum)."""
+    """Return the CRC-16/MCRF4XX table by byte (MAVLink's X.25 checksum)."""
     table = np.zeros(256, np.int64)
     for byte in range(256):
         crc = byte
@@ -244,14 +244,14 @@ def _crc_table() -> Ints:
 
 _CRC = _crc_table()
 
-# What stays the same while compiled ticks are flown.
+# Values that stay constant during compiled ticks.
 _LATITUDE, _LONGITUDE, _ORIGIN_M, _HOME_M, _ARMED, _HOVER, _TERRAIN, _CLEARANCE = range(8)
 _GOAL, _FIX, _ESCS, PARTS = 8, 11, 15, 19
 _UNKNOWN = (math.nan,) * 4
 
 
 class TickContext:
-    """Values of the messages that are not in a tick's log, kept until one of them changes."""
+    """Message values that a tick's log does not contain, cached until one changes."""
 
     SIZE = 23
 
@@ -259,14 +259,14 @@ class TickContext:
         self._values: tuple[float, ...] = ()
         self._revision: object = None
         self.row = np.zeros(0)
-        """The newest values."""
+        """Newest values."""
 
     def of(self, state: AutopilotState) -> Vector:
-        """Return the values (23,); NaN = not known.
+        """Return the values (23,); NaN = unknown.
 
-        Origin, height of home, arming, hover thrust, ground below, destination (local NED), type,
-        satellites and accuracies of the newest fix, outputs that the speed controllers report,
-        bits of SYS_STATUS, load.
+        Origin, home altitude, arming, hover thrust, terrain altitude, clearance, target (local
+        NED), type, satellites and accuracies of the newest fix, outputs reported by the speed
+        controllers, bits of SYS_STATUS, load.
         """
         revision, self._revision = self._revision, state.revision
         if revision is not None and revision is self._revision:
@@ -360,7 +360,7 @@ def _estimated(v: Vector, row: Vector) -> None:
 
 @kernel
 def _placed(v: Vector, row: Vector, context: Vector) -> None:
-    """Write where the vehicle is on the globe, and its altitudes."""
+    """Write global position and altitudes."""
     down, origin_m, home_m = row[es.P + 2], context[_ORIGIN_M], context[_HOME_M]
     known = not math.isnan(origin_m)
     v[_LOCATED] = 0.0
@@ -382,10 +382,10 @@ def _placed(v: Vector, row: Vector, context: Vector) -> None:
 
 @kernel
 def _wanted(v: Vector, row: Fields, context: Vector) -> None:
-    """Write the setpoints of the loops, and what the motors are told.
+    """Write the setpoints of the control loops and the motor commands.
 
     Source: PX4 1.16, PositionControl::getLocalPositionSetpoint: the heading, the yaw rate and the
-    acceleration are always filled in. Disarmed there is nothing else.
+    acceleration are always set. Disarmed, position and velocity are NaN.
     """
     out, d, kind, armed = row.output, row.demand, row.demand_kind, context[_ARMED] != 0.0
     for i in range(7):
@@ -401,7 +401,7 @@ def _wanted(v: Vector, row: Fields, context: Vector) -> None:
         yaw, yaw_rate = d[9], d[10]
     mask = 0
     for i in range(3):
-        # Attitudes and body rates leave the vehicle where it is.
+        # Attitude and rate setpoints report the current position.
         place = d[i] if kind in (POSITION, TRAJECTORY) else row.state[es.P + i]
         speed = out[7 + i]
         if not armed:
@@ -417,7 +417,7 @@ def _wanted(v: Vector, row: Fields, context: Vector) -> None:
         v[_SP_YAW] = yaw if math.isfinite(yaw) else yaw_of(q_sp)
         v[_SP_YAW + 1] = yaw_rate if math.isfinite(yaw_rate) else 0.0
     else:
-        # PX4's way to say no thrust.
+        # PX4's representation of zero thrust.
         _put3(v, _SP_AX, 0.0, 0.0, 100.0)
         v[_SP_YAW], v[_SP_YAW + 1] = v[_ROLL + 2], 0.0
     for i in range(4):
@@ -427,7 +427,7 @@ def _wanted(v: Vector, row: Fields, context: Vector) -> None:
 
 @kernel
 def _speed_controllers(v: Vector, row: Fields, context: Vector) -> None:
-    """Write what the speed controllers report: what they are told, where nothing else is known."""
+    """Write the speed controllers' feedback; if unavailable, derive it from the motor commands."""
     armed, told = context[_ARMED] != 0.0, math.isnan(context[_ESCS])
     for i in range(4):
         output = context[_ESCS + i]
@@ -435,7 +435,7 @@ def _speed_controllers(v: Vector, row: Fields, context: Vector) -> None:
             output = row.motors[i] if armed else 0.0
         v[_ESC_CDEG_1 + i] = units.int16((esc.IDLE_C + esc.SPAN_C * output) * 100.0)
         v[_RPM_1 + i] = round(esc.RPM * output)
-        # As PX4 has it: armed, a motor draws its idle current, turning or not.
+        # As in PX4, an armed motor draws its idle current, turning or not.
         idle_a = esc.IDLE_A if told and armed else 0.0
         v[_AMPERE_1 + i] = esc.current_a(output) if output > 0.0 else idle_a
     v[_VOLT] = row.battery[0]
@@ -443,7 +443,7 @@ def _speed_controllers(v: Vector, row: Fields, context: Vector) -> None:
 
 @kernel
 def _goal(v: Vector, context: Vector) -> None:
-    """Write where an automatic mode is going."""
+    """Write the target of an automatic mode."""
     north, east, down = context[_GOAL], context[_GOAL + 1], context[_GOAL + 2]
     v[_GOAL_KNOWN] = 0.0
     if math.isfinite(north) and math.isfinite(east) and math.isfinite(down):
@@ -566,7 +566,7 @@ _PPM: int = dialect.ESC_CONNECTION_TYPE_PPM
 
 @kernel
 def _write(out: Bytes, at: int, kind: int, value: float, word: Vector, bits: Bytes) -> None:
-    """Write a value at a place: 0 = float32, else an integer of so many bytes, little endian."""
+    """Write a value at an offset: kind 0 = float32, else bytes of a little-endian integer."""
     if kind == 0:
         word[0] = value
         for i in range(4):
@@ -581,14 +581,14 @@ def _write(out: Bytes, at: int, kind: int, value: float, word: Vector, bits: Byt
 def _frame(
     number: int, v: Vector, system: int, seq: int, out: Bytes, at: int, word: Any, bits: Bytes
 ) -> int:
-    """Write the MAVLink 2 frame of a message of the table at `at`; return where it ends."""
+    """Write the MAVLink 2 frame of message `number` at `at`; return its end."""
     table = _TABLE
     size, start = table.sizes[number], at + 10
     for i in range(size):
         out[start + i] = 0
     for f in range(table.first[number], table.first[number + 1]):
         _write(out, start + table.offsets[f], table.kinds[f], v[table.sources[f]], word, bits)
-    # Trailing zeros are not sent.
+    # MAVLink 2 omits trailing zeros.
     while size > 1 and out[start + size - 1] == 0:
         size -= 1
     identity = table.ids[number]
@@ -617,20 +617,20 @@ def _pack(
     out: Bytes,
     ends: Ints,
 ) -> tuple[int, int]:
-    """Pack what is due after each tick; return the number of frames, and the next due time [µs].
+    """Pack the frames due after each tick; return their number and the next due time [µs].
 
     Args:
         flown: (n,) logs of ticks.
         after_us: Time from the log of a tick to its end [µs].
-        context: As `TickContext.of`.
-        numbers: (s,) place of each stream in the table; -1 = it is not there.
-        due_us: (s,) next time of each stream [µs], updated.
-        interval_us: (s,) its interval [µs]; 0 = off.
+        context: Values of `TickContext.of`.
+        numbers: (s,) index of each stream in the table; -1 = not in the table.
+        due_us: (s,) due time of each stream [µs], updated.
+        interval_us: (s,) interval of each stream [µs]; 0 = off.
         system: System id of the sender.
         seq: First sequence number.
         most: Maximum number of frames.
-        out: Written: the frames, one behind the other.
-        ends: (most,) Written: where each of them ends.
+        out: Output: consecutive frames.
+        ends: (most,) Output: end of each frame.
     """
     v, word = np.empty(len(_SOURCES)), np.empty(1, np.float32)
     bits = word.view(np.uint8)
@@ -661,7 +661,7 @@ def _pack(
 
 
 class Packer:
-    """Packs the fast streams of one link."""
+    """Packer of the fast streams of one link."""
 
     def __init__(self) -> None:
         self._out = np.zeros(0, np.uint8)
@@ -679,9 +679,9 @@ class Packer:
         seq: int,
         most: int,
     ) -> tuple[list[bytes], int]:
-        """Return the frames that are due after each of n ticks, and the next due time [µs].
+        """Return the frames due after each of n ticks, and the next due time [µs].
 
-        As `_pack`; `most` is the maximum number of frames per tick.
+        See `_pack`; `most` is the maximum number of frames per tick.
         """
         most *= len(flown)
         if len(self._ends) < most:
@@ -700,7 +700,7 @@ class Packer:
 
 
 def payload(name: str, state: AutopilotState) -> bytes | None:
-    """Return the payload of one of the messages, without trailing zeros; None = nothing to say."""
+    """Return the payload of a message, without trailing zeros; None = no content."""
     number, once = np.array([NUMBERS[name]]), np.ones(1, np.int64)
     frames, _ = Packer().pack(
         flown_of(state), 0, TickContext().of(state), number, np.zeros(1, np.int64), once, 1, 0, 1

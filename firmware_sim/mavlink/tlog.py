@@ -1,4 +1,4 @@
-"""tlog: raw MAVLink with receive times, readable by MAVProxy, QGroundControl and pymavlink.
+"""tlog: raw MAVLink with receive times, for MAVProxy, QGroundControl and pymavlink.
 
 A record is an 8-byte big-endian time [µs since 1970, UTC] and one frame.
 """
@@ -16,22 +16,22 @@ from firmware_sim.mavlink.codec import WireMessage
 
 _TIME = struct.Struct(">Q")
 _LINK_BITS = 0b11
-"""MAVProxy keeps a link number in a time's two lowest bits; ours is 0."""
+"""Low bits of a time stamp, where MAVProxy stores a link number; always 0 here."""
 
 MAX_LOGS = 16
-"""Logs of a flight beside the main one."""
+"""Maximum number of additional logs per flight."""
 
 MAX_BYTES = 1 << 28
-"""Size at which a log beside the main one ends: hours of telemetry, and a flood fills no disk."""
+"""Maximum size of an additional log [bytes]: hours of telemetry. A flood cannot fill the disk."""
 
 
 class TlogWriter(LogFile):
-    """Writes a log of MAVLink frames."""
+    """Writer of a log of MAVLink frames."""
 
     def __init__(
         self, path: Path, start_unix_us: int, on_lost: Callable[[str], None] = lambda _: None
     ) -> None:
-        """Open the file, whose final name is `path`; see `LogFile`.
+        """Open the file with final name `path`; see `LogFile`.
 
         `start_unix_us` is the calendar time of simulated time 0 [µs since 1970, UTC].
         """
@@ -39,7 +39,7 @@ class TlogWriter(LogFile):
         self._start_unix_us = start_unix_us
 
     def beside(self, name: str) -> TlogWriter:
-        """Open another log of the same times: flight-001.NAME.tlog beside flight-001.tlog.
+        """Open an additional log: flight-001.NAME.tlog next to flight-001.tlog.
 
         Raises OSError.
         """
@@ -47,24 +47,24 @@ class TlogWriter(LogFile):
         return TlogWriter(path, self._start_unix_us, self.on_lost)
 
     def write(self, time_us: int, *frames: bytes) -> None:
-        """Add frames, sent or received at simulated `time_us` [µs]."""
+        """Add frames sent or received at simulated `time_us` [µs]."""
         stamp = _TIME.pack(self._start_unix_us + time_us & ~_LINK_BITS)
         self.add(time_us, *(part for frame in frames for part in (stamp, frame)))
 
 
 class TrafficLog:
-    """One tlog per client. The main one is that of the preset remote."""
+    """Set of tlogs, one per client. The main log belongs to the preset remote."""
 
     def __init__(self, now_us: Callable[[], int]) -> None:
-        """Take what returns the simulated time [µs]."""
+        """Store the callable that returns the simulated time [µs]."""
         self._now_us = now_us
         self._main: TlogWriter | None = None
         self._logged: dict[Client, TlogWriter] = {}
-        """By client, in the order in which they were heard."""
+        """Writers by client, in order of arrival."""
         self._names: Counter[str] = Counter()
 
     def begin(self, tlog: TlogWriter, client: Client | None) -> None:
-        """Log a client to `tlog`, which the caller closes, and all that speak beside it."""
+        """Log `client` to `tlog`, which the caller closes, and other clients to additional logs."""
         self.end()
         self._main = tlog
         if client is not None:
@@ -72,7 +72,7 @@ class TrafficLog:
             self._tap(client, tlog)
 
     def heard(self, client: Client, message: WireMessage) -> None:
-        """Note what a client has said: with its first frame its log begins."""
+        """Start a client's log at its first frame."""
         main = self._main
         if main is None or client in self._logged or len(self._logged) > MAX_LOGS:
             return
@@ -82,13 +82,13 @@ class TrafficLog:
         try:
             tlog = main.beside(name if number == 1 else f"{name}-{number}")
         except OSError:
-            self._main = None  # a full disk: the flight goes on, and no more logs are begun
+            self._main = None  # disk full: the flight continues without new logs
             return
         tlog.write(self._now_us(), bytes(message.get_msgbuf()))
         self._tap(client, tlog)
 
     def end(self) -> None:
-        """Stop, and complete the logs that were opened here."""
+        """Stop logging and close the additional logs."""
         for client, tlog in self._logged.items():
             client.link.tap = None
             if tlog is not self._main:

@@ -25,13 +25,13 @@ from firmware_sim.mavlink.server import MavlinkServer
 
 
 class UdpLinks(NamedTuple):
-    """The vehicle's ends of both links."""
+    """Endpoints of the vehicle's two main links."""
 
     api: UdpEndpoint
     gcs: UdpEndpoint
 
     def by_name(self) -> dict[str, Endpoint]:
-        """Return the ends by the names of their links."""
+        """Return the endpoints by link name."""
         return {"onboard": self.api, "gcs": self.gcs}
 
 
@@ -47,7 +47,7 @@ def bind_udp_links(
     """Bind the vehicle's ports of both links.
 
     Raises:
-        UsageError: A port is taken, or an address can be reached from other machines without
+        UsageError: A port is in use, or an address is reachable from other machines without
             `insecure`.
     """
     api = UdpEndpoint(
@@ -72,19 +72,19 @@ def bind_udp_links(
 
 
 DEVICE_PORTS = {payload_link: (14280, 14030), gimbal_link: (13030, 13280)}
-"""Local and remote port of PX4 SITL's links for devices aboard, of instance 0."""
+"""Local and remote port of PX4 SITL's links to onboard devices, for instance 0."""
 
 
 def bind_device_links(
     bind: str, remote_host: str, instance: int, *, insecure: bool, say: Callable[[str], None]
 ) -> list[LinkConfig]:
-    """Bind the vehicle's ports of the payload's and the gimbal's link.
+    """Bind the vehicle's ports of the payload link and the gimbal link.
 
-    A port that is taken is left out, and told: few vehicles have either, and two vehicles may share
-    a host on ports of the user's choice.
+    A port in use is skipped and reported: few vehicles have a payload or a gimbal, and two vehicles
+    may share a host on custom ports.
 
     Raises:
-        UsageError: An address can be reached from other machines without `insecure`.
+        UsageError: An address is reachable from other machines without `insecure`.
     """
     links: list[LinkConfig] = []
     for link, ports in DEVICE_PORTS.items():
@@ -118,9 +118,9 @@ def udp_server(
     onboard: SharedEndpoint | None = None,
     devices: Sequence[LinkConfig] = (),
 ) -> MavlinkServer:
-    """Return the server of all links, still without an autopilot; see `MavlinkServer`.
+    """Return the server of all links, without an autopilot; see `MavlinkServer`.
 
-    `onboard` stands in for the end of the onboard link, which it wraps; None: the end itself.
+    `onboard` wraps and replaces the endpoint of the onboard link; None = use it directly.
     """
     links = [onboard_link(onboard or ends.api), gcs_link(ends.gcs), *devices]
     return MavlinkServer(links, boot_unix_us=boot_unix_us, clock=clock, signing=signing)

@@ -1,1 +1,1 @@
-"""The vehicle, its sensors and its camera in the arena."""
+"""Vehicle, sensors and camera in the arena."""

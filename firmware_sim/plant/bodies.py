@@ -1,4 +1,4 @@
-"""The body that a scenario asks for, by its name."""
+"""Factory of vehicle bodies by name."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ def new_body(
     """Return a vehicle's body at rest on the floor at the start, facing north.
 
     Args:
-        name: Which of them.
-        arena: Where; None = an endless floor.
-        body: Its collision box.
-        airframe: Its mass and inertia.
+        name: Type of body.
+        arena: Arena; None = an endless floor.
+        body: Collision box.
+        airframe: Mass and inertia.
         tick_s: Length of a tick [s].
     """
-    # Imported here: pybullet is not everywhere, and numba compiles what is imported.
+    # Local imports: pybullet is not available everywhere, and numba compiles on import.
     if name == "kernel":
         from firmware_sim.plant.kernel_body import KernelBody
 

@@ -1,4 +1,4 @@
-"""The vehicle's body among the bodies of an arena: what a plant moves, and what it touches."""
+"""Interface of the vehicle's body in an arena: motion and contacts."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ class Touch(NamedTuple):
     """Bodies in contact with the vehicle, by number."""
 
     close: frozenset[int]
-    """Nearer than the contact threshold: a contact that was pressed lasts as long."""
+    """Bodies within the contact threshold; a pressed contact lasts until it leaves this set."""
     pressed: frozenset[int]
-    """Those that push it."""
+    """Bodies that push the vehicle."""
 
 
 NOTHING = Touch(frozenset(), frozenset())
 
 
 class Body(Protocol):
-    """A rigid body with the vehicle's mass, inertia and collision box, in an arena."""
+    """Rigid body with the vehicle's mass, inertia and collision box, in an arena."""
 
     @property
     def names(self) -> Mapping[int, str]:
@@ -43,32 +43,32 @@ class Body(Protocol):
         """Contacts in the newest tick."""
 
     def move(self, at: Vec, force: Vec, torque: Vec, before: Vector, moving_us: int) -> Vector:
-        """Move on by one tick.
+        """Move the body by one tick.
 
         Args:
-            at: Where it is, NED [m].
-            force: All forces but gravity and contacts, NED [N].
+            at: Position, NED [m].
+            force: All forces except gravity and contacts, NED [N].
             torque: NED [N m].
-            before: (16,) its motion before the tick.
-            moving_us: How long what moves has been under way at the end of the tick [µs].
+            before: (16,) motion before the tick.
+            moving_us: Time since the moving obstacles started, at the end of the tick [µs].
 
         Returns:
-            (16,) the motion after the tick, as `plant.kinematics`; a new array.
+            (16,) motion after the tick, see `engine.kinematics`; a new array.
         """
 
     def follow(self, motion: Vector) -> None:
-        """Take the vehicle to be in a motion (16,) that something else has computed."""
+        """Set the motion (16,), computed elsewhere."""
 
     def look_around(self) -> None:
-        """Take what moves to be elsewhere: time has passed without a `move`."""
+        """Update the moving obstacles, because time has passed without a `move`."""
 
     def rest(self) -> Vector:
-        """Return the motion (16,) now, the vehicle taken to be at rest or in steady flight."""
+        """Return the current motion (16,), without acceleration."""
 
     def put(
         self, position: Vec, velocity: Vec = ..., quaternion: Quat = ..., rates: Vec = ...
     ) -> Vector:
-        """Put it somewhere, free of contacts so far; return the motion (16,) there.
+        """Place the body in a motion and clear its contacts; return the motion (16,).
 
         Args:
             position: NED [m].
@@ -78,13 +78,13 @@ class Body(Protocol):
         """
 
     def close(self) -> None:
-        """Release what it holds."""
+        """Release the resources of the body."""
 
 
 def walls_of(arena: Arena) -> list[tuple[str, Vec, Vec]]:
     """Return walls and ceiling of an arena as boxes: name, centre NED, half extents N, E, D [m].
 
-    Their inner faces are on the bounds.
+    The inner faces are on the bounds.
     """
     b = arena.bounds
     t, h = 0.5 * WALL_THICKNESS_M, 0.5 * b.height

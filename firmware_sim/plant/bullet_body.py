@@ -1,7 +1,7 @@
-"""The vehicle's body in pybullet, among those of the arena, some of which move.
+"""Vehicle body in pybullet, among the fixed and moving bodies of the arena.
 
-A BulletClient looks up and wraps every function at every call, which costs more than most of the
-functions. Code that runs at every tick calls `pybullet` itself with the client's number.
+A BulletClient looks up and wraps every function at every call, which takes longer than most of the
+functions. Code that runs every tick calls `pybullet` directly with the client's number.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from firmware_sim.plant.solids import place_at, tour_arrays
 
 @contextlib.contextmanager
 def silenced_output() -> Iterator[None]:
-    """Point standard output and standard error at the null device for a while: for C libraries."""
+    """Redirect standard output and standard error of C libraries to the null device."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = [(number, os.dup(number)) for number in (1, 2)]
@@ -57,7 +57,7 @@ def silenced_output() -> Iterator[None]:
         for number, _ in kept:
             os.dup2(null, number)
         yield
-        # What C has buffered meanwhile must go the same way, not out at exit.
+        # Flush C buffers here; otherwise their content is printed at exit.
         ctypes.CDLL(None).fflush(None)
     finally:
         for number, copy in kept:
@@ -66,7 +66,7 @@ def silenced_output() -> Iterator[None]:
         os.close(null)
 
 
-# It prints banners from C, at import and when a client connects.
+# pybullet prints banners from C, at import and when a client connects.
 with silenced_output():
     import pybullet
     from pybullet_utils.bullet_client import BulletClient
@@ -74,11 +74,11 @@ with silenced_output():
 __all__ = ["NO_CLIENT", "BulletBody", "World", "connect", "pybullet"]
 
 NO_CLIENT = -1
-"""Number of a client that has been closed: every call with it raises pybullet.error."""
+"""Number of a closed client; every call with it raises pybullet.error."""
 
 
 _idle: list[Any] = []
-"""Clients of worlds that were closed: one that is emptied costs a tenth of a new one."""
+"""Clients of closed worlds. Resetting a client takes a tenth of the time of a new one."""
 
 
 def connect() -> Any:
@@ -92,11 +92,11 @@ def connect() -> Any:
 
 
 MARGIN_M = 0.5
-"""Bodies are updated within this distance beyond contact. pybullet detects contacts before it moves
-the vehicle, and 2 cm around it: nearly all of this is a margin."""
+"""Distance beyond contact within which bodies are updated [m]. pybullet detects contacts before it
+moves the vehicle, and 2 cm around it: nearly all of this distance is a safety margin."""
 
 Xyzw = tuple[float, float, float, float]
-"""pybullet's quaternion."""
+"""Quaternion of pybullet."""
 
 
 @kernel
@@ -110,20 +110,20 @@ def _due(
     place: Vector,
     due: NDArray[np.int64],
 ) -> int:
-    """Find the movers that could touch the vehicle, or whose bodies stand where they could.
+    """Find moving obstacles near the vehicle, by their current or by their last updated position.
 
     Args:
-        time_us: Since the start of the episode [µs].
+        time_us: Time since the start of the episode [µs].
         vehicle: (>= 2,) north, east [m].
-        times_s: (n, 1 + k) period of the tour; then when its way-points are passed [s].
-        points: (n, k, 2) way-points north, east [m].
-        leg: (n,) the way-point passed last; updated.
-        reach: (n,) what could touch is nearer than this, seen from above [m].
-        place: (n, 2) north, east of the bodies [m]; updated for those that are due.
-        due: (n,) overwritten with the numbers of those that are due.
+        times_s: (n, 1 + k) period of the tour, then the times of its waypoints [s].
+        points: (n, k, 2) waypoints north, east [m].
+        leg: (n,) index of the last waypoint passed; updated.
+        reach: (n,) maximum horizontal distance of a possible contact [m].
+        place: (n, 2) north, east of the bodies [m]; updated for the obstacles found.
+        due: (n,) output: indices of the obstacles found.
 
     Returns:
-        How many are due.
+        Number of obstacles found.
     """
     count = 0
     for i in range(len(leg)):
@@ -142,22 +142,22 @@ def _due(
 
 
 class Movers:
-    """The moving obstacles of one arena.
+    """Moving obstacles of one arena.
 
-    pybullet gets a body's place only where that can matter, near the vehicle. Thirty bodies moved
-    at every tick would cost as much as all the rest of the plant.
+    pybullet receives a body's position only near the vehicle. Moving thirty bodies every tick would
+    take as long as the rest of the plant.
     """
 
     def __init__(
         self, arena: Arena, bodies: Sequence[int], attitudes: Sequence[Xyzw], radius_m: float
     ) -> None:
-        """Take the bodies, which stand where the arena has them at time 0.
+        """Store the bodies, which are at the arena's positions for time 0.
 
         Args:
             arena: Tours and sizes.
-            bodies: pybullet's numbers of its moving obstacles, in the arena's order.
-            attitudes: Of the bodies, FLU -> ENU.
-            radius_m: No part of the vehicle is further from its centre than this [m].
+            bodies: pybullet's numbers of the moving obstacles, in the arena's order.
+            attitudes: Attitudes of the bodies, FLU -> ENU.
+            radius_m: Maximum distance of any part of the vehicle from its centre [m].
         """
         obstacles, first, n = arena.obstacles, arena.n_static, len(bodies)
         self._bodies, self._attitudes = list(bodies), list(attitudes)
@@ -172,7 +172,7 @@ class Movers:
         self._due = np.zeros(n, np.int64)
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return the number of moving obstacles."""
         return len(self._bodies)
 
     def move(self, time_us: int, vehicle: Vector, client: int) -> None:
@@ -189,39 +189,39 @@ class Movers:
 
 
 def facing(yaw: float) -> Xyzw:
-    """Return pybullet's attitude of a level body that faces `yaw` [rad], 0 = north."""
+    """Return pybullet's attitude of a level body with heading `yaw` [rad], 0 = north."""
     return quat_wxyz_to_xyzw(quat_ned_frd_to_enu_flu(quat_from_euler(0.0, 0.0, yaw)))
 
 
 LEVEL = facing(0.0)
 
 UNTURNED: Xyzw = (0.0, 0.0, 0.0, 1.0)
-"""That of a body whose shape is given in ENU."""
+"""Attitude of a body with a shape in ENU."""
 
 
 class WorldState(NamedTuple):
     """State of a pybullet world."""
 
     bullet: bytes
-    """File of pybullet's `saveBullet`."""
+    """Content of pybullet's `saveBullet` file."""
     movers: Movers | None
     """Moving obstacles; None = the arena has none."""
 
 
 class World:
-    """A pybullet world: floor, hills, walls, obstacles. ENU inside, NED outside."""
+    """pybullet world with floor, hills, walls and obstacles. ENU inside, NED outside."""
 
     def __init__(
         self, arena: Arena | None, vehicle_radius_m: float, tick_s: float = TICK_S
     ) -> None:
         """Build the bodies of an arena; None = an endless floor.
 
-        No part of the vehicle is further from its centre than `vehicle_radius_m` [m]; `tick_s` is
-        the time step of the physics [s].
+        `vehicle_radius_m` is the maximum distance of any part of the vehicle from its centre [m];
+        `tick_s` is the time step of the physics [s].
         """
         self.client: Any = connect()
         self.number: int = int(self.client._client)
-        """Of the client, for direct calls of pybullet's functions."""
+        """Number of the client, for direct calls of pybullet's functions."""
         self.client.setGravity(0.0, 0.0, -GRAVITY_M_S2)
         self.client.setTimeStep(tick_s)
         self.names: dict[int, str] = {}
@@ -239,7 +239,7 @@ class World:
                 self._movers = Movers(arena, bodies[first:], attitudes[first:], vehicle_radius_m)
 
     def state(self) -> WorldState:
-        """Return the state, contacts included."""
+        """Return the state, including contacts."""
         with TemporaryDirectory() as folder:
             path = Path(folder) / "world.bullet"
             with silenced_output():
@@ -247,7 +247,7 @@ class World:
             return WorldState(path.read_bytes(), self._movers)
 
     def restore(self, state: WorldState) -> None:
-        """Take over the state of another world of the same bodies."""
+        """Load the state of another world with the same bodies."""
         with TemporaryDirectory() as folder:
             path = Path(folder) / "world.bullet"
             path.write_bytes(state.bullet)
@@ -262,9 +262,9 @@ class World:
             self.client, self.number = None, NO_CLIENT
 
     def move_obstacles(self, time_us: int, vehicle: Vector) -> None:
-        """Move what moves to where it is `time_us` [µs] after the start of the episode.
+        """Move the moving obstacles to their positions `time_us` [µs] after the start.
 
-        Far from the vehicle, at (>= 2,) NED [m], bodies may stay behind: nothing can touch them.
+        Bodies far from the vehicle, at (>= 2,) NED [m], are not updated: contacts are impossible.
         """
         if self._movers is not None:
             self._movers.move(time_us, vehicle, self.number)
@@ -275,8 +275,8 @@ class World:
             baseCollisionShapeIndex=shape,
             basePosition=ned_to_enu(center),
             baseOrientation=attitude,
-            # A rigid body at rest costs nothing per step. A multi-body, pybullet's default, goes
-            # through Featherstone's algorithm each time; one that is awake gets a new bounding box.
+            # A rigid body at rest takes no time per step. A multi-body, pybullet's default, runs
+            # Featherstone's algorithm every step, and an awake one gets a new bounding box.
             useMaximalCoordinates=True,
         )
         self.client.changeDynamics(body, -1, activationState=pybullet.ACTIVATION_STATE_SLEEP)
@@ -291,19 +291,19 @@ class World:
             flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
         )
         body = self._add(shape, np.zeros(3), UNTURNED, FLOOR)
-        # Without it everything stands a millimetre above the triangles.
+        # With the default margin, bodies rest a millimetre above the triangles.
         self.client.changeDynamics(body, -1, collisionMargin=0.0)
 
     def _box(self, half: tuple[float, float, float]) -> int:
         return int(self.client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half))
 
     def _add_walls(self, arena: Arena) -> None:
-        # A box's own axes are forward, left, up.
+        # The axes of a box are forward, left, up.
         for name, center, half in walls_of(arena):
             self._add(self._box(half), np.array(center), LEVEL, name)
 
     def _add_obstacles(self, arena: Arena) -> tuple[list[int], list[Xyzw]]:
-        """Return the obstacles' bodies and attitudes."""
+        """Return the bodies and attitudes of the obstacles."""
         o = arena.obstacles
         bodies, attitudes = [], []
         for i in range(len(o)):
@@ -322,25 +322,25 @@ class World:
 
 
 _ANY_LINK = -2
-"""pybullet's filter of contacts that lets all links pass."""
+"""pybullet's contact filter value for all links."""
 
 _STILL: Vec = (0.0, 0.0, 0.0)
 _LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
 
 
 class BulletBody:
-    """A multi-body of one link in a pybullet world."""
+    """Multi-body with one link in a pybullet world."""
 
     def __init__(
         self, arena: Arena | None, body: BodyProfile, airframe: Airframe, tick_s: float
     ) -> None:
-        """Put it at rest on the floor at the start, facing north; see `bodies.new_body`."""
+        """Place the body at rest on the floor at the start, facing north; see `bodies.new_body`."""
         self._made_of = arena, body, airframe, tick_s
         diagonal_m = math.hypot(body.width_m, body.width_m, body.height_m)
         self.world = World(arena, 0.5 * diagonal_m, tick_s)
         self._tick_s = tick_s
         self.number = self._build(body, airframe)
-        """pybullet's number of it."""
+        """Number of the body in pybullet."""
         self.touch = NOTHING
 
     @property
@@ -353,16 +353,16 @@ class BulletBody:
         self.world.close()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle it as a new world of the same bodies, and pybullet's state of that."""
+        """Return the pickle state: a new world of the same bodies, with pybullet's state."""
         return BulletBody, self._made_of, (self.world.state(), self.touch)
 
     def __setstate__(self, state: tuple[WorldState, Touch]) -> None:
-        """Take over the state of the body that was pickled."""
+        """Load the state of the pickled body."""
         world, self.touch = state
         self.world.restore(world)
 
     def move(self, at: Vec, force: Vec, torque: Vec, before: Vector, moving_us: int) -> Vector:
-        """Move on by one tick; as `Body`."""
+        """Move the body by one tick; see `Body`."""
         world, number = self.world, self.number
         client = world.number
         here = (at[1], at[0], -at[2])
@@ -389,15 +389,15 @@ class BulletBody:
         quaternion: Quat = _LEVEL,
         rates: Vec = _STILL,
     ) -> Vector:
-        """Put it somewhere; as `Body`."""
+        """Place the body in a motion; see `Body`."""
         self.follow(np.array([*position, *velocity, *quaternion, *rates]))
         return self.rest()
 
     def look_around(self) -> None:
-        """Do nothing: every `move` puts what moves where it is."""
+        """Do nothing: every `move` updates the moving obstacles."""
 
     def follow(self, motion: Vector) -> None:
-        """Take the vehicle to be in a motion (>= 13,); as `Body`."""
+        """Set the motion (>= 13,) of the body; see `Body`."""
         client, number = self.world.client, self.number
         quaternion = motion[QUATERNION]
         attitude = quat_wxyz_to_xyzw(quat_ned_frd_to_enu_flu(quaternion))
@@ -407,11 +407,11 @@ class BulletBody:
         self.touch = NOTHING
 
     def rest(self) -> Vector:
-        """Return the motion (16,), the vehicle taken to be at rest or in steady flight."""
+        """Return the motion (16,), without acceleration."""
         return self._read(None)
 
     def _read(self, before: Vector | None) -> Vector:
-        """Return pybullet's state as a row; without what was before, nothing accelerates."""
+        """Return pybullet's state as a row; zero acceleration without `before`."""
         client, number = self.world.number, self.number
         at, orientation = pybullet.getBasePositionAndOrientation(number, client)
         linear, angular = pybullet.getBaseVelocity(number, client)

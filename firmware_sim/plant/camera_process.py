@@ -1,8 +1,8 @@
-"""A camera whose images take longer than a tick: a process of its own takes them.
+"""Camera with images that take longer than a tick, rendered in a separate process.
 
-The vehicle flies on in real time while an image is drawn. A frame is published when it is done,
-with the time at which it was exposed, as a slow camera's is; exposures that are due meanwhile are
-left out. Only where time is that of the wall clock: elsewhere it waits for an image.
+The vehicle keeps flying in real time while an image is rendered. A frame is published when it is
+complete, with its exposure time, as with a slow camera; exposures due during rendering are skipped.
+Used only in real time; otherwise the simulation waits for each image.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from firmware_sim.flight_controller import FirmwareLostError
 from firmware_sim.plant.camera_server import SimulatedCamera
 
 NICENESS = 10
-"""Images are late in any case; ticks must not be."""
+"""Niceness of the process: images may be late, but ticks must not be."""
 
 
 @dataclass(frozen=True)
 class _Restart:
-    """An episode begins."""
+    """Request to start an episode."""
 
     time_us: int
 
 
 @dataclass(frozen=True)
 class _Take:
-    """A frame is due."""
+    """Request to take a frame."""
 
     time_us: int
     motion: Motion
@@ -49,20 +49,20 @@ class _Take:
 
 @dataclass(frozen=True)
 class _Taken:
-    """A frame is done, and when the next one is due [µs]."""
+    """Completed frame, and the time of the next one [µs]."""
 
     frame: Frame
     next_us: int
 
 
 class CameraProcess:
-    """A process that takes the frames of one episode's camera after the other's.
+    """Process that takes the frames of the cameras of successive episodes.
 
-    It is started for the first of them, and ends with this process, however that ends.
+    Starts with the first camera, and ends with the parent process in all cases.
     """
 
     def __init__(self) -> None:
-        """Start nothing yet."""
+        """Create the object without a process."""
         self._line: Connection | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._answers: SimpleQueue[_Taken | EOFError | None] = SimpleQueue()
@@ -78,38 +78,38 @@ class CameraProcess:
         renderer: Renderer,
         further: Mapping[str, Camera] | None = None,
     ) -> SlowCamera:
-        """Return an episode's camera when it has taken a first picture; see `SimulatedCamera`.
+        """Return an episode's camera after a first image; see `SimulatedCamera`.
 
-        The camera of the episode before takes no more frames.
+        The camera of the previous episode takes no further frames.
 
         Raises:
-            FirmwareLostError: It could not.
+            FirmwareLostError: The process has ended.
         """
         if self._process is None:
             self._start()
         self.send((camera, arena, start_us, noise, seed, renderer, further))
         while self.receive() is not None:
-            pass  # A frame of the episode before was still being taken.
+            pass  # Frame of the previous episode, still in progress.
         return SlowCamera(self, start_us)
 
     def _start(self) -> None:
         self._line, theirs = Pipe()
         with theirs:
-            # Not by -m: what is sent would then be of other classes, those of __main__.
+            # Not -m: sent objects would then have the classes of __main__.
             called = f"from {__name__} import main; main({theirs.fileno()})"
             self._process = subprocess.Popen(  # noqa: S603 (this package)
                 [sys.executable, "-c", called],
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,  # That of the firmware may be a channel.
+                stdout=subprocess.DEVNULL,  # The firmware's stdout may be a channel.
                 pass_fds=[theirs.fileno()],
             )
         self._reading = Thread(target=self._read, args=(self._line,), name="images", daemon=True)
         self._reading.start()
 
     def _read(self, line: Connection) -> None:
-        """Take in what arrives until the process has ended.
+        """Read answers until the process has ended.
 
-        An image exceeds the pipe's buffer. Its reader waits for the writer.
+        An image exceeds the pipe's buffer, so a read blocks until the writer has finished.
         """
         with suppress(EOFError, OSError):
             while True:
@@ -118,11 +118,11 @@ class CameraProcess:
 
     @property
     def answers(self) -> bool:
-        """Whether something has arrived, or the process has ended."""
+        """True if an answer has arrived, or the process has ended."""
         return not self._answers.empty()
 
     def send(self, what: object) -> None:
-        """Ask for something. Raises FirmwareLostError."""
+        """Send a request. Raises FirmwareLostError."""
         if self._line is None:
             raise self._lost()
         try:
@@ -131,7 +131,7 @@ class CameraProcess:
             raise self._lost() from None
 
     def receive(self) -> _Taken | None:
-        """Wait for the next answer; None: a camera is ready. Raises FirmwareLostError."""
+        """Wait for the next answer; None = a camera is ready. Raises FirmwareLostError."""
         if self._line is None:
             raise self._lost()
         answer = self._answers.get()
@@ -149,7 +149,7 @@ class CameraProcess:
         return FirmwareLostError(f"{what}has ended {how}")
 
     def close(self) -> None:
-        """End the process. Harmless when called again."""
+        """End the process. Repeated calls have no effect."""
         if self._line is not None and self._process is not None and self._reading is not None:
             self._process.kill()
             self._process.wait()
@@ -159,29 +159,29 @@ class CameraProcess:
 
 
 class SlowCamera:
-    """Takes frames in another process, one at a time; an `OnboardCamera`."""
+    """Camera in another process, one frame at a time; an `OnboardCamera`."""
 
     def __init__(self, process: CameraProcess, start_us: int) -> None:
-        """Take the process, which has made the camera, and when a frame is due [µs]."""
+        """Store the process, which has created the camera, and the time of the first frame [µs]."""
         self._process = process
         self._busy = False
-        """Whether a frame is being taken."""
+        """True while a frame is in progress."""
         self._taken_us: int | None = None
-        """When that was exposed [µs]; None: there is none, or its episode is over."""
+        """Exposure time of the frame in progress [µs]; None = no frame, or its episode is over."""
         self._next_us = start_us
 
     @property
     def next_us(self) -> int:
-        """Simulated time from which on there is something to do [µs]."""
+        """Earliest simulated time of the next required call [µs]."""
         return self._next_us if self._taken_us is None else self._taken_us
 
     def restart(self, time_us: int) -> None:
-        """Begin an episode at `time_us` [µs]. A frame that is being taken is dropped."""
+        """Start an episode at `time_us` [µs]. A frame in progress is dropped."""
         self._taken_us, self._next_us = None, time_us
         self._process.send(_Restart(time_us))
 
     def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
-        """Publish the frame that is done, if one is, and have one taken, if it is due.
+        """Publish a completed frame, and request the next frame if due.
 
         Raises:
             FirmwareLostError: The process has ended.
@@ -197,10 +197,10 @@ class SlowCamera:
 
 
 def main(number: int) -> None:
-    """Take what is asked for until the line ends.
+    """Process requests until the connection closes.
 
     Args:
-        number: File descriptor of the line.
+        number: File descriptor of the connection.
     """
     give_way(NICENESS)
     line = Connection(number)
@@ -215,5 +215,5 @@ def main(number: int) -> None:
                 case _Take(time_us, motion):
                     frame = taking.take(time_us, motion)
                     line.send(_Taken(frame, taking.next_us))
-    # Nothing is left to be done: taking a renderer's threads down would only take time.
+    # Immediate exit: shutting down a renderer's threads would only take time.
     os._exit(0)

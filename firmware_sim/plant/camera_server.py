@@ -1,4 +1,4 @@
-"""The vehicle's cameras: their schedule, their images, and their publication."""
+"""Cameras of the vehicle: schedule, images, and publication."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from firmware_sim.plant.sensors import Rate
 
 
 class _Eye:
-    """One of a vehicle's cameras: what it sees when it is triggered."""
+    """Single camera of a vehicle, for images on a trigger."""
 
     def __init__(
         self, camera: Camera, arena: Arena, noise: SensorNoise, renderer: Renderer, name: str = ""
     ) -> None:
-        """Take the camera, its arena, conditions, the renderer, and a further camera's name."""
+        """Store camera, arena, conditions and renderer; `name` is an additional camera's."""
         self._expose = exposure_by(renderer, name)
         self._noise = noise_of(camera, noise, name)
         self._forming = ImageFormation(camera, name) if camera.imaging is not None else None
@@ -40,10 +40,10 @@ class _Eye:
         self._mount, self._max_range = Mount.of(camera), camera.range_m
         self._arena = arena
         self.follows = self._forming is not None and self._forming.follows
-        """Whether an image depends on the one before."""
+        """True if an image depends on the previous one."""
 
     def restart(self) -> None:
-        """Begin an episode."""
+        """Start an episode."""
         if self._forming is not None:
             self._forming.restart()
 
@@ -52,9 +52,9 @@ class _Eye:
 
         Args:
             elapsed_us: Time since the episode's start [µs].
-            motion: How the vehicle moves then.
-            seed: Of the episode.
-            number: The image's in the episode, by the rate.
+            motion: Motion of the vehicle at this time.
+            seed: Seed of the episode.
+            number: Number of the image in the episode, from the frame rate.
         """
         image: NDArray[Any]
         jpeg = None
@@ -72,7 +72,7 @@ class _Eye:
 
 
 class ExposedFrame(Frame):
-    """A frame whose images are drawn when one of them is first read: few of them are."""
+    """Frame with images that are rendered on first access, because few are read."""
 
     def __init__(
         self,
@@ -81,39 +81,39 @@ class ExposedFrame(Frame):
         intrinsics: Intrinsics,
         draw: Callable[[], Mapping[str, FurtherImage]],
     ) -> None:
-        """Take what a frame has, and what draws the images: by camera, "" is the main one."""
+        """Store the fields and the renderer of images by camera; "" is the main camera."""
         exposed = {"sequence": sequence, "capture_time_us": capture_time_us}
         vars(self).update(exposed, intrinsics=intrinsics, draw=draw)
 
     @cached_property
     def images(self) -> Mapping[str, FurtherImage]:
-        """All images, by camera."""
+        """All images, by camera name."""
         draw: Callable[[], Mapping[str, FurtherImage]] = vars(self)["draw"]
         return draw()
 
     @property
     def image(self) -> NDArray[Any]:
-        """The main camera's image."""
+        """Image of the main camera."""
         return self.images[""].image
 
     @property
     def jpeg(self) -> bytes | None:
-        """The file that it was decoded from; None: it was never compressed."""
+        """JPEG file of the image; None = never compressed."""
         return self.images[""].jpeg
 
     @cached_property
     def further(self) -> Mapping[str, FurtherImage]:
-        """Those of the further cameras, by name."""
+        """Images of the additional cameras, by name."""
         return {name: each for name, each in self.images.items() if name}
 
     def __reduce__(self) -> tuple[type[Frame], tuple[Any, ...]]:
-        """Return a frame with its images: another process has no camera to draw them."""
+        """Return a frame with its images: another process has no camera to render them."""
         shown = self.image, self.intrinsics, self.jpeg, self.further
         return Frame, (self.sequence, self.capture_time_us, *shown)
 
 
 class SimulatedCamera:
-    """Takes frames of an arena at a fixed rate, from a vehicle's pose: images of all cameras."""
+    """Camera that takes frames of an arena at a fixed rate, with images of all cameras."""
 
     def __init__(
         self,
@@ -125,16 +125,16 @@ class SimulatedCamera:
         renderer: Renderer = "raycast",
         further: Mapping[str, Camera] | None = None,
     ) -> None:
-        """Make the cameras of a vehicle profile.
+        """Create the cameras of a vehicle profile.
 
         Args:
-            camera: The main camera.
-            arena: What it sees.
-            start_us: When the first frame is due [µs].
-            noise: Conditions that its images are taken in; None: the usual ones.
-            seed: Of that noise.
-            renderer: What draws its images.
-            further: Those that are triggered with it, by name; None: there are none.
+            camera: Main camera.
+            arena: Arena to render.
+            start_us: Simulated time of the first frame [µs].
+            noise: Image conditions; None = the defaults.
+            seed: Seed of the noise.
+            renderer: Renderer of the images.
+            further: Additional cameras with the same trigger, by name; None = main camera only.
         """
         asked = noise or SensorNoise()
         cameras = {"": camera, **(further or {})}
@@ -146,40 +146,40 @@ class SimulatedCamera:
         self._seed = seed
         self._rate_hz = camera.rate_hz
         self._sequence = 0
-        # The first picture loads or compiles the kernels: better here than in flight.
+        # The first image loads or compiles the kernels: better here than in flight.
         at_rest = Motion.at_rest(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
         for each in self._eyes.values():
             each.take(0, at_rest, seed, 0)
         self.restart(start_us)
 
     def restart(self, time_us: int) -> None:
-        """Begin an episode, and with it its moving obstacles: the next frame is due at `time_us`.
+        """Start an episode and its moving obstacles; the next frame is due at `time_us` [µs].
 
-        Sequence numbers go on, so that no frame of the new episode is taken for an old one.
+        Sequence numbers continue, so frames of different episodes are distinct.
         """
         self._start_us = self.next_us = time_us
-        """`next_us`: simulated time from which on the next frame is due [µs]."""
+        """`next_us`: simulated time at which the next frame is due [µs]."""
         self._rate = Rate(self._rate_hz)
         for each in self._eyes.values():
             each.restart()
 
     def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
-        """Take a frame that is due and hand it to `publish`; see `take`."""
+        """Take a due frame and pass it to `publish`; see `take`."""
         publish(self.take(time_us, motion))
 
     def capture(self, time_us: int, position: Vector, quaternion: Vector) -> Frame:
-        """Take a frame that is due of a vehicle at rest; see `take`."""
+        """Take a due frame of a vehicle at rest; see `take`."""
         return self.take(time_us, Motion.at_rest(position, quaternion))
 
     def take(self, time_us: int, motion: Motion) -> Frame:
-        """Take a frame that is due; the next is due one period after the slot that this one fills.
+        """Take a due frame; the next is due one period after the slot of this one.
 
-        Slots lie at whole multiples of the period, so that a rate that the tick does not divide
-        is kept on average. Slots that were missed are left out.
+        Slots are at whole multiples of the period, which keeps the average rate even if the tick
+        does not divide the period. Missed slots are skipped.
 
-        It is exposed at simulated `time_us` [µs], which is the middle of an exposure that takes
-        time, from where the vehicle is then; `motion` is kept, not copied. The images are drawn
-        when they are read, unless one of them depends on the one before.
+        The exposure is at simulated `time_us` [µs], or centred on it if it takes time, from the
+        vehicle's pose at that time; `motion` is kept, not copied. The images are rendered on
+        access, unless an image depends on the previous one.
         """
         elapsed_us = time_us - self._start_us
         self._rate.due(elapsed_us)
@@ -197,9 +197,9 @@ class SimulatedCamera:
 
 
 class CameraServer:
-    """Publishes frames over ZeroMQ; a subscriber gets the newest, or none, never a queue.
+    """Publisher of frames over ZeroMQ. A subscriber receives only the newest frame, never a queue.
 
-    Publishing does not block: a slow or stopped companion cannot hold the simulator.
+    Publishing does not block: a slow or stopped companion cannot delay the simulator.
     """
 
     awaited = True
@@ -207,19 +207,19 @@ class CameraServer:
     def __init__(
         self, endpoint: str, context: zmq.Context[zmq.Socket[bytes]] | None = None
     ) -> None:
-        """Bind.
+        """Bind the socket.
 
         Args:
-            endpoint: As "tcp://127.0.0.1:5560"; port 0 or * lets the system choose one.
-            context: A ZeroMQ context to share; None = one of its own.
+            endpoint: Endpoint such as "tcp://127.0.0.1:5560"; port 0 or * selects a free port.
+            context: ZeroMQ context to share; None = a new one.
 
         Raises:
-            UsageError: The port is taken, or the endpoint is none.
+            UsageError: The port is in use, or the endpoint is invalid.
         """
         self._owns_context = context is None
         self._context = zmq.Context() if context is None else context
         self._socket = self._context.socket(zmq.PUB)
-        # Not a high-water mark of 1: that keeps the oldest frame and drops the newest.
+        # A high-water mark of 1 would keep the oldest frame and drop the newest.
         self._socket.setsockopt(zmq.CONFLATE, 1)
         self._socket.setsockopt(zmq.LINGER, 0)
         try:
@@ -235,10 +235,10 @@ class CameraServer:
                 f"camera endpoint {endpoint!r}: {error}; accepted: tcp://ADDRESS:PORT, ipc://PATH"
             ) from error
         self.endpoint: str = self._socket.getsockopt_string(zmq.LAST_ENDPOINT).rstrip("\0")
-        """Where subscribers connect, with the port that was chosen."""
+        """Endpoint for subscribers, with the selected port."""
 
     def publish(self, frame: Frame) -> None:
-        """Offer a frame to whoever is connected, in place of any that is still waiting."""
+        """Send a frame to all subscribers. Replaces a frame that is still waiting."""
         self._socket.send(frame.to_bytes(), zmq.NOBLOCK)
 
     def close(self) -> None:

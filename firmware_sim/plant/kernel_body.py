@@ -1,4 +1,4 @@
-"""The vehicle's body by the batch twin's rigid-body kernel, with contacts of its own: compiled."""
+"""Vehicle body with the vectorized simulator's rigid-body kernel and built-in contacts."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ _FIRST = FLOOR_ID + 1
 
 
 class State(NamedTuple):
-    """Contacts kept from tick to tick; updated in place."""
+    """Contacts stored between ticks; updated in place."""
 
-    kept: Vector  # (KEPT, 7) points on the floor
-    many: NDArray[np.int64]  # (1,) how many
-    room: Vector  # (1,) walls and obstacles are at least this far off [m]
+    kept: Vector  # points on the floor
+    many: NDArray[np.int64]  # (1,) number of these points
+    room: Vector  # (1,) minimum distance to walls and obstacles [m]
     rows: Vector  # (MOST, ROW) contacts of the newest tick
-    impulses: Vector  # (MOST,) theirs [N s]
+    impulses: Vector  # (MOST,) impulses of the contacts [N s]
 
 
 @kernel
@@ -55,7 +55,7 @@ def _find_contacts(
     solids: Solids,
     state: State,
 ) -> int:
-    """Find what the vehicle touches; return how many contacts there are in `state.rows`."""
+    """Find the vehicle's contacts; return the number of contacts in `state.rows`."""
     count = 0
     if state.many[0] > 0 or -p[2] - radius < close:
         count = touch_floor(p, q, half, close, state.kept, state.many, state.rows, 0)
@@ -109,25 +109,25 @@ def advance(
     state: State,
     row: Vector,
 ) -> int:
-    """Move the vehicle on by one tick.
+    """Move the vehicle by one tick.
 
     Args:
-        at: Where it is, NED [m].
-        force: All forces but gravity and contacts, NED [N].
+        at: Position, NED [m].
+        force: All forces except gravity and contacts, NED [N].
         torque: NED [N m].
-        before: (16,) its motion before the tick.
-        moving_us: How long what moves has been under way at the end of the tick [µs].
-        airframe: (15,) as `Airframe`.
+        before: (16,) motion before the tick.
+        moving_us: Time since the moving obstacles started, at the end of the tick [µs].
+        airframe: (15,) fields of `Airframe`.
         half: (3,) half extents of the collision box [m].
-        box: The half diagonal of it, and below which distance bodies are close [m].
-        obstacle_speed: Of the fastest moving obstacle [m/s].
+        box: Half diagonal of the box, and distance below which bodies are close [m].
+        obstacle_speed: Maximum speed of a moving obstacle [m/s].
         tick_s: Length of the tick [s].
         solids: Walls and obstacles.
-        state: What is remembered of contacts.
-        row: (16,) overwritten with the motion after the tick.
+        state: Contacts stored between ticks.
+        row: (16,) output: motion after the tick.
 
     Returns:
-        How many contacts there were, in `state.rows` and `state.impulses`.
+        Number of contacts, in `state.rows` and `state.impulses`.
     """
     a, q = airframe_of(airframe), quaternion(before)
     radius, close = box
@@ -146,17 +146,17 @@ def advance(
 
 
 class KernelBody:
-    """A rigid body of our own, free of pybullet."""
+    """Built-in rigid body without pybullet."""
 
     def __init__(
         self, arena: Arena | None, body: BodyProfile, airframe: Airframe, tick_s: float
     ) -> None:
-        """Put it at rest on the floor at the start, facing north; see `bodies.new_body`."""
+        """Place the body at rest on the floor at the start, facing north; see `bodies.new_body`."""
         self._solids, names = solids_of(arena)
         self.names: Mapping[int, str] = dict(enumerate([FLOOR, *names], start=FLOOR_ID))
         self._half = np.array([0.5 * body.width_m, 0.5 * body.width_m, 0.5 * body.height_m])
         radius = float(np.linalg.norm(self._half))
-        """Half diagonal of its collision box [m]."""
+        """Half diagonal of the collision box [m]."""
         self._box = radius, BREAKING_SHARE * radius
         self._airframe = np.array(airframe)
         self._tick_s = tick_s
@@ -171,14 +171,14 @@ class KernelBody:
         self.touch = NOTHING
 
     def close(self) -> None:
-        """Do nothing: it holds nothing that has to be released."""
+        """Do nothing: the body has no resources to release."""
 
     def rest(self) -> Vector:
         """Return the motion (16,) at rest on the floor at the start."""
         return self.put((0.0, 0.0, -float(self._half[2])))
 
     def move(self, at: Vec, force: Vec, torque: Vec, before: Vector, moving_us: int) -> Vector:
-        """Move on by one tick; as `Body`."""
+        """Move the body by one tick; see `Body`."""
         row = np.empty(WIDTH)
         state = self._state
         count = advance(
@@ -208,12 +208,12 @@ class KernelBody:
         return row
 
     def look_around(self) -> None:
-        """Take what moves to be elsewhere; as `Body`."""
+        """Update the moving obstacles; see `Body`."""
         self._state.room[0] = -math.inf
 
     def follow(self, motion: Vector) -> None:
-        """Take the vehicle to be elsewhere; as `Body`."""
-        del motion  # `move` takes it
+        """Reset the contacts for a new motion; see `Body`."""
+        del motion  # `move` receives it
         self._state.many[0], self._state.room[0] = 0, -math.inf
 
     def put(
@@ -223,7 +223,7 @@ class KernelBody:
         quaternion: Quat = (1.0, 0.0, 0.0, 0.0),
         rates: Vec = (0.0, 0.0, 0.0),
     ) -> Vector:
-        """Put it somewhere; as `Body`."""
+        """Place the body in a motion; see `Body`."""
         state = self._state
         state.many[0], state.room[0] = 0, -math.inf
         self.touch = NOTHING

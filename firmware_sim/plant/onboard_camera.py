@@ -1,4 +1,4 @@
-"""A vehicle's camera as a simulation asks for its frames."""
+"""Interface of a vehicle's camera to the simulation."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from airl_mav.profiles.conditions import SensorNoise
 
 
 class OnboardCamera(Protocol):
-    """Takes frames when they are due; `camera_server.SimulatedCamera` is one."""
+    """Camera that takes frames when due, for example `camera_server.SimulatedCamera`."""
 
     @property
     def next_us(self) -> int:
-        """Simulated time from which on there is something to do [µs]."""
+        """Earliest simulated time of the next required call [µs]."""
         ...
 
     def restart(self, time_us: int) -> None:
-        """Begin an episode, and with it its moving obstacles: a frame is due at `time_us` [µs]."""
+        """Start an episode and its moving obstacles; a frame is due at `time_us` [µs]."""
         ...
 
     def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
-        """Take what is due of a vehicle in motion at `time_us` [µs], and publish what is done."""
+        """Take the frame due at `time_us` [µs] in a motion, and publish completed frames."""
         ...
 
 
 class CameraMaker(Protocol):
-    """Makes cameras; see `camera_server.SimulatedCamera`."""
+    """Factory of cameras; see `camera_server.SimulatedCamera`."""
 
     def __call__(
         self,
@@ -43,5 +43,5 @@ class CameraMaker(Protocol):
         renderer: Renderer,
         further: Mapping[str, Camera] | None = None,
     ) -> OnboardCamera:
-        """Return the camera of a vehicle profile, with those that are triggered with it."""
+        """Return the camera of a vehicle profile, with the additional cameras it triggers."""
         ...

@@ -1,4 +1,4 @@
-"""The optical flow sensor: how the ground below moves in the image of a camera that looks down."""
+"""Optical flow sensor: motion of the ground in the image of a downward camera."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from firmware_sim.plant.rangefinder import DownwardRay
 from firmware_sim.plant.sensors import Rate, White
 
 BEST, INVALID = 255, 0
-"""Quality of a measurement within the limits, and of any other."""
+"""Quality of a measurement within the limits, and of all others."""
 
-# What is added up between two measurements: the body's turn about x and y [rad], the sensor's way
-# along them [m], and for how long [s].
+# Sums between two measurements: body rotation about x and y [rad], sensor displacement along x and
+# y [m], and time [s].
 _TURN_X, _TURN_Y, _WAY_X, _WAY_Y, _TIME, _SIZE = 0, 1, 2, 3, 4, 5
 
 
 @kernel
 def _pass(row: Vector, place: Vector, tick_s: float, since: Vector) -> None:
-    """Add up a tick.
+    """Add a tick to the sums.
 
     Args:
-        row: (16,) the vehicle's motion at its end.
-        place: (3,) of the sensor, FRD [m].
+        row: (16,) motion of the vehicle at its end.
+        place: (3,) position of the sensor, FRD [m].
         tick_s: Length of the tick [s].
-        since: (5,) sums since the measurement before, updated.
+        since: (5,) sums since the last measurement, updated.
     """
     v, w = rotate(conjugate(quaternion(row)), velocity(row)), rates(row)
     since[_TURN_X] += w[0] * tick_s
@@ -43,7 +43,7 @@ def _pass(row: Vector, place: Vector, tick_s: float, since: Vector) -> None:
 
 
 class PlantOpticalFlow:
-    """Measures the flow of what lies straight below, which is taken to be level there."""
+    """Simulated sensor of the flow straight below, where the surface is assumed level."""
 
     def __init__(
         self,
@@ -53,13 +53,13 @@ class PlantOpticalFlow:
         times: float,
         tick_s: float,
     ) -> None:
-        """Switch it on.
+        """Initialize the sensor.
 
         Args:
-            profile: What it is.
-            arena: Where; None = an endless floor.
-            rng: Of its noise, and of nothing else.
-            times: Factor of its noise.
+            profile: Optical flow profile.
+            arena: Arena; None = an endless floor.
+            rng: Random generator of this sensor only.
+            times: Factor of the noise.
             tick_s: Length of a tick [s].
         """
         self.rate = Rate(profile.rate_hz)
@@ -71,14 +71,14 @@ class PlantOpticalFlow:
         self._ray = DownwardRay(place, profile.greatest_m, arena)
         self._since = np.zeros(_SIZE)
         self._before_m: float | None = None
-        """How far the ground was at the measurement before; None = out of reach."""
+        """Ground distance at the last measurement [m]; None = out of range."""
 
     def pass_tick(self, row: Vector) -> None:
-        """Let a tick pass that ends in a motion (16,)."""
+        """Add a tick that ends in motion (16,)."""
         _pass(row, self._place, self._tick_s, self._since)
 
     def read(self, row: Vector, elapsed_us: int) -> FlowReading:
-        """Return what is measured in a motion (16,), so long after obstacles set out [µs]."""
+        """Return a reading in motion (16,), `elapsed_us` [µs] after the obstacles started."""
         profile, white = self._profile, self._white.draw()
         turn_x, turn_y, way_x, way_y, passed_s = self._since.tolist()
         self._since[:] = 0.0
@@ -87,7 +87,7 @@ class PlantOpticalFlow:
         turned = np.full(3, math.nan)
         if now_m is None or before_m is None or min(now_m, before_m) < profile.least_m:
             return FlowReading(np.zeros(2), passed_s, INVALID, turned)
-        # Over a few hundredths of a second the distance changes in a straight line.
+        # Over a few hundredths of a second, the distance changes linearly.
         mean_m = 0.5 * (now_m + before_m)
         flow = np.array([turn_x - way_y / mean_m, turn_y + way_x / mean_m])
         if math.hypot(*flow.tolist()) > profile.greatest_rad_s * passed_s:

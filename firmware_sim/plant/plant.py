@@ -1,4 +1,4 @@
-"""The plant: a body with rotors, drag, battery and sensors, in an arena."""
+"""Plant: a body with rotors, drag, battery and sensors, in an arena."""
 
 from __future__ import annotations
 
@@ -50,40 +50,40 @@ from firmware_sim.plant.room import Room
 from firmware_sim.plant.sensors import SensorSuite
 
 REST_SPEED_M_S = 0.1
-"""Touching the floor slower than this is resting, no collision (AirSim's kRestingVelocityMax)."""
+"""Maximum speed of a floor contact that is not a collision (AirSim's kRestingVelocityMax) [m/s]."""
 
 STILL = 1e-4
-"""A vehicle rests below this speed [m/s] and turn rate [rad/s]."""
+"""Maximum speed [m/s] and turn rate [rad/s] of a vehicle at rest."""
 
 CLEAR_M = 0.03
-"""Contacts are impossible in a tick if nothing comes nearer in it than this, beyond the distance at
-which the physics begins contacts (`BREAKING_SHARE`) [m]."""
+"""Minimum gap without contacts in a tick [m], in addition to the distance at which the physics
+starts contacts (`BREAKING_SHARE`)."""
 
 NEVER_US = 1 << 61
-"""Begin of the tours of obstacles that stand still [µs]."""
+"""Start time of the tours of held obstacles [µs]."""
 
 STOPPED: Speeds = (0.0, 0.0, 0.0, 0.0)
 
 
 class Blowing(Protocol):
-    """Where the wind comes from; `vehicle.wind.Wind` is one."""
+    """Source of wind; see `vehicle.wind.Wind`."""
 
     def step(self) -> Vector:
-        """Advance one tick and return the wind (3,) NED [m/s]; not to be written to."""
+        """Advance one tick and return the wind (3,) NED [m/s]; read-only."""
         ...
 
 
 class Collision(NamedTuple):
-    """The vehicle began to touch something. The floor only when faster than REST_SPEED_M_S."""
+    """Start of a contact. Floor contacts count only above REST_SPEED_M_S."""
 
     time_us: int
     what: str
     speed_m_s: float
-    """Speed just before the contact."""
+    """Speed just before the contact [m/s]."""
 
 
 class Plant:
-    """The vehicle in its arena. Time starts at the clock value given and moves by ticks."""
+    """Vehicle in its arena. Time starts at a given value and advances by ticks."""
 
     def __init__(
         self,
@@ -97,18 +97,18 @@ class Plant:
         rate_hz: int = TICK_HZ,
         computer_w: float = 0.0,
     ) -> None:
-        """Put the vehicle at rest on the floor at the start, facing north.
+        """Place the vehicle at rest on the floor at the start, facing north.
 
         Args:
-            profile: The vehicle.
-            arena: Where; None = an endless floor.
-            rng: All randomness of sensors and wind.
+            profile: Vehicle profile.
+            arena: Arena; None = an endless floor.
+            rng: Random generator of sensors and wind.
             start_us: Simulated time of the first state [µs].
-            aircraft: What was asked of it: wind as `wind_of_episode` returns it, sensors, charge of
-                the battery, which body; None = the defaults.
-            airframe: This vehicle's own; None = that of the profile.
-            rate_hz: Ticks a second.
-            computer_w: What the onboard computer draws from the pack [W].
+            aircraft: Scenario settings: wind as from `wind_of_episode`, sensors, battery charge,
+                body type; None = the defaults.
+            airframe: Airframe of this vehicle; None = from the profile.
+            rate_hz: Tick rate [Hz].
+            computer_w: Power of the onboard computer from the pack [W].
         """
         tick_s = 1.0 / rate_hz
         asked = aircraft or Aircraft()
@@ -116,19 +116,19 @@ class Plant:
         """Latched collision events, oldest first."""
         airframe = airframe or Airframe.from_profile(profile)
         self.record = record = new_aircraft()
-        """Body, rotors, battery and sensors."""
+        """Record of body, rotors, battery and sensors."""
         noise, gusts = sensors_and_gusts(rng)
         self._sensors = SensorSuite(
             profile.sensors, noise, tick_s, asked.sensors.navigation_noise, record
         )
         self.wind: Blowing = Wind(asked.wind, gusts, tick_s)
-        """Asked for what blows; to be replaced between two ticks."""
+        """Source of wind; may be replaced between two ticks."""
         self._winds = np.zeros((0, 3))
-        """Wind NED [m/s] of the coming ticks. A single row does not change."""
+        """Wind NED [m/s] of the coming ticks. A single row is constant wind."""
         fitted, times = profile.sensors.rangefinder, asked.sensors.navigation_noise
         self._rangefinder = None
         if fitted is not None:
-            # A further child: the streams of the other sensors stay what they are.
+            # An additional child leaves the random streams of the other sensors unchanged.
             self._rangefinder = PlantRangefinder(fitted, arena, noise.spawn(1)[0], times)
         flow = profile.sensors.optical_flow
         self._flow = None
@@ -137,10 +137,10 @@ class Plant:
         self._measures_compiled = fitted is None and flow is None and profile.sensors.vision is None
         model = PowerModel.from_profile(profile)
         self.rotor_lag = lag(airframe, tick_s)
-        """Share of an error of its speed that a rotor keeps over a tick."""
+        """Fraction of a rotor speed error that remains after a tick."""
         pack, power_w = pack_row(profile.battery), standing_power_w(0.0, airframe, model)
         self.body: Body = new_body(asked.plant, arena, profile.body, airframe, tick_s)
-        """The vehicle among the bodies of the arena."""
+        """Vehicle body among the bodies of the arena."""
         self._room = Room(arena, profile.body)
         for name, value in (
             ("airframe", airframe),
@@ -167,7 +167,7 @@ class Plant:
         self._motion = record["motion"][0]
         self._touching: frozenset[int] = frozenset()
         self._away = False
-        """Whether the body lies behind: the vehicle has glided since it was moved last."""
+        """True if the body is outdated: compiled ticks have moved the vehicle since."""
 
     @property
     def time_us(self) -> int:
@@ -176,7 +176,7 @@ class Plant:
 
     @property
     def motion(self) -> Vector:
-        """Motion (16,) as `plant.kinematics`; a copy."""
+        """Copy of the motion (16,), see `engine.kinematics`."""
         return self._motion.copy()
 
     @property
@@ -190,7 +190,7 @@ class Plant:
 
     @property
     def power_w(self) -> float:
-        """Electrical power over the newest tick, without the onboard computer's [W]."""
+        """Electrical power over the newest tick [W], without the onboard computer."""
         return self.record["power_w"].item(0)
 
     @property
@@ -199,32 +199,32 @@ class Plant:
 
     @property
     def _elapsed_us(self) -> int:
-        """How long what moves has been under way [µs]."""
+        """Time since the moving obstacles started [µs]."""
         return max(0, self.record["time_us"].item(0) - self.record["moves_us"].item(0))
 
     def hold_obstacles(self) -> None:
-        """Keep what moves where its tours begin, until `begin`."""
+        """Hold moving obstacles at the start of their tours until `begin`."""
         self.record["moves_us"] = NEVER_US
 
     def begin(self) -> None:
-        """Let what moves set out now; contacts so far are forgotten."""
+        """Start the moving obstacles and clear the collisions."""
         self.record["moves_us"] = self.time_us
         self._measure_room()
         self.collisions.clear()
 
     def close(self) -> None:
-        """Release what the body holds."""
+        """Release the resources of the body."""
         self.body.close()
 
     @property
     def position(self) -> tuple[float, float, float]:
-        """Where the vehicle is, NED [m]."""
+        """Position of the vehicle, NED [m]."""
         north, east, down = self._motion[POSITION].tolist()
         return north, east, down
 
     @property
     def rotor_speeds(self) -> Speeds:
-        """Speeds of the rotors, as shares of that at full command, in the order of the motors."""
+        """Rotor speeds as fractions of the speed at full command, in motor order."""
         a, b, c, d = self.record["speeds"][0].tolist()
         return a, b, c, d
 
@@ -232,22 +232,22 @@ class Plant:
 
     @property
     def compiled(self) -> bool:
-        """Whether compiled ticks move and measure as `step` does."""
+        """True if compiled ticks give the same motion and measurements as `step`."""
         return self._measures_compiled and isinstance(self.wind, Wind)
 
     def glide(
         self, controller: Record, ticks: int, truths: Record, flown: Record
     ) -> tuple[int, int]:
-        """Fly up to so many compiled ticks.
+        """Fly up to `ticks` compiled ticks.
 
         Args:
             controller: Record of the flight controller.
-            ticks: How many.
+            ticks: Maximum number of ticks.
             truths: (ticks,) log of the aircraft, written.
             flown: (ticks,) log of the flight controller, written.
 
         Returns:
-            How many ticks are complete, and the event that ended them (`engine.ticks`).
+            Number of complete ticks, and the event that ended them (`engine.ticks`).
         """
         done = 0
         while True:
@@ -272,10 +272,10 @@ class Plant:
     def touch(
         self, controller: Record, ticks: int, truths: Record, flown: Record
     ) -> tuple[int, int]:
-        """Fly up to so many ticks in which contacts are possible; as `glide`.
+        """Fly up to `ticks` ticks in which contacts are possible; see `glide`.
 
-        The body among those of the arena moves the vehicle. It ends after a collision, and when
-        contacts are no longer possible.
+        The body in the arena moves the vehicle. Returns after a collision, and when contacts become
+        impossible.
         """
         record, sensors, before = self.record, self._sensors, len(self.collisions)
         for k in range(ticks):
@@ -323,7 +323,7 @@ class Plant:
         return self._winds[at[4] - 1]
 
     def _measure_room(self) -> bool:
-        """Measure how far everything is that can be touched; return whether that is far enough."""
+        """Measure the distance to all solids; return True if contacts are impossible."""
         record = self.record
         record["resting"] = 0
         record["room_m"] = -math.inf if self._touching else self._room.above_floor_m(self._motion)
@@ -336,14 +336,14 @@ class Plant:
     # --- ticks by Python
 
     def step(self, controls: ActuatorControls) -> SensorSample:
-        """Apply motor commands for one tick and return what the sensors then measure."""
+        """Apply motor commands for one tick and return the sensor sample after it."""
         wind = self._wind_now() if isinstance(self.wind, Wind) else self.wind.step()
         self._move(controls.motors, wind)
         return self.sense()
 
     def _move(self, motors: Speeds, wind: Vector) -> None:
         record = self.record
-        # An empty battery turns no motor.
+        # An empty battery stops the motors.
         motors = motors if record["charge"][0] > 0.0 else STOPPED
         if record["resting"][0] and record["held"][0] and is_clear_record(record):
             rest_record(record, motors, wind)
@@ -354,7 +354,7 @@ class Plant:
             self._has_come_to_rest()
 
     def _moved(self, here: Vec, force: Vec, torque: Vec) -> Vector:
-        """Let the body move for a tick; return the motion after it (16,), and note its contacts."""
+        """Move the body by a tick; return the motion after it (16,), and update its contacts."""
         body, record, before = self.body, self.record, self._motion
         if self._away:
             body.follow(before)
@@ -370,7 +370,7 @@ class Plant:
         return after
 
     def _has_come_to_rest(self) -> bool:
-        """Let the vehicle rest where it stands on the floor alone; return whether it does."""
+        """Mark the vehicle as resting if it is at rest on the floor alone; return the result."""
         record, motion = self.record, self._motion
         names = [self.body.names[other] for other in self._touching]
         if names != [FLOOR]:
@@ -382,7 +382,7 @@ class Plant:
         return resting
 
     def sense(self) -> SensorSample:
-        """Return a sensor sample of the present state."""
+        """Return a sensor sample of the current state."""
         sample = self._sensors.sample(self.time_us, self._motion, self._battery)
         finder, flow = self._rangefinder, self._flow
         if finder is not None and finder.rate.due(self.time_us):
@@ -413,7 +413,7 @@ class Plant:
         quaternion: Quat = (1.0, 0.0, 0.0, 0.0),
         rates: Vec = (0.0, 0.0, 0.0),
     ) -> None:
-        """Put the vehicle somewhere; what it touched and hit so far is forgotten.
+        """Place the vehicle in a motion; clears contacts and collisions.
 
         Args:
             position: NED [m].
@@ -427,8 +427,8 @@ class Plant:
         self.collisions.clear()
 
     def _watch(self, touch: Touch, before: Vector, time_us: int) -> None:
-        """Latch every new contact at the end of a tick [µs]; one that lasts is one event."""
-        # Contacts flicker: one has ended when the bodies are no longer close.
+        """Latch every new contact at the end of a tick [µs]. A lasting contact is one event."""
+        # Contacts flicker: a contact ends when the bodies are no longer close.
         touching = touch.pressed | (self._touching & touch.close)
         if touching - self._touching:
             speed = math.sqrt(sum(v * v for v in before[VELOCITY].tolist()))

@@ -1,4 +1,4 @@
-"""A ray straight down in body axes, and the rangefinder along it, with noise and limits."""
+"""Rangefinder with noise and limits, along a ray straight down in body axes."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ _DOWN = -0.5 * math.pi
 """Angle of the ray above the body's forward axis [rad]."""
 
 _FOCAL_PX = 1_000.0
-"""Of an image of one pixel: so narrow that next to nothing but the ray is looked at."""
+"""Focal length of a one-pixel image: narrow enough to follow a single ray."""
 
 _ENDLESS = Bounds(-1e6, 1e6, -1e6, 1e6, 1.0)
-"""The floor where there is no arena."""
+"""Bounds of the floor without an arena."""
 
 
 class DownwardRay:
-    """Finds ground, walls and obstacles, moving ones and meshes among them."""
+    """Ray that finds ground, walls and obstacles, including moving obstacles and meshes."""
 
     def __init__(self, place: Vec, greatest_m: float, arena: Arena | None) -> None:
-        """Mount it.
+        """Mount the ray.
 
         Args:
-            place: Where it begins, from the vehicle's centre, FRD [m].
-            greatest_m: How far it reaches [m].
-            arena: Where; None = an endless floor.
+            place: Start of the ray relative to the vehicle's centre, FRD [m].
+            greatest_m: Maximum range [m].
+            arena: Arena; None = an endless floor.
         """
         self._greatest_m, self._arena = greatest_m, arena
         self._mount = Mount(place, _DOWN)
@@ -56,12 +56,12 @@ class DownwardRay:
         self.length_m(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), 0)
 
     def length_m(self, position: Vector, quaternion: Vector, elapsed_us: int) -> float | None:
-        """Return how far the next thing is [m]; None: nothing is within reach.
+        """Return the distance to the nearest surface [m]; None = out of range.
 
         Args:
-            position: (3,) of the vehicle, NED [m].
+            position: (3,) position of the vehicle, NED [m].
             quaternion: (4,) body -> NED.
-            elapsed_us: Time since moving obstacles set out [µs].
+            elapsed_us: Time since the moving obstacles started [µs].
         """
         arena, centers = self._arena, self._still
         if arena is not None and arena.tours:
@@ -90,22 +90,22 @@ class DownwardRay:
 
 
 VALID, INVALID = 100, 0
-"""Quality of a range within the limits, and of any other [%]."""
+"""Quality of a range within the limits, and of all others [%]."""
 
 
 class PlantRangefinder:
-    """Measures the distance to what lies below."""
+    """Simulated sensor of the distance to the surface below."""
 
     def __init__(
         self, profile: Rangefinder, arena: Arena | None, rng: np.random.Generator, times: float
     ) -> None:
-        """Switch it on.
+        """Initialize the sensor.
 
         Args:
-            profile: What it is.
-            arena: Where; None = an endless floor.
-            rng: Of its noise, and of nothing else.
-            times: Factor of its noise; the variance that it reports stays.
+            profile: Rangefinder profile.
+            arena: Arena; None = an endless floor.
+            rng: Random generator of this sensor only.
+            times: Factor of the noise; does not affect the reported variance.
         """
         self.rate = Rate(profile.rate_hz)
         self._profile = profile
@@ -113,15 +113,15 @@ class PlantRangefinder:
         self._white = White(rng, 1)
         place = (profile.forward_m, profile.right_m, profile.down_m)
         self.ray = DownwardRay(place, profile.greatest_m, arena)
-        """What it measures along."""
+        """Ray of the measurement."""
 
     def read(self, row: Vector, elapsed_us: int) -> DistanceReading:
-        """Return what is measured in a motion (16,), so long after obstacles set out [µs]."""
+        """Return a reading in motion (16,), `elapsed_us` [µs] after the obstacles started."""
         profile = self._profile
         true = self.ray.length_m(row[POSITION], row[QUATERNION], elapsed_us)
         white = self._white.draw().item()
         least, greatest = profile.least_m, profile.greatest_m
-        # Nothing comes back: such sensors tell their end of the scale, as invalid.
+        # Without an echo, such sensors report their maximum range as invalid.
         told = greatest if true is None else max(0.0, true + self._sigma * white)
         good = true is not None and least <= told <= greatest
         return DistanceReading(

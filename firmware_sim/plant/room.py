@@ -1,4 +1,4 @@
-"""Broad phase: how far the vehicle is from everything that it can touch."""
+"""Broad phase: distance from the vehicle to all solids."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ class Room:
     """Distances from a vehicle's collision box to the bodies of an arena."""
 
     def __init__(self, arena: Arena | None, body: Body) -> None:
-        """Take an arena, None = an endless floor, and the body."""
+        """Store the solids of an arena (None = an endless floor) and the collision box."""
         self._solids, _ = solids_of(arena)
         relief = self._solids.relief
         self._top_m = float(relief.grid[TOP]) if len(relief.heights) else 0.0
-        """Height of the highest hill."""
+        """Height of the highest hill [m]."""
         self._half = 0.5 * np.array([body.width_m, body.width_m, body.height_m])
         self.reach_m = math.hypot(*self._half.tolist())
-        """From the centre of the box to its corners."""
+        """Distance from the centre of the box to its corners [m]."""
         self.closing_m_s = greatest_speed(self._solids)
-        """Greatest speed of an obstacle [m/s]."""
+        """Maximum speed of an obstacle [m/s]."""
 
     def above_floor_m(self, motion: Vector) -> float:
         """Return the height of the box's lowest corner above floor and hills [m]; motion (16,)."""
@@ -37,11 +37,11 @@ class Room:
         return lowest_m - self._top_m
 
     def among_solids_m(self, motion: Vector, moving_us: int) -> float:
-        """Return a distance that no wall and no obstacle is nearer than [m].
+        """Return a lower bound of the distance to walls and obstacles [m].
 
         Args:
-            motion: (16,) of the vehicle.
-            moving_us: How long what moves has been under way [µs].
+            motion: (16,) motion of the vehicle.
+            moving_us: Time since the moving obstacles started [µs].
         """
         room: float = _among_solids(self._solids, motion, self.reach_m, moving_us)
         return room

@@ -1,4 +1,4 @@
-"""Sensor models: from the true state to samples, each with its own noise, bias and rate."""
+"""Sensor models: samples from the true state, each with separate noise, bias and rate."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ from firmware_sim.interfaces import BatterySample, GpsFix, Odometry, SensorSampl
 GPS_SATELLITES = 12
 
 BLOCK = 128
-"""Samples for which noise is drawn at once. The number does not affect the values."""
+"""Number of samples per block of noise. Does not affect the values."""
 
 _WIDTHS = (12, 3, 2, 9)
-"""Numbers of white noise in a sample of accelerometer and gyro, compass, barometer, GPS."""
+"""White noise values per sample of accelerometer and gyro, compass, barometer, GPS."""
 
 
 class Rate:
-    """Schedules a sensor that is slower than the tick, without drift."""
+    """Schedule of a sensor slower than the tick, without drift."""
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
         self.next_us = 0.0
-        """Simulated time before which it is not due [µs]."""
+        """Simulated time of the next sample [µs]."""
         self.period = 0
-        """Number of the period that the newest sample is of."""
+        """Period number of the newest sample."""
 
     def due(self, time_us: int) -> bool:
-        """Return True once for every period that has passed."""
+        """Return True once per elapsed period."""
         if time_us < self.next_us:
             return False
         period = int(time_us * self._rate_hz / US_PER_S)
-        # Rounding may put a time that lies on a boundary into the period before it.
+        # Rounding may assign a time on a boundary to the period before.
         if (period + 1) * US_PER_S / self._rate_hz <= time_us:
             period += 1
         self.period, self.next_us = period, (period + 1) * US_PER_S / self._rate_hz
@@ -63,7 +63,7 @@ class White:
         self._next = 0
 
     def draw(self) -> Vector:
-        """Return new numbers (width,)."""
+        """Return new values (width,)."""
         if self._next == len(self._rows):
             self._rows, self._next = self._rng.standard_normal((BLOCK, self._rows.shape[1])), 0
         row: Vector = self._rows[self._next]
@@ -72,7 +72,7 @@ class White:
 
 
 class _Vision:
-    """Visual-inertial odometry: a pose in the frame of the start, which drifts, told late."""
+    """Visual-inertial odometry: a pose in the start frame, with drift and latency."""
 
     def __init__(self, vision: Vision, rng: np.random.Generator, times: float) -> None:
         self.rate = Rate(vision.rate_hz)
@@ -82,14 +82,14 @@ class _Vision:
         """Position, and attitude of the frame, at the first pose."""
         self._last = np.zeros(3)
         self._drift = np.zeros(3)
-        """Of the position, in the frame [m]."""
+        """Drift of the position, in the frame [m]."""
         self._turned = 0.0
-        """How far the frame's heading has drifted [rad]."""
+        """Drift of the frame's heading [rad]."""
         self._late: deque[tuple[float, Odometry]] = deque()
-        """When each pose is told [µs], oldest first."""
+        """Poses with their delivery times [µs], oldest first."""
 
     def observe(self, time_us: int, row: Vector) -> None:
-        """Take a pose now."""
+        """Sample a pose at the current time."""
         profile, white, times = self._vision, self._white.draw(), self._times
         place, velocity, attitude = row[POSITION], row[VELOCITY], quaternion(row)
         if self._start is None:
@@ -120,7 +120,7 @@ class _Vision:
 
     @property
     def told_us(self) -> float:
-        """When the next pose is told [µs]; inf = none is on its way."""
+        """Delivery time of the next pose [µs]; inf = no pose pending."""
         return self._late[0][0] if self._late else math.inf
 
     def read(self) -> Odometry:
@@ -129,16 +129,16 @@ class _Vision:
 
 
 def frame_at(attitude: Quat) -> Vector:
-    """Return the frame of a vehicle's start: its heading, level (quaternion to NED)."""
+    """Return a level frame with the heading of an attitude (quaternion to NED)."""
     half = 0.5 * yaw_of(attitude)
     return np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
 
 
 class SensorSuite:
-    """All sensors of the vehicle; one call a tick.
+    """All sensors of the vehicle, with one call per tick.
 
-    Every sensor draws from a stream of its own, so that what one measures does not depend on how
-    often another does.
+    Every sensor has a separate random stream, so its measurements do not depend on the rates of the
+    others.
     """
 
     def __init__(
@@ -149,15 +149,15 @@ class SensorSuite:
         times: float = 1.0,
         record: Record | None = None,
     ) -> None:
-        """Switch them on.
+        """Initialize the sensors.
 
         Args:
-            profile: What they are.
-            rng: Of all their noise.
+            profile: Sensor profile.
+            rng: Random generator of all noise.
             tick_s: Length of a tick [s].
-            times: What noise, biases and drifts are multiplied by. What the GPS receiver says of
-                its accuracy stays: nobody is told.
-            record: Of the aircraft, which keeps their state; None = a new one.
+            times: Factor of noise, biases and drifts. Does not affect the accuracy that the GPS
+                receiver reports.
+            record: Record of the aircraft, which stores the sensors' state; None = a new one.
         """
         self._record = record = new_aircraft() if record is None else record
         self.record = new_sample()
@@ -167,7 +167,7 @@ class SensorSuite:
         streams = rng.spawn(5)
         inertial, vision = streams[0], streams[4]
         walk = math.sqrt(tick_s)
-        # The profile's noise is that of a sample at the base tick: its density stays.
+        # The profile gives the noise at the base tick; the noise density is constant.
         white = math.sqrt(TICK_S / tick_s)
         record["imu_sigma"] = times * np.repeat(
             [
@@ -205,19 +205,19 @@ class SensorSuite:
             self._vision = _Vision(profile.vision, vision, times)
 
     def measure(self) -> None:
-        """Measure what compiled ticks measure."""
+        """Sample the compiled sensors."""
         self.refill()
         sense_record(self._record, self.record, *self.noise)
 
     def refill(self) -> None:
-        """Draw new blocks of noise where the old ones are used up."""
+        """Draw new blocks of noise to replace used-up blocks."""
         used = self._record["noise_at"][0]
         for i, rng in enumerate(self._streams):
             if used[i] >= len(self.noise[i]):
                 self.noise[i], used[i] = rng.standard_normal((BLOCK, _WIDTHS[i])), 0
 
     def sample(self, time_us: int, row: Vector, battery: BatterySample) -> SensorSample:
-        """Return what is measured at `time_us` [µs] in motion `row` (16,), `plant.kinematics`."""
+        """Return the sample at `time_us` [µs] in motion `row` (16,), see `engine.kinematics`."""
         record = self._record
         record["time_us"], record["motion"] = time_us, row
         self.measure()

@@ -18,11 +18,11 @@ from firmware_sim.plant.body import walls_of
 
 
 def tour_arrays(arena: Arena) -> tuple[Vector, Vector]:
-    """Return the tours of an arena's n moving obstacles, which have up to k way-points.
+    """Return the tours of an arena's n moving obstacles, with up to k waypoints.
 
     Returns:
-        times: (n, 1 + k) period of the tour; then when its way-points are passed [s], and inf.
-        points: (n, k, 2) way-points north, east [m].
+        times: (n, 1 + k) period of the tour, then the times of its waypoints [s], then inf.
+        points: (n, k, 2) waypoints north, east [m].
     """
     n, k = len(arena.tours), max((len(tour.times_s) for tour in arena.tours), default=1)
     times, points = np.full((n, 1 + k), np.inf), np.zeros((n, k, 2))
@@ -40,11 +40,11 @@ def place_at(
     """Return north, east [m] of moving obstacle i.
 
     Args:
-        time_us: Since the start of the episode [µs].
-        times_s: (n, 1 + k) as `tour_arrays`.
-        points: (n, k, 2) as `tour_arrays`.
-        leg: (n,) the way-point passed last; updated.
-        i: Which.
+        time_us: Time since the start of the episode [µs].
+        times_s: (n, 1 + k) from `tour_arrays`.
+        points: (n, k, 2) from `tour_arrays`.
+        leg: (n,) index of the last waypoint passed; updated.
+        i: Index of the obstacle.
     """
     t = (time_us / US_PER_S) % times_s[i, 0]
     passed = times_s[i, 1:]
@@ -52,7 +52,7 @@ def place_at(
     while passed[k + 1] <= t:
         k += 1
     leg[i] = k
-    # The order of numpy.interp, so that body and picture agree to the last bit.
+    # Same order of operations as numpy.interp: body and image are bit-identical.
     a, b, step = points[i, k], points[i, k + 1], passed[k + 1] - passed[k]
     north = (b[0] - a[0]) / step * (t - passed[k]) + a[0]
     east = (b[1] - a[1]) / step * (t - passed[k]) + a[1]
@@ -60,20 +60,20 @@ def place_at(
 
 
 class Solids(NamedTuple):
-    """Walls and obstacles of an arena, n of them, of which the last m move; and its ground."""
+    """Walls and obstacles of an arena: n solids, of which the last m move; and its ground."""
 
     shape: NDArray[np.int8]  # (n,)
-    center: Vector  # (n, 3) NED [m]; of those that move it is updated
+    center: Vector  # (n, 3) NED [m]; updated for moving ones
     size: Vector  # (n, 3) half extents [m]
     yaw: Vector  # (n,) [rad]
-    times_s: Vector  # (m, 1 + k) as `tour_arrays`
+    times_s: Vector  # (m, 1 + k) from `tour_arrays`
     points: Vector  # (m, k, 2)
     leg: NDArray[np.int64]  # (m,)
     relief: Relief
 
 
 def solids_of(arena: Arena | None) -> tuple[Solids, list[str]]:
-    """Return the walls, obstacles and ground of an arena, and their names; None has none."""
+    """Return walls, obstacles and ground of an arena, and their names; None = no solids."""
     if arena is None:
         return (
             Solids(
@@ -104,7 +104,7 @@ def solids_of(arena: Arena | None) -> tuple[Solids, list[str]]:
 
 
 def greatest_speed(solids: Solids) -> float:
-    """Return how fast the fastest moving obstacle is [m/s]."""
+    """Return the maximum speed of a moving obstacle [m/s]."""
     fastest = 0.0
     for times, points in zip(solids.times_s, solids.points, strict=True):
         passed = times[1:][np.isfinite(times[1:])]
@@ -117,7 +117,7 @@ def greatest_speed(solids: Solids) -> float:
 
 @kernel
 def room_among(solids: Solids, p: Vec, radius: float) -> float:
-    """Return a distance [m] that a sphere around the vehicle surely is from walls and obstacles."""
+    """Return a lower bound [m] of the distance of a sphere around the vehicle to solids."""
     room: float = math.inf
     for i in range(len(solids.shape)):
         c, s = math.cos(solids.yaw[i]), math.sin(solids.yaw[i])

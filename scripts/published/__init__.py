@@ -1,1 +1,1 @@
-"""Published results: figures with what made them (docs/how-to/results.md)."""
+"""Published results: figures with their provenance (docs/how-to/results.md)."""

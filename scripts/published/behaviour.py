@@ -1,15 +1,14 @@
-"""The behaviour fingerprint: does this version fly as that one did?
+"""Behaviour fingerprint: detects changes of the flight behaviour between versions.
 
-A small fixed set of flights, at level gym and in lockstep, and where each one was at stated times.
-What a change of the sources, of a package or of a shipped policy does to flights shows as a
-difference from samples that were written down earlier. The samples have a digest, and published
-results name it: the *behaviour* that they were flown with.
+A small fixed set of flights, at level gym and in lockstep, with their positions at stated times. A
+change of the sources, of a package or of a built-in policy appears as a difference from stored
+samples. Published results contain the digest of the samples: the *behaviour* of their flights.
 
-Processors differ in the last bits of what they compute. So the samples are not compared bit by
-bit, but within `TOLERANCES`: flights that agree within them have the behaviour of the stored
+Processors differ in the last bits of their results. Samples are therefore compared within
+`TOLERANCES`, not bit by bit: flights that agree within them have the behaviour of the stored
 samples. The flights are short and their policies choose among discrete actions or are classical,
 which keeps differences of last bits far below a millimetre; a network with continuous actions is
-followed for three seconds only.
+compared for three seconds only.
 """
 
 from __future__ import annotations
@@ -37,21 +36,21 @@ from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import PlannedEpisode
 
 SCHEMA = 1
-"""Version of the file of samples."""
+"""Version of the samples file."""
 
 ARENAS = ("no-obstacles", "static-obstacles", "dynamic-obstacles", "dense-obstacles", "crowded")
 LOCKSTEP_ARENAS = ("static-obstacles", "dynamic-obstacles")
 DISCRETE = "static-obstacles"
-"""A network that chooses among discrete actions."""
+"""Network that chooses among discrete actions."""
 
 POLICIES = ("greedy", DISCRETE)
-"""Classical, and a network."""
+"""Classical policy, and a network."""
 
 LATENCIES: Mapping[str, str | None] = {"native": None, "late": "lognormal:396ms,20ms"}
-"""As fast as a workstation, and as late as the paper's Raspberry Pi, drawn anew each time."""
+"""A workstation's latency, and the paper's Raspberry Pi's, drawn for each decision."""
 
 LOCKSTEP_LIMIT_S, GYM_LIMIT_S, CONTINUOUS_LIMIT_S = 8.0, 20.0, 3.0
-"""Longest flights; a flight that ends earlier is sampled to its end."""
+"""Maximum flight times; a shorter flight is sampled to its end."""
 
 GYM_SEEDS, LOCKSTEP_SEEDS = (1, 2, 3), (2,)
 
@@ -64,23 +63,23 @@ CONDITIONS: dict[str, Any] = {
     "spread": {"mass": 0.1, "thrust": 0.05, "drag": 0.1},
     "sensors": {"navigation_noise": 1.5, "depth_noise": 0.02},
 }
-"""Everything at once that changes an aircraft and its air."""
+"""All conditions of aircraft and air together."""
 
 _FLIGHT: dict[str, Any] = {"episodes": 1}
 
 SAMPLE_EVERY_US = 1_000_000
-"""Time between the stated times, from the start of navigation."""
+"""Sampling interval, from the start of navigation [µs]."""
 
 DECIMALS = 3
-"""Samples are written down to a millimetre and a millisecond."""
+"""Decimals of stored samples: a millimetre and a millisecond."""
 
 TOLERANCES = {"position_m": 0.01, "time_s": 0.021, "energy_share": 0.001}
-"""What still is the same behaviour: a centimetre at every stated time, one sample of a trajectory
-(20 ms) in the time that the flight took, a thousandth of its energy."""
+"""Tolerances of equal behaviour: a centimetre at every stated time, one trajectory sample (20 ms)
+in flight time, a thousandth of the energy."""
 
 
 class FlightSample(ProfileModel):
-    """What is written down of one flight."""
+    """Stored samples of one flight."""
 
     outcome: str = Field(description="how it ended, in the referee's word")
     time_s: float = Field(description="from the start of navigation to its end [s]")
@@ -91,32 +90,32 @@ class FlightSample(ProfileModel):
 
 
 class Behaviour(ProfileModel):
-    """How a version flies."""
+    """Flight behaviour of a version."""
 
     flights: dict[str, FlightSample] = Field(description="by level, arena, policy and latency")
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the samples, its first 16 hexadecimal digits: the fingerprint."""
+        """Fingerprint: the first 16 hexadecimal digits of their SHA-256."""
         plain = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(plain.encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
 class Difference:
-    """A flight that is not the one that was written down."""
+    """Flight that differs from the stored one."""
 
     flight: str
     what: str
-    """Of what, by how much, and what would have been the same."""
+    """Quantity, difference and tolerance."""
 
     def __str__(self) -> str:
-        """Return one line."""
+        """Return the difference in one line."""
         return f"{self.flight}: {self.what}"
 
 
 def scenarios() -> Iterator[tuple[str, Scenario]]:
-    """Yield the flights of the fingerprint: name and scenario of one episode each."""
+    """Yield the flights of the behaviour fingerprint: name and scenario of one episode each."""
     levels: tuple[tuple[LevelName, tuple[str, ...], tuple[int, ...], float], ...] = (
         ("gym", ARENAS, GYM_SEEDS, GYM_LIMIT_S),
         ("lockstep", LOCKSTEP_ARENAS, LOCKSTEP_SEEDS, LOCKSTEP_LIMIT_S),
@@ -143,7 +142,7 @@ def scenarios() -> Iterator[tuple[str, Scenario]]:
 
 
 def fly_behaviour(only: Sequence[str] = ()) -> Behaviour:
-    """Fly the flights of the fingerprint, or only some of them, by name."""
+    """Fly the flights of the behaviour fingerprint, or only some of them, by name."""
     flown: dict[str, Any] = {
         name: sample(_fly(scenario)) for name, scenario in scenarios() if not only or name in only
     }
@@ -155,13 +154,13 @@ def _fly(scenario: Scenario) -> FlownEpisode:
     if scenario.level == "lockstep":
         return fly(resolved, resolved.fresh_policy(scenario.seed), 0, scenario.seed)
     episodes = [PlannedEpisode(0, scenario.seed)]
-    # The twin leaves no logs: its flier does not look at the folder.
+    # The vectorized simulator writes no logs: its flier ignores the folder.
     (flown,) = GymFlier(resolved).start(RunFolder(Path()), lambda: False)(episodes)
     return flown
 
 
 def sample(flown: FlownEpisode) -> FlightSample:
-    """Return what is written down of a flight: from the start of navigation to the verdict."""
+    """Return the samples of a flight from the start of navigation to the verdict."""
     record, path = flown.record, flown.trajectory
     start_us = record.zero_us
     times_us = np.arange(start_us, record.ended_us + 1, SAMPLE_EVERY_US)
@@ -172,7 +171,7 @@ def sample(flown: FlownEpisode) -> FlightSample:
         time_s=round((record.ended_us - start_us) / US_PER_S, DECIMALS),
         energy_j=round(energy_j or 0.0, DECIMALS),
         positions=tuple(
-            # No -0.0: it would make another digest.
+            # Avoid -0.0, which would change the digest.
             (round(north, DECIMALS) + 0.0, round(east, DECIMALS) + 0.0, round(down, DECIMALS) + 0.0)
             for north, east, down in zip(*(column.tolist() for column in columns), strict=True)
         ),
@@ -180,7 +179,7 @@ def sample(flown: FlownEpisode) -> FlightSample:
 
 
 def differences(stored: Behaviour, flown: Behaviour) -> tuple[Difference, ...]:
-    """Return the flights that differ by more than the tolerances, in the order of the names."""
+    """Return the flights that differ by more than the tolerances, ordered by name."""
     found = []
     for name in sorted({*stored.flights, *flown.flights}):
         if name not in stored.flights or name not in flown.flights:
@@ -192,7 +191,7 @@ def differences(stored: Behaviour, flown: Behaviour) -> tuple[Difference, ...]:
 
 
 def _difference(stored: FlightSample, flown: FlightSample) -> str:
-    """Return what differs first in a flight; empty: nothing."""
+    """Return the first difference of a flight; empty without one."""
     a, b = np.array(stored.positions), np.array(flown.positions)
     n = min(len(a), len(b))
     away = np.linalg.norm(a[:n] - b[:n], axis=1)
@@ -213,7 +212,7 @@ def _difference(stored: FlightSample, flown: FlightSample) -> str:
 
 
 def read_behaviour(path: Path) -> Behaviour:
-    """Read the stored samples; UsageError if they are missing, damaged or misfit their digest."""
+    """Read the stored samples; UsageError if missing, damaged or with a wrong digest."""
     data = read_json(path, SCHEMA, "behaviour")
     found = validated(Behaviour, {"flights": data.get("flights")}, path)
     if data.get("digest") != found.digest:
@@ -222,6 +221,6 @@ def read_behaviour(path: Path) -> Behaviour:
 
 
 def write_behaviour(path: Path, behaviour: Behaviour) -> None:
-    """Write samples down, whole or not at all, with their digest."""
+    """Write samples atomically, with their digest."""
     data = {"schema": SCHEMA, "digest": behaviour.digest, **behaviour.model_dump(mode="json")}
     write_json(path, data)

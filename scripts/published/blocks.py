@@ -1,4 +1,4 @@
-"""The blocks of the pages: which results each shows, and how; the modules tables_* declare them."""
+"""Blocks of the pages: their results and renderers, declared by the modules tables_*."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ Records = Mapping[str, Record]
 Render = Callable[[Records], str]
 
 DEFAULT = "static-obstacles"
-"""The default policy, and the arena that it was trained in."""
+"""Default policy, and its training arena."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """What stands between two marks of a page."""
+    """Content between two marks of a page."""
 
     records: tuple[str, ...]
-    """Names of the results that it shows."""
+    """Names of the results in the block."""
     render: Render
-    """From those to Markdown."""
+    """Function from the results to Markdown."""
 
 
 BLOCKS: dict[str, Block] = {}
-"""By the name that the marks of a page give."""
+"""Blocks by name in the marks of a page."""
 
 
 def block(name: str, *records: str) -> Callable[[Render], Render]:
@@ -40,7 +40,7 @@ def block(name: str, *records: str) -> Callable[[Render], Render]:
 
 
 def block_of(name: str, records: Records) -> Block | None:
-    """Return a block of the pages; `printed-NAME` shows a result that is kept as printed."""
+    """Return a block of the pages; `printed-NAME` shows a result stored as a table."""
     if name in BLOCKS:
         return BLOCKS[name]
     result = name.removeprefix("printed-")

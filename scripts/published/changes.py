@@ -1,8 +1,8 @@
-"""Accepted changes of the flight behaviour, and which results they leave as they were.
+"""Accepted changes of the flight behaviour, and the results that they do not affect.
 
-A change that moves only flights among moving obstacles in lockstep says nothing against a table of
-flights among standing ones. `results/changes.toml` says of each change which levels and arenas it
-touches; `results.py fingerprint` shows the flights by which that was found.
+A change that only affects flights among moving obstacles in lockstep does not invalidate a table of
+flights among static ones. `results/changes.toml` lists the levels and arenas affected by each
+change; `results.py fingerprint` shows the differing flights.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ DIGEST = r"^[0-9a-f]{16}$"
 
 
 class Change(ProfileModel):
-    """From one fingerprint to the next, where what changed is known."""
+    """Change from one behaviour fingerprint to the next, with its effects."""
 
     before: str = Field(pattern=DIGEST, description="fingerprint of the code before")
     after: str = Field(pattern=DIGEST, description="fingerprint of the code with the change")
@@ -34,11 +34,11 @@ class Change(ProfileModel):
     )
 
     def touches(self, name: str, flown: Iterable[tuple[str, str]]) -> bool:
-        """Return whether a result may come out otherwise.
+        """Return True if a result may change.
 
         Args:
-            name: Of the result.
-            flown: Level and arena of each of its runs; none: only its table is kept.
+            name: Name of the result.
+            flown: Level and arena of each of its runs; empty: only its table is stored.
         """
         runs = list(flown)
         if not runs:
@@ -52,7 +52,7 @@ class _Changes(ProfileModel):
 
 @cache
 def read_changes(path: Path) -> Mapping[str, Change]:
-    """Return the accepted changes by the fingerprint before. Raises UsageError: damaged."""
+    """Return the accepted changes by the previous fingerprint. Raises UsageError if damaged."""
     return {each.before: each for each in validated(_Changes, read_toml(path), path).change}
 
 
@@ -63,13 +63,13 @@ def stands(
     name: str,
     flown: Iterable[tuple[str, str]],
 ) -> bool:
-    """Return whether a result would come out alike with today's code.
+    """Return True if a result would be equal with today's code.
 
     Args:
-        behaviour: Fingerprint that it was flown with; None: there was none.
-        today: That of today's code.
-        changes: All that were accepted, by the fingerprint before.
-        name: Of the result.
+        behaviour: Behaviour fingerprint of the result's flights; None: missing.
+        today: Behaviour fingerprint of today's code.
+        changes: All accepted changes, by the previous fingerprint.
+        name: Name of the result.
         flown: Level and arena of each of its runs.
     """
     runs, seen = list(flown), set()

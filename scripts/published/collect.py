@@ -1,4 +1,4 @@
-"""From the folder that a command left to a published result."""
+"""Conversion of a command's output folder to a published result."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ from published.record import (
 
 
 def collect(declared: Declared, out: Path, behaviour: str | None) -> Record:
-    """Return the result that lies in a folder.
+    """Return the result in a folder.
 
     Args:
-        declared: What it is.
-        out: Where its command has flown.
-        behaviour: Fingerprint of the flight behaviour of the code that flew it.
+        declared: Declaration of the result.
+        out: Output folder of its command.
+        behaviour: Behaviour fingerprint of the code that flew it.
 
     Raises:
-        UsageError: The folder does not hold it, or its flights are not all there.
+        UsageError: The folder does not contain it, or lacks flights.
     """
     match declared.kind:
         case "faults":
@@ -76,17 +76,17 @@ def collect(declared: Declared, out: Path, behaviour: str | None) -> Record:
 
 
 class _Table(NamedTuple):
-    """What a command leaves that is no comparison of runs."""
+    """Output of a command that is no comparison of runs."""
 
     printed: Printed
     made: Mapping[str, Any]
-    """With what (`core.provenance`)."""
+    """Provenance (`core.provenance`)."""
     policies: frozenset[str] = frozenset()
-    """Names of those that flew."""
+    """Names of the policies that flew."""
 
 
 def _fault_matrix(out: Path) -> _Table:
-    """Return a fault matrix, as the table that `airl faults` shows."""
+    """Return a fault matrix as the table of `airl faults`."""
     matrix = load(out / "faults.json")
     head, _, *rows = markdown(matrix.cells).strip().split("\n")
     columns, *cells = (
@@ -96,7 +96,7 @@ def _fault_matrix(out: Path) -> _Table:
 
 
 def _roofline(out: Path) -> _Table:
-    """Return the computers of a roofline, one a row."""
+    """Return the computers of a roofline, one per row."""
     path = out / ROOFLINE_FILE
     data = read_json(path, ROOFLINE_SCHEMA, "roofline")
     found = Roofline.model_validate({name: data[name] for name in Roofline.model_fields})
@@ -138,7 +138,7 @@ def _sweep(out: Path) -> _Table:
 
 
 def _table(out: Path) -> _Table:
-    """Return the table that a script has left."""
+    """Return the table written by a script."""
     saved = read_table(out)
     printed = Printed(columns=saved.columns, rows=saved.rows)
     return _Table(printed, saved.made, frozenset(saved.policies))
@@ -156,7 +156,7 @@ def _of_table(declared: Declared, found: _Table, behaviour: str | None) -> Recor
 def made_of(
     command: str, made: Mapping[str, Any], behaviour: str | None, policies: dict[str, str]
 ) -> Made:
-    """Return with what figures were made, from what `core.provenance` wrote down."""
+    """Return the provenance of figures, from the output of `core.provenance`."""
     git, versions = made["git"], dict(made["versions"])
     return Made(
         command=command,
@@ -174,10 +174,10 @@ def made_of(
 def made_by(
     command: str, infos: list[RunInfo], policies: AbstractSet[str], behaviour: str | None
 ) -> Made:
-    """Return with what runs were made: of one command, by one version, on one machine.
+    """Return the provenance of runs: of one command, by one version, on one machine.
 
     Raises:
-        UsageError: They are of different commits: not one version flew them.
+        UsageError: The runs are of different commits.
     """
     commits = {None if info.git is None else info.git["commit"] for info in infos}
     if len(commits) > 1:
@@ -187,7 +187,7 @@ def made_by(
 
 
 def _shipped(policies: AbstractSet[str]) -> dict[str, str]:
-    """Return the digests of those policies that are shipped, by name."""
+    """Return the digests of the built-in policies among the names."""
     shipped = shipped_policies()
     return {name: shipped[name] for name in sorted(policies) if name in shipped}
 
@@ -224,7 +224,7 @@ def _run(quality: Aggregate, info: RunInfo, t2_us: float | None) -> FlownRun:
 
 
 def _source(latency: str) -> str:
-    """Return a source of t2 as published: a run holds where a file of latencies lay."""
+    """Return a source of t2 for publication: a file without its folder."""
     path = Path(latency)
     return path.name if path.is_absolute() else latency
 

@@ -1,4 +1,4 @@
-"""Which figures of the pages do not come from results/*.json: `results/not-covered.toml`."""
+"""Figures of the pages that do not come from results/*.json: `results/not-covered.toml`."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ NOT_COVERED_FILE = RESULTS / "not-covered.toml"
 
 TABLE = re.compile(r"(?:^ *\|.*\n)+", re.M)
 FIGURE = re.compile(r"\**[-+−]?\d[\d,.]*\**\b")
-"""How a cell begins that holds a figure."""
+"""Start of a cell that contains a figure."""
 
 FEWEST_FIGURES = 2
-"""A table with so many cells of figures, the first column aside, is one of figures."""
+"""Minimum number of cells with figures, without the first column, in a table of figures."""
 
 
 class NotCovered(ProfileModel):
-    """A table or a sentence whose figures no result holds."""
+    """Table or sentence whose figures no result contains."""
 
     page: str = Field(description="path from the root")
     text: str = Field(description="the table's first line, or words of the sentence, as they stand")
@@ -43,12 +43,12 @@ def not_covered() -> tuple[NotCovered, ...]:
 
 
 def plain(text: str) -> str:
-    """Return a page without its blocks and line breaks: what a person wrote."""
+    """Return a page without its blocks and line breaks: the text written by hand."""
     return " ".join(MARKED.sub("", text).split())
 
 
 def tables_by_hand() -> Iterator[tuple[str, str]]:
-    """Yield page and first line of each table of figures that stands outside the blocks."""
+    """Yield page and first line of each table of figures outside the blocks."""
     for page in pages():
         for match in TABLE.finditer(MARKED.sub("", page.read_text(encoding="utf-8"))):
             head, _, *rows = match[0].strip().split("\n")
@@ -58,13 +58,13 @@ def tables_by_hand() -> Iterator[tuple[str, str]]:
 
 
 def unknown_tables() -> list[str]:
-    """Return the tables of figures that neither a result nor the check-list has."""
+    """Return the tables of figures absent from results and check-list."""
     listed = {(each.page, each.text) for each in not_covered()}
     return [f"{page}: {head}" for page, head in tables_by_hand() if (page, head) not in listed]
 
 
 def listed_in_vain() -> list[str]:
-    """Return the entries of the check-list that no page has any more."""
+    """Return the entries of the check-list that no page contains."""
     gone = []
     for each in not_covered():
         path = ROOT / each.page

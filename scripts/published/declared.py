@@ -1,4 +1,4 @@
-"""What is published: `results/results.toml`, one entry for each result."""
+"""Declarations of published results: `results/results.toml`, one entry for each."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Kind = Literal[
 
 
 class Declared(ProfileModel):
-    """A result: the command that flies it, and where its figures stand in what that leaves."""
+    """Declaration of a result: its command, and the location of its figures in the output."""
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", description="of results/<name>.json")
     what: str = Field(description="one line for people")
@@ -52,7 +52,7 @@ class Declared(ProfileModel):
 
 
 def read_declared(path: Path = DECLARED_FILE) -> dict[str, Declared]:
-    """Return what is published, by name, in its order. Raises UsageError."""
+    """Return the declared results, by name, in order. Raises UsageError."""
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, tomllib.TOMLDecodeError) as error:

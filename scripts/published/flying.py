@@ -1,4 +1,4 @@
-"""Flying again what is out of date. A killed run goes on: each command has a folder of its own."""
+"""Repetition of outdated results. A killed run resumes: each command has a separate folder."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from published.record import (
 )
 
 RUNS = ROOT / "runs" / "results"
-"""Where commands fly; every fingerprint has folders of its own, so that no run mixes two codes."""
+"""Root of output folders, separate for every fingerprint, so that no run mixes two codes."""
 
 
 def why_out_of_date(declared: Declared, folder: Path = RESULTS) -> str:
-    """Return why a result must be flown again; empty: it need not be. Raises UsageError."""
+    """Return the reason to repeat a result; empty: up to date. Raises UsageError."""
     if not file_of(declared.name, folder).exists():
         return "Not flown yet."
     record = read_record(declared.name, folder)
@@ -39,29 +39,29 @@ def why_out_of_date(declared: Declared, folder: Path = RESULTS) -> str:
 
 
 def behaviour_differs(path: Path) -> tuple[Difference, ...]:
-    """Fly the flights of the fingerprint and return those that are not as written down."""
+    """Fly the flights of the fingerprint and return the differences from the stored ones."""
     return differences(read_behaviour(path), fly_behaviour())
 
 
 def fly_result(declared: Declared, *, quick: bool) -> Path:
-    """Fly a result and write its file; return it.
+    """Fly a result and write its file; return the path.
 
     A quick one has few flights, is written beside its runs, and is never published.
 
     Raises:
-        UsageError: Its command failed, or left something else.
-        KeyboardInterrupt: Ctrl-C; what was flown is kept.
+        UsageError: Its command failed, or wrote other output.
+        KeyboardInterrupt: Ctrl-C; finished flights are kept.
     """
     out = RUNS / f"{declared.name}-{behaviour_today()}{'-quick' if quick else ''}"
     words = [*_program(declared.command), *(shlex.split(declared.quick) if quick else ())]
-    # The checkout's own package, whatever is installed.
+    # Use the checkout's package instead of an installed version.
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [*words, "--out", str(out)], cwd=ROOT, env=environment, check=False
     ).returncode
     if done == EXIT_INTERRUPTED:
         raise KeyboardInterrupt
-    # Flights that end otherwise than documented are a result, too: the table marks them.
+    # Flights with undocumented results are also a result: the table marks them.
     if done and not (declared.kind == "faults" and done == EXIT_NOT_MET):
         hint = f"; {out} may hold other code's flights" if done == EXIT_USAGE else ""
         raise UsageError(f"{declared.name}: {declared.command}: exit status {done}{hint}")
@@ -71,16 +71,16 @@ def fly_result(declared: Declared, *, quick: bool) -> Path:
 
 
 def take_result(declared: Declared, out: Path, behaviour: str | None, root: Path = ROOT) -> Path:
-    """Write the file of a result that lies in a folder, and its pictures; return the file.
+    """Write the file of a result from a folder, and its pictures; return the file.
 
     Args:
-        declared: What it is.
-        out: Where its command has flown.
-        behaviour: Fingerprint of the flight behaviour of the code that flew it.
-        root: Checkout whose results and pages these are.
+        declared: Declaration of the result.
+        out: Output folder of its command.
+        behaviour: Behaviour fingerprint of the code that flew it.
+        root: Checkout with the results and pages.
 
     Raises:
-        UsageError: The folder does not hold it, or its flights are not all there.
+        UsageError: The folder does not contain it, or lacks flights.
     """
     record = collect(declared, out, behaviour)
     for picture in declared.pictures:
@@ -92,7 +92,7 @@ def take_result(declared: Declared, out: Path, behaviour: str | None, root: Path
 
 
 def _program(command: str) -> Sequence[str]:
-    """Return a command as this interpreter runs it. Raises UsageError for another program."""
+    """Return a command for this interpreter. Raises UsageError for another program."""
     program, *rest = shlex.split(command)
     if program == "airl":
         return sys.executable, "-m", "airl_mav.cli.main", *rest

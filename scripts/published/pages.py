@@ -1,6 +1,6 @@
 """Pages and cards, written from the results.
 
-A page marks what is written into it:
+A page marks the generated parts:
 
     <!-- results: gap-short -->
     ...
@@ -32,7 +32,7 @@ ALONE = re.compile(r"^ *<!-- (?:results:|end of results)", re.M)
 POLICIES = ROOT / "profiles" / "policies"
 
 TABLES = (tables_gap, tables_levels, tables_policies, tables_response)
-"""Imported, they have declared their blocks."""
+"""Modules whose import declares their blocks."""
 
 
 def pages() -> list[Path]:
@@ -44,7 +44,7 @@ def rendered(text: str, records: dict[str, Record], page: object) -> str:
     """Return a page with its blocks written from the results.
 
     Raises:
-        UsageError: A block or a result that it shows does not exist; a mark has no end.
+        UsageError: A block lacks its declaration or a result; a mark has no end.
     """
 
     def write(match: re.Match[str]) -> str:
@@ -56,7 +56,7 @@ def rendered(text: str, records: dict[str, Record], page: object) -> str:
 
 
 def body(name: str, records: dict[str, Record], page: object) -> str:
-    """Return what stands between the marks of a block: the table, then what flew it."""
+    """Return the content of a block: the table, then its provenance."""
     found = block_of(name, records)
     if found is None:
         raise UsageError(f"{page}: results: {name}: no such block")
@@ -68,7 +68,7 @@ def body(name: str, records: dict[str, Record], page: object) -> str:
 
 
 def shown(records: dict[str, Record]) -> set[str]:
-    """Return the names of the results that a page or a card shows."""
+    """Return the names of the results on pages and cards."""
     names = {
         match["name"] for page in pages() for match in MARKED.finditer(page.read_text("utf-8"))
     }
@@ -81,7 +81,7 @@ def shown(records: dict[str, Record]) -> set[str]:
 
 
 def card_results(records: dict[str, Record]) -> dict[str, tuple[MeasuredResult, ...]]:
-    """Return what belongs on the cards, by policy: flights under its own rules, in any arena."""
+    """Return the results for the cards, by policy: flights under its rules, in any arena."""
     found: dict[str, dict[tuple[str, str, str], MeasuredResult]] = {}
     for entry in read_declared().values():
         if not entry.cards or entry.name not in records:
@@ -108,7 +108,7 @@ def _result(run: FlownRun, record: Record) -> MeasuredResult:
 
 
 def stale_cards(records: dict[str, Record]) -> Iterator[tuple[Path, tuple[MeasuredResult, ...]]]:
-    """Yield the folder of each policy whose card says something else, and what it should say."""
+    """Yield the folder and the correct results of each policy with an outdated card."""
     for name, results in card_results(records).items():
         if read_card(POLICIES / name).results != results:
             yield POLICIES / name, results
@@ -118,7 +118,7 @@ def stale_cards(records: dict[str, Record]) -> Iterator[tuple[Path, tuple[Measur
 
 
 def write_all(records: dict[str, Record]) -> list[Path]:
-    """Write pages and cards anew where they differ; return those. Raises UsageError."""
+    """Write pages and cards that differ; return their paths. Raises UsageError."""
     written = []
     for page in pages():
         text = page.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A published result: its figures, and with what code, when and where they were flown."""
+"""Published result: its figures, and their provenance."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from published.changes import read_changes, stands
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "results"
 BEHAVIOUR_FILE = RESULTS / "behaviour.json"
-"""The samples that today's code flies; `results.py fingerprint` holds them against it."""
+"""Samples of today's code; `results.py fingerprint` compares against them."""
 
 CHANGES_FILE = RESULTS / "changes.toml"
-"""What the changes from earlier fingerprints to that of today touch."""
+"""Effects of the changes from earlier behaviour fingerprintes to today's."""
 
 SCHEMA = 1
 
@@ -29,7 +29,7 @@ MEASURES = ("success_rate", "flight_time_s", "distance_m", "energy_j")
 
 
 class Figure(ProfileModel):
-    """A figure with its 95 % interval."""
+    """Figure with its 95 % interval."""
 
     value: float | None = Field(description="None: nothing to work it out from")
     low: float | None = None
@@ -38,7 +38,7 @@ class Figure(ProfileModel):
 
     @classmethod
     def of(cls, estimate: Estimate) -> Figure:
-        """Return an estimate, in numbers of a length that a person can read."""
+        """Return an estimate, in numbers of readable length."""
         value, low, high = (
             None if each is None else float(f"{each:.7g}")
             for each in (estimate.value, estimate.low, estimate.high)
@@ -47,7 +47,7 @@ class Figure(ProfileModel):
 
 
 class FlownRun(ProfileModel):
-    """A policy's flights under one set of conditions."""
+    """Flights of a policy under one set of conditions."""
 
     policy: str
     arena: str
@@ -62,7 +62,7 @@ class FlownRun(ProfileModel):
 
 
 class Gap(ProfileModel):
-    """A run against a reference, over pairs of flights of the same seed."""
+    """Comparison of a run with a reference, over pairs of flights of the same seed."""
 
     target: str = Field(description="name of the run")
     reference: str
@@ -75,7 +75,7 @@ class Gap(ProfileModel):
 
 
 class Printed(ProfileModel):
-    """A table as it was printed: what is behind it is not kept, or no run of a policy."""
+    """Table as printed: its data are not stored, or are no run of a policy."""
 
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -88,7 +88,7 @@ class Printed(ProfileModel):
 
 
 class Made(ProfileModel):
-    """With what figures were made."""
+    """Provenance of figures."""
 
     command: str = Field(description="as a person types it")
     date: str = Field(pattern=r"^\d{4}-\d{2}-\d{2}$", description="when it was flown, UTC")
@@ -106,7 +106,7 @@ class Made(ProfileModel):
 
 
 class Record(ProfileModel):
-    """All of a result."""
+    """Complete record of a result."""
 
     name: str
     what: str = Field(description="one line for people")
@@ -117,12 +117,12 @@ class Record(ProfileModel):
 
 
 def file_of(name: str, folder: Path = RESULTS) -> Path:
-    """Return where a result lies."""
+    """Return the file of a result."""
     return folder / f"{name}.json"
 
 
 def read_record(name: str, folder: Path = RESULTS) -> Record:
-    """Read a result. Raises UsageError: it is missing or damaged."""
+    """Read a result. Raises UsageError if missing or damaged."""
     path = file_of(name, folder)
     data = read_json(path, SCHEMA, "result")
     del data["schema"]
@@ -130,7 +130,7 @@ def read_record(name: str, folder: Path = RESULTS) -> Record:
 
 
 def write_record(record: Record, folder: Path = RESULTS) -> Path:
-    """Write a result, whole or not at all; return its path."""
+    """Write a result atomically; return its path."""
     path = file_of(record.name, folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_json(path, {"schema": SCHEMA, **record.model_dump(mode="json")})
@@ -145,19 +145,19 @@ def all_records(folder: Path = RESULTS) -> dict[str, Record]:
 
 @cache
 def behaviour_today() -> str:
-    """Return the fingerprint that today's code is held to. Raises UsageError."""
+    """Return the behaviour fingerprint of today's code. Raises UsageError."""
     return read_behaviour(BEHAVIOUR_FILE).digest
 
 
 @cache
 def shipped_policies() -> Mapping[str, str]:
-    """Return the SHA-256 of every shipped policy's file, by name."""
+    """Return the SHA-256 of every built-in policy's file, by name."""
     known = {name: find_policy(name).sha256 for name in policy_names() if name not in POLICIES}
     return {name: sha256 for name, sha256 in known.items() if sha256 is not None}
 
 
 def out_of_date(record: Record) -> str:
-    """Return why figures are not those of today's code, as a sentence; empty: they are."""
+    """Return a sentence on why figures are outdated; empty: up to date."""
     made, runs = record.made, [(run.level, run.arena) for run in record.runs.values()]
     flown = f"Flown on {made.date} with version {made.version}"
     changes = read_changes(CHANGES_FILE)

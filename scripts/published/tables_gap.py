@@ -116,7 +116,7 @@ def _mitigation_paper() -> PublishedTable:
 
 
 def _told(target: str, reference: str) -> tuple[str, ...]:
-    """Return a gap of the paper: as printed where it prints one, else from its columns (◦)."""
+    """Return a gap of the paper: as printed, or calculated from its columns (◦)."""
     paper = _mitigation_paper()
     worked_out = published_gap(paper.columns[reference], paper.columns[target])
     own = [getattr(worked_out, field) for field in _GAP_FIELDS]
@@ -132,7 +132,7 @@ def _told(target: str, reference: str) -> tuple[str, ...]:
 
 _GAP_FIELDS = ("success", "flight_time_percent", "distance_percent", "energy_percent")
 SAME_PERCENT = 0.05
-"""Gaps closer than this [%] are the same as printed."""
+"""Maximum difference of gaps [%] that count as equal to the printed ones."""
 
 
 @block("gap-lockstep", "gap-lockstep")
@@ -219,7 +219,7 @@ def _system(arena: str) -> Render:
         record = records["system"]
         runs = [record.runs[f"{arena}-{role}"] for role in ("reference", "target")]
         gap = _gap(record, "target", "reference", arena)
-        # The table of a network; the other one of its arena is of mitigation.
+        # Select the table of a network; the other table of its arena is of mitigation.
         told = next(t for t in load_published().tables if t.arena == arena and t.policy)
         paper, printed = told.columns, told.printed["target"]
         a, b = paper["reference"], paper["target"]

@@ -64,7 +64,7 @@ def sitl(records: Records) -> str:
 
 
 _PREDICTED = {"`static-obstacles`": "predicted"}
-"""Results with flights that were predicted from a file of latencies, by what flew."""
+"""Results with flights predicted from a file of latencies, by policy."""
 
 
 @block("predicted", *_PREDICTED.values())
@@ -137,7 +137,7 @@ def _levels(parts: tuple[tuple[str, Record], ...], target_level: str = "lockstep
                 )
             )
             if field == "flight_time_s":
-                # One long flight can make a mean.
+                # One long flight can dominate a mean.
                 median = gap.median_flight_time
                 change = f"{number(median, 1, '+')} %"
                 rows.append(("its median by pairs", NONE, NONE, change, interval_cell(median)))

@@ -1,4 +1,4 @@
-"""Tables of the shipped policies, in their own arenas and in others."""
+"""Tables of the built-in policies, in their training arenas and in others."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from published.blocks import Records, block
 from published.record import FlownRun
 from published.text import NONE, energy_kj, number, rate, table
 
-# --- the shipped policies
+# --- the built-in policies
 
 SHIPPED: dict[str, tuple[str, str]] = {
     "static-obstacles": ("generalisation", "static-obstacles-static-obstacles"),
@@ -34,10 +34,10 @@ SHIPPED: dict[str, tuple[str, str]] = {
     "body-rates-120ms": ("body-rates-gap", "no-obstacles-mitigated"),
     "body-rates-hall": ("body-rates-hall", "run"),
 }
-"""Where the flights of each policy stand: in its own arena, as late as in its training."""
+"""Results of each policy in its training arena, at its training latency."""
 
 RECORDS = tuple(dict.fromkeys(record for record, _ in SHIPPED.values()))
-"""The records that they are in."""
+"""Records of these results."""
 
 _MAKERS = {"dqn": "double DQN", "ppo": "PPO", "dagger": "DAgger"}
 _ACTIONS = {
@@ -128,17 +128,17 @@ def park(records: Records) -> str:
     return table(("policy", "success", "flight time"), rows)
 
 
-# --- without one of its inputs
+# --- without one input
 
 _ZEROED = ("none", "velocity", "goal", "depth")
-"""Runs of the ablation, by what is made zero; the paper's word for the goal is position."""
+"""Runs of the ablation, by zeroed input; the paper calls the goal "position"."""
 
 _LAYOUTS = {
     "no-obstacles": "paper-layout-no-obstacles",
     "static-obstacles": "paper-layout",
     "dynamic-obstacles": "paper-layout-dynamic-obstacles",
 }
-"""The policies of the paper's layout, by arena; those of ours have the arena's name."""
+"""Policies with the paper's layout, by arena; policies with our layout have the arena's name."""
 
 
 @block("ablation", "ablation")
@@ -161,7 +161,7 @@ def _told(success_percent: float | None) -> str:
     return NONE if success_percent is None else f"{success_percent:g}"
 
 
-# --- goals farther off than any that was learned
+# --- goals beyond the training distance
 
 
 @block("held-out-zone", "held-out-zone")

@@ -1,4 +1,4 @@
-"""The table of what lies between a velocity setpoint and the velocity."""
+"""Table of the stages between a velocity setpoint and the velocity."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from published.blocks import Records, block
 from published.text import NONE, table
 
 STEP_M_S, MOVED_M_S = 2.0, 0.05
-"""What is flown, and what counts as a reaction (`scripts/response_taken_apart.py`)."""
+"""Step size, and reaction threshold (`scripts/response_taken_apart.py`)."""
 
 
 @block("setpoint-response", "response-taken-apart")
 def setpoint_response(records: Records) -> str:
-    """Return the stages of our own vehicle, then what PX4 and the fitted model make of the same."""
+    """Return the stages of the built-in vehicle, then PX4's and the fitted model's."""
     flown = records["response-taken-apart"].printed
     assert flown is not None
     rows = [[f"built-in: {stage}", *cells] for stage, *cells in flown.rows]
@@ -35,7 +35,7 @@ def setpoint_response(records: Records) -> str:
 
 
 def _modelled_s(share: float) -> float:
-    """Return when the first-order model of the quad has covered a share of a step [s]."""
+    """Return the time at which the quad's first-order model has covered a share of a step [s]."""
     model = load_vehicle("quad").response
     assert model is not None
     return model.dead_time_s - model.velocity_time_s * math.log(1.0 - share)

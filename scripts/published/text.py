@@ -1,4 +1,4 @@
-"""Figures as text, as the pages print them."""
+"""Figures as text in the format of the pages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NONE = "–"
 
 
 def interval(figure: Figure, digits: int, sign: str = "", scale: float = 1.0) -> str:
-    """Return a figure's interval in brackets, after a space; empty where it has none."""
+    """Return a figure's interval in brackets, after a space; empty without one."""
     if figure.low is None or figure.high is None:
         return ""
     low, high = (_rounded(scale * end, digits, sign) for end in (figure.low, figure.high))
@@ -20,7 +20,7 @@ def interval(figure: Figure, digits: int, sign: str = "", scale: float = 1.0) ->
 
 
 def interval_cell(figure: Figure) -> str:
-    """Return an interval in a cell of its own."""
+    """Return an interval for a separate cell."""
     if figure.low is None or figure.high is None:
         return NONE
     return f"{figure.low:+.1f} … {figure.high:+.1f}"
@@ -37,7 +37,7 @@ def both(figure: Figure, digits: int, sign: str = "", scale: float = 1.0) -> str
 
 
 def rate(run: FlownRun) -> str:
-    """Return a success rate in percent; every rate is printed with its interval."""
+    """Return a success rate with its interval, in percent."""
     return both(run.success_rate, 1, scale=100.0)
 
 
@@ -52,20 +52,20 @@ def energy_kj(run: FlownRun) -> str:
 
 
 def change(target: PublishedRun, reference: PublishedRun, field: str) -> float:
-    """Return by how much a figure of the paper differs [%]."""
+    """Return the relative difference of a figure of the paper [%]."""
     first, second = getattr(reference, field), getattr(target, field)
     return float(100.0 * (second - first) / first)
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -> str:
-    """Return a table as Markdown; the last `numbers` columns are set right."""
+    """Return a table as Markdown; the last `numbers` columns are right-aligned."""
     rules = ["---"] * (len(columns) - numbers) + ["---:"] * numbers
     lines = [columns, rules, *rows]
     return "\n".join(re.sub(" +", " ", f"| {' | '.join(line)} |") for line in lines)
 
 
 def made_line(record: Record) -> str:
-    """Return the line under a table: what flew it, and whether today's code would fly it so."""
+    """Return the line under a table: its provenance, with a note if outdated."""
     made = record.made
     commit = f"commit {made.commit[:7]}" if made.commit else f"version {made.version}"
     line = f"`{made.command}` · {made.date}, {commit}, {made.cpu} · `results/{record.name}.json`"
@@ -74,5 +74,5 @@ def made_line(record: Record) -> str:
 
 
 def _rounded(value: float, digits: int, sign: str) -> str:
-    """Return a number in decimals; what was rounded to zero keeps its sign."""
+    """Return a number in decimals; rounding to zero keeps the sign."""
     return f"{value:{sign},.{digits}f}"

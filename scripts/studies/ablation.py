@@ -1,11 +1,11 @@
-"""Sensor ablation: which of its inputs does a policy need?
+"""Sensor ablation: a policy's need for each of its inputs.
 
     python scripts/studies/ablation.py [--quick] [--episodes N] [--out DIR] [--config FILE]
 
-The paper (V.D) makes depth, velocity and position zero, one by one and without training again. This
-does the same with policies of our `body` layout and of the paper's own, each in the arena that it
-was trained in: one comparison for each, in a folder of its own. No policy of the paper's layout is
-shipped: those are trained first, about two minutes each on one core, which needs the train extra.
+The paper (V.D) sets depth, velocity and position to zero, one by one and without new training. This
+study does the same with policies of our `body` layout and of the paper's layout, each in its
+training arena: one comparison for each, in a separate folder. No policy of the paper's layout is
+built in: those are trained first, about two minutes each on one core, which needs the train extra.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from airl_mav.scenario.model import Scenario
 OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)
 
 INPUTS = {"none": "all inputs", "velocity": "no velocity", "goal": "no goal", "depth": "no depth"}
-"""What is made zero, and how its run is called; the paper's word for the goal: position."""
+"""Zeroed inputs and the names of their runs; the paper calls the goal "position"."""
 
 
 class PolicyConfig(ProfileModel):

@@ -1,7 +1,8 @@
-"""What the studies share: options, configuration, training, flights to one goal.
+"""Shared parts of the studies: options, configuration, training, flights to one goal.
 
-A configuration is a scenario as TOML with the study's own fields; `[quick]` holds what --quick
-changes. Every run folder lies below --out, and the same --out goes on with what was interrupted.
+A configuration is a scenario as TOML with additional fields of the study; `[quick]` contains the
+changes of --quick. Every run folder is below --out, and the same --out resumes an interrupted
+study.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ Declare = Callable[[Scenario], Experiment]
 
 @contextmanager
 def study(options: StudyOptions, model: type[Config], script: str) -> Iterator[tuple[Config, Path]]:
-    """Give the configuration and the folder; errors of fields name the configuration's file."""
+    """Yield the configuration and the folder; field errors name the configuration's file."""
     path = options.config or Path(script).with_suffix(".toml")
     data = read_scenario_file(path)
     data |= validated(model, data, path).quick if options.quick else {}
@@ -71,7 +72,7 @@ def study(options: StudyOptions, model: type[Config], script: str) -> Iterator[t
 def find_or_train(
     policy: str, root: Path, console: Console, training: str | None = None, steps: int | None = None
 ) -> str:
-    """Return a policy that is there, or train it below `root`; a killed training goes on."""
+    """Return an existing policy, or train it below `root`; a killed training resumes."""
     try:
         find_policy(policy)
         return policy
@@ -91,7 +92,7 @@ def find_or_train(
 def fly(
     declare: Declare, scenario: Scenario, one_goal: OneGoal | None, root: Path, console: Console
 ) -> int:
-    """Fly an experiment, then the same to one goal; return the exit status of both."""
+    """Fly an experiment, then repeat it to one goal; return the exit status of both."""
     code, _ = fly_and_show(declare(scenario), root, console)
     if code or one_goal is None:
         return code
@@ -107,7 +108,7 @@ def fly(
 
 
 def aside(path: Trajectory, episode: EpisodeRecord) -> float:
-    """Return the greatest distance of a path from the line through start and goal [m]."""
+    """Return the maximum distance of a path from the line through start and goal [m]."""
     start_us = episode.zero_us
     north, east = np.array(episode.goal) / np.linalg.norm(episode.goal)
     position = path.between(start_us, episode.ended_us).position

@@ -1,10 +1,10 @@
-"""Compensation: what do errors of its model cost?
+"""Compensation: cost of errors in its model.
 
     python scripts/studies/compensation.py [--quick] [--episodes N] [--out DIR] [--config FILE]
 
-A policy flies undelayed, late, and late with its latency compensated: as the vehicle's profile
-says, and with a response, an expected latency and a number of images that are wrong or others. All
-on the same seeds, at level gym. Prints a table, and leaves it as compensation.md and table.json.
+A policy flies undelayed, delayed, and delayed with latency compensation: with the vehicle profile's
+values, and with a wrong response, expected latency or number of images. All use the same seeds, at
+level gym. Prints a table, and writes it as compensation.md and table.json.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ from airl_mav.scenario.resolve import resolve
 OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)
 
 FACTORS = (0.5, 0.75, 1.5, 2.0)
-"""Of each part of the response."""
+"""Factors of each part of the response."""
 
 LATENCIES = (0.5, 0.75, 1.25, 1.5)
-"""Of the latency that is expected."""
+"""Factors of the expected latency."""
 
 IMAGES = (1, 2, 8)
-"""How many are remembered; 4 by default."""
+"""Numbers of stored images; the default is 4."""
 
 QUANTILE = 0.9
-"""Of the newest latencies, expected in place of their mean."""
+"""Quantile of recent latencies, expected in place of their mean."""
 
 SLOTS = 256
 
@@ -65,7 +65,7 @@ class CompensationConfig(StudyConfig):
 
 
 class Scaled(ExpectedLatency):
-    """Expects a latency that is wrong by a factor."""
+    """Expected latency with a wrong factor."""
 
     def __init__(self, n: int, factor: float) -> None:
         super().__init__(n)
@@ -77,7 +77,7 @@ class Scaled(ExpectedLatency):
 
 
 class Quantile(ExpectedLatency):
-    """Expects a quantile of the newest latencies."""
+    """Expected latency as a quantile of recent latencies."""
 
     def expected_us(self) -> NDArray[np.int64]:
         newest = np.ma.masked_array(
@@ -90,13 +90,13 @@ class Quantile(ExpectedLatency):
 
 
 class Case(NamedTuple):
-    """One row of the table."""
+    """Row of the table."""
 
     what: str
     latency: str
     compensate: bool = True
     vehicle: Callable[[VehicleProfile], VehicleProfile] = lambda vehicle: vehicle
-    """Changes the response that compensation reckons with; it flies as ever."""
+    """Function that changes the compensation's response model; the flown vehicle is unchanged."""
     expected: Callable[[int], ExpectedLatency] = ExpectedLatency
     images: int = 4
 
@@ -111,7 +111,7 @@ def with_response(vehicle: VehicleProfile, name: str, factor: float) -> VehicleP
 
 
 def cases(late: str, spread: str) -> Iterator[Case]:
-    """Give the rows of the table below the reference."""
+    """Yield the rows of the table below the reference."""
     yield Case("not compensated", late, compensate=False)
     yield Case("compensated", late)
     parts = {
@@ -181,7 +181,7 @@ def run(options: StudyOptions, console: Console | None = None) -> int:
         ]
         reference: dict[int, EpisodeResult] = {}
         rows = []
-        # The commit that flies: another may be checked out before it has flown.
+        # Commit at the start: another may be checked out before the end.
         made = provenance(shlex.join(["python", *sys.argv]))
         shown = new_console(stderr=True)
         for case in track(planned, "flying", console=shown, disable=not shown.is_terminal):

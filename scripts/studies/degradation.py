@@ -1,10 +1,10 @@
-"""Degradation: what latency that is added to every decision costs a policy.
+"""Degradation: cost of latency added to every decision of a policy.
 
     python scripts/studies/degradation.py [--quick] [--episodes N] [--out DIR] [--config FILE]
 
 The paper (VI.C) slows its Static Obstacles policy on a Core i9 by sleep, to 150 and 300 ms, and
-draws its trajectories with a fixed goal. This flies policies at growing latencies on the same
-seeds, shows whether every step costs more, and flies the same again to one goal.
+draws its trajectories with a fixed goal. This study flies policies at growing latencies on the same
+seeds, shows the cost of every step, and repeats the flights to one goal.
 """
 
 from __future__ import annotations

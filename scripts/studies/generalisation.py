@@ -1,10 +1,10 @@
-"""Generalisation: does a policy fly well in arenas that it was not trained in?
+"""Generalisation: flight quality of a policy outside its training arena.
 
     python scripts/studies/generalisation.py [--quick] [--episodes N] [--out DIR] [--config FILE]
 
-The paper (V.C) flies its policies of No and of Dynamic Obstacles in its three arenas. This flies
-policies in all arenas on the same seeds, and prints what each loses or gains away from the arena
-that it was trained in, beside the paper's figures.
+The paper (V.C) flies its policies of No and of Dynamic Obstacles in its three arenas. This study
+flies policies in all arenas on the same seeds, and prints each policy's change from its training
+arena, beside the paper's figures.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class GeneralisationConfig(StudyConfig):
 
 
 def away_from_home(flown: ExperimentRun) -> TableView:
-    """Return the success of every policy against that in its own arena, the paper's below it."""
+    """Return the success of every policy against its training arena, with the paper's below."""
     at = {(run.cell.label, run.cell.group): run.episodes for run in flown.cells}
     homes = {run.cell.label: entry_of(run.cell, "").trained_in for run in flown.cells}
     arenas = tuple(dict.fromkeys(arena for _, arena in at))

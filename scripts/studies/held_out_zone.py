@@ -1,11 +1,11 @@
-"""The held-out zone: does a policy reach goals farther off than any it was trained for?
+"""Held-out zone: a policy's success at goals beyond its training distance.
 
     python scripts/studies/held_out_zone.py [--quick] [--episodes N] [--out DIR] [--config FILE]
 
 The paper trains to its Zone 2 and evaluates in Zone 3, "the region not used during training". Here
-a policy learns with goals within a radius, and is flown to goals within and beyond it, beside the
-one that learned with goals everywhere. The first is trained by the study, by the other's training
-configuration, which takes about two minutes on one core and needs the train extra.
+a policy trains with goals within a radius, and flies to goals within and beyond it, beside a policy
+trained with goals everywhere. The study trains the first with the other's training configuration,
+about two minutes on one core, which needs the train extra.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def write_toml(path: Path, content: dict[str, Any]) -> str:
 
 
 def zones(config: HeldOutConfig, root: Path) -> dict[str, str]:
-    """Write the arena of the configuration with its goals within and beyond the radius."""
+    """Write the configured arena with its goals within and beyond the radius."""
     spec = load_profile("arenas", config.arena, ArenaSpec)
     plain = spec.model_dump(mode="json", exclude_none=True)
     within = plain | {"zones_m": [config.radius_m]}

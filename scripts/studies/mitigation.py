@@ -1,11 +1,11 @@
-"""Mitigation: a policy that was trained as late as the onboard computer decides.
+"""Mitigation: a policy trained with the onboard computer's latency.
 
     python scripts/studies/mitigation.py [--quick] [--episodes N] [--out DIR] [--config FILE]
 
 The paper (VII.B) trains its Static Obstacles policy with the latency of a Raspberry Pi 4 and
-compares it there with one that knew no latency. This measures the hardware gap without and with
-mitigation, against both of the possible references, and flies the same again to one goal. Policies
-that are not there are trained first, by the training configurations of their names.
+compares it there with a policy trained without latency. This study measures the hardware gap
+without and with mitigation, against both references, and repeats the flights to one goal. Missing
+policies are trained first, by the training configurations of their names.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""Policy size and latency: how long a decision of each network of the template grid takes here.
+"""Policy size and latency: decision time of each network of the template grid on this machine.
 
     python scripts/studies/policy_size.py [--runs N] [--quick] [--threads N] [--out DIR]
 
 The paper's appendix C (Fig. 16): randomly initialised networks of L convolutions x F filters, each
-timed on ONNX Runtime on the machine that this runs on. It shows whether latency grows with size,
-and how well multiply-accumulates predict it, which is what `--workload estimate` rests on.
+timed on ONNX Runtime on this machine. The study shows whether latency grows with size, and the
+accuracy of a prediction from multiply-accumulates, the basis of `--workload estimate`.
 
-Each network leaves one file, cells/<layers>x<filters>.json: started again with the same --out, the
-study goes on with those that are missing, or that have fewer runs than asked for. The result is
-policy-size.json, .md and .png; all of it is written again as each network ends.
+Each network has one file, cells/<layers>x<filters>.json: with the same --out, the study resumes
+with missing networks, and with networks of too few runs. The result is policy-size.json, .md and
+.png, updated after each network.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ SCHEMA = 1
 DEFAULT = Path(__file__).with_suffix(".toml")
 FITTED = {"p50_ms": "p50", "processor_p50_ms": "processor time, p50,"}
 WARM_UP = 10
-"""Inferences before those that count."""
+"""Inferences before the timed ones."""
 QUICK_RUNS = 70
-"""Enough for a p90."""
+"""Sufficient for a p90."""
 DISTURBED = 0.95
-"""Share of a core below which the machine had other things to do [1]."""
+"""Minimum share of a core on an undisturbed machine [1]."""
 
 
 class StudyConfig(ProfileModel):
-    """Which networks, how often."""
+    """Networks of the study, and number of runs."""
 
     description: str = Field(description="one line for people")
     layers: Annotated[tuple[int, ...], Each(1, 16, ascending=True)] = quantity("layers", "1")
@@ -90,7 +90,7 @@ OPTIONS = StudyOptions
 
 @dataclass(frozen=True)
 class Timed:
-    """One network as it was timed."""
+    """Timing of one network."""
 
     layers: int
     filters: int
@@ -102,13 +102,13 @@ class Timed:
     p50_ms: float
     p90_ms: float | None
     p99_ms: float | None
-    """None: too few runs, as everywhere (latency.percentiles)."""
+    """Percentiles; None: too few runs, as everywhere (latency.percentiles)."""
     min_ms: float
     max_ms: float
     processor_p50_ms: float
     """Median processor time of an inference, all threads: without the machine's other work."""
     core_share: float
-    """Processor time by wall time and thread: near 1 when nothing else wanted the cores."""
+    """Processor time by wall time and thread: near 1 on an undisturbed machine."""
 
     @property
     def network(self) -> str:
@@ -133,7 +133,7 @@ def study(options: StudyOptions, config: StudyConfig, console: Console) -> None:
     runs = QUICK_RUNS if options.quick else options.runs or config.runs
     cells = options.out / "cells"
     cells.mkdir(parents=True, exist_ok=True)
-    # Small ones first: something is there early, and what takes long comes last.
+    # Small ones first, for early results; long ones last.
     grid = sorted(
         ((layers, filters) for layers in config.layers for filters in config.filters),
         key=lambda cell: size_of(config, *cell).macs,
@@ -170,7 +170,7 @@ def size_of(config: StudyConfig, layers: int, filters: int) -> Size:
 
 
 def time_network(config: StudyConfig, layers: int, filters: int, runs: int, threads: int) -> Timed:
-    """Time a network: warm-up left out, a new image for each inference."""
+    """Time a network without warm-up, with a new image for each inference."""
     rng = np.random.default_rng([config.seed, layers, filters])
     model = build_template(layers, filters, config.observation, config.actions, rng)
     runtime = OnnxRuntime(model, config.observation, config.actions, threads)
@@ -234,7 +234,7 @@ def shared(config: StudyConfig) -> dict[str, Any]:
 
 
 def read(folder: Path, cell: tuple[int, int], config: StudyConfig, threads: int) -> Timed | None:
-    """Return what a network was timed to. Raises UsageError when it was another, or elsewhere."""
+    """Return the timing of a network. Raises UsageError for another network or machine."""
     path = folder / f"{cell[0]}x{cell[1]}.json"
     if not path.exists():
         return None
@@ -250,7 +250,7 @@ def write(path: Path, data: dict[str, Any]) -> None:
     replace_file(path, (json.dumps(data, indent=2, allow_nan=False) + "\n").encode())
 
 
-# --- what it shows
+# --- results
 
 
 def told(t: Timed) -> str:

@@ -1,10 +1,10 @@
-"""Quantisation: does a policy in 8-bit integers fly as it does in floats?
+"""Quantisation: comparison of a policy in 8-bit integers and in floats.
 
     python scripts/studies/quantisation.py [--quick] [--episodes N] [--out DIR] [--config FILE]
 
-Each policy is exported with `airl export --int8` into the study's folder and flown beside the one
-in floats, in the arena that it was trained in, on the same seeds and equally late: one comparison
-for each, in a folder of its own. How much sooner it decides on a computer, `airl profile` says.
+Each policy is exported with `airl export --int8` into the study's folder and flown beside the float
+policy, in its training arena, on the same seeds and with the same latency: one comparison for each,
+in a separate folder. `airl profile` measures the speed-up on a computer.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How well the size of a network predicts how long it takes."""
+"""Fit of network latency by network size."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ Grid = tuple[int, int]
 
 @dataclass(frozen=True)
 class Fit:
-    """What multiply-accumulates (MACs) say of a time."""
+    """Fit of times by multiply-accumulates (MACs)."""
 
     n: int
     """Number of networks."""
     intercept_ms: float
     ms_per_gmac: float
     r_squared: float
-    """Of the straight line through all networks (least squares)."""
+    """R² of the straight line through all networks (least squares)."""
     estimate_error_median: float
-    """Of the rule `--workload estimate`, each network from the other one nearest in MACs: absolute
-    error as a share."""
+    """Median error of `--workload estimate`, each network from the other one nearest in MACs:
+    absolute error as a share."""
     estimate_error_worst: float
     parameters_r_squared: float
-    """Of the line through the numbers of parameters instead."""
+    """R² of the line through the numbers of parameters."""
     both_r_squared: float
-    """Of the plane through MACs and parameters: a weight that is used once must still be read."""
+    """R² of the plane through MACs and parameters: a weight used once must still be read."""
     grows: float
-    """Share of the pairs of neighbours on the grid of which the larger network is the slower."""
+    """Share of neighbour pairs on the grid in which the larger network is slower."""
 
 
 def fit_times(sizes: Mapping[Grid, Size], times_ms: Mapping[Grid, float]) -> Fit | None:

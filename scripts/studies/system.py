@@ -3,9 +3,9 @@
     python scripts/studies/system.py [--quick] [--episodes N] [--out DIR] [--config FILE]
 
 The paper (VI.B) flies the best policy of each of three arenas on a Core i9 and on a Raspberry Pi 4,
-and draws trajectories with a fixed goal. This flies our policy of each arena on the same seeds, as
-late as the paper's best network of that arena was on both computers, shows the hardware gap of each
-arena beside the paper's, and flies the same again to one goal.
+and draws trajectories with a fixed goal. This study flies our policy of each arena on the same
+seeds, with the latency of the paper's best network of that arena on both computers, shows the
+hardware gap of each arena beside the paper's, and repeats the flights to one goal.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def declare(scenario: Scenario, config: SystemConfig) -> Experiment:
     """Declare the hardware gap of every arena as one experiment."""
     gaps = [
         declare_gap(
-            # The paper compensates nothing.
+            # The paper does not compensate latency.
             scenario.model_copy(update=each.model_dump() | {"compensate": False}),
             mitigated=NOT_MITIGATED,
             reference=config.reference,

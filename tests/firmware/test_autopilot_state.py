@@ -121,7 +121,7 @@ def test_a_value_is_stored_as_one_fact() -> None:
     stored = parameters.by_name("MPC_XY_CRUISE")
     assert stored is not None
     assert stored.value == 1e9
-    assert parameters.value("MPC_XY_CRUISE") < 1e9  # what is flown
+    assert parameters.value("MPC_XY_CRUISE") < 1e9  # value in flight
     before = parameters.value("MPC_XY_CRUISE")
     parameters.set("MPC_XY_CRUISE", math.nan)
     assert parameters.value("MPC_XY_CRUISE") == before

@@ -131,7 +131,7 @@ def test_an_episode_drops_what_was_taken_for_the_one_before(process: CameraProce
     frames = fly(camera, 1_000_000, lambda more: len(more) == 3)
     assert not seen
     assert frames[0].capture_time_us >= 1_000_000
-    # Its images are those of obstacles whose tours begin at 1 s.
+    # Obstacle tours restart at 1 s, and the images show it.
     drawn = SimulatedCamera(CAMERA, arena(), 1_000_000, None, 3)
     for frame in frames:
         at = frame.capture_time_us

@@ -1,4 +1,4 @@
-"""Frames from the plant to the companion: when, of what, and only the newest."""
+"""Frames from the plant to the companion: timing, content, and dropping of old frames."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ FRAME_LENS = Intrinsics.from_fov(64, 48, math.pi / 2)
 
 
 def test_images_are_drawn_when_they_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the moment of the exposure, in any order, and the same in another process."""
+    """Late reads show the exposure's state, in any order and in another process."""
     arena, profile = (
         room(12.0, pillar_at=6.0),
         quad(camera={"width_px": 33, "height_px": 25}).camera,
@@ -253,7 +253,7 @@ def test_a_panorama_arrives_whole() -> None:
 
 @pytest.mark.parametrize("kind", ["rgb", "grey"])
 def test_colours_arrive_whole(kind: CameraKind) -> None:
-    """Through ZeroMQ: as the ray caster draws them, and what they are."""
+    """Frames through ZeroMQ keep the ray caster's image and the intrinsics."""
     profile = load_vehicle("quad").camera.model_copy(update={"kind": kind})
     scene = room(12.0, pillar_at=6.0)
     sent = take(SimulatedCamera(profile, scene))
@@ -273,7 +273,7 @@ def test_colours_arrive_whole(kind: CameraKind) -> None:
 
 
 def test_slow_reader_gets_only_the_newest() -> None:
-    # In-process, so that no transport can hold frames back: what waits is what ZeroMQ keeps.
+    # In-process: no transport buffers frames, only ZeroMQ's queue does.
     with zmq.Context() as context:
         server = CameraServer("inproc://camera", context)
         source = ZmqFrameSource("inproc://camera", SimClock(), context)
@@ -360,7 +360,7 @@ def test_no_message_larger_than_a_frame_is_taken_in(monkeypatch: pytest.MonkeyPa
             publisher.send(frame(2).to_bytes())
         newest = source.latest()
         assert newest is not None and newest.frame.sequence == 2
-        assert source.malformed == 0  # what was too large has not been handed over
+        assert source.malformed == 0  # the oversized message was not delivered
         source.close()
 
 

@@ -134,7 +134,7 @@ def test_without_data_it_stands_still_unless_it_may_go_where_none_ever_were() ->
     assert math.hypot(*allowed) == pytest.approx(5.0)
     careful = prevention(CP_DIST=2.0)
     assert careful.constrain(asked, (2.0, 0.0), view, 0.0, BEGAN_US) == (0.0, 0.0)
-    # Where there were data and are none any more, nobody goes.
+    # Directions that lost their data are blocked.
     lost = obstacles(lambda i: 1000 if i == 30 else UNKNOWN_CM, time_us=BEGAN_US + US_PER_S)
     gone = cp.constrain(turned(20.0), (0.0, 0.0), lost, 0.0, BEGAN_US + US_PER_S)
     assert gone == (0.0, 0.0)
@@ -234,7 +234,7 @@ def test_a_full_stick_stops_before_a_wall() -> None:
     assert 2.5 < kept.nearest_m < 5.0
     assert kept.rig.mode is Mode.POSITION
     assert abs(float(kept.rig.truth.velocity[0])) < 0.2
-    # Nobody reports any more: it stands still, and after 5 s it is in Hold.
+    # Without obstacle data the vehicle stops, and after 5 s it switches to Hold.
     kept.told = False
     kept.rig.run(4.0, kept.each)
     modes = [kept.rig.mode]

@@ -25,9 +25,9 @@ OK, NO = Result.ACCEPTED, Result.TEMPORARILY_REJECTED
 SAME = "same"
 """Expected mode: as before."""
 RESTORED = "restored"
-"""Expected mode: the lasting one that was asked for last."""
+"""Expected mode: the lasting mode of the latest request."""
 
-# What the user hears. A refusal is told with CRITICAL severity (measured), events with INFO.
+# Texts to the user. Refusals have CRITICAL severity (measured), events INFO.
 ARMED = (Severity.INFO, "Armed by external command")
 DISARMED = (Severity.INFO, "Disarmed by external command")
 NO_ARM = (Severity.CRITICAL, "Arming denied: Resolve system health failures first")
@@ -182,7 +182,7 @@ def test_invariants(events: list[Ask | Event]) -> None:
     for event in events:
         step = transition(flight, event)
         before, flight = flight, step.flight
-        # Nothing is armed that was not ready and asked to arm.
+        # Only ready vehicles arm, and only on request.
         if before.phase < GROUND <= flight.phase:
             assert (event, before.phase) == (Event.ARM, STANDBY)
             assert flight.phase is GROUND
@@ -195,7 +195,7 @@ def test_invariants(events: list[Ask | Event]) -> None:
         # The table itself raises no failsafe.
         assert not flight.failsafe
         assert flight.mode is flight.intended
-        # What disarming returns to: the last lasting mode that was asked for and granted.
+        # Disarming returns to the last lasting mode that was requested and granted.
         if isinstance(event, Ask):
             granted = event.available or before.phase < GROUND
             granted = granted and before.mode is not Mode.TERMINATION

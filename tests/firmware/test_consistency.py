@@ -1,4 +1,4 @@
-"""How the estimator tells sensors that have gone wrong from noise."""
+"""Distinction between failed sensors and noise in the estimator."""
 
 from __future__ import annotations
 

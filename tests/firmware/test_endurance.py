@@ -1,4 +1,4 @@
-"""How long the battery lasts against how long a return takes."""
+"""Remaining battery time against the duration of a return."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_return_climbs_flies_home_and_lands() -> None:
 
 @pytest.mark.parametrize(("capacity", "returns"), [(-1.0, False), (700.0, True)])
 def test_a_vehicle_returns_while_the_battery_still_lasts(capacity: float, returns: bool) -> None:
-    """700 mAh are 168 s at 15 A, half of it too few. Without a capacity nobody knows."""
+    """700 mAh last 168 s at 15 A; half is too little. Without a capacity there is no estimate."""
     drop = ("battery drop 50% at 14s",)
     with flight(1, parameters={"BAT1_CAPACITY": capacity}, faults=drop) as rig:
         rig.take_off(5.0, settle_s=0.0)

@@ -32,10 +32,10 @@ from firmware_sim.plant.plant import Plant
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 STEP_US = 100_000
-"""Requests come so often."""
+"""Request period [µs]."""
 
 UNALIGNED_US = 68_000
-"""So often that they do not come with the looks of the failsafes."""
+"""Request period that is not aligned with the failsafe checks [µs]."""
 
 NAN3 = np.full(3, math.nan)
 
@@ -170,7 +170,7 @@ def test_what_finds_nothing_new_changes_no_bit(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_telemetry_does_not_depend_on_it_either() -> None:
-    """Of the fast streams: the others are sent after the newest tick."""
+    """Compare the fast streams; the others are sent after the newest tick."""
     fast = {kind: name for name, kind in _ids().items()}
     sent = []
     for fly in (in_one_go, tick_by_tick):

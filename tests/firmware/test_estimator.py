@@ -170,7 +170,7 @@ def altered(
 
 @cache
 def undisturbed() -> tuple[list[SensorSample], list[Estimate]]:
-    """What the sensors of a flight say, and what is made of it."""
+    """Return the sensor samples of a flight, and the estimates."""
     samples = [sample for sample, *_ in unbiased(16.0).samples()]
     return samples, run(Estimator(VALUE), iter(samples))
 
@@ -252,7 +252,7 @@ def test_poor_sensors_keep_it_unhealthy() -> None:
 
 
 class Witness:
-    """A filter that only notes what it is told."""
+    """Filter that only records its inputs."""
 
     def __init__(self, covariance: np.ndarray, _noise: np.ndarray) -> None:
         self.covariance = covariance
@@ -403,8 +403,8 @@ def logs() -> list[Log]:
 METRES_PER_PA = (pressure_hpa(490.0) - pressure_hpa(491.0)) ** -1 / 100
 HORIZONTAL_FIELD = float(np.hypot(*MAGNETIC_FIELD_NED[:2]))
 
-# name, component -> the sensor's white noise over what the filter is told (both standard
-# deviations): the filter is told more, to cover what it does not model.
+# name, component -> the sensor's white noise / the filter's noise (both standard deviations).
+# The filter assumes more noise, to cover unmodelled errors.
 NOISE_SHARE = {
     ("gps_horizontal", 0): SENSORS.gps.horizontal_noise_m / VALUE("EKF2_GPS_P_NOISE"),
     ("gps_horizontal", 1): SENSORS.gps.horizontal_noise_m / VALUE("EKF2_GPS_P_NOISE"),
@@ -436,7 +436,7 @@ def stacked(log: Log, name: str) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["gps_horizontal", "gps_vertical", "baro", "heading"])
 def test_nis_is_never_optimistic(logs: list[Log], name: str) -> None:
-    """Below the 99.9 % quantile of a filter that is told the truth; nothing gated away."""
+    """NIS is below the 99.9 % quantile of a filter with true noise; the gate rejects nothing."""
     for log in logs:
         i, s = stacked(log, name)
         nis = np.einsum("ni,nij,nj->n", i, np.linalg.inv(s), i)

@@ -1,4 +1,4 @@
-"""The compiled filter against filterpy's: the same flight through both, and each step by itself.
+"""The compiled filter against filterpy's: over the same flight, and step by step.
 
 Differences are in units of standard deviations, so that one tolerance serves all states.
 """
@@ -38,7 +38,7 @@ FILTERS = [KernelFilter, FilterpyFilter]
 
 @dataclass
 class Course:
-    """What an estimator made of a flight."""
+    """Outputs of an estimator over a flight."""
 
     states: np.ndarray  # (ticks, ROW_SIZE)
     covariances: np.ndarray  # (seconds, 16, 16), once a second
@@ -50,7 +50,7 @@ class Course:
 
 @pytest.fixture(scope="module")
 def samples() -> list[SensorSample]:
-    """What the sensors said in a minute: rest, take-off, a restless flight in gusts."""
+    """Record the sensor samples of a minute: rest, take-off, a restless flight in gusts."""
     with flight(3, wind=WINDY) as rig:
         seen: list[SensorSample] = []
         step = rig.ap.step
@@ -95,7 +95,7 @@ def course(samples: Sequence[SensorSample], new_filter: NewFilter) -> Course:
 
 
 def units(states: np.ndarray) -> np.ndarray:
-    """Return the units of nominal states: the standard deviations of what has one."""
+    """Return the units of nominal states: standard deviations; 1 for values without one."""
     sigma = states[:, es.SIGMA : es.RATIO]
     unit = np.ones_like(states)
     # A quaternion's component moves by half an angle; rates and acceleration have no state.
@@ -107,7 +107,7 @@ def units(states: np.ndarray) -> np.ndarray:
 
 
 def worst_difference(a: Course, b: Course) -> dict[str, float]:
-    """Return the greatest difference of two courses by what differs."""
+    """Return the maximum difference of two courses for each quantity."""
     assert a.names == b.names
     innovations, spreads = [], []
     for i, j, s, t in zip(
@@ -216,7 +216,7 @@ def test_both_fly_the_same() -> None:
         assert rig.ap.take_messages() == shadow.take_messages()
 
 
-# --- each step by itself, against the textbook
+# --- single steps, against the textbook
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -125,7 +125,7 @@ def test_the_words_on_board_describe_every_event_and_enumeration() -> None:
 
 @pytest.mark.parametrize("value", [3e38, -3e38, 1e300, -1e300, math.inf, -math.inf, math.nan])
 def test_an_event_can_be_made_of_any_numbers(value: float) -> None:
-    """What does not fit becomes the nearest: nothing that is told may end a flight."""
+    """Out-of-range values are clamped: no event may end a flight."""
     for definition in definitions():
         happened = definition.event(*[value] * len(definition.arguments))
         _, values = read(happened)
@@ -470,7 +470,7 @@ def target(frame: int) -> Any:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_what_services_refuse_is_an_event(refused: Any, text: str | None, words: str) -> None:
-    """Everybody is told, in PX4's words for those who read events and for those who do not."""
+    """All clients receive an event, and PX4's text for clients without event support."""
     rig = Rig()
     rig.client.send(refused)
     rig.bench.run(0.1)
@@ -550,7 +550,7 @@ def test_mavsdk_understands_events_and_the_health_report(flight: Flown) -> None:
     denied = "Arming denied: Resolve system health failures first"
     wait_for(lambda: denied in [e.message for e in heard])
     with flight.at(5.0):
-        # The mode and the report of its checks are told apart from one another.
+        # The mode and the result of its checks are separate messages.
         wait_for(lambda: report().current_mode_intention.mode_name == "RTL")
         wait_for(lambda: not report().current_mode_intention.can_arm_or_run)
     assert "Mode not suitable for arming" in [

@@ -37,7 +37,7 @@ from tests.support.ardupilot_wire import State, read_state
 from tests.support.ports import LOOPBACK, free_ports
 
 START_US = 7_000_000_000
-"""Simulated time goes on over the episodes of a process."""
+"""Start of simulated time [µs]; it continues over the episodes of a process."""
 
 IDLE = [1000] * 4
 NUMBERS = st.floats(-1e6, 1e6)
@@ -168,7 +168,7 @@ class Rig:
         return self.socket.recv(65_000)
 
     def silent(self) -> bool:
-        """Whether no line comes for some time."""
+        """Return True if no line arrives within 0.3 s."""
         self.socket.settimeout(0.3)
         try:
             self.socket.recv(65_000)
@@ -256,7 +256,7 @@ def test_a_lost_line_is_sent_again_unchanged() -> None:
 def test_what_was_asked_more_than_once_is_answered_once() -> None:
     with exchange() as rig:
         rig.connect()
-        for _ in range(3):  # nobody stepped the plant for three seconds
+        for _ in range(3):  # the plant is not stepped for three seconds
             rig.say(packet(0))
         step = rig.step()
         rig.line()
@@ -347,7 +347,7 @@ def test_nobody_comes() -> None:
 
 
 def test_one_that_has_flown_before_is_not_taken() -> None:
-    """Its clock stands at the end of that flight; one that a dead simulator left behind asks on."""
+    """Its clock shows the end of that flight; a stale instance keeps repeating its packet."""
     with exchange() as rig, _socket() as veteran:
         rig.say(packet(5000), veteran)
         with pytest.raises(FirmwareMissingError, match="only one that has flown before"):

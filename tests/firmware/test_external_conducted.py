@@ -1,4 +1,4 @@
-"""What a conductor needs of PX4: an echo, an instance of its own, threads at rest."""
+"""PX4 as a conductor needs it: an echo, a separate instance, idle threads."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Receiver:
                 self.taken.append(message.get_type())
                 if message.get_type() != "PING" or self.deaf:
                     continue
-                # Somebody else's echo, and telemetry, come before ours.
+                # Another client's echo, and telemetry, arrive before ours.
                 for target in ((255, 190), (message.get_srcSystem(), message.get_srcComponent())):
                     ping = dialect.MAVLink_ping_message(0, message.seq, *target)
                     self._socket.sendto(encoder.pack(ping), address)
@@ -98,7 +98,7 @@ def test_when_the_echo_is_there_everything_before_was_taken_in() -> None:
             link.await_echo()
             assert px4.taken[-2:] == ["SET_POSITION_TARGET_LOCAL_NED", "PING"]
         kinds = [frame[7] for frame in link.take()]
-    # The echo itself is nobody's telemetry; another's is.
+    # Our echo is not passed on as telemetry; another client's is.
     assert kinds.count(dialect.MAVLINK_MSG_ID_PING) == 20
     assert kinds.count(dialect.MAVLINK_MSG_ID_HEARTBEAT) >= 39
 
@@ -237,8 +237,8 @@ def test_a_program_is_found_by_its_connection() -> None:
             connection, address = server.accept()
             with connection:
                 assert program_at(address[0], address[1], port) == child.pid
-                # The same port of its own, but for another connection, and this process's own end,
-                # are nobody to wait for.
+                # Another connection from the same port, and this process's own end, match no
+                # program.
                 assert program_at(address[0], address[1], port + 1) is None
                 assert program_at(LOOPBACK, port, address[1]) is None
             child.kill()
@@ -253,7 +253,7 @@ def test_the_simulator_port_is_looked_at_too() -> None:
         check_free(INSTANCE)
 
 
-# --- what ends, and what is stopped
+# --- exit and stop
 
 
 def launched(folder: Path, shell: str) -> Launcher:

@@ -1,4 +1,4 @@
-"""A board in HITL over a pseudo-terminal: found, fed, and what can be wrong with it."""
+"""A board in HITL over a pseudo-terminal: detection, sensor data and errors."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def test_which_step_is_missing(
         bridge.wait_connected(2.0, alive)
     bridge.close()
     peer.close()
-    assert not peer.received  # nothing was said to what may be anything
+    assert not peer.received  # nothing is sent to an unidentified device
 
 
 def test_mavlink_without_an_autopilot(router: Router, peer: HitlPeer) -> None:
@@ -251,7 +251,7 @@ def test_the_boards_own_clock_is_its_time(router: Router, peer: HitlPeer) -> Non
         first = stepper.bridge.time_us
         stepper.until(lambda: stepper.bridge.time_us > first + 100_000)
         assert stepper.bridge.time_us <= peer.board.time_us
-        # Times sent go on evenly from a small number, wherever simulated time is.
+        # Sent times advance evenly from a small number, independent of simulated time.
         assert np.unique(np.diff(peer.sensor_times)).tolist() == [TICK_US]
         assert peer.sensor_times[0] == 1_000_000
 
@@ -353,7 +353,7 @@ def test_a_standstill_of_ours_is_no_silence_of_the_boards(
     monkeypatch.setattr(hitl, "SILENCE_US", 1_500_000)
     with connected(router, peer) as stepper:
         time.sleep(0.5)
-        router.pump()  # what had come before we stopped
+        router.pump()  # data from before the pause
         time.sleep(2.0)  # a board without sensors says nothing more
         for _ in range(250):
             stepper.step()

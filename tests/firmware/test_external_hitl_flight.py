@@ -129,7 +129,7 @@ def test_take_off_and_hover(flight: Flight, peer: HitlPeer) -> None:
 
 
 def in_background(flight: Flight, call: Callable[[], Any], what: str) -> Any:
-    """Fly on while a blocking call runs on a thread of its own; return its result."""
+    """Run a blocking call in a separate thread while flying; return its result."""
     with ThreadPoolExecutor(1) as pool:
         future = pool.submit(call)
         flight.until(future.done, what)
@@ -143,7 +143,7 @@ def test_one_episode_after_the_other(flight: Flight, peer: HitlPeer) -> None:
     flight.until(lambda: flight.observer.ready, "ready to arm")
     flight.simulation.close()
     flight.simulation = flight.boot()
-    assert peer.boots == boots + 1  # told so at the end, and not once more
+    assert peer.boots == boots + 1  # rebooted once, at the end of the episode
     flight.until(lambda: flight.observer.ready, "ready to arm")
 
 

@@ -132,7 +132,7 @@ def scene(
 
 
 def lost(flight: Scene, seconds: float = 10.0) -> str:
-    """Fly until the firmware is lost; return what is said of it."""
+    """Fly until the firmware is lost; return the error message."""
     with pytest.raises(FirmwareLostError) as caught:
         flight.fly(seconds)
     text = str(caught.value)
@@ -186,7 +186,7 @@ def test_slower_sensors_come_at_their_own_rates_and_the_truth_as_asked() -> None
         assert count["baro"] == pytest.approx(2.0 * profile.barometer.rate_hz, abs=1)
         fixes = [m for m in heard if m.get_type() == "HIL_GPS"]
         assert len(fixes) == pytest.approx(2.0 * profile.gps.rate_hz, abs=1)
-        # It asks for one every 5 ms: four of five samples.
+        # The peer requests one every 5 ms: four of five samples.
         states = [m for m in heard if m.get_type() == "HIL_STATE_QUATERNION"]
         assert len(states) == pytest.approx(400, abs=2)
         assert states[-1].alt == pytest.approx(489_400, abs=200)
@@ -242,7 +242,7 @@ class Client:
 
 
 class Wire:
-    """A connection that answers what a test tells it to."""
+    """Connection that sends the answers a test specifies."""
 
     def __init__(self, port: int) -> None:
         self.socket = socket.create_connection((LOOPBACK, port), PATIENCE_S)
@@ -320,7 +320,7 @@ def test_it_stalls() -> None:
 
 
 def test_disarmed_it_may_leave_samples_unanswered() -> None:
-    """Real PX4 does, in Offboard on the ground without a setpoint: its time must go on."""
+    """Real PX4 does, in Offboard on the ground without a setpoint: the time must advance."""
     with scene(idle=0.2) as flight:
         flight.until(lambda: flight.bridge.time_us > 0, 5.0)
         flight.fly(0.3)
@@ -424,7 +424,7 @@ def test_it_connects_and_never_answers() -> None:
         finally:
             flight.sim.close()
     assert "answered none of" in text
-    # No faster than they would be measured: what is sent piles up.
+    # Samples are sent no faster than measured: without answers they pile up.
     assert bridge.unanswered <= 0.3 * 250 + 2
 
 

@@ -1,4 +1,4 @@
-"""MAVLink between a board's line and its clients: what passes, what stays, how much."""
+"""MAVLink between a board's line and its clients: forwarding, filtering and rate limit."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_telemetry_passes_unchanged_however_the_line_cuts_it(bench: Bench) -> No
 
 def test_what_stands_between_frames_passes_to_nobody(bench: Bench) -> None:
     first, second = bench.board.pack(HEARTBEAT), bench.board.pack(HEARTBEAT)
-    # What looks like a header is waited for: at most as long as a frame is.
+    # Bytes that look like a header are held for at most a frame's length.
     more = [bench.board.pack(HEARTBEAT) for _ in range(20)]
     noisy = b"NuttShell (NSH)\n\xfd\x09" + first + b"\xfe\xfd\xff\r\n" + second + second
     bench.line.say(noisy + b"".join(more))
@@ -198,7 +198,7 @@ def test_clients_cannot_flood_the_line() -> None:
     assert flood() == 0
     bench.clock.advance(1_000_000)
     assert 2_000 - len(frame) < flood() <= 2_000 + len(frame)
-    # The simulator's own messages are none of this.
+    # The simulator's own messages are outside this budget.
     before = len(bench.line.sent)
     assert bench.router.send_ahead(frame)
     assert len(bench.line.sent) == before + len(frame)

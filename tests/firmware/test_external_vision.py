@@ -1,4 +1,4 @@
-"""External vision: what is read of ODOMETRY, and flights of a vehicle that has no GPS."""
+"""External vision: parsing of ODOMETRY, and flights of a vehicle without GPS."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.support.flight_rig import Rig, quad, velocity_setpoint
 NAN = math.nan
 TRIANGLE = tuple(float(i) for i in range(21))
 DIAGONAL = [0.0, 6.0, 11.0, 15.0, 18.0, 20.0]
-"""Of a matrix that is sent as TRIANGLE."""
+"""Diagonal of a matrix sent as TRIANGLE."""
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 BATTERY = BatterySample(16.0, 1.0, 0.0, 1.0)
 
@@ -148,7 +148,7 @@ def test_vision_position_estimate() -> None:
 
 
 def test_mavsdk_s_mocap_plugin_is_understood() -> None:
-    """What a program on the drone sends by MAVSDK is what the estimator is given."""
+    """Odometry that an onboard program sends with MAVSDK reaches the estimator."""
     unknown = mocap.Covariance([NAN])
     with mavlink_clients.mavsdk_over_memory() as (companion, pacer):
         autopilot = pacer.bench.autopilot
@@ -240,7 +240,7 @@ def without_gps(**changes: Any) -> Rig:
 
 
 def off(rig: Rig) -> Vector:
-    """How far the estimate of position and velocity (6,) is from the truth."""
+    """Return the true minus the estimated position and velocity (6,)."""
     estimate, truth = rig.ap.state().estimate, rig.truth
     return np.concatenate([truth.position - estimate.position, truth.velocity - estimate.velocity])
 
@@ -273,7 +273,7 @@ def test_without_vision_or_gps_it_is_not_armed() -> None:
 
 
 def test_hold_needs_a_place_on_the_globe_and_position_does_not() -> None:
-    """As PX4: who does not know where north lies, or its origin, has no global position."""
+    """PX4: without north, or an origin, there is no global position."""
     vehicle = load_vehicle("quad-vio")
     rig = Rig(3, vehicle=quad(sensors=vehicle.sensors.model_dump()), parameters=vehicle.parameters)
     rig.run(3.0)
@@ -300,7 +300,7 @@ def test_vision_that_falls_silent_ends_the_flight_as_without_gps() -> None:
     assert rig.ap.estimator.vision.fused == Control(0)
     assert rig.mode is Mode.OFFBOARD
     rig.until(lambda: rig.ap.flight.failsafe, 8.0)
-    # EKF2_NOAID_TOUT, 5 s, and what the commander waits for.
+    # EKF2_NOAID_TOUT, 5 s, plus the commander's delay.
     assert 4.5 < (rig.sim.time_us - quiet_us) / US_PER_S < 7.0
     rig.until(lambda: rig.ap.flight.phase == 1, 60.0)
     assert rig.truth.velocity[2] < 2.0
@@ -321,7 +321,7 @@ def test_a_jump_that_is_told_is_taken_over_and_one_that_is_not_is_refused() -> N
     rig.step_through(shifted)
     told = 1
     rig.run(1.0)
-    # Not told: refused, for as long as positions may be missing; the velocity holds it.
+    # Unreported jump: rejected until the position times out; velocity holds the estimate.
     assert np.abs(off(rig)[:2]).max() < 0.3
     rig.run(6.0)
     np.testing.assert_allclose(off(rig)[:2], -jump[:2], atol=0.6)
@@ -354,7 +354,7 @@ def test_a_height_that_jumps_is_refused_for_a_while_and_then_taken_over() -> Non
 def test_a_heading_of_the_globe_has_to_agree_with_the_compass(
     wrong_deg: float, believed: bool
 ) -> None:
-    """As PX4: it begins where it is within the gate, and the compass is given up for it then."""
+    """PX4: heading fusion starts within the gate, and then disables the compass."""
     rig = without_gps(EKF2_EVA_NOISE=0.05)
     step, turn = rig.ap.step, Rotation.from_rotvec([0.0, 0.0, math.radians(wrong_deg)])
 
@@ -448,7 +448,7 @@ def test_what_the_sensor_tells_is_the_profile_s() -> None:
             if sample.odometry is not None:
                 told.append((time_us, sample.odometry))
         times = np.array([t for t, _ in told])
-        # The first pose is of the start, and is told late.
+        # The first pose is from the start, and arrives after the delay.
         assert times[0] == profile.vision.delay_s * US_PER_S
         assert len(times) == pytest.approx(6.0 * profile.vision.rate_hz, abs=2)
         positions = np.array([o.position for _, o in told])

@@ -23,7 +23,7 @@ FALLBACK_M_S = 0.75
 
 NORTHWARD = velocity_setpoint(2.0, 0.0, 0.0)
 REST_DOWN_M = -0.055
-"""Where the body's centre is when it stands: half its height."""
+"""Down position of the body's centre at rest: half its height [m]."""
 
 NO_TAKEOVER_S = 2.0
 SEED = 1
@@ -34,7 +34,7 @@ def count(rig: Rig, text: str) -> int:
 
 
 def until_said(rig: Rig, text: str, limit_s: float) -> float:
-    """Fly until a text is said once more; return the time [s] until then."""
+    """Fly until a text is reported again; return the elapsed time [s]."""
     began_s, before = rig.time_s, count(rig, text)
     rig.until(lambda: count(rig, text) > before, limit_s)
     return rig.said(text) - began_s
@@ -45,7 +45,7 @@ def until_disarmed(rig: Rig, limit_s: float) -> float:
 
 
 def highest_until_disarmed(rig: Rig, limit_s: float) -> float:
-    """Fly until disarmed; return the greatest true height on the way [m]."""
+    """Fly until disarmed; return the maximum true height [m]."""
     heights = [rig.height]
 
     def disarmed() -> bool:
@@ -330,7 +330,7 @@ def test_kill_in_the_air_cuts_the_motors() -> None:
 LOW, CRITICAL, EMERGENCY = "Low battery", "Critical battery", "Emergency battery level"
 HELD = "Failsafe activated: entering Hold for 5 seconds"
 HOLD_S = 5.0
-"""COM_FAIL_ACT_T: so long the vehicle holds before it does what a failsafe asks."""
+"""COM_FAIL_ACT_T: hold time before a failsafe's action [s]."""
 
 
 class Drain:

@@ -54,7 +54,7 @@ def said(rig: Rig, text: str) -> int:
 
 
 def touch_down(rig: Rig, limit_s: float) -> float:
-    """Fly until disarmed; return the greatest downward speed within half a metre of the floor."""
+    """Fly until disarmed; return the maximum descent speed within 0.5 m of the floor [m/s]."""
     fastest = 0.0
 
     def ended() -> bool:
@@ -84,7 +84,7 @@ def test_ground_station_lost_returns_home() -> None:
         assert (rig.mode, rig.ap.flight.failsafe) == (Mode.HOLD, True)
         assert said(rig, "Failsafe activated: entering Hold for 5 seconds") == 1
         assert until_mode(rig, Mode.RETURN, 6.0) == pytest.approx(4.9, abs=0.1)
-        # The link is back: the return goes on.
+        # The link is back: the return continues.
         rig.ap.gcs_heartbeat(rig.sim.time_us)
         assert touch_down(rig, 60.0) < GENTLE_M_S
         assert away(rig) < 1.0
@@ -192,7 +192,7 @@ def test_a_stuck_gyro_terminates() -> None:
         assert said(rig, "GYRO #0 failed: STALE!") == 1
         rig.tick()
         assert rig.ap.state().motors == (0.0, 0.0, 0.0, 0.0)
-        # The estimate is of no use any more; the motors are.
+        # Lockdown needs no estimate, only stopped motors.
         rig.until(lambda: rig.ap.flight.phase <= Phase.STANDBY, 6.0)
         assert said(rig, "Disarmed by lockdown") == 1
 
@@ -234,7 +234,7 @@ def test_termination_is_for_good() -> None:
 
 
 def test_modes_that_cannot_be_armed_in() -> None:
-    """PX4: Return and Land are refused, and the reason is told."""
+    """PX4: Return and Land are refused, with the reason."""
     with flight(SEED) as rig:
         rig.boot()
         for mode in (Mode.RETURN, Mode.LAND):

@@ -1,7 +1,7 @@
-"""The failsafes as a pure table: every pair of conditions, and PX4's rules as a second opinion.
+"""Failsafes as a pure table: every pair of conditions, against independent rules.
 
-The rules are written here a second time, as PX4's documentation tells them: a list of what each
-single failure does, the worst of which is flown, and the chain of modes that it gives way to.
+The rules are written here a second time, from PX4's documentation: a list of actions for each
+single failure, the worst of which is flown, and the chain of fallback modes.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def test_manual_control_lost_holds_then_returns() -> None:
     m.step(200 * MS)
     assert m.action() is Action.RETURN
     assert m.texts[-1] == "Failsafe activated"
-    # The signal is back: the return goes on until the user chooses a mode.
+    # The signal is back: the return continues until the user chooses a mode.
     m.step(manual_control_signal_lost=False)
     assert m.action() is Action.RETURN
     m.mode = Mode.ALTITUDE
@@ -279,7 +279,7 @@ def with_every_action(value: int) -> Settings:
 
 
 def assert_flown(mode: Mode, options: Settings, names: tuple[str, ...]) -> None:
-    """Let conditions occur; what is chosen at once and after the wait can be flown."""
+    """Apply conditions; the modes chosen at once and after the wait can be flown."""
     m = Machine(mode, options)
     for elapsed_us in (LONG_ARMED_US, 6 * S):
         m.step(elapsed_us, **{name: _BAD[name] for name in names})
@@ -334,7 +334,7 @@ def test_the_chain_of_fallbacks() -> None:
 
 
 class Known(NamedTuple):
-    """What the second opinion looks at."""
+    """Inputs of the independent rules."""
 
     c: Conditions
     p: Settings
@@ -376,7 +376,7 @@ def _low_battery(k: Known) -> Action:
 
 
 def _unflyable(k: Known) -> Action:
-    """The mode itself cannot go on."""
+    """Return the action for a mode that cannot continue."""
     mode, action = k.mode, Action.NONE
     if mode is Mode.OFFBOARD and k.c.offboard_control_signal_lost:
         losses = [
@@ -503,7 +503,7 @@ _CHAIN = [
 
 
 def second_opinion(k: Known) -> Action:
-    """What flies at last: the worst that applies, as far down the chain as it must go."""
+    """Return the final action: the worst that applies, after its necessary fallbacks."""
     worst = max(rule(k) for rule in RULES)
     if Action.WARN < worst < Action.DISARM:
         worst = next(
@@ -573,7 +573,7 @@ def test_the_wait_only_ever_holds(
     machine.step()
     machine.step(later_ms * MS)
     final = second_opinion(Known(conditions, options, mode))
-    # As PX4: who is landing or returning goes on with it until a return turns out impossible.
+    # As in PX4: landing or returning continues until a return turns out impossible.
     on_the_way = {Action.WARN} if mode in (Mode.LAND, Mode.RETURN, Mode.PRECISION_LAND) else set()
     assert machine.action() in {final, Action.HOLD, *on_the_way}
     if machine.action() is not final:

@@ -221,7 +221,7 @@ HEARTBEAT = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
 
 
 def link_of(*faults: str, conducted: bool = False) -> tuple[FailingEndpoint, Any, Any]:
-    """Return a failing link, its healthy endpoint, and what sets the time [µs]."""
+    """Return a failing link, its healthy endpoint, and a function that sets the time [µs]."""
     inner, clock = MemoryEndpoint(), SimClock()
     endpoint = FailingEndpoint(inner, clock, conducted=conducted)
     timeline = FaultTimeline([Fault.model_validate(text) for text in faults], 1, 0)

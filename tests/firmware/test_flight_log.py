@@ -53,7 +53,7 @@ def topic(log: ULog, name: str) -> dict[str, Any]:
 
 
 def unpaced_firmware() -> Firmware:
-    """Return the built-in flight controller, whose link nobody listens to."""
+    """Return the built-in flight controller, with no client on its link."""
     links = [onboard_link(MemoryEndpoint())]
     return Firmware(BuiltinFlightStack(MavlinkServer(links, boot_unix_us=0)), None, Unpaced())
 
@@ -121,14 +121,14 @@ def test_parameters_that_change_after_the_log_was_closed_go_nowhere(tmp_path: Pa
         assert firmware.simulation is not None
         internals = firmware.simulation.autopilot.internals
         assert internals is not None
-        for tick in range(300):  # more than a second: what a log takes would be written
+        for tick in range(300):  # more than a second: an open log would write them
             internals.parameters.set("MPC_XY_VEL_MAX", 5.0 + tick % 2)
             firmware.step()
     assert ULog(str(tmp_path / "flight-001.ulg")).changed_parameters == []
 
 
 def test_vision_is_logged_as_it_was_told(tmp_path: Path) -> None:
-    """By the topic that Flight Review and PX4's own tools look for."""
+    """Topic that Flight Review and PX4's own tools read."""
     with closing(unpaced_firmware()) as firmware:
         firmware.load(EpisodeSetup(load_vehicle("quad-vio"), None, 1), tmp_path / "f.tlog", 0)
         for _ in range(1_000):
@@ -138,7 +138,7 @@ def test_vision_is_logged_as_it_was_told(tmp_path: Path) -> None:
     seen, truth = topic(log, "vehicle_visual_odometry"), topic(log, "vehicle_attitude_groundtruth")
     assert len(seen["timestamp"]) > 80
     assert np.all(np.diff(seen["timestamp_sample"]) > 0)
-    # In the frame of the start, whose heading nobody knows: it stands there, and is upright.
+    # In the frame of the start, with unknown heading: the vehicle is at rest and upright.
     assert set(seen["pose_frame"]) == {2}
     for axis in range(3):
         assert seen[f"position[{axis}]"] == pytest.approx(0.0, abs=0.2)
@@ -148,7 +148,7 @@ def test_vision_is_logged_as_it_was_told(tmp_path: Path) -> None:
     assert np.median(level) == pytest.approx(
         float(np.median(np.hypot(truth["q[1]"], truth["q[2]"]))), abs=0.03
     )
-    assert set(seen["quality"]) == {0}  # the simulated camera tells none
+    assert set(seen["quality"]) == {0}  # the simulated camera reports none
 
 
 def test_intervals_are_met_by_the_grid() -> None:
@@ -184,7 +184,7 @@ def test_a_flight_is_logged_whole(flown: tuple[Path, ULog]) -> None:
         path = np.interp(times[inside], record.time_us, record.position[:, axis])
         # Between two samples of the record it may touch down.
         assert truth[name][inside] == pytest.approx(path, abs=5e-3)
-    # The estimate is near it, and so is what the motors do: a hover takes half of their range.
+    # The estimate is near the truth; a hover takes about half of the motors' range.
     estimate = topic(log, "vehicle_local_position")
     later = estimate["timestamp"] > 10_000_000
     error = np.interp(estimate["timestamp"], truth["timestamp_sample"], truth["z"]) - estimate["z"]

@@ -1,4 +1,4 @@
-"""The geofence: its geometry against an independent method, and what a breach is."""
+"""Geofence: its geometry against an independent method, and breaches."""
 
 from __future__ import annotations
 
@@ -245,7 +245,7 @@ def test_a_vehicle_that_looks_ahead_stays_inside(predict: int) -> None:
 
 
 def test_no_place_outside_is_taken_to_hold_at() -> None:
-    """As PX4: the vehicle holds where it is, and says why; a fence that only warns is no fence."""
+    """PX4: the vehicle holds and reports why; a fence that only warns has no effect."""
     limits = {"GF_MAX_HOR_DIST": 20.0, "GF_MAX_VER_DIST": 15.0, "GF_ACTION": 3}
     rig = Rig(seed=2, parameters=limits)
     outside = Reposition(Place((40.0, 0.0, -5.0), math.nan))
@@ -287,7 +287,7 @@ LAND = at(0, 90, 0, N.LAND)
         (1, (0, 80), (0, 90)),
         (3, (0, 80), (0, 90)),
         (3, (0, 10), (0, 0)),
-        (0, (0, 80), (0, 0)),  # the mission's landing is not asked for
+        (0, (0, 80), (0, 0)),  # RTL_TYPE 0 ignores the mission's landing
     ],
 )
 def test_return_goes_to_the_nearest_place(

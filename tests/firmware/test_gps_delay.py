@@ -1,8 +1,8 @@
-"""Fixes that come late: what the estimator makes of them, assumed (EKF2_GPS_DELAY) and not.
+"""Delayed GPS fixes in the estimator, with and without an assumed delay (EKF2_GPS_DELAY).
 
-The vehicle stands, then accelerates north, then goes on at constant velocity, so that what a fix
-of `d` seconds ago differs by from the present has a closed form: `a d` in velocity while it
-accelerates, and `v d - a d²/2` in position.
+The vehicle stands, accelerates north, then keeps a constant velocity. The error of a fix of `d`
+seconds ago has a closed form: `a d` in velocity during acceleration, and `v d - a d²/2` in
+position.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Dash(Flight):
 
 
 class Seen(NamedTuple):
-    """What came of one fix."""
+    """Result of one fix."""
 
     time_s: float
     position: float
@@ -124,7 +124,7 @@ def test_innovations_of_a_late_receiver_grow_with_speed_and_are_refused() -> Non
 
 
 def test_a_little_too_late_is_flown_by_and_the_position_lags() -> None:
-    """At constant speed nothing tells the fix is old: the estimate is behind by v d."""
+    """At constant speed the delay is unobservable: the estimate lags by v d."""
     delay_s = 0.2
     assert seen(delay_s)[-1].lag_m == pytest.approx(SPEED * delay_s, rel=0.2)
 
@@ -154,6 +154,6 @@ def test_the_horizon_is_where_the_vehicle_was() -> None:
         horizon.moved(before, state[es.P : es.Q])
         history.append(state[es.P : es.Q].copy())
     np.testing.assert_allclose(horizon.seen_from(state), history[-11])
-    # What is corrected now was as wrong then.
+    # A correction of the present also applies to the past.
     state[es.P : es.Q] += 5.0
     np.testing.assert_allclose(horizon.seen_from(state), history[-11] + 5.0)

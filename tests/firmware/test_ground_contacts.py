@@ -76,9 +76,9 @@ def places(seed: int, n: int, *, steepest: float = math.inf) -> list[tuple[float
 
 
 def touching_height(north: float, east: float, turn: Rotation) -> float:
-    """Return how high the centre of the box is where it first touches when lowered: by points.
+    """Return the height of the box's centre at its first contact when lowered.
 
-    The lower side of a box is that of its faces; many points on each tell it, to a millimetre.
+    Points on all faces of the box give the height to a millimetre.
     """
     grid = np.linspace(-1.0, 1.0, 161)
     u, v = (each.ravel() for each in np.meshgrid(grid, grid))
@@ -115,7 +115,7 @@ def test_the_kernel_s_box_touches_hills_where_their_surface_says() -> None:
             count = touch_ground(p, wxyz(turn), HALF, CLOSE, relief, rows, 0)
             assert (rows[:count, 6] < 0.0).any() == touched
             assert near_ground(relief, p, RADIUS, CLOSE)
-            # What pushes it pushes it upwards, from a point of the box.
+            # Contacts push upwards, from a point of the box.
             np.testing.assert_allclose(np.linalg.norm(rows[:count, 3:6], axis=1), 1.0)
             assert (rows[:count, 5] < 0.0).all()
             own = turn.inv().apply(rows[:count, :3])

@@ -1,4 +1,4 @@
-"""Hover start: what a take-off leaves, without its time."""
+"""Hover start: the state after a take-off, without its duration."""
 
 from __future__ import annotations
 

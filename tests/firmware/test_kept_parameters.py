@@ -79,7 +79,7 @@ def test_what_is_set_is_kept_as_given_and_there_after_a_restart(tmp_path: Path) 
         vehicle.run(80)  # a third of a second, as PX4 waits
         assert "MPC_TILTMAX_AIR\t500\t9" in path.read_text()
         vehicle.set("MPC_XY_CRUISE", 7.0)
-    with flown(path) as vehicle:  # what was not saved yet is saved at the end
+    with flown(path) as vehicle:  # unsaved changes are saved at the end
         assert vehicle.get("MPC_TILTMAX_AIR") == 500.0
         assert vehicle.get("MPC_XY_CRUISE") == 7.0
         assert vehicle.get("MPC_THR_HOVER") == pytest.approx(0.52)  # the vehicle's own

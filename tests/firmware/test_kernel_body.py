@@ -60,7 +60,7 @@ def both(place: Arena | None = None) -> Iterator[list[Plant]]:
 
 
 def apart(plants: list[Plant]) -> float:
-    """Return how far the two are apart: the greatest difference of position and attitude."""
+    """Return the maximum difference of position and attitude between both plants."""
     one, other = (plant.motion[[0, 1, 2, 6, 7, 8, 9]] for plant in plants)
     return float(np.abs(one - other).max())
 
@@ -107,7 +107,7 @@ def test_it_hits_first_what_pybullet_s_body_hits_first(seed: int) -> None:
 
 
 def test_separations_agree_with_pybullet_s_distances() -> None:
-    """Of the tilted box from boxes and cylinders, near and overlapping."""
+    """Compare the tilted box with boxes and cylinders, near and overlapping."""
     client = connect()
     rng = np.random.default_rng(3)
     near, into = 0, 0
@@ -175,9 +175,9 @@ def test_a_wall_stops_it_and_lets_it_fall(name: str) -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_both_bodies_hit_walls_doors_and_ceiling_as_plain_pybullet(seed: int) -> None:
-    """Thrown at room walls, at lintels, at the ceiling, and through doors to what is behind them.
+    """Throw the vehicle at room walls, at lintels, at the ceiling, and through doors.
 
-    Times are those of the same tick, but for a few of the kernel's.
+    Contact times equal plain pybullet's to the tick, except for a few of the kernel's.
     """
     spec = load_profile("arenas", "rooms", ArenaSpec)
     place = generate(spec, seed, name="rooms", vehicle_width_m=WIDTH)

@@ -1,4 +1,4 @@
-"""Strangers on the network and on this machine: what they may not reach, fill, flood or fake."""
+"""Unauthenticated clients, remote and local: limits on access, storage, floods and spoofing."""
 
 from __future__ import annotations
 
@@ -261,7 +261,7 @@ def test_a_checksum_of_a_large_file_takes_several_ticks(tmp_path: Path) -> None:
     client = field.hub.client(7)
     answers = []
     for tick in range(8):
-        if tick in (0, 2):  # asked again, out of impatience
+        if tick in (0, 2):  # repeated by an impatient client
             ftp(client, 5, 14, b"large")
         field.run(1)
         answers += [(tick, bytes(m.payload)) for m in client.received("FILE_TRANSFER_PROTOCOL")]
@@ -271,7 +271,7 @@ def test_a_checksum_of_a_large_file_takes_several_ticks(tmp_path: Path) -> None:
     assert crc == zlib.crc32(data, 0xFFFF_FFFF) ^ 0xFFFF_FFFF
     ftp(client, 6, 14, b"large")
     field.run(1)
-    ftp(client, 7, 3, b"/")  # something else: the checksum is given up
+    ftp(client, 7, 3, b"/")  # another request: the checksum is cancelled
     field.run(20)
     sequences = [bytes(m.payload)[:2] for m in client.received("FILE_TRANSFER_PROTOCOL")]
     assert sequences == [b"\x08\0"]

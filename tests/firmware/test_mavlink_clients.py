@@ -159,7 +159,7 @@ def test_clients_are_bounded_and_those_that_live_stay(field: Field) -> None:
     newcomers = (field.hub.client(port) for port in count(1_000))
 
     def crowd() -> None:
-        for _ in range(4):  # each from an address of its own
+        for _ in range(4):  # each from a separate address
             next(newcomers).send(heartbeat())
 
     beats = count()
@@ -199,7 +199,7 @@ def flood(
 
 
 def quiet_flight(seconds: float) -> list[bytes]:
-    """Return all that the onboard client gets when nobody else is there; it asks as it goes."""
+    """Return all frames to a sole onboard client, which sends requests in flight."""
     return flight(Field(), seconds, lambda: None)
 
 
@@ -236,7 +236,7 @@ def test_a_flood_on_one_link_leaves_the_other_alone(per_tick: int, seconds: floa
 
 def test_a_flood_of_broadcasts_is_passed_on_at_a_bounded_rate() -> None:
     field = Field()
-    RawClient(field.onboard).send(heartbeat())  # so that it is somebody to pass on to
+    RawClient(field.onboard).send(heartbeat())  # registers the client as a recipient
     talker, numbers = field.hub.client(66), count()
 
     def everything() -> None:

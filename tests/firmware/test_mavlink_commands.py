@@ -1,4 +1,4 @@
-"""Commands over raw pymavlink: what a real PX4 1.16 was measured to answer."""
+"""Commands over raw pymavlink: answers as measured with a real PX4 1.16."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_arming(rig: Rig) -> None:
     assert rig.autopilot.commands == ["arm force=False"]
     rig.command(400, 1, 21196)
     rig.command(400, 0)
-    rig.command(400, 0, 21196)  # what MAVSDK 4.1's arm_force() really sends: kill
+    rig.command(400, 0, 21196)  # MAVSDK 4.1's arm_force() really sends this: kill
     assert rig.autopilot.commands[1:] == [
         "arm force=True",
         "disarm force=False",

@@ -23,7 +23,7 @@ MEASURED_PAYLOAD_HZ = {
     "ALTITUDE": 1.43, "VFR_HUD": 1.43, "HEARTBEAT": 1.0, "MISSION_CURRENT": 1.0,
     "SYS_STATUS": 0.73, "SCALED_PRESSURE": 0.13,
 }  # fmt: skip
-"""Of a PX4 1.16 SITL over 30 s."""
+"""Message rates of a PX4 1.16 SITL over 30 s [Hz]."""
 
 SECONDS = 30
 

@@ -1,4 +1,4 @@
-"""The generated dialect: what it has, the official checksums, and how it is kept."""
+"""The generated dialect: its content, the official checksums, and its generation."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ OFFICIAL_CRC_EXTRA = {
     "CURRENT_MODE": 193,
     "AVAILABLE_MODES_MONITOR": 30,
 }
-"""Of the definitions that mavlink.io publishes (mavlink/mavlink, July 2026)."""
+"""CRC_EXTRA of the definitions at mavlink.io (mavlink/mavlink, July 2026)."""
 
 
 def test_checksums_are_the_official_ones() -> None:

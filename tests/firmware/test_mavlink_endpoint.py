@@ -80,7 +80,7 @@ def test_the_newest_other_talker_hears_us_too(
     vehicle.send(b"\xfd 1")
     assert (companion.recv(9), first.recv(9)) == (b"\xfd 1", b"\xfd 1")
     second.sendto(FRAME, vehicle.local)
-    companion.sendto(FRAME, vehicle.local)  # the preset remote displaces nobody
+    companion.sendto(FRAME, vehicle.local)  # the preset remote displaces no client
     assert len(drain(vehicle)) == 2
     assert vehicle.peer == second.getsockname()
     vehicle.send(b"\xfd 2")

@@ -1,4 +1,4 @@
-"""MAV_CMD_INJECT_FAILURE: what PX4 1.16 was measured, or reads, to answer, and what then fails."""
+"""MAV_CMD_INJECT_FAILURE: PX4 1.16's answers, measured or from its code, and the faults."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Aloft:
             self.server.send(self.simulation.time_us)
 
     def inject(self, unit: float, kind: float, instance: float = 0) -> int | None:
-        """Return the answer; None: there is none."""
+        """Return the answer; None = no answer."""
         self.client.received()
         self.client.command(dialect.MAV_CMD_INJECT_FAILURE, unit, kind, instance)
         self.run(0.008)

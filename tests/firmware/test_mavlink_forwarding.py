@@ -1,4 +1,4 @@
-"""Who gets what is meant for others: PX4's rules, and no loops."""
+"""Forwarding of messages to other systems: PX4's rules, and no loops."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_a_broadcast_reaches_all_others_once(field: Field) -> None:
         ((1, 0), {"camera", "gimbal"}),  # every component of this system
         ((0, 0), {"camera", "gimbal", "other"}),
         ((1, 1), set()),  # this vehicle's autopilot alone
-        ((9, 1), set()),  # nobody has heard of it
+        ((9, 1), set()),  # unknown system
         ((1, 191), set()),
     ],
 )

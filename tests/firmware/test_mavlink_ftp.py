@@ -1,4 +1,4 @@
-"""MAVLink FTP: by the real MAVSDK, by pymavlink's client, and what must be refused, by hand."""
+"""MAVLink FTP: real MAVSDK, pymavlink's client, and hand-made requests to refuse."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ FAIL_ERRNO, INVALID_SIZE, INVALID_SESSION, NO_SESSIONS, END, UNKNOWN, EXISTS, PR
 
 
 class Card:
-    """A vehicle with a folder of its own and a client that speaks the protocol by hand."""
+    """Vehicle with a private folder, and a client that builds FTP requests by hand."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -104,7 +104,7 @@ def nak(code: int) -> tuple[int, bytes]:
 
 
 def transferred(start: Any, *words: Any) -> FtpResult:
-    """Return the last result of one of MAVSDK's transfers."""
+    """Return the final result of a MAVSDK transfer."""
     done: Queue[FtpResult] = Queue()
     start(*words, lambda result, _progress, _data: done.put(result))
     while (result := done.get(timeout=PATIENCE_S)) is FtpResult.NEXT:
@@ -261,7 +261,7 @@ def test_refusals_have_px4s_codes(card: Card) -> None:
 
 
 def test_the_session_number_comes_back_but_for_the_one_that_was_opened(card: Card) -> None:
-    # As PX4: MAVProxy counts sessions by itself, and takes no answer with another number.
+    # As in PX4: MAVProxy numbers its sessions, and rejects answers with another number.
     (card.folder / "a").write_bytes(b"text")
 
     def session_of(opcode: int, data: bytes) -> tuple[int, int]:

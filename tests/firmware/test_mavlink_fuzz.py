@@ -17,9 +17,9 @@ from tests.support.mavlink_clients import Bench, RawClient
 # Derandomised: a 16-bit checksum lets one random frame in 65,536 pass, too many for a test to
 # depend on luck.
 LINKS = ("onboard", pytest.param("gcs", marks=pytest.mark.nightly))
-"""Of two links with one reader: the ground station's is fuzzed in the night."""
+"""Two links with one reader: the ground station's is fuzzed in nightly runs."""
 
-# What the services read: the messages most worth distorting.
+# Messages that the services read: the best targets for distortion.
 HANDLED = (
     "command_long", "command_int", "set_mode", "set_position_target_local_ned", "param_set",
     "param_request_read", "param_request_list", "mission_count", "mission_request_list",
@@ -29,7 +29,7 @@ HANDLED = (
 
 
 def still_answers(bench: Bench, link: str) -> None:
-    """Assert that a command on the link is acknowledged and that streams go on."""
+    """Assert that a command on the link is acknowledged and that streams continue."""
     client = RawClient(getattr(bench, link))
     client.received()
     client.command(512, dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)

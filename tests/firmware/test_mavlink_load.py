@@ -1,4 +1,4 @@
-"""Twenty clients at 50 Hz with parameter downloads: everybody is answered, nobody is forgotten."""
+"""Twenty clients at 50 Hz with parameter downloads: all requests are answered."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_twenty_clients_at_50_hz_with_parameter_downloads() -> None:
     server = MavlinkServer(
         [onboard_link(MemoryEndpoint()), gcs_link(hub)], autopilot, boot_unix_us=0
     )
-    # Each is a system of its own, so that an answer names who asked.
+    # Each client is a separate system, so that an answer names its requester.
     clients = [hub.client(port, (100 + port, 190)) for port in range(CLIENTS)]
     ticks = SECONDS * US_PER_S // TICK_US
     sent = 0

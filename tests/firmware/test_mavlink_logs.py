@@ -1,4 +1,4 @@
-"""Flight logs over MAVLink: list, download, and the stream of what is being written."""
+"""Flight logs over MAVLink: list, download, and streaming of the open log."""
 
 from __future__ import annotations
 

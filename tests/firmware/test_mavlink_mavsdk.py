@@ -290,7 +290,7 @@ def test_refusals_come_at_once_and_by_name() -> None:
         assert failure(lambda: telemetry.set_rate_raw_imu(5.0)) == "UNKNOWN"  # and not this one
         companion.plugin(MissionRaw).clear_mission()
         action.arm()
-        # MAVSDK 4.1 sends force-disarm here; the vehicle does as it is told.
+        # MAVSDK 4.1 sends force-disarm here; the vehicle obeys.
         action.arm_force()
         with pacer.lock:
             assert pacer.bench.autopilot.commands[-1] == "disarm force=True"

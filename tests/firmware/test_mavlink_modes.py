@@ -16,7 +16,7 @@ REQUEST_MESSAGE, SET_STANDARD_MODE = 512, 262
 ACCEPTED, REJECTED, DENIED, FAILED = 0, 1, 2, 4
 
 ON_THE_WIRE = len({custom_mode(mode) for mode in Mode})
-"""Number of modes that clients can tell apart: Descend is shown as Land."""
+"""Number of modes that clients can distinguish: Descend is shown as Land."""
 
 
 def modes(rig: Rig, number: int) -> tuple[int, list[Any]]:
@@ -67,6 +67,6 @@ def test_standard_modes_that_are_lacking_are_refused() -> None:
     lacking = {k.standard for k in KNOWN} - {k.standard for k in existing()}
     for standard in lacking:
         assert rig.command(SET_STANDARD_MODE, standard)[0] in (REJECTED, FAILED)
-    # Those that no multicopter has: none, cruise, and numbers that mean nothing.
+    # Standard modes that no multicopter has: none, cruise, and invalid numbers.
     for number in (0, 3, 9, 99, float("nan")):
         assert rig.command(SET_STANDARD_MODE, number)[0] == FAILED

@@ -74,7 +74,7 @@ def ours(kind: Any, values: Values) -> bytes:
 
 
 def packed(pack: Callable[[], bytes]) -> bytes | type[Exception]:
-    """Return the frame, or what was raised because a value does not fit."""
+    """Return the frame, or the exception type if a value does not fit."""
     try:
         return pack()
     except (struct.error, OverflowError) as error:
@@ -173,7 +173,7 @@ def decoded(name: str, state: AutopilotState) -> Any:
 
 
 def check_streams(autopilot: KinematicAutopilot, bench: Bench) -> set[str]:
-    """Compare each stream's frame with pymavlink's; return the streams that said something."""
+    """Compare each stream's frame with pymavlink's; return the streams that sent a frame."""
     state, spoken = autopilot.state(), set()
     for name, build in streams(bench).items():
         if build is None:
@@ -195,11 +195,11 @@ def test_every_stream_at_rest() -> None:
     bench.run(0.2)
     own = {"SYSTEM_TIME", "VIBRATION", "BATTERY_STATUS", "TIMESYNC", "PING"}
     own |= {"TIME_ESTIMATE_TO_TARGET", "MAG_CAL_REPORT"}
-    # There is no plant, nobody's sticks are heard, and there is no radio.
+    # There is no plant, no manual control input, and no radio.
     lacking = {"HIL_STATE_QUATERNION", "MANUAL_CONTROL", "RC_CHANNELS"}
     own |= lacking
     assert set(streams(bench)) == BUILDERS.keys() | own
-    # Nothing orbits, nothing goes anywhere by itself, and nothing looks down.
+    # There is no orbit, no target position, and no sensor that looks down.
     idle = {"ORBIT_EXECUTION_STATUS", "POSITION_TARGET_GLOBAL_INT"}
     idle |= {"DISTANCE_SENSOR", "OPTICAL_FLOW_RAD"}
     silent = SILENT.keys() | idle | lacking

@@ -110,7 +110,7 @@ def test_the_full_list_is_paced_and_complete() -> None:
 
 
 def test_the_hash_is_another_after_every_change() -> None:
-    """With the flight controller's own store: the hash is worked out once for all who begin."""
+    """With the flight controller's own store: the hash is computed once for all new clients."""
     store = Stored()
     before = _hash_message(store)
     assert _hash_message(store) == before

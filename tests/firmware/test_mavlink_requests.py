@@ -156,7 +156,7 @@ def test_data_streams_only_ever_speed_up(rig: Rig) -> None:
     assert rig.bench.server.counters()["onboard"].ignored == before_ignored + 1
 
 
-# --- what a PX4 SITL sends to who asks for it
+# --- messages that a PX4 SITL sends on request
 
 
 def requested(rig: Rig, name: str) -> Any:

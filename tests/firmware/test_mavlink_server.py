@@ -121,7 +121,7 @@ def test_the_snapshot_is_only_taken_when_there_is_something_to_send(
     # Those two have rates that no client can change.
     counts = client.count()
     assert counts == {"ATTITUDE": 10, "HEARTBEAT": 1, "MISSION_CURRENT": 1}
-    # Of this server, which is given no logs of ticks, each is one of a snapshot.
+    # Without tick logs, this server takes one snapshot for each of these.
     assert taken == 250 + counts.total()
 
 

@@ -52,7 +52,7 @@ def test_ping(rig: Rig) -> None:
 
 
 def test_mavproxys_packed_parameters_are_no_file(rig: Rig) -> None:
-    """MAVProxy asks for them when it connects, and falls back to the list of parameters."""
+    """MAVProxy requests the file when it connects, and falls back to the parameter list."""
     name, opened = b"@PARAM/param.pck", 4
     body = struct.pack("<HBBBBBxI", 65_535, 0, opened, len(name), 0, 0, 0) + name
     message = dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, list(body.ljust(251, b"\0")))

@@ -84,7 +84,7 @@ def test_other_frames_are_refused_aloud_once(rig: Rig, frame: int) -> None:
     assert "".join(chunk for _, chunk in chunks) == text
     assert {severity for severity, _ in chunks} == {2}
     assert rig.autopilot.refusals[-1][0] == text
-    # After one that was accepted it is told again.
+    # After an accepted setpoint the refusal is reported again.
     rig.set_local(2503, vx=1.0)
     rig.set_local(2503, frame=frame, vx=1.0)
     rig.bench.tick()
@@ -164,7 +164,7 @@ def test_attitudes_and_body_rates(rig: Rig) -> None:
     assert isinstance(open_yaw, RateDemand)
     assert math.isnan(open_yaw.rates[2])
     assert open_yaw.thrust == 0.0
-    # What latency analysis recognises them by: angles or rates, and the thrust.
+    # Latency analysis recognises setpoints by angles or rates, and thrust.
     roll = 2.0 * math.atan2(0.8, 0.6)
     assert rig.autopilot.wires[0] == pytest.approx((0.0, 0.0, 0.0, 0.5))
     assert rig.autopilot.wires[1] == pytest.approx((roll, 0.0, 0.0, 1.0), abs=1e-6)

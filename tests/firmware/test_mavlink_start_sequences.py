@@ -1,4 +1,4 @@
-"""How ground stations and companions begin, replayed: QGroundControl and MAVROS get all they need.
+"""Replayed start sequences: QGroundControl and MAVROS receive everything they need.
 
 QGroundControl: InitialConnectStateMachine.cc, StandardModes.cc, ComponentInformationManager.cc.
 MAVROS: sys_status.cpp, param.cpp, waypoint.cpp, sys_time.cpp, home_position.cpp, command.cpp.
@@ -27,7 +27,7 @@ def _has(field: str, value: int) -> Callable[[Any], bool]:
 
 
 class Station:
-    """A client of a lossy link that asks again for what has not come, as QGroundControl does."""
+    """Client on a lossy link that repeats unanswered requests, as QGroundControl does."""
 
     def __init__(self, ids: tuple[int, int], lost_every: int = 0) -> None:
         self.rig = Rig()
@@ -72,13 +72,13 @@ class Station:
         return int(ack.result)
 
     def request(self, number: int, name: str, *params: float) -> Any:
-        """Return a message that is asked for by REQUEST_MESSAGE."""
+        """Request a message with REQUEST_MESSAGE and return it."""
         filled = [float(number), *params, *[0.0] * (6 - len(params))]
         message = dialect.MAVLink_command_long_message(1, 1, 512, 0, *filled)
         return self.ask(message, name)
 
     def file(self, name: str) -> bytes:
-        """Return a file that is read in bursts, with what was lost read again."""
+        """Return a file read in bursts; lost parts are read again."""
 
         def call(opcode: int, data: bytes = b"", offset: int = 0, size: int | None = None) -> Any:
             self._sequence += 1
@@ -114,7 +114,7 @@ class Station:
         return b"".join(parts[offset] for offset in sorted(parts))
 
     def parameters(self) -> dict[int, str]:
-        """Return the names by index: the list, and what was lost of it one by one."""
+        """Return the names by index: from the list, then lost entries one by one."""
         found: dict[int, str] = {}
         total = 0
         self.client.send(dialect.MAVLink_param_request_list_message(1, 1))
@@ -164,7 +164,7 @@ def test_qgroundcontrol_connects(lost_every: int) -> None:
     assert sorted(names) == list(range(len(station.rig.autopilot.parameters)))
     assert {"SYS_AUTOSTART", "MPC_XY_VEL_MAX"} <= {p["name"] for p in described["parameters"]}
     assert [station.plan(kind) for kind in (MISSION, FENCE, RALLY)] == [0, 0, 0]
-    # What its pages ask besides, of devices that are not there: refused, and not in silence.
+    # Its pages also query devices that do not exist: refused, not ignored.
     for number in (259, 280):  # CAMERA_INFORMATION, GIMBAL_MANAGER_INFORMATION
         assert station.command(512, number) != dialect.MAV_RESULT_ACCEPTED
 
@@ -173,7 +173,7 @@ def test_mavros_connects() -> None:
     # Same system as the vehicle, component MAV_COMP_ID_ONBOARD_COMPUTER.
     companion = Station((1, 191))
     assert companion.command(520, 1, target=(1, 1)) == dialect.MAV_RESULT_ACCEPTED
-    # It asks all components first, and the autopilot when nobody has answered.
+    # It queries all components first, and the autopilot if there is no answer.
     everybody = dialect.MAVLink_command_long_message(0, 0, 520, 0, 1, 0, 0, 0, 0, 0, 0)
     assert companion.ask(everybody, "AUTOPILOT_VERSION")
     synced = companion.ask(

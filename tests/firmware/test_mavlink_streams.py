@@ -90,7 +90,7 @@ def test_rates_are_exactly_those_of_a_real_px4() -> None:
     gcs.count()
     seconds = 20
     bench.run(seconds)
-    # No stream of those whose rate can be set: it comes every three seconds, and a little.
+    # Not a stream with an adjustable rate: its period is slightly more than three seconds.
     events = {"CURRENT_EVENT_SEQUENCE": 6}
     streams = {name: hz * seconds for name, hz in MEASURED_ONBOARD.items()}
     assert onboard.count() == {**streams, **events}
@@ -217,7 +217,7 @@ def test_height_is_above_home_not_above_the_origin() -> None:
 
 
 def test_odometry_is_in_the_local_frame() -> None:
-    """As PX4 1.16 sends it, velocity too."""
+    """PX4 1.16 sends velocity in the local frame, too."""
     message = newest(flown(), "ODOMETRY")
     assert [message.vx, message.vy, message.vz] == [1.5, -0.5, 0.25]
     assert (message.frame_id, message.child_frame_id) == (1, 1)  # LOCAL_NED both
@@ -302,7 +302,7 @@ def test_battery_state_is_undefined_without_thresholds() -> None:
 
 
 def test_sys_status() -> None:
-    """The bits are those of a running PX4 1.16 SITL, disarmed and armed, without a radio."""
+    """The expected bits are from a running PX4 1.16 SITL, disarmed and armed, without a radio."""
     prearm, ahrs, gps, radio = 0x1000_0000, 0x20_0000, 0x20, 0x1_0000
     booting = newest(KinematicAutopilot(), "SYS_STATUS")
     assert booting.onboard_control_sensors_health & (gps | prearm | ahrs) == 0
@@ -523,7 +523,7 @@ def test_heartbeat(
 
 @pytest.mark.parametrize("mode", list(Mode))
 def test_a_requested_mode_is_the_reported_one(mode: Mode) -> None:
-    """Descend is shown as Land, and a termination cannot be asked for as a mode, as in PX4."""
+    """PX4: Descend is shown as Land, and termination cannot be requested as a mode."""
     number = custom_mode(mode)
     requested = requested_mode(129, number >> 16 & 0xFF, number >> 24)
     alike = {Mode.DESCEND: Mode.LAND, Mode.TERMINATION: None}

@@ -1,4 +1,4 @@
-"""Missions of in-range but absurd values: whatever is stored can be flown without harm."""
+"""Missions of in-range but absurd values: every stored mission can be flown without harm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What makes PX4 reject a mission, and with which text."""
+"""Missions that PX4 rejects, with the reasons and texts."""
 
 from __future__ import annotations
 

@@ -179,7 +179,7 @@ def test_invalid_items_end_the_upload(rig: Rig, fields: dict[str, Any], result: 
     answers = rig.exchange(item_int(0, **fields))
     assert [m.type for m in answers if m.get_type() == "MISSION_ACK"] == [result]
     assert text_of(answers) == [(2, "IGN MISSION_ITEM: Invalid item")]
-    # What was stored before still is, and a new upload may begin.
+    # The stored mission remains, and a new upload may begin.
     assert len(rig.autopilot.plans.mission) == len(MIXED)
     assert upload(rig, MIXED[:2]) == 0
 
@@ -272,7 +272,7 @@ def test_the_last_item_again_is_acknowledged_again(rig: Rig) -> None:
 
 
 def test_a_download_that_is_never_acknowledged_blocks_nothing(rig: Rig) -> None:
-    """As dronekit's."""
+    """Dronekit's downloads are never acknowledged."""
     upload(rig, MIXED[:1])
     for follow, answer in (
         (dialect.MAVLink_mission_set_current_message(1, 1, 0), "MISSION_CURRENT"),

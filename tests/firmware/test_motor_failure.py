@@ -1,4 +1,4 @@
-"""Motors that fail: slow ones and unequal ones against closed forms, and what the detector sees."""
+"""Motor faults: slow and unequal motors against closed forms, and failure detection."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_slow_motor_has_its_time_constant(factor: float) -> None:
 
 
 def test_a_slow_motor_brakes_as_slowly() -> None:
-    """Told to stop: s(t) = s(0) exp(-t / (k tau)), by what a healthy rotor makes of the command."""
+    """After a stop: s(t) = s(0) exp(-t / (k tau)), from a healthy rotor at the slowed command."""
     factor, ticks, speed = 10.0, 25, 0.9
     stop = ActuatorControls(0, (0.0,) * 4, armed=True)
     share = lag(AIRFRAME, TICK_S)
@@ -74,9 +74,9 @@ def seen(outputs: tuple[float, ...], told: tuple[float, ...], until_ms: int) -> 
     [
         (0.0, 0.5, 100, False),
         (0.0, 0.5, 104, True),
-        # Told so little that it may stand.
+        # Command too low for the check: the motor may be stopped.
         (0.0, 0.2, 500, False),
-        # 1 A and 15 A more by the command: healthy from 2 A times what it is told.
+        # 1 A plus 15 A times the command: healthy from 2 A times the command.
         (0.06, 0.96, 500, True),
         (0.07, 0.96, 500, False),
     ],

@@ -1,4 +1,4 @@
-"""Optical flow: what the sensor sees, what is estimated by it, and what is flown by that."""
+"""Optical flow: sensor model, estimation, and flight."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_a_leaning_vehicle_sees_the_flow_of_its_own_axes() -> None:
     away = (3.0 - lean.apply(place)[2]) / down[2]
     moved = -(lean.inv().apply(velocity) + np.cross(rates, place)) - np.cross(rates, [0, 0, away])
     reading = seen(profile, row_of(3.0, tuple(velocity), tuple(rates), lean))
-    # What moves to the right in the image is a positive turn about x, and backward one about y.
+    # Motion to the right in the image is a positive turn about x; backward, one about y.
     assert reading.flow / INTERVAL_S == pytest.approx([moved[1] / away, -moved[0] / away], rel=1e-6)
 
 
@@ -306,7 +306,7 @@ def test_flow_that_a_vehicle_lacks_cannot_fail() -> None:
         resolve(Scenario(vehicle="quad-vio", faults=("flow off",), level="lockstep"))
 
 
-# --- what is told
+# --- messages
 
 
 def flow_message(**changes: Any) -> Any:

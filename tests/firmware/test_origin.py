@@ -82,7 +82,7 @@ def test_the_answer_is_the_origin_whoever_was_meant() -> None:
     ]
     assert {(m.latitude, m.longitude, m.altitude) for m in origins} == {WIRE}
     rig.bench.tick()
-    # All other clients are told, too.
+    # All other clients receive it, too.
     (other,) = rig.station.received("GPS_GLOBAL_ORIGIN")
     assert (other.latitude, other.longitude, other.altitude) == WIRE
 

@@ -1,4 +1,4 @@
-"""Simulated time that the host cannot keep up with is given up, not raced through."""
+"""Simulated time that the host cannot keep up with is skipped, not raced through."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_lag_is_given_up_once() -> None:
     tick_us = TICK_US
     assert paced.wait(tick_us, [], never) == tick_us
     assert paced.slipped_us > MAX_LAG_US
-    # What passes before an episode begins is no part of it.
+    # Lag before an episode begins does not count.
     total = paced.slipped_us
     time.sleep(0.01)
     paced.restart(tick_us)
@@ -71,7 +71,7 @@ def _stopping(pause_s: float, real: Any) -> Any:
 
 
 def test_stamps_never_go_back(talking: list[int]) -> None:
-    """Whatever is read before, at and after a slip has times in order."""
+    """Data read before, at and after a slip has times in order."""
     paced = WallPacing(FAST)
     stamps: list[int] = []
     slips = 0
@@ -82,7 +82,7 @@ def test_stamps_never_go_back(talking: list[int]) -> None:
         before_us = paced.slipped_us
         stamps.append(paced.wait(tick_us, talking, stamps.append))
         slips += paced.slipped_us > before_us
-        # Nor does the clock go back behind one: what happens next is later.
+        # The clock never goes back behind a stamp: later events have later times.
         assert paced.clock.time_us() >= stamps[-1]
     assert stamps == sorted(stamps)
     assert slips >= 2

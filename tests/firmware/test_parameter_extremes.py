@@ -21,13 +21,13 @@ FAR = 1e9
 """Hardly any parameter has this in its range, and each type holds it."""
 
 SMALL = (0.0, 5e-324, 1e-30)
-"""Zero, and what is hardly more: the smallest double, and a number that MAVLink can carry."""
+"""Zero and tiny values: the smallest double, and a number that MAVLink can carry."""
 
 FORWARD = velocity_setpoint(2.0, 1.0, -0.2, yaw=math.nan, yaw_rate=0.5)
 
 
 def extremes(spec: ParameterSpec) -> list[float]:
-    """Return both ends of what is flown, what lies beyond, and zero and its neighbours."""
+    """Return both ends of the flown range, values beyond it, and zero and its neighbours."""
     return list(dict.fromkeys([spec.flown_low, spec.flown_high, -FAR, FAR, *SMALL]))
 
 
@@ -51,7 +51,7 @@ def fly_on(rig: Rig, seconds: float) -> None:
 
 
 def fly_at(rig: Rig, spec: ParameterSpec, value: float) -> None:
-    """Fly a moment with a parameter set to a value: as a take-off begins, or as it goes on."""
+    """Fly briefly with a parameter set to a value, at the start of a take-off or in flight."""
     usual = rig.ap.parameters[spec.name]
     rig.ap.parameters.set(spec.name, value)
     fly_on(rig, 0.3)
@@ -70,7 +70,7 @@ def test_each_parameter_at_the_ends_of_its_range(group: list[ParameterSpec]) -> 
         rig.boot()
         cases = [(spec, value) for spec in group for value in extremes(spec)]
         for spec, value in cases:
-            # From the ground: filters and integrators begin anew.
+            # From the ground: filters and integrators restart.
             rig.ap.arm(force=True)
             rig.ap.takeoff(2.0)
             fly_at(rig, spec, value)

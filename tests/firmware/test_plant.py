@@ -104,7 +104,7 @@ def arena(
 
 @pytest.fixture(params=get_args(PlantName) if HAS_PYBULLET else ("kernel",))
 def body(request: pytest.FixtureRequest) -> str:
-    """Name a body: what is true of the plant is true with each."""
+    """Return a body's name: all bodies must pass the plant's tests."""
     name: str = request.param
     return name
 
@@ -438,7 +438,7 @@ def test_a_soft_touch_down_and_sliding_are_no_collisions(make: PlantMaker) -> No
     put(plant, (0.0, 0.0, -HEIGHT / 2 - 0.02), (0.0, 0.0, 0.08))
     run(plant, HOVER, 0.5)
     run(plant, OFF, 1.0)
-    # A push, and not `plant.put`: what stands goes on standing.
+    # A push, not `plant.put`, which leaves a resting vehicle at rest.
     plant.record["motion"] = plant.body.put(plant.position, (2.0, 0.0, 0.0))
     plant.record["resting"] = 0
     run(plant, OFF, 1.0)
@@ -761,7 +761,7 @@ def test_a_closed_plant_cannot_touch_another_one(make: PlantMaker) -> None:
 
 DISC_M2 = 4 * math.pi * 0.254**2 / 4
 ROTORS_W = (MASS * G) ** 1.5 / math.sqrt(2 * 1.225 * DISC_M2) / 0.65 / 0.68
-"""Of the quad in a hover: 10 inch, figure of merit 0.65, drive 0.68."""
+"""Rotor power of the quad in a hover [W]: 10 inch, figure of merit 0.65, drive 0.68."""
 
 
 def test_on_the_floor_power_is_that_of_standing_rotors(make: PlantMaker) -> None:

@@ -73,7 +73,7 @@ def test_any_rate_is_kept_without_drift(rate_hz: float, start: int) -> None:
     period = US_PER_S / rate_hz
     # The first one at once, the others in step with the period.
     assert len(times) == pytest.approx(4.0 * rate_hz, abs=2.01)
-    # Each sample at the first tick of its own period.
+    # Each sample at the first tick of its period.
     periods = np.array([math.floor(t / period + 1e-9) for t in times])
     assert np.all(np.diff(periods) >= 1)
     late = (np.array(times) - periods * period)[1:]

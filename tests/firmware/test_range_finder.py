@@ -1,4 +1,4 @@
-"""A rangefinder in flight: where the ground is, what is flown by it, and what clients are told."""
+"""A rangefinder in flight: terrain estimate, height control, and messages to clients."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def box() -> Arena:
 
 
 def indoors(arena: Arena | None = None, *, gps: bool = False, **changes: float) -> Rig:
-    """The shipped vehicle with a rangefinder; with GPS in vision's place, if that is asked for."""
+    """Return a rig of the shipped vehicle with a rangefinder; `gps` replaces vision."""
     profile = load_vehicle("quad-indoor")
     parameters = {**profile.parameters, **changes}
     if gps:
@@ -106,7 +106,7 @@ def farther(sample: SensorSample, by_m: float) -> SensorSample:
 
 
 def test_a_flight_over_a_box() -> None:
-    """Against the truth: the ground below, floor or box, and all that clients are told of it."""
+    """Compare the ground distance over floor and box, as clients receive it, with the truth."""
     rig = indoors(box())
     on_ground = clearance(rig)
     # Nearer than it measures: it stands as high as the profile says.
@@ -286,12 +286,12 @@ def test_when_the_ground_is_held() -> None:
     assert hold.place(piloting(level=0.2), -2.1) == -2.1 and not hold.holds
     hold.place(piloting(), -2.3)
     assert hold.place(piloting(ground_m=NAN), -2.1) == -2.1 and not hold.holds
-    # The throttle unlocks; what there is when the vehicle has come to stand is held.
+    # The throttle unlocks; the height after the vehicle has stopped is held.
     hold.place(piloting(), -2.3)
     assert math.isnan(hold.place(piloting(climbing=True), NAN)) and hold.holds
     assert math.isnan(hold.place(piloting(climb_m_s=0.7), NAN))
     assert hold.place(piloting(down_m=-3.0, ground_m=3.0), NAN) == pytest.approx(-3.0)
-    # Ground that was put elsewhere is locked anew.
+    # Ground that was reset is locked again.
     assert hold.place(piloting(down_m=-3.0, ground_m=2.0, resets=1), NAN) == pytest.approx(-3.0)
     asked["MPC_ALT_MODE"] = 1.0
     assert hold.place(piloting(), -2.3) == -2.3 and not hold.holds
@@ -324,7 +324,7 @@ def ground(dist_bottom_m: float, *, valid: bool = True, by_range: bool = True) -
         (ground(0.1), 1.0),
         (ground(2.0), NAN),
         (ground(2.0, valid=False), 3.0),
-        # Ranges that have never told the ground decide nothing.
+        # Ranges that never determined the ground have no effect.
         (ground(2.0, by_range=False), 1.0),
     ],
 )
@@ -340,7 +340,7 @@ def test_landing_is_believed_unless_the_height_is_held(down_m_s: float, needed_s
 
 
 def landing_s(told: Clearance | None, down_m_s: float = 0.1) -> float:
-    """Return when a vehicle at rest, told to move downwards so fast, has landed [s]."""
+    """Return the landing time [s] of a vehicle at rest with a downward setpoint; NaN = never."""
     asked = {
         "LNDMC_TRIG_TIME": 1.0,
         "LNDMC_Z_VEL_MAX": 0.25,
@@ -426,7 +426,7 @@ def test_a_client_s_rangefinder_tells_the_ground_and_another_direction_does_not(
     rig.run(2.0, lambda: tell(lambda: down))
     assert clearance(rig).valid
     assert clearance(rig).dist_bottom_m == pytest.approx(0.3, abs=0.02)
-    # It falls silent, is sent no more, and is no longer fused.
+    # Without new ranges, the message stops and fusion ends.
     rig.run(1.0)
     assert distance.distance_sensor(rig.ap.state()) is None
     assert not finder(rig).tells_ground

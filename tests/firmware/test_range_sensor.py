@@ -1,6 +1,6 @@
-"""Which ranges are believed: the cases of PX4's own tests (test_SensorRangeFinder.cpp), and others.
+"""Validity of ranges: the cases of PX4's own tests (test_SensorRangeFinder.cpp), and others.
 
-PX4 1.16 has no test of its RangeFinderConsistencyCheck: that is held against its definition.
+PX4 1.16 has no test of its RangeFinderConsistencyCheck; the reference is its definition.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def test_a_range_that_is_stuck_after_a_time_without() -> None:
     for _ in range(2 * US_PER_S // dt):
         feed(finder, sample)
         sample = replace(sample, time_us=sample.time_us + dt)
-    # Good by itself, and always the same.
+    # Good quality, but constant.
     assert not finder.is_healthy
     for _ in range(2):
         sample = replace(sample, range_m=sample.range_m + 1.0)
@@ -215,7 +215,7 @@ def test_ranges_that_do_not_move_are_found_in_a_climb_and_believed_again_in_anot
     # The vehicle is thought to climb (negative down) and the ranges stay: the innovation is up.
     assert check.mean_ratio == pytest.approx(expected * (1.0 - (1.0 - share) ** steps), rel=1e-6)
     climb(check, 20.0, 0.2, 0.2, start_s=12.0)
-    # Too slow to tell.
+    # Too slow for a decision.
     assert not check.is_consistent
     climb(check, 3.0, 1.0, 1.0, start_s=40.0)
     assert check.is_consistent

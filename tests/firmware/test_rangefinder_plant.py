@@ -1,4 +1,4 @@
-"""What the plant's rangefinder measures: against pybullet's rays, closed forms and its profile."""
+"""The plant's rangefinder against pybullet's rays, closed forms and its profile."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_moving_obstacles_are_where_they_are_at_that_time() -> None:
 
 
 def test_a_rangefinder_changes_nothing_of_what_other_sensors_measure() -> None:
-    """Its noise is a stream of its own, and it comes at its own rate."""
+    """Its noise is a separate random stream, and its rate is independent."""
     plain, fitted = load_vehicle("quad-vio"), load_vehicle("quad-indoor")
     plants = [Plant(each, None, np.random.default_rng(4)) for each in (plain, fitted)]
     told: list[int] = []

@@ -258,7 +258,7 @@ def test_parameters_are_asked_for_in_bursts_until_they_came() -> None:
     client = ParameterClient(sent.append)
     names = [f"P{i}" for i in range(25)]
     assert client.ask(names) == names
-    assert sent == []  # nobody to ask yet
+    assert sent == []  # no target yet
     client.address(3, 1, PX4_ID)
     client.ask(names)
     assert [message.param_id for message in sent] == names[:10]
@@ -341,7 +341,7 @@ def test_others_on_the_link_are_not_taken_for_the_firmware() -> None:
 def test_it_asks_for_what_does_not_come() -> None:
     far = Far()
     far.observer.send(0)
-    assert not far.endpoint.outbox  # nobody to ask
+    assert not far.endpoint.outbox  # no target yet
     far.hear(heartbeat(ARDUPILOT_ID, 4, 89))
     far.observer.send(2_000_000)
     decoder = dialect.MAVLink(None)
@@ -410,7 +410,7 @@ def parameters_of(firmware: str, out: Path) -> list[str]:
 def test_firmware_that_is_set_from_the_file_flies_the_vehicle(
     firmware: str, tmp_path: Path
 ) -> None:
-    """Read back as their own tools do, the values are those that are checked on the ground."""
+    """The firmware's own tools read back the values that are checked on the ground."""
     lines = parameters_of(firmware, tmp_path / "file")
     airframe = KINDS[firmware][0](quad())
     if firmware == "ardupilot":

@@ -1,4 +1,4 @@
-"""What the firmware process keeps of a flight: everything for a harness, nothing stand alone."""
+"""Recording in the firmware process: everything for a harness, nothing stand alone."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TICKS_A_MINUTE = 60 * 250
 
 
 class Mute(MemoryEndpoint):
-    """Nobody takes what is sent here."""
+    """Endpoint that discards streams."""
 
     def send_streams(self, frames: Sequence[bytes]) -> None:
         del frames
@@ -115,7 +115,7 @@ def test_memory_stays_bounded_where_nobody_collects_the_record() -> None:
     assert blocks_kept_by_two_minutes(recording=False) < 200
 
 
-@pytest.mark.nightly  # What is kept: test_simulation.py.
+@pytest.mark.nightly  # Recorded data: test_simulation.py.
 def test_the_same_flight_recorded_keeps_its_samples() -> None:
     assert blocks_kept_by_two_minutes(recording=True) > 6_000
 

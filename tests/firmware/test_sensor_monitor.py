@@ -1,4 +1,4 @@
-"""Which sensors are believed: silent ones, and those that repeat themselves."""
+"""Sensor validity: silent sensors and repeated values."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Stand:
         self._ticks = 0
 
     def wait(self, seconds: float, *, flying: bool = False) -> list[str]:
-        """Let time go by; return what is told. Without randomness every sample is the same."""
+        """Let time pass; return the texts. Without randomness every sample is the same."""
         told: list[str] = []
         for _ in range(round(seconds * US_PER_S / TICK_US)):
             draw = np.zeros(7) if self.rng is None else self.rng.standard_normal(7)

@@ -118,7 +118,7 @@ def test_fifteen_episodes_leave_nothing_behind() -> None:
             simulation.capture_due(simulation.time_us, lambda _: None)
         simulation.arrays()
         simulation.close()
-        # Or what waits to be collected decides how large the process becomes.
+        # Otherwise uncollected garbage decides the size of the process.
         del simulation
         gc.collect()
 

@@ -36,7 +36,7 @@ class Whole:
         self.p = f @ self.p @ f.T + np.diag(noise)
 
     def fuse(self, h: Vector, innovation: Vector, variance: Vector, mask: Vector) -> Vector:
-        """Return the correction (17,) of a measurement; gains outside the mask are none."""
+        """Return the correction (17,) of a measurement; gains outside the mask are zero."""
         s = h @ self.p @ h.T + np.diag(variance)
         k = (self.p @ h.T @ np.linalg.inv(s)) * mask[:, None]
         a = np.eye(N) - k @ h
@@ -120,7 +120,7 @@ def test_ground_has_nothing_to_do_with_a_height_that_is_put_elsewhere() -> None:
 
 
 def test_variances_without_measure_end_nothing() -> None:
-    """Those that a client states may make a matrix that is singular to what numbers can hold."""
+    """Variances from a client may make a numerically singular matrix."""
     terrain = TerrainFilter(KernelFilter(np.diag(es.INITIAL_SIGMA**2), NOISE))
     terrain.put(0.0, 1.0)
     terrain.cross[Z] = 0.1

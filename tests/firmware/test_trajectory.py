@@ -117,7 +117,7 @@ def test_a_target_is_reached_within_all_limits(target: tuple[float, float, float
 
 
 def test_a_long_leg_is_cruised() -> None:
-    """Of 100 m, most is flown at 5 m/s: PX4 takes 100 / 5 and the ways up and down in speed."""
+    """Most of 100 m is flown at 5 m/s: PX4 takes 100 / 5 plus acceleration and braking."""
     path = Trajectory()
     rows = fly(path, Leg((100.0, 0.0, 0.0)), 30.0)
     assert np.median(rows[:, 3]) == pytest.approx(5.0, abs=0.01)

@@ -40,7 +40,7 @@ assert not new, new
 """
 
 
-# What quad-vio has, quad-indoor has as well.
+# quad-indoor includes everything of quad-vio.
 @pytest.mark.parametrize(
     "vehicle",
     [

@@ -51,7 +51,7 @@ def test_with_a_landing_the_mission_is_flown_on_to_it() -> None:
     # A mission that is not being flown begins at the nearest item, height counted.
     near = along_mission(stored, ORIGIN, place(1, 19, 7), flying=False)
     assert places(near) == places(way[1:])
-    # A landing that has been passed by is nobody's end: what follows it is flown.
+    # A mission past its landing continues with the next item.
     last = along_mission(stored, ORIGIN, place(50, 50, 5), flying=False)
     assert places(last) == expected((16, 50, 50))
 

@@ -131,7 +131,7 @@ class PlainWorld:
         self.time_us = 0
 
     def throw(self, position: np.ndarray, velocity: np.ndarray) -> list[tuple[int, str]]:
-        """Return when the vehicle first pressed on what, in order."""
+        """Return the times [µs] and names of new contacts, in order."""
         client, v = self.client, self.vehicle
         client.resetBasePositionAndOrientation(v, ned_to_enu(position), FACING_NORTH)
         client.resetBaseVelocity(v, ned_to_enu(velocity), (0.0, 0.0, 0.0))

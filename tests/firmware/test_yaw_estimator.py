@@ -1,4 +1,4 @@
-"""The yaw estimator against a plain reference and the truth, and what it saves a flight from."""
+"""The yaw estimator against a plain reference and the truth, and its use in flight."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from firmware_sim.autopilot.yaw_estimator import WEIGHT, YAW, YawEstimator
 from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
 
 ACCURACY = 0.05
-"""Of the GPS velocity [m/s]: EKF2_GPS_V_NOISE of the shipped vehicle."""
+"""Accuracy of the GPS velocity [m/s]: EKF2_GPS_V_NOISE of the shipped vehicle."""
 
 
 class Tick(NamedTuple):
     gyro: np.ndarray
     accel: np.ndarray
     velocity: np.ndarray | None
-    """By GPS, in ticks that have one."""
+    """GPS velocity; None between fixes."""
     flying: bool
     yaw: float
     """True heading."""
@@ -40,7 +40,7 @@ def errors_deg(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def ticks() -> list[Tick]:
-    """What IMU and GPS say of a take-off, and of a flight to the north, the east and back."""
+    """Record IMU and GPS of a take-off and a flight to the north, the east and back."""
     seen: list[Tick] = []
     with flight(4) as rig:
         step = rig.ap.step
@@ -105,7 +105,7 @@ def test_it_finds_the_heading_wherever_the_vehicle_points(ticks: list[Tick], ang
 def test_a_wrong_heading_is_explained_by_another(
     ticks: list[Tick], off_deg: float, least: float
 ) -> None:
-    """What it takes of 2 s of motion does not depend on where GPS has turned the models to."""
+    """The explained share of 2 s of motion is independent of the models' frame."""
     wrong = [
         estimator.explained(tick.yaw + math.radians(off_deg))
         for tick, estimator in observed(turned(ticks, 1.0))
@@ -270,7 +270,7 @@ def test_a_heading_is_taken_over_without_the_tilt(yaw: float) -> None:
 
 
 class Told(YawEstimator):
-    """One that has come to a heading, and to how much of the motion that explains."""
+    """Estimator with a fixed heading error, uncertainty, and explained share of the motion."""
 
     def __init__(self, off_deg: float, sigma_deg: float, explained: float) -> None:
         super().__init__()

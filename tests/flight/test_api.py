@@ -168,7 +168,7 @@ def test_another_run_is_not_mixed_in(flown: Run) -> None:
 
 @pytest.mark.nightly
 def test_it_flies_in_a_thread(tmp_path: Path) -> None:
-    """Where Python delivers no signals: in a notebook's executor, behind a server."""
+    """Python delivers no signals in a thread, as in a notebook's executor or a server."""
     found: dict[str, Any] = {}
 
     def work() -> None:
@@ -249,7 +249,7 @@ def test_the_latency_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     for name in ("degradation.json", "degradation.html", "degradation.md"):
         assert (out / name).stat().st_size > 1000
     assert str(out / "degradation.html") in text
-    # The same figures from Python, with nothing flown again; a longer curve goes on.
+    # Python returns the same figures without new flights; a longer curve resumes.
     monkeypatch.setattr(show, "write_document", lambda _, folder: folder / "none.html")
     found = degrade(asked(episodes=3), ("native", "150ms", "400ms", "950ms"), ("greedy",), out=out)
     assert list(found.runs) == [f"greedy-{name}" for name in ("native", "150ms", "400ms", "950ms")]

@@ -1,4 +1,4 @@
-"""The fingerprint of the flight behaviour: it holds today, and it sees what changes a flight."""
+"""Fingerprint of the flight behaviour: unchanged today, sensitive to changes of a flight."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def stored() -> Behaviour:
 
 
 def test_flights_are_those_of_the_published_results(stored: Behaviour) -> None:
-    """Where they are not, and that is meant: scripts/results.py fingerprint --accept."""
+    """Accept an intended change with scripts/results.py fingerprint --accept."""
     assert [str(each) for each in differences(stored, fly_behaviour())] == []
 
 

@@ -1,4 +1,4 @@
-"""A flight with the real MAVSDK is recorded, and becomes a run that says what was flown."""
+"""A recorded flight with the real MAVSDK, and the run created from the recording."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def test_it_is_judged_as_a_rehearsal_is(recorded: Recorded, run: Run) -> None:
 def test_where_no_current_is_measured_there_is_no_energy(
     recorded: Recorded, run: Run, tmp_path: Path, told_a: float | None
 ) -> None:
-    """As by the battery of a simulated PX4: older recordings hold its -1 A."""
+    """PX4 SITL's battery reports no current: older recordings contain its -1 A."""
     box = read_black_box(recorded.path)
     file = BlackBoxFile(tmp_path / "flight.mcap", box.run)
     for messages in box.messages.values():
@@ -179,7 +179,7 @@ def test_where_no_current_is_measured_there_is_no_energy(
     page = (tmp_path / "flight" / "report.html").read_text(encoding="utf-8")
     assert "Energy without the computer" in page and "Mean power: of airframe" not in page
     assert not (tmp_path / "flight" / "energy.png").exists()
-    # One of both knows it: the rest is compared.
+    # Only one of the two runs has energy: the other figures are compared.
     console = Console(record=True, width=100, quiet=True)
     assert report(ReportOptions(runs=(run.path, ours.path), out=tmp_path / "both"), console) == 0
     told = console.export_text()
@@ -201,7 +201,7 @@ def test_airl_report_shows_it_and_what_a_crash_left_of_it(
     assert left.outcome is Outcome.ABORTED
     assert left.reason.startswith("the recording ends while")
     assert "the companion, its computer or the power failed" in left.notes[0]
-    # Taken in once, it is not made again; another file of that name is told apart.
+    # A second import reuses the run. Another file with the same name is rejected.
     assert take_in(cut) == tmp_path / "cut"
     shutil.copy(recorded.path, cut)
     with pytest.raises(UsageError, match="holds another run"):
@@ -214,7 +214,7 @@ def test_airl_report_shows_it_and_what_a_crash_left_of_it(
 def test_rehearsed_where_it_flew_it_is_the_same_flight(
     recorded: Recorded, run: Run, tmp_path: Path
 ) -> None:
-    """As far as a flight in lockstep can tell, which hears nothing while it holds an action."""
+    """Tolerances cover the lockstep hold: no message arrives while an action is held."""
     out = tmp_path / "out"
     found = refly(recorded.path, out, arena=demo_scenario().arena_name, episodes=2)
     (flown,) = run.episodes

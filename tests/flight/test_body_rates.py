@@ -140,14 +140,14 @@ def test_the_vehicles_log_tells_when_setpoints_came(tmp_path: Path, policy: str)
     assert len(ways) > 0.9 * len(setpoints)
     assert first_us <= np.median(ways) <= last_us
     assert last_us - first_us <= 25_000
-    # Those of velocities are not there.
+    # The log contains no velocity setpoints.
     with_none = align(path_of(box), log, stamps["sent_us"], setpoints)
     assert with_none.setpoints < 10
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_overdue_body_rates_are_replaced_by_a_stand(tmp_path: Path, seed: int) -> None:
-    """Now and then a decision takes a second: the vehicle turns no more meanwhile, and stays up."""
+    """One decision in 31 takes a second: the vehicle stops rotating and stays in the air."""
     latencies = tmp_path / "stalls.txt"
     latencies.write_text("5\n" * 30 + "1000\n")
     late = flown(POLICY, seed, latency=str(latencies))
@@ -194,7 +194,7 @@ def test_an_attitude_is_flown_and_told_as_such() -> None:
     asked = leaning.latency["attitude_setpoint"]
     assert "setpoint" not in leaning.latency
     assert (leaning.latency["accepted_us"] != NO_STAMP).all()
-    # Flown attitudes follow what was asked, half a second after the beginning.
+    # Attitudes follow the setpoints from one second after the first setpoint.
     path, sent = leaning.trajectory, leaning.latency["sent_us"]
     later = sent > sent[0] + 1_000_000
     rows = np.searchsorted(path.time_us, sent[later] + 150_000)

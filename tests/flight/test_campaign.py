@@ -1,4 +1,4 @@
-"""Campaigns: what is flown once, shared, spread over workers, and gone on with after a kill."""
+"""Campaigns: flights flown once, shared, distributed over workers, and resumed after a kill."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_flights_do_not_depend_on_who_flies_them(tmp_path: Path, reference: Path
 
 def test_cells_with_the_same_flights_share_them(tmp_path: Path, reference: Path) -> None:
     ended: list[CellRun] = []
-    # The pace, and who flies it, decide nothing.
+    # Flights depend neither on the pace nor on the number of workers.
     twin = replace(gym_cell("c", slots=3, workers=5), title="the same again")
     run, _ = fly(tmp_path, [*cells(), twin], ended=ended.append)
     assert [each.cell.name for each in ended] == ["a", "b"]
@@ -101,7 +101,7 @@ def test_live_cells_with_the_same_flights_share_them(tmp_path: Path) -> None:
     first = gym_cell("a", episodes=2)
     twin = replace(gym_cell("b", episodes=2, slots=3), title="the same again")
     ended: list[CellRun] = []
-    # The twin flies in place of level sitl: who shares with whom is under test, not the level.
+    # The vectorized simulator replaces level sitl: the test covers sharing, not the level.
     with (
         open_campaign(tmp_path, declared([first]), command="a test") as store,
         patch.object(experiment, "fly_live", lambda *given, name: fly_scenario(*given)),

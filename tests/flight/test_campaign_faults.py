@@ -1,8 +1,8 @@
-"""Campaigns that are killed at random moments: no flight is lost, doubled or half-written.
+"""Campaigns killed at random moments: no flight is lost, duplicated or half-written.
 
-Whoever is killed, firmware, companion or harness, and whenever: in the end every seed has been
-flown once and its files are whole. Flights in lockstep with killed workers are in
-`test_evaluate_lockstep.py`, learners in `test_training.py`.
+Kills hit the firmware, the companion or the harness at any moment. Each seed is flown exactly once
+and its files are complete. `test_evaluate_lockstep.py` covers lockstep flights with killed workers,
+`test_training.py` covers learners.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ WINDOWS = {
     "half a line": "os.fsync = tear",
     "a line": "after(run_folder.RunFolder, 'save_episodes')",
 }
-"""Moments at which a harness dies while it saves, by what is then on the disk."""
+"""Moments at which a harness dies while saving, named by the content on disk."""
 
 
 class Campaign:
@@ -166,7 +166,7 @@ class Campaign:
             assert np.hypot(*(there - episode.goal)) < episode.goal_radius_m + 1.0
             decided = stamps["sent_us"]
             assert len(decided) >= 1
-            # Equal: what happens while the simulator stands still happens at one of its ticks.
+            # Equality is possible: while the simulator is stopped, events occur at a single tick.
             assert episode.navigation_us <= decided.min() <= decided.max() <= path.time_us[-1]
             check_log(self.out / f"flight-{episode.index:03d}.tlog", path.time_us)
         names = {path.name for path in self.out.iterdir()}
@@ -240,7 +240,7 @@ def test_whoever_is_killed_whenever_every_seed_is_flown_once(
     assert len(killed) >= 2
     assert "Traceback" not in told
     campaign.check_whole()
-    # Each loss that was lived through is told, and noted with the flight.
+    # Each survived loss is reported, and noted with the flight.
     for name in ("companion", "firmware"):
         told_of = told.count(f"begins again: the {name} died (SIGKILL)")
         noted = [note for line in campaign.saved() for note in line["notes"]]
@@ -266,7 +266,7 @@ for script in json.loads(sys.argv.pop(1)):
             os._exit(end.code)
     print("status", os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
 """
-"""Runs one command line again and again, each time in a new process, without loading it anew."""
+"""Program that runs one command line repeatedly, each time in a forked process."""
 
 
 def evaluate(folder: Path, out: Path, *scripts: str) -> list[int]:

@@ -68,7 +68,7 @@ def test_take_off_follows_px4s() -> None:
             flown.append((rig.height - floor, -float(rig.truth.velocity[2])))
             rig.run(PX4_EVERY_S)
         heights, climbs = np.array(flown).T
-        # What differs is a tenth of a second at each change of speed, and the estimate's error.
+        # Remaining differences: 0.1 s at each change of speed, and the estimation error.
         np.testing.assert_allclose(heights, np.array(PX4_HEIGHT_M) - 0.06, atol=0.12)
         np.testing.assert_allclose(climbs, PX4_CLIMB_M_S, atol=0.15)
         assert rig.mode is Mode.HOLD

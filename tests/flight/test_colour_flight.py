@@ -90,7 +90,7 @@ def test_it_is_evaluated_at_level_gym(policy: Path, tmp_path: Path) -> None:
 def test_the_companion_gets_the_images_that_the_twin_renders(
     policy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """To the bit, on the wire and as the network sees them."""
+    """Images are bit-identical on the wire and in the network's input."""
     taken: dict[int, tuple[np.ndarray, np.ndarray, Frame]] = {}
     real = SimulatedCamera.take
 
@@ -211,7 +211,7 @@ jpeg_quality = 75
 def test_a_flight_sees_formed_images_as_jpeg_leaves_them(
     policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those that the wire would carry; the same flight again sees the same again."""
+    """Images are the JPEG images of the wire; a repeated flight receives identical images."""
     vehicle = tmp_path / "formed.toml"
     vehicle.write_text(FORMED, encoding="utf-8")
     taken: dict[int, tuple[Motion, Frame]] = {}
@@ -236,6 +236,6 @@ def test_a_flight_sees_formed_images_as_jpeg_leaves_them(
         flights.append([each.image.tobytes() for each in seen])
     assert len(set(flights[0])) == len(flights[0]) > 3
     assert flights[0] == flights[1]
-    # It does move: what is exposed for a while is exposed in motion.
+    # The vehicle moves: the exposure time causes motion blur.
     assert max(np.abs(motion.velocity).max() for motion, _ in taken.values()) > 0.5
     assert max(np.abs(motion.rates).max() for motion, _ in taken.values()) > 0.1

@@ -1,4 +1,4 @@
-"""How the companion's link copes with other flight controllers than PX4: real MAVSDK, stand-ins."""
+"""The companion's link with flight controllers other than PX4: real MAVSDK, stand-ins."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_flight_on_ardupilot() -> None:
 @pytest.mark.slow
 @pytest.mark.xdist_group("flight")
 def test_what_was_heard_of_the_last_ardupilot_does_not_count() -> None:
-    """Between two episodes the firmware is started anew; the link stays."""
+    """Between two episodes the firmware restarts; the link stays."""
     (port,), _ = free_ports(1, 0)
     with link_on(port) as link:
         with ardupilot(port, position_s=1.0):
@@ -105,7 +105,7 @@ def test_what_was_heard_of_the_last_ardupilot_does_not_count() -> None:
             link.prepare(10.0)
             assert not link.healthy
             assert math.isnan(link.kinematics().position[0])
-            # It is the second one that is heard: attitudes come, asked for anew.
+            # Messages of the second vehicle arrive: attitudes are requested again.
             wait_for(lambda: not math.isnan(link.kinematics().quaternion[0]))
             assert not link.healthy
             with pytest.raises(LinkError, match="refuses to arm"):

@@ -1,4 +1,4 @@
-"""What airl conformance makes of telemetry: step responses, tolerances, reports, and Ctrl-C."""
+"""Results of airl conformance: step responses, tolerances, reports, and Ctrl-C."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ horizontal_noise_m = 0.02
 vertical_noise_m = 0.02
 [parameters]
 """
-"""The sensors of a simulator without much noise, as those that PX4's column was measured with."""
+"""Sensors of a simulator with little noise, similar to the simulator of PX4's column."""
 
 
 @contextmanager
@@ -66,11 +66,11 @@ def checks_of(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def patient_reference(folder: Path) -> Path:
-    """Return PX4's column with times judged to 0.2 s.
+    """Return PX4's column with a tolerance of 0.2 s on times.
 
-    Everything here lives by the wall clock, three times as fast: 10 ms that a busy host loses
-    between two processes are 30 ms of the vehicle's. What the latencies really are is held to 10 %
-    in simulated time, tests/flight/test_step_response.py.
+    These tests run at three times real time: a delay of 10 ms between two processes on a busy host
+    is 30 ms of simulated time. tests/flight/test_step_response.py checks the latencies to 10 % in
+    simulated time.
     """
     column = (profiles_dir() / "conformance" / "px4.toml").read_text(encoding="utf-8")
     path = folder / "px4.toml"
@@ -144,7 +144,7 @@ def test_a_detuned_vehicle_does_not_conform(tmp_path: Path) -> None:
     assert checks["auto-disarm"]["outcome"] == "pass"
 
 
-@pytest.mark.nightly  # What ends a flight is noted: test_conformance.py.
+@pytest.mark.nightly  # The end of a flight is noted: test_conformance.py.
 @pytest.mark.slow
 @pytest.mark.xdist_group("rehearsal")
 @pytest.mark.timeout(300)

@@ -1,4 +1,4 @@
-"""Which contacts end a flight: landing is none of them."""
+"""Contacts that end a flight: landing does not."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from firmware_sim.plant.plant import Collision
         # A policy has no business on the floor.
         (FLOOR, 0.2, Phase.AIR, Mode.OFFBOARD, True),
         (FLOOR, 0.2, Phase.AIR, Mode.HOLD, True),
-        # Whatever else is hit, however gently.
+        # Any other contact, at any speed.
         ("wall north", 0.01, Phase.AIR, Mode.LAND, True),
         ("box 3", 0.01, Phase.GROUND, Mode.TAKEOFF, True),
         ("box 3", 2.0, Phase.STANDBY, Mode.HOLD, True),

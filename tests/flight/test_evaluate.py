@@ -1,4 +1,4 @@
-"""`airl evaluate`: what it flies, what it leaves behind, what it survives."""
+"""`airl evaluate`: flights, output files, and recovery."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from tests.support.processes import ROOT, run_alone, wait_until
 EPISODES = 30
 LOCKSTEP = {"level": "lockstep"}
 DENSE: dict[str, Any] = {"arena": ("dense-obstacles",), "episodes": EPISODES, "seed": 20}
-"""Where some flights reach the goal and some do not."""
+"""Arena in which only some flights reach the goal."""
 
 
 def evaluate(*policies: str | Path, page: bool = False, **options: Any) -> tuple[int, str]:
@@ -77,7 +77,7 @@ def _few_pictures() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def greedy(tmp_path_factory: pytest.TempPathFactory) -> tuple[LoadedRun, str]:
-    """`airl evaluate greedy` and `airl report`: the run, and what was printed."""
+    """`airl evaluate greedy` and `airl report`: the run, and the printed text."""
     out = tmp_path_factory.mktemp("greedy") / "run"
     code, text = evaluate("greedy", out=out, **DENSE)
     assert code == 0
@@ -421,7 +421,7 @@ def test_a_long_table_is_cut_short_and_says_so(
 
 
 def test_the_picture_of_all_flights(greedy: tuple[LoadedRun, str]) -> None:
-    """Where a flight failed, the picture is red; where most flew, green."""
+    """The picture is red at failed flights and green along most paths."""
     run_, _ = greedy
     with Image.open(run_.path / "trajectories.png") as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
@@ -752,7 +752,7 @@ def test_a_table_of_policies_and_arenas(
         star = " *" if (cell["label"], cell["group"]) == ("linear", "no-obstacles") else ""
         assert shown in text
         assert shown.replace("[", "\\[").replace("]", "\\]") + star.replace("*", "\\*") in markdown
-    # A cell is what the same evaluation alone is.
+    # A cell equals the same evaluation run alone.
     evaluate("greedy", arena=("static-obstacles",), episodes=8, seed=3, out=tmp_path / "one")
     assert same_runs(load(out / "greedy-static-obstacles"), load(tmp_path / "one"))
     assert "goal radius 2.5 m, hold 0.4 s" in markdown

@@ -65,7 +65,7 @@ def _few_pictures() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> tuple[LoadedRun, str]:
-    """One worker, this process, undisturbed; and what was printed."""
+    """Undisturbed run with this process as the only worker, and the printed text."""
     out = tmp_path_factory.mktemp("lockstep") / "one"
     with page_alone(), flown_here():
         code, text = evaluate("greedy", workers=1, out=out)
@@ -212,9 +212,9 @@ class Evaluating:
 
 @contextmanager
 def evaluating(folder: Path, out: Path) -> Iterator[Evaluating]:
-    """Run the evaluation of the reference on two workers in a process of its own.
+    """Run the evaluation of the reference on two workers in a separate process.
 
-    Paced, which changes nothing but the time there is to disturb it: a second a flight at least.
+    Pacing leaves time to disturb the run, at least a second a flight, and changes nothing else.
     """
     words = ["evaluate", "greedy", "--level", "lockstep", "--arena", ARENA, "--workers", "2"]
     words += ["--episodes", str(EPISODES), "--seed", str(SEED), "--out", str(out), "--speed", "25"]

@@ -1,4 +1,4 @@
-"""Every program in examples/ runs as it stands and says what it should."""
+"""Every program in examples/ runs unmodified and prints the expected text."""
 
 from __future__ import annotations
 
@@ -215,7 +215,7 @@ def test_camera_publisher_is_heard(tmp_path: Path) -> None:
     assert source.malformed == 0
     lens = Intrinsics.from_fov(64, 48, math.radians(90.0))
     assert received.frame.intrinsics == lens
-    # The ground 2 m below: what the ray of the lowest row meets.
+    # The lowest row's ray hits the ground 2 m below.
     lowest = 2000.0 * lens.focal / (47 - lens.cy)
     assert abs(int(received.frame.depth_mm[-1, 0]) - lowest) <= 1
     assert not received.frame.depth_mm[:24].any(), "nothing above the horizon"

@@ -89,7 +89,7 @@ def test_a_run_folder_tells_its_faults_and_flies_them_again(tmp_path: Path) -> N
 
 
 def test_mavsdk_s_failure_plugin_makes_sensors_fail() -> None:
-    """As PX4's SITL: what it knows succeeds, what it lacks does not; it has to be enabled."""
+    """Match PX4 SITL: supported failures succeed, others fail; SYS_FAILURE_EN is required."""
     answers: list[str] = []
 
     def program(stage: Stage) -> None:

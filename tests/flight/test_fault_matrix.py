@@ -1,4 +1,4 @@
-"""The fault matrix: a handful of its flights, what is made of them, and the command."""
+"""Fault matrix: a handful of its flights, their results, and the command."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_what_a_quadrotor_survives_and_what_not() -> None:
         ("gps stuck", "climb", "landed"),
         ("gps noise 5x", "ground", "landed"),
         ("gps delay 200ms", "hold", "landed"),
-        # What is wrong before take-off keeps the vehicle on the ground.
+        # A fault before take-off keeps the vehicle on the ground.
         ("accel off", "ground", "not armed"),
         ("mag bias 0.1,0.1,0gauss", "ground", "not armed"),
         ("gps off", "ground", "not armed"),
@@ -128,7 +128,7 @@ def test_the_command_flies_shows_and_saves(tmp_path: Path) -> None:
 def test_a_stopped_run_goes_on_where_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Only what is missing is flown; another vehicle or version may not go on there."""
+    """Only missing flights are flown. Another vehicle or version cannot resume the run."""
 
     def options(*faulty: str, **more: object) -> faults.FaultsOptions:
         asked = {"faults": faulty, "phases": ["ground"], "episodes": 1, "workers": 1}
@@ -168,7 +168,7 @@ def test_what_cannot_be_flown_gets_one_line(fields: dict[str, object], line: str
 
 
 def test_every_phase_of_the_matrix_sets_its_faults_off() -> None:
-    """A fault that never began would pass for one that was survived."""
+    """A fault that never began would pass as survived."""
     for phase in MATRIX_PHASES:
         flown = fly_fault(quad(), "battery off", phase, 1)
         assert any("battery" in text.lower() for text in flown.said), phase

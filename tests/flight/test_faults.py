@@ -1,4 +1,4 @@
-"""What goes wrong in flight: every fault ends in a defined way, with everything cleaned up."""
+"""Faults in flight: every fault has a defined outcome, and every process is cleaned up."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def setpoints(log: list[tuple[float, Any]]) -> list[tuple[float, Any]]:
 
 
 def time_of_text(log: list[tuple[float, Any]], text: str) -> float:
-    """Return when the autopilot first said something [s]."""
+    """Return the time of the autopilot's first message with a text [s]."""
     return next(t for t, m in log if m.get_type() == "STATUSTEXT" and text in m.text)
 
 
@@ -185,7 +185,7 @@ def test_killed_companion_lets_the_failsafe_land(tmp_path: Path, ground: Ground)
 
 @pytest.mark.nightly
 def test_a_flight_that_loses_its_companion_is_flown_again(tmp_path: Path, ground: Ground) -> None:
-    """One that loses its firmware is flown again in test_campaign_faults.py."""
+    """Flights without their firmware are flown again in test_campaign_faults.py."""
     ports = choose_ports(ground.port)
     with sitl(tmp_path, ports, "--episodes", "1", goal_m=15.0) as run:
         children = run.find_children("firmware", "companion")
@@ -201,7 +201,7 @@ def test_a_flight_that_loses_its_companion_is_flown_again(tmp_path: Path, ground
     assert episode.outcome == "success"
     (note,) = episode.notes
     assert note.startswith("flown again: the companion died (SIGKILL)")
-    # What becomes of a vehicle without its companion is seen through first.
+    # The vehicle first completes its failsafe without the companion.
     assert "Failsafe activated" in note and "Disarmed by landing" in note
     nothing_half_written(tmp_path / "run")
 
@@ -216,7 +216,7 @@ def test_killed_harness_leaves_nobody_behind(tmp_path: Path, ground: Ground) -> 
         run.no_child_left()
 
 
-# --- somebody presses Ctrl-C
+# --- Ctrl-C
 
 
 FEW_PICTURES = (
@@ -247,7 +247,7 @@ def test_interrupted_flight(tmp_path: Path, ground: Ground) -> None:
     text = run.text()
     assert f"interrupted: what was flown is kept; --out {tmp_path / 'run'} goes on" in text
     assert "Traceback" not in text
-    # The report of what was finished.
+    # Report of the finished flights.
     assert "Quality of flight" in text
     folder = tmp_path / "run"
     assert len(load(folder).episodes) >= 1
@@ -356,7 +356,7 @@ def test_hung_policy_is_stopped_then_leaves_offboard_then_lands(
     log = read_tlog(tmp_path / "flight.tlog")
     sent = setpoints(log)
     forward = [t for t, m in sent if m.vx > 0.5]
-    # What the last good decision commanded flew on until the watchdog's bound.
+    # The last good command was flown until the watchdog's bound.
     first_of_last = result.log.columns()["sent_us"][-1]
     assert first_of_last > 0
     zeroed = next(t for t, m in sent if t > forward[-1] and m.vx == m.vy == m.vz == 0.0)
@@ -367,8 +367,8 @@ def test_hung_policy_is_stopped_then_leaves_offboard_then_lands(
         and m.command == dialect.MAV_CMD_DO_SET_MODE
         and t > zeroed
     )
-    # Three decisions held for 0.5 s each, the fourth until it is overdue; a busy host may have
-    # given up simulated time, or been late by a moment.
+    # Three decisions held for 0.5 s each, the fourth until it is overdue. A busy host may have
+    # skipped simulated time, or been slightly delayed.
     lost = given_up_s(vehicle)
     assert 3 * 0.5 + 1.5 - lost - 0.2 <= zeroed - forward[0] <= 3 * 0.5 + 1.5 + 1.5
     assert 1.0 - lost - 0.2 <= left - zeroed <= 1.0 + 1.0
@@ -520,7 +520,7 @@ class UdpRelay:
             each.bind((LOOPBACK, 0))
             each.settimeout(0.1)
         self.port: int = self._sockets["vehicle"].getsockname()[1]
-        """Where the vehicle sends to."""
+        """Port that the vehicle sends to."""
         self._stop = threading.Event()
         self._threads = [
             threading.Thread(target=self._carry, args=ends, daemon=True)
@@ -601,8 +601,8 @@ def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground
         frozen = ground.track[-1][0]
         os.kill(children["firmware"], signal.SIGCONT)
         wait_until(lambda: ground.track[-1][0] > frozen, "time to go on")
-        # The clock goes on where it stood: nothing is caught up with. (This listener may have been
-        # a moment behind when it was stopped.)
+        # The clock resumes from the same time and skips nothing. (This listener may have lagged
+        # when the firmware was stopped.)
         assert frozen - before < 0.5e3 * SPEED * stopped_s
         assert next(t for t, _, _ in list(ground.track) if t > frozen) - frozen < 1000
         assert run.wait() == EXIT_INVALID
@@ -631,7 +631,7 @@ def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground
 
 @pytest.mark.nightly
 def test_long_stopped_firmware_ends_in_a_defined_way(tmp_path: Path, ground: Ground) -> None:
-    """3 s is what MAVSDK allows between heartbeats; the watchdog may be first. Flown again."""
+    """MAVSDK allows 3 s between heartbeats; the watchdog may act first. Flown again."""
     ports = choose_ports(ground.port)
     with sitl(tmp_path, ports, "--episodes", "1", goal_m=25.0) as run:
         children = run.find_children("firmware", "companion")
@@ -681,7 +681,7 @@ class Noise:
             return choose.randbytes(choose.randrange(1, 600))
         if kind == 1:
             return bytes(frame[: choose.randrange(1, len(frame))])
-        # One bit, anywhere but in the sequence number's neighbourhood: the checksum must tell.
+        # One bit, except around the sequence number: the checksum must detect the change.
         at = choose.choice([5, 6, *range(10, len(frame))])
         frame[at] ^= 1 << choose.randrange(8)
         return bytes(frame)
@@ -751,7 +751,7 @@ def test_a_taken_port_ends_a_firmware(tmp_path: Path) -> None:
     told_in_one_line(vehicle, port, "--camera-port")
 
 
-@pytest.mark.nightly  # The firmware alone: above. What a child tells: test_child_processes.py.
+@pytest.mark.nightly  # The firmware alone: above. Messages of a child: test_child_processes.py.
 @pytest.mark.parametrize(
     ("option", "kind"),
     [("--api-port", socket.SOCK_DGRAM), ("--camera-port", socket.SOCK_STREAM)],

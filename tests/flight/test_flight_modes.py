@@ -61,7 +61,7 @@ def test_a_late_take_off_is_not_cut_short() -> None:
     "share", [0.5, *(pytest.param(s, marks=pytest.mark.nightly) for s in (0.65, 0.8, 1.25)), 1.45]
 )
 def test_a_vehicle_of_another_weight_than_its_parameters_say(share: float) -> None:
-    """MPC_THR_HOVER is that of the profile; the true one is this share of it."""
+    """MPC_THR_HOVER matches the profile; the true mass is `share` of the profile's mass."""
     body = quad().body
     wrong = {"mass_kg": share * body.mass_kg}
     with flight(0, vehicle=quad(body=wrong)) as rig:

@@ -33,7 +33,7 @@ LEAST_PARAMETERS = 877
 
 
 def interpreter(client: str) -> str:
-    """Return the Python of a client's environment; skip the test where there is none."""
+    """Return the Python of a client's environment; skip the test without an environment."""
     folder = os.environ.get(FOLDER)
     if folder is None:
         pytest.skip(f"{FOLDER} is not set: scripts/foreign_clients.py FOLDER installs {client}")
@@ -79,7 +79,7 @@ def started(words: list[str], folder: Path) -> Iterator[tuple[subprocess.Popen[b
 
 
 def flown_by(words: list[str], folder: Path) -> dict[str, float]:
-    """Let a client's program fly; return its last line, which says what it got."""
+    """Let a client's program fly; return the figures in its last line."""
     with started(words, folder) as (client, said):
         wait_until(lambda: client.poll() is not None, f"the end of {words[1]}", 200.0)
         text = said.read_text(encoding="utf-8", errors="replace")

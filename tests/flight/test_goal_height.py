@@ -26,7 +26,7 @@ SPEED_M_S = 2.0
 
 
 class Climbing:
-    """Flies straight to the goal, up as fast as ahead asks for."""
+    """Pilot that flies in a straight line to the goal, including the climb."""
 
     def __init__(self) -> None:
         self.below: list[float] = []
@@ -82,7 +82,7 @@ def test_it_climbs_to_the_goal_at_both_levels(arena: Path) -> None:
     assert away == pytest.approx(RADIUS_M, abs=0.05)
     assert -end[2] > HEIGHT_M - RADIUS_M > ALTITUDE_M + RADIUS_M
     assert pilot.below[0] == pytest.approx(ALTITUDE_M - HEIGHT_M, abs=0.3)
-    # MAVSDK's setpoints said so: down is negative on the way up.
+    # MAVSDK's setpoints agree: down is negative during the climb.
     setpoints = flown.latency["setpoint"]
     assert setpoints[1:-1, 2].max() < -0.1
     environment = spec_of(

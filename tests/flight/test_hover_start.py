@@ -1,4 +1,4 @@
-"""Flights that start in a hover, and those of the same seeds that take off, in lockstep."""
+"""Flights from a hover start and from take-off, with the same seeds, in lockstep."""
 
 from __future__ import annotations
 

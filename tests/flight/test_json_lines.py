@@ -1,4 +1,4 @@
-"""`--json` and `--quiet`: what programs and CI jobs read of a command, by short real runs."""
+"""`--json` and `--quiet`: output for programs and CI jobs, checked in short real runs."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_an_evaluation_in_lines(tmp_path: Path) -> None:
     assert not of(lines_of(again), "flight")
     assert lines_of(again)[-1] == finished
 
-    # A page that somebody has drawn is kept up to date.
+    # An existing report page is kept up to date.
     page = write_report(out)
     _, again = airl("evaluate", *words, "--episodes", "4")
     assert of(lines_of(again), "status")[-1]["text"] == "drawing the report"

@@ -1,4 +1,4 @@
-"""The same latency file flown at every level: each decision is as late as the trace says."""
+"""The same latency file flown at every level: each decision has the latency of the trace."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("latency-levels")]
 POLICY, ARENA, EPISODES, SEED = "no-obstacles", "no-obstacles", 2, 700
 
 TRACE_MS = [40.0 + 3.0 * k for k in range(101)]
-"""A ramp: every value tells its place, and neighbours are neighbours."""
+"""Ramp: each value identifies its index, and consecutive values stay consecutive."""
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""What the companion does when it may not go on: flights in lockstep, with the real MAVSDK."""
+"""The companion's behaviour at its limits: flights in lockstep, with the real MAVSDK."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def flown(**changes: object) -> FlownEpisode:
     ("mode", "breaks"), [(Mode.HOLD, False), (Mode.RETURN, False), (Mode.HOLD, True)]
 )
 def test_who_takes_over_has_the_vehicle(mode: Mode, breaks: bool) -> None:
-    """At most one heartbeat later nothing more is sent, and no mode is asked for."""
+    """Within one heartbeat the companion stops sending setpoints and mode requests."""
     scenario = demo_scenario(policy="greedy")
     setup = EpisodeSetup(scenario.vehicle, scenario.arena_of(FAR_SEED), FAR_SEED)
     results: list[MissionResult] = []
     modes: list[tuple[Mode, int]] = []
-    """What was flown, and since when [µs]."""
+    """Flown modes, each with its start [µs]."""
 
     with Stage(transport_us=TRANSPORT_US) as stage:
 
@@ -100,7 +100,7 @@ def test_a_picture_that_stays_is_not_flown_on() -> None:
 
 
 def test_telemetry_that_stays_is_not_flown_on() -> None:
-    """The vehicle still hears us: it is told to hold, and no answer comes."""
+    """The vehicle still hears the companion: Hold is requested, and no answer arrives."""
     record = flown(faults=("downlink cut at offboard+500ms",)).record
     assert record.outcome is Outcome.ABORTED
     assert "link lost" in record.reason

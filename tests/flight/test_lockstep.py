@@ -1,4 +1,4 @@
-"""Lockstep with the real MAVSDK: the same flight every time, whatever the machine does."""
+"""Lockstep with the real MAVSDK: bit-identical flights under any load of the machine."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_the_flight_is_a_flight(reference: FlownEpisode) -> None:
 
 
 def test_a_vehicle_without_gps_is_told_where_it_is_and_flies() -> None:
-    """By the companion, as on the aircraft: it arms in Hold, which needs a global position."""
+    """The companion sends the position, as on the aircraft: Hold requires a global position."""
     flight = flown(demo_scenario(vehicle="quad-vio"))
     assert flight.record.outcome is Outcome.SUCCESS
     assert flight.record.notes == ()
@@ -110,7 +110,7 @@ def test_a_take_off_takes_about_as_long_as_movers_are_told(reference: FlownEpiso
 def test_a_flight_on_a_full_disk_goes_on_without_its_logs(
     scenario: ResolvedScenario, reference: FlownEpisode, tmp_path: Path
 ) -> None:
-    """The very same flight; what was logged before can be read."""
+    """The flight is identical; messages logged before the failure are readable."""
     tlog = tmp_path / "flight.tlog"
     with largest_file(65_536):
         episode = fly(scenario, scenario.fresh_policy(SEED), 0, SEED, tlog=tlog)
@@ -176,7 +176,7 @@ def test_waits_take_few_turns_and_are_the_flight_that_polls(
 def test_without_the_barrier_reruns_differ(
     scenario: ResolvedScenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The control: what the test above sees is the barrier's doing, not luck."""
+    """Control experiment: without the barrier, reruns differ."""
 
     class Hasty(ThreadPartner):
         def _settle(self, handle: Handle) -> None:
@@ -215,7 +215,7 @@ def test_earlier_flights_leave_no_trace(
 
 @pytest.mark.nightly
 def test_a_process_that_is_stopped_flies_the_same(reference: FlownEpisode) -> None:
-    """SIGSTOP: MAVSDK's timers run out meanwhile, by the wall clock."""
+    """SIGSTOP: MAVSDK's timers expire during the stop, by the wall clock."""
     moments = np.random.default_rng(5)
     command = [sys.executable, lockstep_kit.__file__, f"{STOPPED}"]
     environment = {**os.environ, "PYTHONPATH": str(Path.cwd())}
@@ -366,7 +366,7 @@ def test_failsafes_come_at_the_same_tick_at_every_speed(
 
 
 def test_offboard_loss_comes_one_second_after_the_last_setpoint() -> None:
-    """COM_OF_LOSS_T; what MAVSDK would repeat ends with its process."""
+    """COM_OF_LOSS_T; MAVSDK's repeated setpoints end with its process."""
     told: list[int] = []
     setup = EpisodeSetup(load_vehicle("quad"), None, 1)
     with Stage() as stage:

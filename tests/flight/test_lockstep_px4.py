@@ -93,7 +93,7 @@ def test_simulated_time_goes_on_while_a_command_is_answered() -> None:
 
         stage.run(EpisodeSetup(load_vehicle("quad"), None, 1), program)
     assert end.waited > 3
-    # One command, whose answer takes three looks: no more time passes than that.
+    # One command, answered after three polls: only this time passes.
     assert TICK_US <= flown_us[0] <= 5 * TICK_US
 
 
@@ -137,7 +137,7 @@ def test_a_flight_with_its_stand_in(tmp_path: Path, px4_instance: int) -> None:
     names = run.stamps[0].keys()
     assert "sent_us" in names
     assert "accepted_us" not in names
-    # A decision takes 1 ms, whatever the host is doing.
+    # A decision takes 1 ms, independent of the host's load.
     t2_us = run.stamps[0]["action_ready_us"] - run.stamps[0]["infer_start_us"]
     np.testing.assert_array_equal(t2_us, 1_000)
 

@@ -1,4 +1,4 @@
-"""Lockstep in two processes: the flight is the one of a single process, whatever happens between.
+"""Lockstep in two processes: the flight is identical to a flight in one process.
 
 The reference is `flight.fly`, which flies MAVSDK on raw bytes in a thread: no sockets, no words.
 """
@@ -228,7 +228,7 @@ def test_orders_of_the_referee_arrive_in_their_turn(
         assert companion.wait() == 1, companion.text()
     assert "stopped" in companion.text()
     assert lanes | lanes_in(companion.text()) == reference.lanes
-    # The fingerprint tells flights apart.
+    # The fingerprint distinguishes flights.
     assert all(reference.lanes[name] != successful.lanes[name] for name in LANES)
 
 
@@ -308,7 +308,7 @@ def test_neither_lost_words_nor_a_key_change_the_flight(
 def test_a_companion_without_the_key_can_be_interrupted(
     reference: Reference, tmp_path: Path, key: Path
 ) -> None:
-    """MAVSDK waits for answers that are refused; a command of it is given up after two seconds."""
+    """MAVSDK waits for rejected answers; its commands time out after two seconds."""
     ports = choose_ports()
     with (
         running(firmware_words(ports, "--signing-key", str(key)), tmp_path) as firmware,

@@ -90,7 +90,7 @@ class NoCamera:
     endpoint = ""
 
     def publish(self, frame: Any) -> None:
-        """Nobody looks."""
+        """Discard the frame."""
 
     def close(self) -> None:
         """Nothing to do."""
@@ -318,14 +318,14 @@ def test_phases_are_told_once() -> None:
     assert told == [("arming", NOW_US)]
 
 
-# --- strangers, and who has no key
+# --- unauthenticated clients
 
 
 KEY = bytes(range(5, 37))
 
 
 class Stranger:
-    """Somebody else on the onboard link, with a key or without."""
+    """Another client on the onboard link, with a key or without."""
 
     def __init__(self, vehicle: Any, key: bytes | None = None) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -388,7 +388,7 @@ def stored(tmp_path: Path) -> StoredSigning:
 
 
 def test_turns_pass_signed(stored: StoredSigning) -> None:
-    """What the vehicle's end hands on is as without a key; every frame of the wire is signed."""
+    """The vehicle forwards the same bytes as without a key; every frame on the wire is signed."""
     mate = Mate("D1 200000 0", "D2 end", key=KEY)
     mate.start()
     pings = [Encoder().pack(dialect.MAVLink_ping_message(i, i, 0, 0)) for i in range(100)]

@@ -1,4 +1,4 @@
-"""The long comparisons of scripts/: killed and started again, they go on from the flights flown."""
+"""Long comparisons of scripts/: after a kill and a restart, they resume from stored flights."""
 
 from __future__ import annotations
 

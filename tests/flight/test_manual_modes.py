@@ -1,4 +1,4 @@
-"""Modes that a pilot's sticks fly, and those that circle and follow, in simulated time."""
+"""Stick-controlled modes, Orbit and Follow, in simulated time."""
 
 from __future__ import annotations
 

@@ -286,7 +286,7 @@ def test_refusals_in_the_air_and_hold(tmp_path: Path) -> None:
         ports = choose_ports(ground.port)
         with client(tmp_path, ports=ports) as c:
             c.take_off(2.0)
-            # MAVSDK refuses by itself; the ground station asks the vehicle.
+            # MAVSDK rejects the call locally; the ground station sends the request to the vehicle.
             assert failure(c.offboard.start) == "NO_SETPOINT_SET"
             offboard = (dialect.MAV_CMD_DO_SET_MODE, 0, 129.0, 6.0, 0.0, *[math.nan] * 4)
             ground.send(dialect.MAVLink_command_long_message(1, 1, *offboard), ports.gcs_local)
@@ -330,7 +330,7 @@ def test_return_to_launch(tmp_path: Path) -> None:
 
 @pytest.mark.nightly  # The same calls in simulated time: test_px4_walk.py.
 def test_arming_before_it_is_ready_is_refused(tmp_path: Path) -> None:
-    # Slow, so that there is time to ask before the estimator has converged.
+    # Slow, to allow an arming request before the estimator has converged.
     with client(tmp_path, speed=0.25) as c:
         assert not c.telemetry.health_all_ok()
         assert failure(c.action.arm) == "COMMAND_DENIED"

@@ -50,7 +50,7 @@ def test_a_mission_with_a_jump_a_pause_and_hold_at_its_end() -> None:
                 reached.append((index, away(rig, *where)))
 
         rig.until(lambda: watch() or len(reached) == 2, 40.0)  # type: ignore[func-returns-value]
-        # Paused on the way to item 2: it stands, and goes on with the same item.
+        # Paused before item 2: the vehicle stops, and resumes with the same item.
         rig.run(1.0, watch)
         assert rig.ap.set_mode(Mode.HOLD) is Result.ACCEPTED
         rig.run(4.0)

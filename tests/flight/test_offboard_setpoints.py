@@ -74,7 +74,7 @@ def test_every_kind_of_setpoint() -> None:
         assert math.degrees(quat_yaw(rig.truth.quaternion) - before) == pytest.approx(38.0, abs=5.0)
         settle(rig)
 
-        # Refused setpoints are no sign of life, and the failsafe says what was wrong.
+        # Rejected setpoints are no sign of life, and the failsafe reports the error.
         rig.stream(None)
         for _ in range(30):
             rig.ap.refuse_setpoint("SET_POSITION_TARGET_LOCAL_NED invalid", rig.sim.time_us)
@@ -84,7 +84,7 @@ def test_every_kind_of_setpoint() -> None:
 
 
 def test_another_kind_of_setpoint_is_followed_half_a_second_later() -> None:
-    """As PX4 follows it, which publishes its control mode twice a second: measured."""
+    """PX4 publishes its control mode twice a second: measured."""
     turn = RateDemand((0.0, 0.0, 1.0), 0.5)
     with flight(0) as rig:
         rig.take_off(5.0, settle_s=0.5)

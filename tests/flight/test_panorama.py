@@ -1,4 +1,4 @@
-"""A vehicle that sees all round, in lockstep: what its companion gets is what the twin renders."""
+"""A vehicle with a panoramic camera, in lockstep: the companion receives the twin's images."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SEED = 3
 
 
 class Watching:
-    """The reactive policy, and what it was shown."""
+    """Reactive policy that stores its observations."""
 
     def __init__(self, seen: list[Observation]) -> None:
         self._policy, self._seen = GreedyPolicy(), seen
@@ -86,7 +86,7 @@ def test_the_companion_gets_the_images_that_the_twin_renders(
 
 
 def _check_scans(seen: list[Observation]) -> None:
-    """Whoever scans what was seen in a flight knows where it saw what, and as the twin does."""
+    """Check the scans of a flight's observations against the twin's, with their poses."""
     camera = seen[0].intrinsics
     spec = ObservationSpec(
         layout="scan",
@@ -108,7 +108,7 @@ def _check_scans(seen: list[Observation]) -> None:
 
 @pytest.mark.parametrize("compensate", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_the_twin_flies_it_too(*, compensate: bool) -> None:
-    """Compensated it sees each image carried forward: also that of what lies behind."""
+    """Compensation carries each image forward, including the view behind the vehicle."""
     spec = {"vehicle": "quad-panorama", "arena": "no-obstacles", "compensate": compensate}
     spec |= {"image_width_px": 64, "image_height_px": 20}
     navigation = Navigation(spec_of(None, spec), 1)

@@ -1,7 +1,7 @@
-"""The decision loop and the watchdog: order and length of every step, and what ends a flight.
+"""Decision loop and watchdog: order and length of every step, and reasons to end a flight.
 
-Only the two ends are stood in for (`Link` and `FrameSource` are protocols). Exact times are checked
-in simulated time; what two threads do together runs on the wall clock, and only lower bounds count.
+Only `Link` and `FrameSource`, which are protocols, have stand-ins. Exact times are checked in
+simulated time. Tests of two threads run on the wall clock and check lower bounds only.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SPEED = 4.0
 
 
 class FakeLink:
-    """A vehicle that stands where it is told and notes what it is told."""
+    """Vehicle that stays at a set position and stores its commands."""
 
     def __init__(self, clock: Clock) -> None:
         self.connected = True
@@ -68,7 +68,7 @@ class FakeLink:
 
 
 class FakeFrames:
-    """A camera with a new frame whenever asked, `age_us` old and decoded in `decode_us`."""
+    """Camera with a new frame for each request, `age_us` old and decoded in `decode_us`."""
 
     def __init__(self, clock: Clock, age_us: int = 3000, decode_us: int = 500) -> None:
         self.silent = False
@@ -192,7 +192,7 @@ def test_every_stamp_is_where_it_belongs(
     # The next frame is taken when the hold is over, not before.
     captured, held = flight.column("capture_us"), flight.column("held_until_us")
     np.testing.assert_array_equal(captured[1:] + 3000, held[:-1])
-    # What is logged is what was sent, when it was sent.
+    # The log contains the sent setpoints, with their send times.
     assert [t for t, _ in flight.link.commands] == flight.column("sent_us").tolist()
     np.testing.assert_allclose(flight.column("setpoint"), [s for _, s in flight.link.commands])
 

@@ -48,14 +48,14 @@ class Deciding:
 
 @dataclass
 class Flight:
-    """What happened."""
+    """Results of a flight."""
 
     result: MissionResult
     simulation: Simulation
     modes: list[Mode]
-    """In the order flown."""
+    """Modes in the order flown."""
     phases: list[str]
-    """Of the companion."""
+    """Phases of the companion."""
     refused: list[Result]
     """The pilot's switches that were not taken."""
 
@@ -72,7 +72,7 @@ def fly_with(
     stop_at_s: float = math.inf,
     act: Callable[[Observation], Action] = fly_ahead,
 ) -> Flight:
-    """Fly with a pilot who is asked 4 times a second, with the time since the start [s]."""
+    """Fly with a pilot called 4 times a second with the time since the start [s]."""
     scenario = demo_scenario(policy="greedy")
     setup = EpisodeSetup(scenario.vehicle, scenario.arena_of(SEED), SEED)
     results: list[MissionResult] = []
@@ -208,7 +208,7 @@ def test_after_the_wait_was_ended_no_switch_is_taken() -> None:
 @pytest.mark.xdist_group("flight")
 @pytest.mark.timeout(300)
 def test_the_program_tells_the_ground_station_and_waits_for_the_switch(tmp_path: Path) -> None:
-    """As two programs over UDP, with a ground station as the pilot's."""
+    """Run two programs over UDP, with a ground station for the pilot."""
     with ground_station() as ground:
         ports = choose_ports(gcs=ground.port)
         firmware = ["-m", "airl_mav.cli.firmware", "--arena", "open-field", "--speed", "2"]
@@ -227,7 +227,7 @@ def test_the_program_tells_the_ground_station_and_waits_for_the_switch(tmp_path:
 
         with running([*firmware, *ports.options()], tmp_path) as vehicle:
             vehicle.wait_for_text("Ctrl-C ends it")
-            # Broadcasts go to those who have said something.
+            # Broadcasts require a message from the receiver first.
             station = dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3
             ground.send(dialect.MAVLink_heartbeat_message(*station), ports.gcs_local)
             with running(companion, tmp_path) as program:

@@ -28,7 +28,7 @@ compared_with_pybullet = pytest.mark.skipif(not HAS_PYBULLET, reason="pybullet i
     [("static-obstacles", SEED), pytest.param("crowded", 3, marks=pytest.mark.nightly)],
 )
 def test_both_plants_fly_the_same_flight(arena: str, seed: int) -> None:
-    """From standing to landing, decided from depth images, but for rounding: 1 mm is asked."""
+    """Flights decided from depth images differ by rounding only, required below 1 mm."""
     pair = compared(arena, arena, seed)
     assert pair.outcomes == ("success", "success")
     assert pair.samples[0] == pair.samples[1] > 500

@@ -1,4 +1,4 @@
-"""The companion or the firmware stopped or killed, as asked for: real processes, real signals."""
+"""Process faults that stop or kill the companion or the firmware: real processes and signals."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("rehearsal"), pytest.mar
 
 NIGHTLY = pytest.mark.nightly
 GOES_ON_US = 200_000
-"""Greatest time from a signal to its effect, and back [simulated µs]."""
+"""Maximum time from a signal to its effect, and back [simulated µs]."""
 
 
 def flown(folder: Path, fault: str) -> EpisodeRecord:

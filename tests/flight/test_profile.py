@@ -1,4 +1,4 @@
-"""`airl profile`: what it measures, what it writes, and what flies from it afterwards."""
+"""`airl profile`: measurements, output files, and flights with the measured profile."""
 
 from __future__ import annotations
 
@@ -372,7 +372,7 @@ def test_power_that_the_computer_tells_is_its_watts(
     assert held.source.endswith(f"; watts: {told}; price: not known")
     facts = json.loads((out / f"box.{DEFAULT_POLICY}-bare.json").read_text())
     assert facts["power"]["source"] == "INA monitor: VDD_IN"
-    # Measured again: said once. Given by a person: kept, whatever is measured later.
+    # Measured again: listed once. Given by the user: kept over later measurements.
     profile(few, out=out, root=root)
     assert load_computer(str(out / "box.toml")).source.count("watts: ") == 1
     profile(few.model_copy(update={"watts": 9.0, "price_usd": 5.0}), out=out, root=root)
@@ -444,7 +444,7 @@ def test_exposures_are_brought_to_this_computers_clock() -> None:
     assert stamps["capture_uncertainty_us"].min() >= 200
     assert stamps["capture_uncertainty_us"].max() <= 303
     assert len(stamps["decoded_us"]) == 30
-    # Those of decisions only, not of take-off and landing.
+    # Only exchanges of decisions, not of take-off and landing.
     first_us, last_us = stamps["exchange_sent_us"][[0, -1]]
     assert stamps["infer_start_us"][0] <= first_us < last_us <= stamps["held_until_us"][-1]
     assert "least round trip 0.400 ms" in remarks[0]
@@ -566,7 +566,7 @@ def test_on_the_drones_computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     within_us = stamps["capture_uncertainty_us"]
     assert (np.abs(error_us) <= within_us).all()
     assert (within_us < 4_000).all()
-    # What the true clock gives, as level sitl does, lies within what is printed.
+    # Figures of the true clock, as in level sitl, lie within the printed bounds.
     true_t1_us = stamps["decoded_us"] - (stamps["capture_simulator_us"] - ahead_us)
     shown, most_us = facts["stages_us"]["t1"], facts["stages_us"]["t1_uncertainty"]["max"]
     true_p50_us = np.percentile(true_t1_us, 50.0, method="inverted_cdf")

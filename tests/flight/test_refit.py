@@ -1,4 +1,4 @@
-"""A vehicle that is not as its profile says flies in wind and late: what a refit makes of it."""
+"""Refit of a flight with a perturbed vehicle in wind and with latency."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from tests.support.recorded_flights import RecordedFlight
 from tests.support.refit_truths import Truth, drawn_truth, errors_of, true_dead_time_s, uplink_s
 
 TRUTH = drawn_truth(6)
-"""Late link, much drag, some wind: all that is asked for shows in one flight."""
+"""Late link, high drag, some wind: one flight makes all parameters observable."""
 
 OTHER = replace(drawn_truth(10), gust_m_s=0.0)
 
@@ -127,7 +127,7 @@ def test_the_black_box_alone_tells_what_it_can(refitted: Refitted) -> None:
     assert "give the vehicle's log" in found.estimate("mass_kg").unobservable
     assert "give the vehicle's log" in found.estimate("link_ms").unobservable
     both = refitted.found
-    # Of the lean, where the log tells what the accelerometer felt.
+    # Wind from the lean alone; the log adds accelerometer data.
     wind, truth = found.air.wind, refitted.truth.wind
     assert wind is not None and wind != both.air.wind
     assert np.hypot(wind[0] - truth[0], wind[1] - truth[1]) < 0.5
@@ -307,10 +307,10 @@ def test_the_same_flight_gives_the_same_refit(refitted: Refitted) -> None:
     )
 
 
-# --- rehearsed on what was fitted
+# --- rehearsed with the fitted vehicle
 
 
-@pytest.mark.nightly  # What is fitted, and how it is flown again, have tests of their own.
+@pytest.mark.nightly  # The fit and repeated flights have separate tests.
 @pytest.mark.slow
 def test_rehearsed_on_what_was_fitted_it_is_the_flight(refitted: Refitted, tmp_path: Path) -> None:
     """Once each: with all of the refit, with its parts, and with nothing of it."""

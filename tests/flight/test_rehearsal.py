@@ -1,7 +1,7 @@
 """The harness's part of an episode: every order of events has one outcome.
 
-The two processes are stood in for, so that events come in exactly the order that a test asks for;
-`test_sitl.py` and `test_faults.py` fly real ones.
+Both processes have stand-ins, so that events arrive in a test's exact order. `test_sitl.py` and
+`test_faults.py` fly real processes.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ Script = list[Item | Callable[[], None]]
 
 
 def at(seconds: float, north: float = 0.0, **more: Any) -> Item:
-    """A state of the vehicle, so long after the reset."""
+    """Return a state of the vehicle, `seconds` after the reset."""
     fields: dict[str, Any] = {
         "time_us": START_US + round(seconds * 1e6),
         "position": (north, 0.0, -2.0),
@@ -89,7 +89,7 @@ def ended(reason: str = "goal reached", *notes: str) -> Item:
 
 
 class Stage:
-    """Stands in for both processes; plays a script when told to fly."""
+    """Stand-in for both processes; plays a script at the request to fly."""
 
     def __init__(self, *scripts: Script) -> None:
         self.scripts = list(scripts)
@@ -102,12 +102,12 @@ class Stage:
         self.slips: list[tuple[int, int]] = []
         self.strangers: list[str] = []
         self.faults: list[tuple[str, int, int]] = []
-        """What has acted, from when to when [µs]."""
+        """Faults that acted, each with begin and end [µs]."""
         self.goes_on: list[Item] = []
-        """What is said when a process goes on."""
-        """When the firmware has given up time, and how much [µs]."""
+        """Events when a process resumes."""
+        """`slips` holds the times at which the firmware skipped time, and the lengths [µs]."""
         self.starts: list[list[Item]] = []
-        """What is said at each start; both are ready when nothing is left of it."""
+        """Events at each start; both processes are ready once the list is empty."""
 
     def put(self, *items: Item) -> None:
         assert self.events is not None
@@ -204,7 +204,7 @@ def write_record(
     strangers: Sequence[str],
     faults: Sequence[tuple[str, int, int]],
 ) -> None:
-    """What the firmware leaves of an episode: 100 s at 10 m/s to the north."""
+    """Write the firmware's files of an episode: 100 s at 10 m/s to the north."""
     n = 5001
     time_us = START_US + np.arange(n, dtype=np.int64) * 20_000
     position = np.zeros((n, 3))
@@ -386,14 +386,14 @@ def test_success_then_crash_is_called_off_without_landing(play: Callable[..., Ru
 def test_time_given_up_is_taken_off_the_companions_clock(
     play: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # So much of it that the flight is invalid: no other attempt is made.
+    # The skipped time makes the flight invalid; the limit prevents another attempt.
     monkeypatch.setattr(rehearsal, "MAX_ATTEMPTS", 1)
     run = play(
         [
             at(0.5),
             at(1.0, slipped_us=3_000_000),
-            # 5.1 s by the companion's clock is 2 s by the simulator's, which has given up another
-            # 0.1 s that no state has told yet.
+            # 5.1 s of the companion's clock are 2 s of the simulator's clock, which has skipped
+            # another 0.1 s. No state has reported the skip yet.
             phase("navigating", 5.1),
             at(2.5, 1.0, slipped_us=3_100_000),
             at(9.0, 8.0, slipped_us=3_500_000),
@@ -506,13 +506,13 @@ def test_nothing_is_started_when_there_is_nothing_to_fly(play: Callable[..., Run
     assert run.stage.all == []
 
 
-# --- somebody dies
+# --- a process dies
 
 DIED: Item = (COMPANION, Exited(-9))
 
 
 def test_a_flight_that_lost_its_companion_is_flown_again(play: Callable[..., Run]) -> None:
-    """By two new processes, once the failsafe has been seen through."""
+    """Two new processes fly again after the failsafe has ended."""
     run = play(
         FLOWN,
         [
@@ -616,7 +616,7 @@ def test_a_log_on_a_full_disk_is_a_note(play: Callable[..., Run]) -> None:
     assert (record.outcome, record.notes) == ("success", (what,))
 
 
-# --- faults of the processes, as asked for
+# --- requested faults of the processes
 
 
 def due(fault: str, seconds: float, *, begins: bool = True) -> Item:
@@ -674,7 +674,7 @@ def test_a_killed_firmware_leaves_what_was_flown(play: Callable[..., Run]) -> No
 
 
 def test_a_stopped_firmware_goes_on_by_the_wall_clock(play: Callable[..., Run]) -> None:
-    """Its simulated time stands: nobody but the rehearsal can tell when it is over."""
+    """Simulated time stops: only the rehearsal can time the end of the fault."""
     fault = "firmware stopped at 3s for 50ms"
     run = play([phase("navigating", 2.0), at(2.9, 1.0), due(fault, 3.0)])
     run.stage.goes_on = [at(9.0, 8.0), ended()]
@@ -718,7 +718,7 @@ def test_a_flight_that_is_lost_every_time_ends_the_run(
     with pytest.raises(RehearsalError, match="flight 001, seed 6: lost 3 times; at last "):
         run.fly(3)
     assert len(run.observer.losses) == 2
-    # What was flown before is kept, nothing of the lost ones.
+    # Earlier flights are kept; the lost flights leave nothing.
     assert [record.index for record in run.observer.records] == [0]
     assert [e.index for e in load(run.folder.path).episodes] == [0]
     assert all(child.stopped for child in run.stage.all)
@@ -742,7 +742,7 @@ def test_ended_but_never_saved(play: Callable[..., Run]) -> None:
 def test_companion_that_never_answers_is_ended(
     play: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Hung for good: its end is what makes the flight controller's failsafe act."""
+    """A hung companion is ended, which triggers the flight controller's failsafe."""
     for name in ("TAKEOFF_LIMIT_S", "WRAP_UP_S"):
         monkeypatch.setattr(rehearsal, name, 0.1)
     run = play([at(0.05), phase("navigating", 0.06), at(0.08)], FLOWN)

@@ -44,7 +44,7 @@ ASKED = AskedFlight.asked
 
 
 def slowly(flight: AskedFlight) -> Any:
-    """Stand in for `AskedFlight.asked`: what comes is waited for longer."""
+    """Stand in for `AskedFlight.asked`: wait 30 s first."""
     threading.Event().wait(30.0)
     return ASKED(flight)
 
@@ -127,7 +127,7 @@ def test_both_checkers_are_content() -> None:
 
 
 def test_pictures_are_those_of_the_twin_and_a_vec_env_of_sb3_takes_them() -> None:
-    """stable-baselines3's make_vec_env asks for pictures, whether or not it is asked for any."""
+    """stable-baselines3's make_vec_env always requests a render mode."""
     knobs = {"arena": "dynamic-obstacles"}
     pictures = []
     for name in (REHEARSAL, NAVIGATION):
@@ -181,7 +181,7 @@ def test_episodes_one_after_the_other_as_in_the_batch_twin() -> None:
 
 
 def test_of_several_latencies_each_episode_draws_the_twin_s() -> None:
-    """A held action lasts so much longer."""
+    """A longer latency lengthens a held action."""
     knobs: dict[str, Any] = {
         "arena": "no-obstacles",
         "delay": {"latency": ["10ms", "200ms", "390ms"]},
@@ -250,7 +250,7 @@ def test_ctrl_c_ends_the_flight_and_the_next_one_begins(monkeypatch: pytest.Monk
         before = signal.signal(signal.SIGALRM, interrupt)
         try:
             for act in (lambda: env.step(AHEAD), lambda: env.reset(seed=2)):
-                # As soon as the learner waits for what has been asked.
+                # Interrupt while the learner waits for a request.
                 monkeypatch.setattr(AskedFlight, "asked", slowly)
                 signal.setitimer(signal.ITIMER_REAL, 0.1)
                 with pytest.raises(KeyboardInterrupt):

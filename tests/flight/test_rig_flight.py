@@ -119,7 +119,7 @@ def test_the_network_has_an_input_for_each(policy: Path) -> None:
 def test_the_companion_gets_the_images_that_the_twin_renders(
     policy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of all cameras, to the bit: on the wire and as the network sees them."""
+    """Images of all cameras are bit-identical on the wire and in the network's input."""
     taken: dict[int, tuple[np.ndarray, np.ndarray, Frame]] = {}
     real = SimulatedCamera.take
 

@@ -282,7 +282,7 @@ def test_injected_latency(tmp_path: Path) -> None:
     # Where the host gave up time, the simulator's clock has seen less of it.
     lost_us = run.episodes[0]["slipped_us"]
     assert np.all(t2_us >= drawn_us - lost_us)
-    # What the host adds; the median does not mind a busy moment.
+    # Overhead of the host; the median ignores a busy moment.
     assert np.median(t2_us - drawn_us) < 20_000
     spread_ms = 4.0 * 19.8 / np.sqrt(len(t2_us))
     assert abs(np.mean(drawn_us) / 1e3 - 396.0) < spread_ms

@@ -94,7 +94,7 @@ def test_a_rehearsal_with_px4_that_dies_once(tmp_path: Path, px4_instance: int) 
     assert "peer: simulator on TCP port" in (run / "autopilot.log").read_text(encoding="utf-8")
     with np.load(run / "latency.npz") as archive:
         names = {name.partition("/")[2] for name in archive.files}
-    # What nobody can see is not made up.
+    # Unobservable quantities are absent.
     assert "sent_us" in names
     assert not names & {"accepted_us", "motor_us", "estimate/position"}
     log = mavutil.mavlogfile(str(run / "flight-000.tlog"))
@@ -157,7 +157,7 @@ def test_a_rehearsal_with_ardupilot(tmp_path: Path, px4_instance: int) -> None:
 
 @pytest.mark.nightly
 def test_a_rehearsal_with_a_board(tmp_path: Path) -> None:
-    """Over a pseudo-terminal, at a board's own pace; its frame is checked, and told to differ."""
+    """The board runs at real time on a pseudo-terminal; its different airframe is reported."""
     ports = choose_ports()
     peer = HitlPeer(tmp_path)
     words = [

@@ -1,6 +1,6 @@
-"""Level sitl goes on where it was left: which runs are the same one, what is flown, what is said.
+"""Resuming level sitl: identity of a run, remaining flights, and messages.
 
-Flights are stood in for; `test_campaign_faults.py` kills real ones.
+Flights have stand-ins; `test_campaign_faults.py` kills real flights.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Stage:
 
     def __init__(self) -> None:
         self.ends: dict[int, BaseException] = {}
-        """What happens in the place of an episode, once, by index."""
+        """Exceptions raised in place of an episode, once each, by index."""
         self.flown: list[int] = []
         self.begun = 0
 
@@ -142,7 +142,7 @@ def test_an_interrupted_run_goes_on(fly: Fly, stage: Stage, tmp_path: Path) -> N
     assert f"{out}: 2 of 4 episodes are there" in text
     assert stage.flown == [0, 1, 2, 3]
     assert [e.seed for e in load(out).episodes] == [5, 6, 7, 8]
-    # Finished: shown again, nothing is started. What is asked for by its default is the same run.
+    # Finished: shown again, no process starts. An explicit default value is the same run.
     code, text = fly(speed=1.0, hold_s=0.5)
     assert (code, stage.begun) == (0, 3)
     assert f"{out}: 4 of 4 episodes are there" in text

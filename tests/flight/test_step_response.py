@@ -27,13 +27,13 @@ Reading = Callable[[Rig], float]
 Command = Callable[[Rig], Setpoint]
 
 TOLERANCE = 0.10
-"""Of rise and latency."""
+"""Relative tolerance of rise time and latency."""
 
 POINTS = 0.05
-"""Of overshoot."""
+"""Tolerance of overshoot."""
 
 RESOLUTION_S = 0.010
-"""Of times in the stored column: messages of one run."""
+"""Resolution of times in the stored column, from messages of one run."""
 
 
 class Figures(NamedTuple):
@@ -52,7 +52,7 @@ class Response:
     times: np.ndarray
     share: np.ndarray
     size: float
-    """Of the step, in its unit."""
+    """Size of the step, in its unit."""
 
     def first(self, share: float) -> float:
         return float(self.times[np.argmax(self.share >= share)])
@@ -67,18 +67,18 @@ class Response:
 
     @property
     def end(self) -> float:
-        """Where it settles: the mean of its last second."""
+        """Final value: the mean of the last second."""
         return float(self.share[self.times > self.times[-1] - 1.0].mean())
 
 
 class Quantity(NamedTuple):
-    """What a step is a step of."""
+    """Quantity that a step changes."""
 
     told: Reading
-    """As telemetry has it."""
+    """Value in telemetry."""
     true: Reading
     change: float
-    """What counts as a reaction."""
+    """Minimum change that counts as a reaction."""
 
 
 def velocity(axis: int) -> Quantity:
@@ -148,7 +148,7 @@ class Pilot:
 
 
 class Row(NamedTuple):
-    """What PX4 does."""
+    """Response of PX4."""
 
     stored: Figures
     """On an external airframe, in its telemetry."""
@@ -166,7 +166,7 @@ class Step(NamedTuple):
     seconds: float
     up: Row
     down: Row | None = None
-    """None = not measured on PX4."""
+    """Response to the step back; None = not measured on PX4."""
 
 
 def respond(
@@ -176,7 +176,7 @@ def respond(
     seconds: float,
     span: tuple[float, float],
 ) -> tuple[Response, Response]:
-    """Fly a step from a steady state; return what telemetry and what the truth shows of it."""
+    """Fly a step from a steady state; return its response in telemetry and in truth."""
     pilot.fly(int(rng.integers(50, 60)))
     sent_us = pilot.true[-1][0] - int(rng.integers(TICK_US))
     pilot.order(command)
@@ -199,7 +199,7 @@ def _response(rows: list[tuple[int, float]], sent_us: int, before: float, after:
 
 
 Shown = list[tuple[Response, Response]]
-"""Of several steps, what telemetry and what the truth shows."""
+"""Responses of several steps in telemetry and in truth."""
 
 
 def fly(step: Step) -> tuple[Shown, Shown]:
@@ -341,6 +341,6 @@ def test_steps_are_px4s(name: str) -> None:
     if step.down is not None:
         check(down, step.down, step.quantity.change, ())
     for told, true in up:
-        # What is left at the end: the integral's, half a degree of heading.
+        # Final error: from the integral, half a degree of heading.
         assert told.end == pytest.approx(1.0, abs=0.05)
         assert true.end == pytest.approx(1.0, abs=0.05)

@@ -19,7 +19,7 @@ def speed(rig: Rig) -> float:
 
 
 def go(rig: Rig, request: Reposition, limit_s: float) -> float:
-    """Go to a place; return the greatest speed on the way [m/s]."""
+    """Go to a place; return the maximum speed on the way [m/s]."""
     fastest = 0.0
     rig.ap.set_mode(Mode.HOLD, request)
 

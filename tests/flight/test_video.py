@@ -44,7 +44,7 @@ t=0 0
 m=video {port} RTP/AVP 96
 a=rtpmap:96 H264/90000
 """
-"""What a player is told of the stream (RFC 4566); the parameter sets come with the key frames."""
+"""Session description for a player (RFC 4566); the key frames contain the parameter sets."""
 
 
 def depth_frame(depth_m: NDArray[np.floating], sequence: int = 0) -> Frame:
@@ -86,7 +86,7 @@ def test_near_is_bright_and_nothing_is_black() -> None:
     row = picture[100, ::5, 0].astype(int)
     assert (np.diff(row) <= 0).all()
     assert row[0] > 200
-    assert 30 <= row[-1] < 40  # far is still told from nothing
+    assert 30 <= row[-1] < 40  # far is still distinct from no return
 
 
 @pytest.mark.parametrize(("width", "height"), [(64, 48), (321, 241), (640, 480), (9, 7), (360, 1)])
@@ -184,7 +184,7 @@ def test_a_picture_that_is_no_newer_is_left_out() -> None:
 
 
 def test_a_link_that_carries_nothing_ends_no_video() -> None:
-    """To the broadcast address the system lets nobody send who has not asked for it."""
+    """The system rejects broadcasts from a socket without SO_BROADCAST."""
     port = udp_port()
     with contextlib.closing(CameraServer("tcp://127.0.0.1:*")) as server:
         said: list[str] = []

@@ -1,4 +1,4 @@
-"""Flights that are watched: the same bit by bit, and on record where somebody changed them."""
+"""Flights with viewers: bit-identical, with interventions on record."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tests.support.scene import has_drawn
 
 
 class Watchers:
-    """A view's end in this process: takes all in, and pauses, steps and goes on as a person may."""
+    """Viewer in this process: reads everything, and pauses, steps and resumes."""
 
     def __init__(self, steering: Steering, *, steps: int = 0) -> None:
         self.shown, self.kinds = Shown(), set[type]()
@@ -82,7 +82,7 @@ def test_a_watched_flight_is_the_same_bit_by_bit() -> None:
     assert watched.sha256 is not None
     assert {Episode, Vehicle, Picture, Decided} <= watchers.kinds
     shown = watchers.shown
-    # What is drawn of it is what was flown: down at the goal, over the whole way.
+    # The drawn path is the flown path: down at the goal, over the whole way.
     assert shown.to_goal_m is not None
     assert shown.to_goal_m < 3.5
     assert len(shown.trail) > 100
@@ -155,7 +155,7 @@ def test_a_browser_shows_the_flight(tmp_path: Path) -> None:
         for _ in range(2):
             assert page.press("Step")
         wait_until(lambda: told_time(page.text()) != time, "a step")
-        # What the policy saw, each pixel three by three.
+        # The policy's image, each pixel magnified three times.
         sizes = page.evaluate(
             "[...document.querySelectorAll('img')].map((i) => [i.naturalWidth, i.naturalHeight])"
         )
@@ -185,6 +185,6 @@ def paused_under_way(page: Page) -> str | None:
 
 
 def told_time(text: str) -> str:
-    """Return the flight's time as the panel tells it."""
+    """Return the flight's time from the panel's text."""
     line = next((line for line in text.splitlines() if line.startswith("time")), "")
     return line.partition(" s")[0]

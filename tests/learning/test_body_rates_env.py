@@ -93,7 +93,7 @@ def test_what_is_commanded_turns_as_commanded() -> None:
 
 
 class Clockwork:
-    """Vehicles in the middle of a long decision, of which only the time goes on."""
+    """Vehicles in the middle of a long decision, where only time advances."""
 
     def __init__(self, n: int) -> None:
         frames = FrameTimes(np.zeros(n, np.int64), 33_333, 5_000, delays_of([]))
@@ -117,7 +117,7 @@ class Clockwork:
         expire(self._decision, self.fleet, i, self._state, 0)
 
     def told(self, i: int = 0) -> tuple[float, bool, tuple[float, ...]]:
-        """Return the time [ms], and what vehicle i follows."""
+        """Return the time [ms], True for body rates, and the current setpoint of vehicle i."""
         fleet = self.fleet
         return fleet.time_us[i] / US_PER_MS, bool(fleet.by_rates[i]), tuple(fleet.setpoint[i])
 
@@ -154,7 +154,7 @@ def stands(navigation: Navigation) -> list[bool]:
 
 
 def test_overdue_body_rates_are_replaced_by_a_stand() -> None:
-    """As the companion's watchdog does; unless it is told to wait longer."""
+    """Apply the companion watchdog's timeout; `decision_timeout_s` changes it."""
     assert stands(begun(2)) == [True, True]
     rules = {"decision_timeout_s": 3.0}
     assert stands(begun(2, episode=rules)) == [False, False]
@@ -175,7 +175,7 @@ def test_a_saved_stall_goes_on_as_it_was() -> None:
 
 
 def test_an_expired_command_is_a_hover_by_velocity() -> None:
-    """As the companion stops: body rates of zero would keep the tilt."""
+    """Hover like the companion: zero body rates would keep the tilt."""
     rules = {"hold_s": 0.1, "hover_after_s": 0.0}
     navigation = begun(2, decisions="sequential", episode=rules, delay={"native_ms": 400.0})
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""A decision of few environments takes few calls of Python, whatever the load of the machine."""
+"""Python call budget of a decision with few environments, independent of machine load."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEPS = 30
 
 
 def calls_of(env: Any, action: Any) -> float:
-    """Return the calls in a step of flights that go on."""
+    """Return the Python and C calls per step of flights in progress."""
     calls = 0
 
     def count(_frame: Any, event: str, _of: Any) -> None:
@@ -38,6 +38,6 @@ def calls_of(env: Any, action: Any) -> float:
 @pytest.mark.parametrize("n", MOST_CALLS)
 def test_a_step_takes_few_calls(n: int) -> None:
     env = NavigationEnv() if n == 1 else NavigationVectorEnv(n)
-    # Action 2 stands still: no flight ends.
+    # Action 2 hovers in place: no flight ends.
     found = calls_of(env, 2 if n == 1 else np.full(n, 2))
     assert found <= MOST_CALLS[n], f"{found:.1f} calls a step; the budget is {MOST_CALLS[n]}"

@@ -1,4 +1,4 @@
-"""Checkpoints: a run goes on bit for bit, a kill leaves a whole one, damage is seen."""
+"""Checkpoints: bit-identical resume, completeness after a kill, detection of damage."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_a_run_goes_on_in_another_process_bit_for_bit(tmp_path: Path) -> None:
     assert_same(expected, dict(np.load(out)))
 
 
-# One of each kind; the others keep what they learn from as one of these does.
+# One learner of each kind; the others keep their learning state like one of these.
 EVERY_TIME = {"dqn", "qr-dqn", "recurrent-ppo", "sac"}
 
 
@@ -325,7 +325,7 @@ def test_damage_is_told_and_the_one_before_is_used(
     assert len(told) == 1
     assert "checkpoint-000002: damaged checkpoint, not used: " in told[0]
     assert "\n" not in told[0]
-    # The damaged one takes nobody's place: two whole ones stay.
+    # The damaged checkpoint is not counted: two complete checkpoints stay.
     marked(model, 3)
     save_checkpoint(folder, model, {"mark": 3})
     assert load_latest(folder, model, told.append) == {"mark": 3}

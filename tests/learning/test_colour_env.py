@@ -1,4 +1,4 @@
-"""Environments whose vehicle sees colour: what they give, to whom, and what they refuse."""
+"""Environments with a colour camera: observations, supported learners, rejected settings."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_stable_baselines3_takes_it_for_an_image(kind: CameraKind) -> None:
     seen, *_ = env.step(np.full(3, 12))
     for observation in (first, seen):
         assert env.observation_space.contains({k: v[0] for k, v in observation.items()})  # type: ignore[union-attr]
-    # What was new is what was before; before the first there was nothing.
+    # Older channels equal the previous observation; they are zero in the first one.
     channels = CHANNELS[kind]
     assert not first[kind][:, channels:].any()
     np.testing.assert_array_equal(seen[kind][:, channels:], first[kind][:, :channels])  # type: ignore[call-overload]
@@ -103,7 +103,7 @@ def test_the_image_is_that_of_the_one_caster(kind: CameraKind, projection: Proje
     assert len(np.unique(env.cameras.image)) > 50
 
 
-# Stuck cameras of the twin, of depth: test_twin_faults.py. Colour compiles a renderer of its own.
+# Stuck depth cameras: test_twin_faults.py. Colour compiles a separate renderer.
 @pytest.mark.nightly
 def test_a_camera_that_is_stuck_shows_the_same_picture() -> None:
     (stuck,) = Scenario(faults=("camera stuck at offboard+1s",)).faults
@@ -152,7 +152,7 @@ def test_the_expert_that_reads_depth_cannot_be_imitated() -> None:
 def test_networks_of_colour_are_exported(
     algorithm: str, told: tuple[Told, ...], tmp_path: Path
 ) -> None:
-    """With a memory, and with what it is told: DQN is trained and flown elsewhere."""
+    """Cover a recurrent policy and in-flight inputs; other tests train and fly DQN."""
     size = {"height_px": 12, "width_px": 16, "horizontal_fov_deg": 90.0, "range_m": 20.0}
     seen = {"kind": "rgb", "frames": 2, "in_flight": told}
     spec = ObservationSpec.model_validate(size | seen)

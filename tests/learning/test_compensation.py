@@ -1,4 +1,4 @@
-"""Compensated latency and pipelined decisions: twin and companion alike, and what they reach."""
+"""Latency compensation and pipelined decisions: simulator against companion, and the benefit."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def blown(fleet: Fleet, ticks: int, air: np.ndarray | None) -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_twin_and_plant_fly_the_same_gusts_and_the_same_aircraft(seed: int) -> None:
-    """20 s of manoeuvres; each draws gusts and airframe from the seed by itself."""
+    """Fly 20 s of manoeuvres; both sides draw gusts and airframe independently from the seed."""
     drawn = draw_airframe(VEHICLE.airframe, SPREAD, stream(seed, Stream.AIRFRAME))
     pilot = PlantPilot(60.0, seed=seed, aircraft=Aircraft(wind=GUSTY), airframe=drawn)
     fleet, arenas, winds = new_fleet(1), batch_of([OPEN]), Winds(1, GUSTY)
@@ -144,7 +144,7 @@ def test_the_drawn_wind_is_uniform_in_speed_and_direction() -> None:
 
 
 def test_the_twin_s_gusts_have_the_spread_and_correlation_time_stated() -> None:
-    """Of the tick that each vehicle is in, over many blocks, as `advance` reads it."""
+    """Read gusts at each vehicle's tick over many blocks, as `advance` does."""
     winds, sigma, tau = Winds(400, GUSTY), GUSTY.gust_m_s, GUSTY.gust_time_s
     fleet = new_fleet(400)
     for i in range(400):
@@ -212,7 +212,7 @@ def test_a_windy_flight_is_its_seed_s_whatever_flies_beside_and_goes_on_from_a_c
 
 
 def test_the_plant_s_camera_has_the_twin_s_pixels() -> None:
-    """A vehicle that stands still, frame after frame."""
+    """Compare consecutive frames of a vehicle at rest."""
     noise, seed = SensorNoise(depth_noise=0.05, depth_dropout=0.1), 11
     trace = Trace(1)
     twin = navigation(

@@ -107,7 +107,7 @@ def test_zones_hold_the_smaller_ones() -> None:
 
 @pytest.mark.parametrize(("threshold", "expected"), [(0.5, [0, 1, 1, 2, 2]), (0.51, [0] * 5)])
 def test_trains_through_the_zones(threshold: float, expected: list[int]) -> None:
-    """One of two vehicles fails every time."""
+    """Fail one of the two vehicles in every episode."""
     env = NavigationVectorEnv(
         2,
         arena="no-obstacles",
@@ -175,7 +175,7 @@ def test_episodes_are_flown_in_their_stage_and_put_back_there() -> None:
 
 
 class Dies(TrainingProgress):
-    """Ends the training at once, as a kill does, after so many steps."""
+    """Progress callback that ends the training at once, like a kill, after a number of steps."""
 
     def __init__(self, steps: int) -> None:
         self.steps = steps

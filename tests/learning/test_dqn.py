@@ -25,7 +25,7 @@ ON, DEAD, LATE = 0, 1, 2
 
 
 def seen(numbers: Any) -> dict[str, np.ndarray]:
-    """Observations that can be told apart by a number."""
+    """Return a distinct observation for each number."""
     numbers = np.asarray(numbers)
     depth = np.broadcast_to((numbers % 251)[..., None, None, None], (*numbers.shape, 1, 2, 2))
     goal = np.stack([numbers, numbers / 2, -numbers], axis=-1)
@@ -241,7 +241,7 @@ def test_same_seed_same_weights() -> None:
 
 
 class Endless(ToyFleet):
-    """Stands still, earns one a step; episodes end after five steps, of old age or of death."""
+    """Vehicles at rest with reward 1 a step; episodes of five steps terminate or are truncated."""
 
     def __init__(self, vehicles: int, *, dies: bool) -> None:
         super().__init__(vehicles)
@@ -293,7 +293,7 @@ def test_values_converge_to_the_closed_form(n_step: int, dies: bool) -> None:
     with torch.no_grad():
         values = model.q_net(now).max(1).values.numpy()
     left = 5 - np.arange(5)
-    # Death: the sum of what is left. Old age: the task goes on for ever.
+    # Termination: the sum of the remaining rewards. Truncation: the task continues forever.
     expected = (1 - 0.7**left) / 0.3 if dies else np.full(5, 1 / 0.3)
     np.testing.assert_allclose(values, expected, rtol=0.08)
 

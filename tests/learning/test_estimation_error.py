@@ -54,7 +54,7 @@ def test_a_gauss_markov_process_keeps_its_spread_and_forgets_exponentially() -> 
 
 
 def test_one_long_step_is_many_short_ones() -> None:
-    """The same distribution, whatever the decision period; and each vehicle's own step."""
+    """Check equal distributions for any decision period, and separate steps per vehicle."""
     model = EstimationError(np.ones(9), np.geomspace(0.2, 5.0, 9))
     rng = np.random.default_rng(2)
     start = np.full((40_000, 9), 2.0)
@@ -73,7 +73,7 @@ def test_one_long_step_is_many_short_ones() -> None:
 def test_attitude_is_turned_about_the_world_s_axes() -> None:
     rng = np.random.default_rng(3)
     position, velocity, errors = (rng.normal(size=(50, k)) for k in (3, 3, 9))
-    errors[:, 6:] *= 0.5  # no more than half a turn, or the shorter way round is found
+    errors[:, 6:] *= 0.5  # at most half a turn, else the shorter rotation is found
     truth = Rotation.random(50, random_state=4)
     quaternion = np.roll(truth.as_quat(), 1, axis=-1)
     p, v, q = perturbed(position, velocity, quaternion, errors)
@@ -118,7 +118,7 @@ def test_a_fit_finds_the_model_it_was_drawn_from() -> None:
 
 
 def ekf_errors(rig: Rig, seconds: float, seed: int) -> np.ndarray:
-    """Fly about, by other manoeuvres than those of the fit; return errors (samples, 9), 50 Hz."""
+    """Fly manoeuvres that differ from the fit's; return errors (samples, 9) at 50 Hz."""
     rng = np.random.default_rng(seed)
     start = rig.truth.position.copy()
     rig.take_off(3.0, settle_s=0.0)
@@ -154,10 +154,10 @@ def flown() -> np.ndarray:
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", GROUPS)
 def test_the_shipped_model_is_as_wrong_as_the_ekf(flown: np.ndarray, name: str) -> None:
-    """Rms within a factor of 1.5 for velocity and 2 for the rest.
+    """Compare the RMS within a factor of 1.5 for velocity and 2 for the rest.
 
     Position hardly changes in a flight: few independent samples. Attitude is worst in the first
-    seconds, until an acceleration has told the filter its biases: manoeuvres matter.
+    seconds, until accelerations make the filter's biases observable: manoeuvres matter.
     """
     errors = list(GROUPS[name][1])
     rms = np.sqrt(np.mean(flown[..., errors] ** 2))

@@ -1,4 +1,4 @@
-"""Export: what ONNX Runtime gives is what the trained model gives, whatever trained it."""
+"""Export: ONNX Runtime reproduces the trained model's outputs, for every training library."""
 
 from __future__ import annotations
 
@@ -349,7 +349,7 @@ class Metric:
 def test_any_arrays_go_to_the_network_in_the_layout_s_order(
     algorithm: str, changed: str, tmp_path: Path
 ) -> None:
-    """A layout of one's own has them sorted, even where they are those of `body`."""
+    """Sort the arrays of a custom layout by name, even if they equal the arrays of `body`."""
     (tmp_path / "layouts.py").write_text(OWN_LAYOUT)
     changes: dict[str, Any] = {}
     if changed != "layout":
@@ -625,7 +625,7 @@ class Narrow(Net):
 def test_a_module_of_one_s_own_flies_as_it_decides(
     name: str, layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the names of its arguments: a layout of one's own has goal and velocity the other way."""
+    """Match inputs to argument names: a custom layout swaps goal and velocity."""
     (tmp_path / "nets.py").write_text(NETS)
     (tmp_path / "layouts.py").write_text(OWN_LAYOUT)
     spec = SPEC
@@ -640,7 +640,7 @@ def test_a_module_of_one_s_own_flies_as_it_decides(
     source, out = f"{tmp_path / 'nets.py'}:{name}", tmp_path / "mine"
     assert airl(monkeypatch, "export", source, "--layout", layout, "--out", out, *words) == 0
     card = load_card(out, trust=True)
-    # Of the configuration, but for what was said.
+    # From the configuration, except for the options given.
     assert (card.actions.set, card.hold_s, card.training.arena) == (
         "velocity",
         0.3,

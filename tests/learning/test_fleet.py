@@ -119,7 +119,7 @@ class PlantPilot:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_flies_like_the_pybullet_plant(seed: int) -> None:
-    """30 s of manoeuvres, same setpoints: 5 mm is asked, rounding is what is left."""
+    """Fly 30 s of manoeuvres with equal setpoints: 5 mm is required, only rounding remains."""
     rng = np.random.default_rng(seed)
     fleet, arenas, pilot = new_fleet(1), batch_of([OPEN]), PlantPilot(60.0)
     hover(fleet, 0, 60.0, VEHICLE)
@@ -413,7 +413,7 @@ def test_vehicle_radius_covers_the_collision_box_s_width() -> None:
 
 @pytest.mark.parametrize("thrust_curve", [0.0, 0.4, 1.0])
 def test_a_heavy_vehicle_begins_in_a_steady_hover(thrust_curve: float) -> None:
-    """However far the vehicle is from what the controller counts on, nothing sags."""
+    """Hold the altitude however far mass and thrust are from the controller's assumptions."""
     fleet, arenas = new_fleet(1), batch_of([OPEN])
     nominal = VEHICLE.airframe
     heavy = nominal._replace(

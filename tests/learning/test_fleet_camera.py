@@ -1,4 +1,4 @@
-"""What a fleet sees: pixel for pixel what the rehearsal's camera renders from the same poses."""
+"""Fleet camera: pixel-identical to the rehearsal's camera at the same poses."""
 
 from __future__ import annotations
 

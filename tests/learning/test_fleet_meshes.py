@@ -42,7 +42,7 @@ shapes = ["{first}", "{second}", "tree", "box"]
 
 @pytest.fixture(scope="module")
 def worlds(tmp_path_factory: pytest.TempPathFactory) -> list[Arena]:
-    """Arenas of two meshes among shapes and assets; one of them without any mesh."""
+    """Return arenas of two meshes among shapes and assets; one arena has no mesh."""
     folder = tmp_path_factory.mktemp("meshes")
     torus = trimesh.creation.torus(0.8, 0.3, major_sections=24, minor_sections=10)
     torus.export(folder / "torus.stl")
@@ -144,7 +144,7 @@ def test_colour_is_bit_for_bit_that_of_the_rehearsal(
 def test_slots_take_new_arenas_in_any_order(worlds: list[Arena]) -> None:
     seen = MeshesSeen(2)
     seen.put(0, worlds[-1])
-    assert seen.batch is None  # nothing is spent where there are none
+    assert seen.batch is None  # nothing is allocated without meshes
     for order in ((0, 1), (3, 2), (4, 5), (1, 0)):
         pair = [worlds[number] for number in order]
         for i, world in enumerate(pair):

@@ -77,7 +77,7 @@ def own(world: Arena, fleet: Seen, i: int) -> np.ndarray:
 def test_depth_is_bit_for_bit_that_of_the_rehearsal_in_any_order(worlds: list[Arena]) -> None:
     seen = MeshesSeen(2)
     seen.put(0, worlds[-1])
-    assert seen.batch is None  # nothing is spent where there are none
+    assert seen.batch is None  # nothing is allocated without terrain
     differ = 0
     for k, order in enumerate(((4, 0), (1, 2), (3, 4), (2, 3), (0, 1))):
         pair = [worlds[number] for number in order]

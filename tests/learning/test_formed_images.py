@@ -26,7 +26,7 @@ jpeg_quality = 70
 [camera.imaging.auto_exposure]
 time_constant_s = 0.0
 """
-"""All but what depends on a frame's number."""
+"""Imaging settings except noise, which depends on the frame number."""
 
 NOISY = "full_well_e = 3000.0\nread_noise_e = 8.0" + QUIET
 
@@ -100,7 +100,7 @@ def test_noise_is_that_of_the_frame_s_number(tmp_path: Path) -> None:
 
 
 def test_what_was_trained_before_sees_no_difference(tmp_path: Path) -> None:
-    """A table that asks for nothing: the images of the compiled loop over all vehicles."""
+    """Compare an empty table with the images of the compiled loop over all vehicles."""
     formed, plain = flown(tmp_path, ""), flown(tmp_path, "", vehicle="quad-rgb")
     np.testing.assert_array_equal(captured(formed), captured(plain))
 

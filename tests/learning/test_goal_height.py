@@ -1,4 +1,4 @@
-"""The batch twin in three dimensions: what is seen of the goal, what is judged, who flies gates."""
+"""Vectorized simulator in three dimensions: goal observations, verdicts, flights through gates."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_the_goal_has_its_height_in_the_observation() -> None:
         away = np.array([*arena.goal, -arena.goal_height_m]) - truth.position[i]
         assert navigation.flights().goal_distance_m[i] == pytest.approx(np.linalg.norm(away))
     assert encoded["goal"].shape == (3, 4)
-    # The first three numbers are those of a network that is not told.
+    # The first three values do not depend on `goal_height`.
     untold = Navigation(spec_with(**(GATES | {"goal_height": False})), 3)
     untold.begin([0, 1, 2], [5, 6, 7])
     for _ in range(5):

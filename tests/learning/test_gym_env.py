@@ -42,7 +42,7 @@ PAPER: dict[str, Any] = {
     "reward": "paper",
 }
 DOOR = f"airl_mav:{NAVIGATION}"
-"""What a user asks Gymnasium for."""
+"""Environment id passed to Gymnasium."""
 
 FORWARD = 22
 """`arc-25`: full speed ahead."""
@@ -52,7 +52,7 @@ class _Canvas(FigureCanvasAgg):  # type: ignore[misc]  # matplotlib is not follo
     """A window without a display: events do nothing."""
 
     manager_class = FigureManagerBase
-    # What matplotlib calls the only framework that "runs" where there is no display.
+    # matplotlib's name for the only framework that "runs" without a display.
     required_interactive_framework = "headless"
     shown: list[np.ndarray] = []  # noqa: RUF012
 
@@ -63,7 +63,7 @@ class _Canvas(FigureCanvasAgg):  # type: ignore[misc]  # matplotlib is not follo
 
 @pytest.fixture
 def window(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[np.ndarray]]:
-    """A matplotlib backend that pretends to have a display; what it showed."""
+    """Yield the images shown by a matplotlib backend that pretends to have a display."""
     backend: Any = types.ModuleType("pretended_display")
     backend.FigureCanvas = _Canvas
     monkeypatch.setitem(sys.modules, backend.__name__, backend)
@@ -114,7 +114,7 @@ def test_sb3_trains_on_the_environment_s_name_alone() -> None:
 
 
 def test_the_hyper_parameters_for_rl_zoo_are_such_as_sb3_takes() -> None:
-    """As rl-zoo3 reads its files: by the id, and all but three are the learner's arguments."""
+    """Read the file as rl-zoo3 does: by id; all but three keys are arguments of the learner."""
     yaml = pytest.importorskip("yaml", reason="needs the [docs] extra")
     asked = yaml.safe_load((ROOT / "examples/rl_zoo3_ppo.yml").read_text())[NAVIGATION]
     flights, steps = asked.pop("n_envs"), asked.pop("n_timesteps")
@@ -274,7 +274,7 @@ def test_wrong_arguments_of_the_vector_environment() -> None:
 def test_what_is_no_action_of_the_set_is_not_flown(
     knobs: dict[str, Any], action: Any, line: str
 ) -> None:
-    """Nothing moves, and the episode goes on with a valid one."""
+    """Reject an invalid action without moving; the episode continues with a valid action."""
     env, many = NavigationEnv(**knobs), NavigationVectorEnv(2, **knobs)
     env.reset(seed=1)
     many.reset(seed=[1, 2])
@@ -449,7 +449,7 @@ def test_the_picture_shows_vehicle_goal_movers_and_depth() -> None:
     orange = [_near(each, "#f0932b") for each in (first, later)]
     assert len(orange[0]) > 50
     assert set(map(tuple, orange[0])) != set(map(tuple, orange[1]))
-    # The depth image is that of the observation, 336 pixels wide, every pixel of it a square.
+    # The observation's depth image is drawn 336 pixels wide, each of its pixels a square.
     top, left, side = 32, 595, 10.5
     rows, columns = (np.arange(24) + 0.5) * side, (np.arange(32) + 0.5) * side
     centres = later[top + rows.astype(int)[:, None], left + columns.astype(int)[None]]
@@ -458,7 +458,7 @@ def test_the_picture_shows_vehicle_goal_movers_and_depth() -> None:
 
 
 def test_pictures_are_of_now_and_of_this_episode() -> None:
-    """The layer that stays is drawn anew with each episode, and no mark of the last one is left."""
+    """Redraw the static layer for each episode, without marks of the previous episode."""
     env, fresh = (NavigationEnv(render_mode="rgb_array") for _ in range(2))
     env.reset(seed=3)
     env.render()

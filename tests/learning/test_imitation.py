@@ -1,4 +1,4 @@
-"""Experts and learning from them: the planner flies well, what it teaches is learned and kept."""
+"""Experts and imitation learning: the planner flies well, and policies keep its behaviour."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Training that begins with what another one has learned."""
+"""Training that starts from the weights of another training."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def weights(out: Path) -> dict[str, torch.Tensor]:
 
 @pytest.mark.nightly
 def test_begins_with_the_best_weights_of_a_run(before: Path, tmp_path: Path) -> None:
-    # It ends before its first update: what it has is what it began with.
+    # Training ends before its first update: its weights are still the initial weights.
     for name, initial, same in (("on", before, True), ("afresh", None, False)):
         changes = {"seed": 2, "steps": 20, "initial": None if initial is None else str(initial)}
         run.train(TrainingConfig.model_validate(TINY | changes), tmp_path / name, name=name)

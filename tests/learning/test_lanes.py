@@ -137,9 +137,9 @@ def commanded(fleet: Fleet, rng: np.random.Generator, by_rates: float = 0.0) -> 
 @pytest.mark.parametrize("windy", [False, True])
 @pytest.mark.parametrize("by_rates", [0.0, 0.5, 1.0])
 def test_together_as_alone(n: int, windy: bool, by_rates: float) -> None:
-    """Of unequal vehicles, for unequal numbers of ticks, from unequal moments on.
+    """Advance different vehicles for different numbers of ticks from different times.
 
-    Commanded by velocities, by body rates, or by one after the other.
+    Commands are velocities, body rates, or one after the other.
     """
     rng = np.random.default_rng(n)
     air = rng.normal(0.0, 4.0, (n, 7, 3)) if windy else np.zeros((n, 1, 3))

@@ -1,4 +1,4 @@
-"""A vehicle with a planar lidar in the twin: what its network sees, and the rehearsal's ranges."""
+"""Planar lidar in the vectorized simulator: network input and the rehearsal's ranges."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_network_sees_its_ranges_with_a_seam() -> None:
     seen, _ = env.reset(seed=[5, 8])
     assert seen["depth"].shape == (2, 1, 2, 450)
     assert set(seen) == {"depth", "velocity", "goal"}
-    # A level vehicle: what it measured, from byte to byte, and what lies behind at either end.
+    # Level vehicle: measured ranges as bytes, with 45 wrapped columns at either end.
     for i in range(2):
         measured = env.navigation.cameras.image[i, 0] / 1e3
         wanted = scan_bytes(np.where(measured > 0.0, measured, np.inf)[None], 12.0)[0]

@@ -43,7 +43,7 @@ VEHICLE = vehicle_of(QUAD, parameter_values(QUAD.parameters).__getitem__)
 TRUE_STATE = {"navigation_noise": 0.0}
 TICK_US = 4000
 PERIOD_US = 33_333
-"""Of the quad's camera, 30 Hz."""
+"""Frame period of the quad's camera [µs], 30 Hz."""
 
 
 def spec_with(**knobs: object) -> EnvironmentSpec:
@@ -56,7 +56,7 @@ def rounded(time_us: float) -> int:
 
 
 class ByHand:
-    """One vehicle, one tick at a time; what happens when is worked out here once more."""
+    """One vehicle, advanced tick by tick, with an independent computation of event times."""
 
     def __init__(self, arena_name: str, seed: int) -> None:
         spec = load_profile("arenas", arena_name, ArenaSpec)
@@ -232,7 +232,7 @@ def test_a_flight_takes_the_drawn_latencies_and_the_holds() -> None:
 
 
 class StillLink:
-    """A flight controller that stands still."""
+    """Flight controller of a vehicle at rest."""
 
     connected = True
 
@@ -329,7 +329,7 @@ def test_one_arena_for_all_episodes() -> None:
     for arena in (first, second):
         assert np.array_equal(arena.goal, alone.arenas[0].goal)
         assert np.array_equal(arena.obstacles.center, alone.arenas[0].obstacles.center)
-    # What chance decides in the flight stays each episode's own.
+    # Random draws during the flight differ between episodes.
     truth, told = navigation.truth(), navigation.kinematics()
     assert np.array_equal(truth.position[0], truth.position[1])
     assert not np.array_equal(told.velocity[0], told.velocity[1])
@@ -406,7 +406,7 @@ def test_the_image_is_that_of_the_newest_decoded_frame(transport_ms: float, link
         ages.add(age)
         image = expected(hand.tick - age)
         assert np.array_equal(navigation.see().depth_mm[0], image)
-        # It can tell ages apart: a tick more or less is another image.
+        # The comparison detects wrong ages: one tick changes the image.
         assert not np.array_equal(expected(hand.tick - age - 1), image)
     assert len(ages) > 1
     assert min(ages) >= transport_us // TICK_US
@@ -487,7 +487,7 @@ def test_the_held_altitude_is_the_one_that_telemetry_tells() -> None:
     [
         (TRUE_STATE, True),
         ({"estimation": False}, False),
-        # Decisions without a drift of errors are compiled anew.
+        # Decisions without drift of the errors compile separately.
         pytest.param({"estimation": False}, True, marks=pytest.mark.nightly),
     ],
 )
@@ -503,7 +503,7 @@ def test_without_estimation_telemetry_is_the_truth(without: dict[str, object], f
 
 
 def test_what_it_returns_is_not_what_it_flies() -> None:
-    """Nobody outside can move a vehicle by writing into what they were given."""
+    """Write into returned arrays and check that the vehicle does not move."""
     navigation, other = (Navigation(spec_with(arena="no-obstacles"), 1) for _ in range(2))
     for each in (navigation, other):
         each.begin([0], [1])
@@ -535,7 +535,7 @@ def test_an_ended_flight_stays_as_it_ended() -> None:
 
 @pytest.mark.parametrize(("mass", "sag_m"), [(0.0, 1e-3), (0.15, 0.5)])
 def test_begins_in_a_hover_that_stays_where_it_is(mass: float, sag_m: float) -> None:
-    """Without a command the vehicle does not drift; one of another mass sags, and comes back."""
+    """Check that the vehicle does not drift without a command; another mass sags and recovers."""
     spec = spec_with(
         arena="no-obstacles", randomisation={"mass": mass, "thrust": mass, **TRUE_STATE}
     )
@@ -574,7 +574,7 @@ def test_zones_and_seeds_are_checked() -> None:
 
 
 def test_states_of_the_decisions_before_are_kept_with_their_images() -> None:
-    """Of each vehicle, since its episode began; with the estimator's error, as it was told them."""
+    """Check each vehicle's states since its episode began, as reported with estimation errors."""
     knobs = {"arena": "static-obstacles", "frames": 3, "layout": "scan"}
     navigation = Navigation(spec_of(None, {**knobs, "randomisation": {"estimation": True}}), 2)
     navigation.begin([0, 1], [3, 4])

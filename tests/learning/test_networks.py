@@ -1,4 +1,4 @@
-"""Networks: the paper's parameter counts, shapes, what goes in; refusals."""
+"""Networks: the paper's parameter counts, shapes, inputs, rejected specifications."""
 
 from __future__ import annotations
 

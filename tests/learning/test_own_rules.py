@@ -1,4 +1,4 @@
-"""A layout, an action set and an arena generator of the user's: flown, and asked trust for."""
+"""Custom layout, action set and arena generator: flown, and loaded only with trust."""
 
 from __future__ import annotations
 
@@ -241,7 +241,7 @@ def test_the_user_s_arena_is_flown_in_and_drawn(
         crossed = flown[np.argmin(np.abs(flown[:, 0] - 10.0)), 1]
         assert episode.outcome.value != "success" or abs(crossed - gap) < 2.0
     assert run.report().exists()
-    # As another process would find the folder, which nobody has told it to trust.
+    # Simulate another process, in which the folder is not trusted.
     monkeypatch.setattr(plugins, "_loaded", set())
     with pytest.raises(UsageError, match=r"its generator '.*:wall' is code that would run on this"):
         run.report()

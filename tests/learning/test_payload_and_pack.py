@@ -40,7 +40,7 @@ def hover_w(mass_kg: float) -> float:
 def twin(
     profile: VehicleProfile, computer_w: float = 0.0, charge: float = 1.0
 ) -> tuple[Fleet, Callable[[int], None]]:
-    """Return a vehicle of the twin that hovers, and what flies it on for a number of ticks."""
+    """Return a hovering vehicle of the simulator, and a function that advances it by ticks."""
     vehicle = vehicle_of(profile, Parameters(profile.parameters).__getitem__, computer_w)
     fleet, arenas = new_fleet(1), batch_of([OPEN])
     hover(fleet, 0, 50.0, vehicle, battery=charge)
@@ -62,7 +62,7 @@ def in_the_plant(profile: VehicleProfile) -> Measured:
     for _ in range(10):
         plant.step(full)
     climb = (speed - plant.truth().velocity[2]) / (10 * TICK_S)
-    # A hover is not stable by itself: each tick it is put back where it was.
+    # A hover is unstable without control: reset the pose each tick.
     share = profile.body.mass_kg * G / (4 * profile.rotor.thrust_max_n)
     hovering = ActuatorControls(0, (share,) * 4, True)
 

@@ -47,7 +47,7 @@ def test_the_file_is_smaller_and_its_card_says_how_it_was_made(
         "static-obstacles",
         FRAMES,
     )
-    # Between the seeds that choose the best weights (from 500,000 on) and those of training.
+    # Between the seeds for selecting the best weights (from 500,000 on) and for training.
     assert 500_000 + 100_000 < made.first_seed == FIRST_SEED
     assert floats.training.first_arena_seed is not None
     assert made.last_seed < floats.training.first_arena_seed

@@ -1,4 +1,4 @@
-"""Domain randomisation: ranges, exact repetition, and nothing where nothing is asked for."""
+"""Domain randomization: ranges, exact repetition, and nominal values by default."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GROUPS = {
 
 
 def factors(airframe: Airframe) -> dict[str, float]:
-    """What each field was multiplied by; fields that are zero stay out."""
+    """Return the factor of each field; fields that are zero are left out."""
     pairs = zip(airframe._fields, airframe, NOMINAL, strict=True)
     return {name: value / nominal for name, value, nominal in pairs if nominal}
 
@@ -77,7 +77,7 @@ def test_every_seed_flies_its_own_airframe() -> None:
 
 
 def test_extra_delay_is_one_value_an_episode_within_its_range() -> None:
-    """Added to t2 of every decision; time tells."""
+    """Measure by flight time the delay added to t2 of every decision."""
     spec = EnvironmentSpec(
         arena="no-obstacles",
         delay={"native_ms": 0.0},

@@ -61,7 +61,7 @@ def fresh(policy: LearnedPolicy) -> LearnedPolicy:
 
 
 class Recorded:
-    """The companion's policy, and what it was shown and did."""
+    """The companion's policy, with a record of its observations and actions."""
 
     def __init__(self, policy: LearnedPolicy, seen: list[Any], done: list[Any]) -> None:
         self.policy, self.seen, self.done = policy, seen, done
@@ -118,7 +118,7 @@ def test_the_selection_flies_as_the_export(
 
 
 def test_what_was_seen_before_is_kept_alike_in_twin_and_companion(tmp_path: Path) -> None:
-    """Three images a decision: in lockstep each is what the decisions before saw, and decides."""
+    """Compare stacks of three images: in lockstep, the images of the previous decisions."""
     shape = SHAPE.model_copy(update={"frames": 3})
     velocity = ActionSpec(set="velocity")
     stacked = make_model("PPO", "velocity", spec=shape, n_steps=8, batch_size=8)
@@ -142,12 +142,12 @@ def test_what_was_seen_before_is_kept_alike_in_twin_and_companion(tmp_path: Path
             before = flight[max(k - 2, 0) : k][::-1]
             for kept, image in zip(each.earlier_mm, before, strict=False):
                 np.testing.assert_array_equal(kept, image.depth_mm)
-            # The twin has room for what is not there yet, the companion keeps more than is asked.
+            # The simulator pads missing images with zeros; the companion keeps more than required.
             assert all((kept == 0).all() for kept in each.earlier_mm[k:])
 
 
 def test_a_companion_begins_each_flight_with_nothing_in_mind(model: Any, tmp_path: Path) -> None:
-    """In lockstep, through MAVLink: what it was shown, shown to the model, gives what it did."""
+    """Feed observations recorded in lockstep over MAVLink to the model: it repeats the actions."""
     folder = tmp_path / "dreamer"
     export_sb3(model, facts(name="dreamer", actions=ActionSpec(set="velocity")), folder)
     scenario = demo_scenario(policy=str(folder), time_limit_s=5.0)
@@ -158,7 +158,7 @@ def test_a_companion_begins_each_flight_with_nothing_in_mind(model: Any, tmp_pat
         assert isinstance(begun, LearnedPolicy)
         fly(scenario, Recorded(begun, seen, done), 0, seed)
         assert len(done) > 5
-        # Another object, as a companion that was started anew has it, decides the same again.
+        # A new policy object, as in a restarted companion, repeats the decisions.
         again = scenario.fresh_policy(seed)
         assert [again.act(each) for each in seen] == done
 
@@ -188,7 +188,7 @@ def test_a_policy_with_a_memory_flies_in_a_companion_of_its_own(model: Any, tmp_
     assert episode.outcome in (Outcome.TIMEOUT, Outcome.SUCCESS, Outcome.COLLISION)
     setpoints = run.stamps[0]["setpoint"]
     assert len(setpoints) > 5
-    # It decides anew with each image, and flies what it decides.
+    # Each image leads to a new decision, which is flown.
     assert np.ptp(setpoints[:, 0]) > 0.0
     assert np.isfinite(setpoints).all()
 

@@ -17,7 +17,7 @@ HOLD_S = 0.5
 
 
 def flights(distance_m: list[float], speed_m_s: list[float], **verdicts: int) -> Flights:
-    """Return flights that go on, but for those with a verdict by its name."""
+    """Return flights in progress, except for vehicles with a verdict, given by its name."""
     n = len(distance_m)
     verdict = np.full(n, Verdict.FLYING, np.int64)
     for name, i in verdicts.items():

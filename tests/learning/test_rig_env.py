@@ -1,4 +1,4 @@
-"""Vehicles with further cameras in the batch twin: bit for bit the images of the plant's."""
+"""Additional cameras in the vectorized simulator: images bit-identical to the plant's."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def rig(tmp_path: Path) -> Path:
     "arena", ["dynamic-obstacles", pytest.param("hills", marks=pytest.mark.nightly)]
 )
 def test_the_plant_s_cameras_take_the_same_images(rig: Path, arena: str) -> None:
-    """Of all kinds of error: matching, ranging, exposure in motion, noise of photons."""
+    """Cover all error types: matching, ranging, exposure during motion, photon noise."""
     noise = SensorNoise(depth_noise=0.02, depth_dropout=0.02)
     env = flown(rig_env(rig, arena=arena, randomisation=noise.model_dump()))
     everyone, fleet = np.ones(2, np.bool_), env.fleet
@@ -115,7 +115,7 @@ def test_further_cameras_change_nothing_of_what_there_was(rig: Path) -> None:
         np.testing.assert_array_equal(ours[key], array)
     for kept, other in zip(with_all.fleet, alone.fleet, strict=True):
         np.testing.assert_array_equal(kept, other)
-    # What one camera draws does not change with the others.
+    # A camera's random draws do not depend on the other cameras.
     few = flown(rig_env(rig, randomisation=noise, cameras={"right": {}}))
     np.testing.assert_array_equal(few.observe()["depth_right"], ours["depth_right"])
 

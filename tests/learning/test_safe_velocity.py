@@ -158,9 +158,9 @@ def test_the_greatest_speed_lies_between_the_two() -> None:
 
 
 def test_the_whole_loop_with_its_camera_stops_in_time() -> None:
-    """Rendered depth and real decisions: full speed until the wall is nearer than D, then none.
+    """Fly rendered depth and real decisions: full speed until the wall is nearer than D, then 0.
 
-    Each flight has a D of its own, so that decisions fall at all moments before the wall.
+    Each flight has a different D, so that decisions occur at all times before the wall.
     """
     flights = 100
     distances = np.linspace(6.0, 10.0, flights)

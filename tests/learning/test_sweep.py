@@ -1,4 +1,4 @@
-"""The architecture search: what a sweep is, how it is judged and shown."""
+"""Architecture search: definition, evaluation and figures of a sweep."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def test_parameters_in_closed_form_are_those_of_torch(
 
 
 def test_the_sizes_are_those_that_the_paper_names() -> None:
-    # 40.3 M and 161.77 M parameters (section VI.A); the latter are those of 8x64.
+    # 40.3 M and 161.77 M parameters (section VI.A); the latter belongs to 8x64.
     assert template_size(5, 32, 154, 256, 25).parameters == 40_412_761
     assert template_size(8, 64, 154, 256, 25).parameters == 161_771_033
     for name, work in load_computer("ras-pi-4").workloads.items():

@@ -34,7 +34,7 @@ pytestmark = [
 ]
 
 SEED, TRIALS = 6, 2
-"""Of the trainings, and how many there are: one of each size."""
+"""Training seed, and number of trainings (each size is trained once)."""
 
 SMALL = (
     TINY.replace("seeds = [1, 2]", f"seeds = [{SEED}]")
@@ -92,7 +92,7 @@ def checkpointed(folder: Path, before: frozenset[str] = frozenset()) -> frozense
     """Return the newest checkpoints of trainings that have not ended, less those of before."""
     found = set()
     for latest in folder.glob("out/*/checkpoints/latest"):
-        # Gone meanwhile: that training has ended.
+        # The file disappears when the training ends.
         with suppress(OSError):
             if not (latest.parents[1] / "result.json").exists():
                 found.add(f"{latest.parents[1].name} {latest.read_text(encoding='utf-8')}")
@@ -122,7 +122,7 @@ def test_a_sweep_trains_judges_and_tells_all(undisturbed: Path) -> None:
         card = read_card(policy)
         assert Size(card.parameters, card.macs) == size_of(config, trial)
         assert card.training.seed == trial.seed
-        # What was only there to go on with has gone.
+        # Files needed only for resuming are deleted.
         assert not (policy.parent / "checkpoints").exists()
 
 
@@ -172,7 +172,7 @@ def test_interrupted_and_killed_it_goes_on_as_if_nothing_had_happened(
         workers = workers_of(process)
         process.process.send_signal(signal.SIGKILL)
         process.wait()
-        # What was written when it died is whole.
+        # Files written before the kill are complete.
         config = load_sweep(f"{tmp_path / 'small.toml'}")
         held = SweepFolder(tmp_path / "out", config).results(trials(config))
         assert len(held) < TRIALS
@@ -210,7 +210,7 @@ def test_ray_comes_to_the_same_results(tmp_path: Path, undisturbed: Path) -> Non
 def test_a_killed_task_of_ray_begins_again(
     tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Inherited by the workers of this very Ray, and by nobody else's.
+    # Inherited only by the workers of this Ray instance.
     mark = f"AIRL_SWEEP_TEST={tmp_path}"
     monkeypatch.setenv(*mark.split("="))
     with running(sweep(tmp_path, "--executor", "ray", "--workers", "1"), tmp_path) as process:

@@ -40,7 +40,7 @@ def pilots() -> SinglePilots:
 
 @dataclass
 class Kept:
-    """A flight and what the trace says of it."""
+    """A flight and its trace."""
 
     flown: EpisodeResult
     path: Trajectory

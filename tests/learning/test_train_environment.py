@@ -1,4 +1,4 @@
-"""How late, and how fast, `airl train` is asked to train."""
+"""Latency and speed options of `airl train`."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def straight(short: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that nobody disturbed."""
+    """Return the folder of an uninterrupted run."""
     out = tmp_path_factory.mktemp("straight") / "run"
     code, text = airl("train", str(short), "--out", str(out))
     assert code == 0, text
@@ -114,9 +114,9 @@ def test_of_another_algorithm_than_its_base_s_nothing_is_left(tmp_path: Path) ->
 def test_a_killed_run_goes_on_as_if_nothing_had_happened(
     short: Path, straight: Path, tmp_path: Path
 ) -> None:
-    """kill -9 at any moment; the evaluations and the weights are those of the straight run.
+    """Kill with -9 at any time; evaluations and weights equal those in the uninterrupted run.
 
-    In every run: tests/learning/test_checkpoint.py kills at every step of saving.
+    In every test run, tests/learning/test_checkpoint.py kills at every step of saving.
     """
     out = tmp_path / "run"
     with subprocess.Popen(
@@ -176,7 +176,7 @@ def test_programs_read_lines(short: Path, tmp_path: Path) -> None:
     # Trained to the end already: quiet says where the result lies, and nothing else.
     code, text = airl("train", str(config), "--out", str(out), "--resume", "--quiet")
     assert [line.split()[0] for line in text.splitlines()] == ["best", "policy", "folder"]
-    # What was exported flies through MAVSDK, well or not.
+    # The exported policy flies through MAVSDK; its success is not checked.
     words = option_words(level="lockstep", episodes=1, workers=1, time_limit_s=5.0)
     with flown_here():
         code, _ = airl("evaluate", str(out / "policy"), *words, "--out", str(tmp_path / "flight"))
@@ -254,7 +254,7 @@ def test_a_wrong_configuration_gets_one_line(text: str, names: list[str], tmp_pa
 
 
 def test_the_curves_of_a_learner_with_rollouts_have_a_point_for_each(tmp_path: Path) -> None:
-    """Of the return too: stable-baselines3 counts rollouts where others count episodes."""
+    """Check the return's curve, too: stable-baselines3 counts rollouts, not episodes."""
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     config = TrainingConfig.model_validate(
         {
@@ -288,13 +288,13 @@ def test_two_do_not_train_in_one_folder(tmp_path: Path, monkeypatch: pytest.Monk
         run.train(config, tmp_path / "run", name="one")
 
 
-@pytest.mark.nightly  # What a short training exports flies: test_programs_read_lines.
+@pytest.mark.nightly  # test_programs_read_lines flies the export of a short training.
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_learns_exports_and_flies(tmp_path: Path) -> None:
     """From nothing to a rehearsal: learns far beyond chance, then flies through MAVSDK."""
     config = tmp_path / "tiny.toml"
-    # A small image and flights that soon time out: chance, and who knows nothing yet, fly long.
+    # A small image and a short time limit: random and untrained policies fly for long.
     config.write_text(
         'description = "tiny"\nsteps = 24_000\n'
         '[environment]\narena = "no-obstacles"\nimage_width_px = 16\nimage_height_px = 12\n'

@@ -1,4 +1,4 @@
-"""Faults in the batch twin: against the plant, what lockstep does with them, and closed forms."""
+"""Faults in the vectorized simulator: against the plant, in lockstep, and closed forms."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_gust_rises_and_falls_as_one_minus_the_cosine() -> None:
 
 @pytest.mark.parametrize("words", ["at offboard+1s for 1s", "at offboard+700ms", ""])
 def test_late_frames_come_in_order(words: str) -> None:
-    """As a queue has it: each no earlier than the one before (`firmware_sim.faults.camera`)."""
+    """Check that frames never overtake, as in a queue (`firmware_sim.faults.camera`)."""
     cameras = navigation(f"camera delay 250ms {words}").cameras
     cameras.begin(0, 5)
     failing = cameras._late[0]

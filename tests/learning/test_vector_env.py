@@ -347,7 +347,7 @@ def test_sb3_s_other_methods() -> None:
 
 
 def through_a_file(state: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What a checkpoint does to a state: arrays only, nothing pickled."""
+    """Save and load a state as a checkpoint does: arrays only, no pickle."""
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **state)
     buffer.seek(0)

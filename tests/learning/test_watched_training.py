@@ -96,7 +96,7 @@ class Watchers:
 
 
 def weights(folder: Path) -> dict[str, str]:
-    """Return the digests of what a training has learned: of the best weights, and of the last."""
+    """Return the digests of a training's weights: the best and all checkpoints."""
     found = {}
     for path in (folder / "best" / "model.zip", *sorted((folder / "checkpoints").rglob("*.zip"))):
         with zipfile.ZipFile(path) as saved:
@@ -109,7 +109,7 @@ def weights(folder: Path) -> dict[str, str]:
 
 @pytest.mark.nightly
 def test_a_watched_training_learns_the_same(tmp_path: Path) -> None:
-    """Bit for bit, while somebody looks at it as fast as it goes."""
+    """Compare weights bit by bit, while a viewer follows at unlimited speed."""
     (tmp_path / "short.toml").write_text(SHORT, encoding="utf-8")
     config = load_profile("training", str(tmp_path / "short.toml"), TrainingConfig)
     run.train(config, tmp_path / "alone", name="one")
@@ -195,7 +195,7 @@ def test_what_is_shown_is_what_was_flown(decisions: str) -> None:
 
 
 def test_a_training_that_goes_on_shows_whole_episodes() -> None:
-    """One that was under way when it was resumed is passed over: its beginning is not known."""
+    """Skip an episode in progress at the resume: its beginning is unknown."""
     ends = Ends()
     watched = WatchedTraining(ends.ends, EnvironmentSpec(), TrainingProgress())
     watched.close()

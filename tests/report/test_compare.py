@@ -1,4 +1,4 @@
-"""`airl report RUN RUN`: what differs between runs, in figures, in words, on a page."""
+"""`airl report RUN RUN`: differences between runs as figures, text and a page."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def test_latency_cells_are_what_numpy_says(runs: dict[str, Path], compared: Comp
     assert row["n"] == f"{len(raw):,}"
     assert row["mean"] == f"{raw.mean():.2f}"
     assert row["p90"] == f"{np.percentile(raw, 90, method='inverted_cdf'):.2f}"
-    # What a twin has in one is shown in one.
+    # Stages that the simulator combines are shown as one stage.
     titles = {row[0] for row in view.rows}
     assert "setpoint → motor" in titles
     assert not {"link", "control", "send"} & titles
@@ -259,7 +259,7 @@ def test_the_command_prints_and_writes(runs: dict[str, Path], tmp_path: Path) ->
     assert "drone and desk: 24 pairs." in text
     assert "Deadlines and smoothness" in text
     assert (out / "compare.html").exists()
-    # Once more into the same folder.
+    # Write into the same folder again.
     ask(runs["fast"], runs["slow"], out=out, names=("desk", "drone"))
 
 

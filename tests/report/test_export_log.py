@@ -185,7 +185,7 @@ def test_what_the_camera_saw_lies_on_the_bodies_of_the_scene(
         away = distances_to(told.of("/scene/arena")[0], world)
         if len(movers_ns):
             scene = told.of("/scene/movers")[int(np.argmin(np.abs(movers_ns - time_ns)))]
-            # They are told at 10 Hz, and fly up to 2.5 m/s.
+            # Movers are logged at 10 Hz, and fly at up to 2.5 m/s.
             other = distances_to(scene, world)
             moving += int(np.sum((other < 0.15) & (away > 0.15)))
             away = np.where(other < 0.15, 0.0, away)
@@ -203,7 +203,7 @@ def test_hills_are_in_the_scene_and_the_goal_stands_on_them() -> None:
 
     spec = load_profile("arenas", "hills", ArenaSpec)
     arenas = (generate(spec, seed, name="hills", vehicle_width_m=0.6) for seed in range(30))
-    # One whose goal is on a hill.
+    # An arena with its goal on a hill.
     arena = next(each for each in arenas if each.ground and each.ground.height_at(*each.goal) > 0.3)
     ground = arena.ground
     assert ground is not None
@@ -295,7 +295,7 @@ def test_viewers_can_jump_to_any_time(told: ReadMcap) -> None:
     assert told.schemas["/camera/depth"] == "foxglove.RawImage"
     assert told.schemas["/camera/calibration"] == "foxglove.CameraCalibration"
     assert told.schemas["/log"] == "foxglove.Log"
-    # What comes once must not share its topic with what comes again and again.
+    # Static content must not share its topic with repeated messages.
     for topic in ("/scene/arena", "/scene/path", "/scene/vehicle"):
         assert len(told.of(topic)) == 1
     for topic, messages in told.messages.items():
@@ -375,7 +375,7 @@ def test_a_flight_of_level_gym_has_px4s_topics(gym: Path, tmp_path: Path) -> Non
         rows = np.searchsorted(path.time_us, turned["timestamp"])
         for part in range(4):
             np.testing.assert_allclose(turned[f"q[{part}]"], path.quaternion[rows, part], atol=1e-6)
-        # What the twin's battery had left at the end, worked out again from power and time.
+        # Remaining battery of the simulator at the end, recomputed from power and time.
         battery = log.get_dataset("battery_status").data
         assert record.battery_remaining is not None
         last_us = int(battery["timestamp"][-1])
@@ -396,7 +396,7 @@ def test_a_flight_of_level_gym_has_px4s_topics(gym: Path, tmp_path: Path) -> Non
 def test_a_flight_that_began_before_its_clock_is_later_by_as_much(
     gym: Path, tmp_path: Path
 ) -> None:
-    """As one with a vehicle's log, whose clock is that of a companion that was started later."""
+    """Export a flight on the clock of a companion that started later, as with a vehicle's log."""
     flight = recorded(gym)
     path = flight.replayed.path
     earlier = replace(path, time_us=path.time_us - 5_000_000)
@@ -413,7 +413,7 @@ def test_a_flight_that_began_before_its_clock_is_later_by_as_much(
 
 
 def test_body_rates_and_attitudes_have_px4s_topics(tmp_path: Path) -> None:
-    """Of a flight in lockstep, beside which stands what the flight controller has logged."""
+    """Compare a lockstep flight with the log of its flight controller."""
     policy = f"{ROOT / 'examples' / 'own_body_rates.py'}:ToGoal"
     scenario = Scenario(policy=policy, arena="no-obstacles", level="lockstep", tlogs=True)
     rehearse(scenario, out=tmp_path / "run")
@@ -511,7 +511,7 @@ def live(gym: Path) -> Iterator[Any]:
 
 
 def subscribed(port: int) -> tuple[Any, dict[int, str]]:
-    """Connect as Foxglove does, and ask for all; return the socket, and topics by subscription."""
+    """Connect and subscribe to all topics as Foxglove does; return socket and topics by id."""
     client = pytest.importorskip("websockets.sync.client")
     socket = client.connect(
         f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None
@@ -550,7 +550,7 @@ def test_a_flight_is_published_whole(live: Any, gym: Path) -> None:
         times = heard_until(socket, topics, "/end")
         assert times["/scene/arena"]
         assert times["/tf"] == sorted(times["/tf"])
-        # Who comes when all is over sees what stands there, and the vehicle where it is.
+        # A client that connects after the end receives static content and the last pose.
         late, known = subscribed(live.port)
         with late:
             seen = heard_until(late, known, "/scene/arena")

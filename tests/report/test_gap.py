@@ -211,7 +211,7 @@ SYSTEM = {table.arena: table for table in PUBLISHED.tables[1:]}
 
 @pytest.mark.parametrize("arena", sorted(SYSTEM))
 def test_the_papers_system_evaluation_follows_from_its_columns(arena: str) -> None:
-    """So its figures are copied right, and its definition is ours; its success is in points."""
+    """Verify the copied figures and our definition of the gap; success is in points."""
     table = SYSTEM[arena]
     found = published_gap(table.columns["reference"], table.columns["target"])
     printed = table.printed["target"]

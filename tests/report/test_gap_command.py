@@ -1,4 +1,4 @@
-"""`airl gap`: what it flies, what it says, what it leaves behind, what it goes on with."""
+"""`airl gap`: flights, output, files, and resuming."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def measure(mitigated: str, *, page: bool = False, **options: Any) -> tuple[int,
 
 @pytest.fixture(scope="module")
 def whole(mitigated: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A gap without any trouble: its folder, and what was printed."""
+    """Return the folder and output of an uninterrupted gap."""
     out = tmp_path_factory.mktemp("whole") / "gap"
     code, text = measure(mitigated, out=out, page=True)
     assert code == 0
@@ -152,7 +152,7 @@ def test_the_columns_and_what_they_are_flown_on(whole: tuple[Path, str]) -> None
     means = {role: info["setup"]["injection"]["latency"]["mean_ms"] for role, info in runs.items()}
     assert means == dict.fromkeys(ROLES, 396.0) | {"reference": 11.0, "mitigated-reference": 11.0}
     watts = {role: info["setup"]["computer_watts"] for role, info in runs.items()}
-    # Energy of the computer is that of the target in the training's conditions, too.
+    # The computer's power is the target's in the training conditions, too.
     assert watts == dict.fromkeys(ROLES, 1.7) | {"reference": 0.0, "mitigated-reference": 0.0}
     on_ground = [role for role, info in runs.items() if info["setup"]["computer_on_ground"]]
     assert on_ground == ["reference", "mitigated-reference"]
@@ -263,7 +263,7 @@ def test_compensation_closes_most_of_the_gap(whole: tuple[Path, str]) -> None:
 def test_the_same_policy_has_the_same_gap_and_none_where_it_was_trained(
     whole: tuple[Path, str],
 ) -> None:
-    """The stand-in for the mitigated policy is the default one: what is known of it is exact."""
+    """Use the default policy as the mitigated policy, so that the expected values are exact."""
     data = data_of(whole[0])
     without, with_ = (gap_of(data, key) for key in ("without-mitigation", "with-mitigation"))
     for metric in ("success_rate", "flight_time_s", "energy_j"):
@@ -347,7 +347,7 @@ def test_tables_and_figures_agree(whole: tuple[Path, str]) -> None:
 
 
 def test_the_file_is_the_whole_comparison(whole: tuple[Path, str], tmp_path: Path) -> None:
-    """What is read back is what is worked out from the runs, and is written again as it was."""
+    """Compare the loaded file with a rebuild from the runs; saving it again is byte-identical."""
     read = load_comparison(whole[0], "gap")
     assert read == rebuild_comparison(whole[0])[0]
     save_comparison(read, tmp_path)
@@ -355,7 +355,7 @@ def test_the_file_is_the_whole_comparison(whole: tuple[Path, str], tmp_path: Pat
 
 
 class Page(HTMLParser):
-    """What a page shows, and what it asks for."""
+    """Text of a page, and the resources that it requests."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -395,7 +395,7 @@ def test_the_page_opens_offline_and_its_pictures_lie_beside_it(whole: tuple[Path
 
 def test_the_markdown_has_every_table(whole: tuple[Path, str]) -> None:
     text = (whole[0] / "gap.md").read_text()
-    assert text.count("\n| --- |") == 11  # Each by itself, the gaps, nine in detail.
+    assert text.count("\n| --- |") == 11  # The runs, the gaps, nine in detail.
     for block in re.findall(r"(?:^\|.*\|\n)+", text, re.M):
         rows = [re.findall(r"(?<!\\)\|", line) for line in block.splitlines()]
         assert len({len(row) for row in rows}) == 1
@@ -424,7 +424,7 @@ def test_worst_seeds_of_nothing() -> None:
     assert worst_seeds([], []) == []
 
 
-# --- what it goes on with
+# --- resuming
 
 
 def test_the_same_out_shows_it_again(whole: tuple[Path, str], mitigated: str) -> None:
@@ -495,7 +495,7 @@ def test_no_gap_here(tmp_path: Path) -> None:
         rebuild_comparison(tmp_path)
 
 
-# --- what it can be asked for
+# --- options
 
 
 def test_without_mitigation_and_in_two_arenas(tmp_path: Path) -> None:
@@ -530,7 +530,7 @@ def test_another_source_of_latency(tmp_path: Path, latency: str) -> None:
     assert code == 0
     data = data_of(tmp_path / "out")
     a, b, *_ = columns_of(data)
-    # The reference is undelayed: no workload of it is as late as a measured latency says.
+    # The reference is undelayed: no workload matches the measured latency.
     assert a["stages"]["t2"]["mean"] == 1e3
     assert b["stages"]["t2"]["mean"] == pytest.approx(150e3, rel=0.02)
     assert data["extra"]["published_tables"] == {}
@@ -712,7 +712,7 @@ def test_ctrl_c_and_again(whole: tuple[Path, str], mitigated: str, tmp_path: Pat
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     try:
-        # Early: the whole of it takes but seconds, and this test may be starved meanwhile.
+        # Early: a complete run takes only seconds, and this test may be starved.
         first = out / "static-obstacles-reference"
         deadline = time.monotonic() + 120.0
         while not first.exists() and process.poll() is None and time.monotonic() < deadline:

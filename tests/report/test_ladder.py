@@ -1,4 +1,4 @@
-"""`airl ladder`: what it flies, what it says, what it leaves behind, what it survives."""
+"""`airl ladder`: flights, output, files, and interruptions."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from tests.support.run_demo import demo_arena, demo_episode, demo_setup
 LADDER_FILE = "ladder.json"
 EPISODES, SITL_EPISODES = 24, 6
 WORDS: dict[str, Any] = {"arena": "dense-obstacles", "episodes": EPISODES, "seed": 20}
-"""Where some flights reach the goal and some do not."""
+"""Setup in which some flights reach the goal and some do not."""
 
 SLOW: dict[str, Any] = {"computer": "ras-pi-4", "workload": "template-5x32"}
 """Decides some 400 ms later."""
@@ -88,7 +88,7 @@ def climb(*, page: bool = False, **options: Any) -> tuple[int, str]:
 
 @pytest.fixture(scope="module")
 def whole(_twins: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A ladder without any trouble: its folder, and what was printed."""
+    """Return the folder and output of an uninterrupted ladder."""
     out = tmp_path_factory.mktemp("whole") / "ladder"
     code, text = climb(out=out, page=True)
     assert code == 0
@@ -545,7 +545,7 @@ def test_a_broken_ladder_gets_one_line(content: str, named: str, tmp_path: Path)
 
 
 def interrupted_after(flights: int) -> Any:
-    """Return a patch that presses Ctrl-C after so many flights."""
+    """Return a patch that sends Ctrl-C after a number of flights."""
     real, flown = EpisodeSaver.add, []
 
     def add(saver: EpisodeSaver, episode: FlownEpisode) -> None:

@@ -1,4 +1,4 @@
-"""What the policy saw and chose, worked out again: against the flights that it flew."""
+"""Recomputed observations and decisions of the policy, compared with its flights."""
 
 from __future__ import annotations
 

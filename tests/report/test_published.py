@@ -1,4 +1,4 @@
-"""Published figures are those of results/*.json, and say so when the code has moved on."""
+"""Published figures equal results/*.json, and are marked as outdated after code changes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def records() -> dict[str, Record]:
 
 @pytest.mark.parametrize("page", pages.pages(), ids=lambda page: str(page.relative_to(ROOT)))
 def test_pages_are_written_from_the_results(page: Path, records: dict[str, Record]) -> None:
-    """Where one is not: make results-docs."""
+    """Run `make results-docs` if this fails."""
     text = page.read_text(encoding="utf-8")
     assert pages.rendered(text, records, page) == text
 
@@ -66,7 +66,7 @@ def test_declared_results_are_there(records: dict[str, Record]) -> None:
 
 @pytest.fixture
 def fresh(records: dict[str, Record]) -> Record:
-    """A result as if today's code had flown it, whatever has been accepted since."""
+    """Return a result of today's code, independent of all accepted changes."""
     made = {"behaviour": record.behaviour_today(), "policies": dict(record.shipped_policies())}
     gap = records["gap"]
     return gap.model_copy(update={"made": gap.made.model_copy(update=made)})
@@ -83,7 +83,7 @@ def test_an_older_behaviour_is_said_under_its_tables(
     made = today.made
     flown = f"Flown on {made.date} with version {made.version}"
     assert f"**{flown}, before today's flight behaviour.**" in said
-    # The figures are the same: only what is said of them differs.
+    # The figures are equal: only the text about them differs.
     assert said.split("`airl gap")[0] == pages.rendered(text, records, "page").split("`airl gap")[0]
 
 
@@ -154,7 +154,7 @@ def test_the_changes_written_down_name_flights_that_are_flown_and_results_that_a
     flown = read_behaviour(record.BEHAVIOUR_FILE).flights
     for change in changes.values():
         assert set(change.untouched) <= set(records)
-        # A change may be told to touch more than was seen, never less.
+        # A change may declare a larger effect than observed, never a smaller one.
         for name in change.flights:
             assert name in flown
             level, arena, *_ = name.split(", ")

@@ -1,4 +1,4 @@
-"""`airl render --camera VEHICLE`: what the camera of a vehicle profile takes."""
+"""`airl render --camera VEHICLE`: images of a vehicle profile's camera."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_a_film_has_the_pictures_of_that_camera(vehicle: Path, tmp_path: Path) -
     with Image.open(out) as image:
         assert image.size == (64, 48)
         assert sum(1 for _ in ImageSequence.Iterator(image)) > 2
-    # Rates by attitudes are those that lead from one to the next.
+    # Integrated rates reproduce the attitudes.
     run = ReplayedRun(folder.path)
     flight = run.flight(run.record(0))
     path = flight.path
@@ -105,7 +105,7 @@ def test_what_the_profile_says_is_not_asked_for(words: tuple[str, ...], told: st
 
 
 def test_ground_truth_is_written_as_numbers(tmp_path: Path) -> None:
-    """Of an arena: the caster's own, and flow of a camera that flies ahead."""
+    """Compare an arena's ground truth with the ray caster, and flow of a camera flying ahead."""
     spec = load_profile("arenas", "dynamic-obstacles", ArenaSpec)
     arena = generate(spec, 4, name="dynamic-obstacles", vehicle_width_m=0.55)
     k = Intrinsics.from_fov(64, 48, math.radians(90.0))
@@ -123,7 +123,7 @@ def test_ground_truth_is_written_as_numbers(tmp_path: Path) -> None:
     motion = CameraMotion(at, north, np.array([4.0, 0.0, 0.0]), np.zeros(3))
     flow = optical_flow(picture, k, motion, velocities_of(arena, 1_500_000))
     np.testing.assert_array_equal(found["flow"], flow)
-    # As a picture, too: what does not move is white.
+    # As a picture, too: static surfaces are white.
     render("no-obstacles", *size, "--show", "flow", "--out", str(tmp_path / "flow.png"))
     with Image.open(tmp_path / "flow.png") as image:
         assert (np.asarray(image) == 255).all()

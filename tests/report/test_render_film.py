@@ -1,4 +1,4 @@
-"""`airl render RUN`: what the camera of a recorded flight saw, as a film."""
+"""`airl render RUN`: camera images of a recorded flight as a film."""
 
 from __future__ import annotations
 

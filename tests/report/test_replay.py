@@ -1,4 +1,4 @@
-"""A run that was flown, replayed: what is shown is what is recorded."""
+"""Replay of a recorded run: the page shows the recorded data."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_a_moment_is_shown_as_it_was_recorded(flight: ReplayedFlight, seconds: f
     assert shown.age_ms == pytest.approx(age_ms)
     assert shown.ages
     assert shown.ages[-1][1] == pytest.approx(age_ms, abs=41.0)
-    # The camera sees the arena: what it shows is not blank.
+    # The camera sees the arena: its image is not blank.
     assert shown.decided_image is not None
     assert len(np.unique(shown.decided_image)) > 20
 
@@ -144,7 +144,7 @@ def test_the_command_serves_pages_of_this_computer_alone(folder: Path, tmp_path:
 
 
 class Watched:
-    """A page that somebody watches, though nobody does."""
+    """Page with a simulated viewer."""
 
     def __init__(self, folder: Path, beside: Path | None = None) -> None:
         viser = pytest.importorskip("viser")
@@ -180,7 +180,7 @@ def test_the_scene_glides_to_where_the_slider_is_dragged(watched: Watched) -> No
     page.advance(0.05)
     assert page._seconds == begun + 1.0
     page._slide_to(begun + 1.5)
-    page._go_to(begun)  # Whoever goes somewhere else ends it.
+    page._go_to(begun)  # Jumping to another time ends it.
     page.advance(0.05)
     assert page._seconds == begun
 
@@ -217,7 +217,7 @@ def test_the_page_plays_steps_and_shows_the_other_run(watched: Watched) -> None:
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three cells: two that have flown, one that is damaged."""
+    """Return a campaign of three cells: two with flights, one damaged."""
     path = tmp_path_factory.mktemp("campaign") / "gap"
     for name, episodes in (("late", 3), ("early", 2)):
         write_demo_run(path / name, episodes=episodes, profile="static-obstacles")
@@ -275,7 +275,7 @@ def test_any_two_runs_of_a_campaign_can_be_chosen(campaign: Path) -> None:
         choose(beside, "early")
         assert page._other is not None and page._other.record.seed == seed
         assert page._part.visible
-        # What is damaged is told, and changes nothing.
+        # A damaged run is reported, and changes nothing.
         choose(run, "gone")
         choose(beside, "gone")
         assert len(told) == 2 and all("gone" in each for each in told)

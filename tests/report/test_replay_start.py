@@ -1,4 +1,4 @@
-"""`airl view` refuses a wrong run, then tells its address, and only then compiles and draws."""
+"""`airl view` rejects a wrong run, prints its address, and only then compiles and draws."""
 
 from __future__ import annotations
 

@@ -208,7 +208,7 @@ def test_the_page_is_one_file_that_reaches_nothing_else(page: str) -> None:
     (first,) = [ref for ref in parsed.references if not ref.startswith("#")]
     assert first.startswith("data:image/svg+xml;base64,")
     assert not parsed.tags & {"link", "iframe", "object"}
-    # The library, what shows the views with it, and their data are in the page, once each.
+    # The library, the script of the views, and their data are in the page, once each.
     assert page.count("<script") == 3
     assert unpacked(script_of(page, "page-library")) == plotly_script()
     script = page[page.rindex("<script>") :]

@@ -1,4 +1,4 @@
-"""What `airl report` says of a run that is damaged, or that cannot be worked out any more."""
+"""Messages of `airl report` for runs that are damaged or cannot be recomputed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The views in three dimensions: what they hold, against the run and its arenas."""
+"""Content of the 3D views, compared with the run and its arenas."""
 
 from __future__ import annotations
 

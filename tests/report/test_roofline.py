@@ -46,7 +46,7 @@ CARD = read_card(profiles_dir() / "policies" / "static-obstacles")
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """Folder and terminal of one command with three computers, and one that was never timed."""
+    """Return the folder and output of one command with three computers and an untimed one."""
     folder = tmp_path_factory.mktemp("roofline")
     (folder / "heavy.toml").write_text(BOARD, encoding="utf-8")
     untimed = BOARD[: BOARD.index("[workloads")]
@@ -158,7 +158,7 @@ def test_the_page_stands_alone(shown: tuple[Path, str]) -> None:
 
 
 class StopsBefore:
-    """A network that turns away from what is nearer than a depth, above the horizon."""
+    """Network that turns away from objects nearer than a depth, above the horizon."""
 
     def __init__(self, depth_m: float) -> None:
         self._byte = depth_m / CARD.observation.range_m * 255.0

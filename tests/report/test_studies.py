@@ -1,4 +1,4 @@
-"""The studies: what they show is what lies in their run folders, and a kill loses nothing."""
+"""Studies: tables equal the data in the run folders, and a kill loses nothing."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def check_contrasts(folder: Path, kind: str, pairs: set[tuple[str, str]]) -> Non
 
 @pytest.fixture(scope="module")
 def degraded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A small degradation study: its folder, and what was printed."""
+    """Return the folder and output of a small degradation study."""
     root = tmp_path_factory.mktemp("degradation")
     code, text = study("degradation", DEGRADATION, root / "out")
     assert code == 0
@@ -241,7 +241,7 @@ def test_system_evaluation_is_the_gap_of_every_arena(tmp_path: Path) -> None:
 
 
 def test_compensation_says_what_flies_how(tmp_path: Path) -> None:
-    """The rows of a right model are what `airl evaluate` flies; those of wrong ones are others."""
+    """Compare the right model's rows with `airl evaluate`; rows of wrong models differ."""
     few: dict[str, Any] = {"FACTORS": (0.5,), "LATENCIES": (0.5,), "IMAGES": (1,)}
     with patch.multiple(importlib.import_module("compensation"), **few):
         config = (SCRIPTS / "compensation.toml").read_text()
@@ -296,7 +296,7 @@ def test_an_arena_twice_gets_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_mitigation_is_the_gap_of_two_policies(tmp_path: Path) -> None:
-    # Two policies that are there; which of them was trained for what is not under test.
+    # Two existing policies; their training conditions are not under test.
     code, _ = study(
         "mitigation",
         'episodes = 6\npolicy = "greedy"\nmitigated = "static-obstacles-ppo"\n'

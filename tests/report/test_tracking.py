@@ -1,4 +1,4 @@
-"""How a flight followed its commands: against scipy's rotations and closed forms."""
+"""Tracking errors of a flight, compared with scipy's rotations and closed forms."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def turning(tmp_path_factory: pytest.TempPathFactory) -> LoadedRun:
     angles = np.stack([SPIN_DEG_S * seconds, np.full(len(path), -8.0), np.full(len(path), 5.0)])
     attitude = Rotation.from_euler("ZYX", angles.T, degrees=True)
     scalar_first = np.roll(attitude.as_quat(), 1, axis=1)
-    # An attitude may be told with either sign.
+    # Either sign of a quaternion describes the attitude.
     scalar_first[::3] *= -1.0
     truth = replace(path, quaternion=scalar_first)
     off = Rotation.from_euler("ZYX", (angles + np.array([[2.0], [0.5], [0.0]])).T, degrees=True)

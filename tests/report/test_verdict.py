@@ -1,4 +1,4 @@
-"""The verdict of a run: its sentence, its status, and what a CI job reads of it."""
+"""The verdict of a run: its sentence, its status, and the files for a CI job."""
 
 from __future__ import annotations
 

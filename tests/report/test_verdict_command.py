@@ -1,4 +1,4 @@
-"""`airl verdict`: as few flights as it takes, what it goes on with, what it leaves for a CI job."""
+"""`airl verdict`: sequential flights, resuming, and files for a CI job."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def said(out: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A verdict that was interrupted in its second step and gone on with; what was printed."""
+    """Return the folder and output of a verdict interrupted in its second step and resumed."""
     out = tmp_path_factory.mktemp("verdict") / "out"
     code, text = interrupted_after(27, out)
     assert code == 130
@@ -82,7 +82,7 @@ def test_it_flies_no_more_than_the_decision_takes(whole: tuple[Path, str]) -> No
     n, failures = len(flown), sum(outcome != "success" for outcome in flown)
     assert n in LOOKS
     assert n < 100
-    # So many failures would be rare at the limit; after the look before they were not.
+    # This failure count is rare at the limit; at the previous interim analysis it was not.
     assert stats.binom.sf(failures - 1, n, 0.05) < 0.025
     before = max(look for look in LOOKS if look < n)
     early = sum(outcome != "success" for outcome in flown[:before])
@@ -117,7 +117,7 @@ def test_an_interruption_changes_nothing(whole: tuple[Path, str], tmp_path: Path
 
 
 def test_the_same_folder_answers_other_questions(whole: tuple[Path, str]) -> None:
-    """Nothing new is flown for what the flights that are there decide, or may not."""
+    """Answer from the existing flights without new ones, or stay undecided."""
     out, _ = whole
     before = (out / TARGET / "episodes.jsonl").read_bytes()
     n = len(outcomes(out / TARGET))

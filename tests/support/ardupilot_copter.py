@@ -32,7 +32,7 @@ _BUILTIN = {LOITER: Mode.HOLD, RTL: Mode.RETURN, LAND: Mode.LAND, BRAKE: Mode.HO
 _POSITION_MODES = (GUIDED, LOITER, RTL, BRAKE)
 
 GUID_TIMEOUT_US = 3 * US_PER_S
-"""A velocity is held for so long without a new one, then the vehicle stops, still in GUIDED."""
+"""Hold time of a velocity without a new one; then the vehicle stops, still in GUIDED."""
 
 SPIN_ARM = 0.05
 """Motors of an armed vehicle that stands."""
@@ -44,7 +44,7 @@ STOP = Setpoint(_NAN3, np.zeros(3), math.nan, 0.0)
 
 PARAMETERS: dict[str, float] = {
     "FRAME_CLASS": 1,
-    "FRAME_TYPE": 0,  # PLUS: what it is unless told otherwise
+    "FRAME_TYPE": 0,  # PLUS, the default
     "GUID_TIMEOUT": 3.0,
     "MOT_BAT_VOLT_MAX": 0.0,
     "MOT_BAT_VOLT_MIN": 0.0,
@@ -65,7 +65,7 @@ PARAMETERS: dict[str, float] = {
 
 
 class Copter:
-    """Sensors of its own making, the built-in autopilot at 250 Hz, ArduCopter's modes."""
+    """Simulated sensors, the built-in autopilot at 250 Hz, and ArduCopter's modes."""
 
     def __init__(self, parameters: dict[str, float] | None = None, position_s: float = 3.0) -> None:
         """Power up.
@@ -136,7 +136,7 @@ class Copter:
         fr, rl, fl, rr = self.inner.state().motors
         if self.parameters["FRAME_TYPE"] == 1:
             return fr, rl, fl, rr
-        # What it would send to motors right, left, front, rear.
+        # Outputs for the motors right, left, front, rear.
         thrust, yaw = (fr + rl + fl + rr) / 4, (fr + rl - fl - rr) / 4
         roll, pitch = math.sqrt(2) * (rl + fl - fr - rr) / 4, math.sqrt(2) * (fr + fl - rl - rr) / 4
         return thrust - roll + yaw, thrust + roll + yaw, thrust + pitch - yaw, thrust - pitch - yaw
@@ -149,7 +149,7 @@ class Copter:
 
     @property
     def position_ok(self) -> bool:
-        """Whether its EKF uses GPS."""
+        """True if the EKF uses GPS."""
         return self._position_ok
 
     @property
@@ -213,7 +213,7 @@ class Copter:
             self.inner.set_mode(Mode.OFFBOARD)
 
     def _follow(self) -> None:
-        """Take note of what the autopilot did by itself."""
+        """Update the state from the autopilot's automatic changes."""
         self.inner.take_messages()
         if self._armed and self.inner.flight.phase < 2:
             self._armed = False

@@ -1,4 +1,4 @@
-"""ArduCopter's MAVLink, as measured on 4.7: what it says unasked, and how it answers."""
+"""ArduCopter's MAVLink, as measured on 4.7: default streams and responses."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ class Manners:
         return Result.UNSUPPORTED
 
     def _setpoint(self, message: WireMessage) -> None:
-        """Velocities only; what it cannot use it drops without a word."""
+        """Accept velocities only; silently drop unsupported setpoints."""
         velocity = np.array([message.vx, message.vy, message.vz])
         if message.type_mask & _VELOCITY_BITS or not np.isfinite(velocity).all():
             return
@@ -191,7 +191,7 @@ class Manners:
         self.copter.velocity(Setpoint(np.full(3, nan), velocity, heading, yaw_rate))
 
     def _parameter(self, kind: str, message: WireMessage, context: Context) -> None:
-        """Values travel as what they are, not as bits of a float; unknown names get no answer."""
+        """Send values as floats, not as reinterpreted bits; ignore unknown names."""
         if not for_vehicle(message, context):
             return
         link = context.link

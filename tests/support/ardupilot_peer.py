@@ -21,7 +21,7 @@ from tests.support.ardupilot_wire import MAGIC, JsonLink
 
 
 class Fault:
-    """What goes wrong, and when: die, stall, restart, garbage (`stall@12.5`)."""
+    """Fault of the peer: die, stall, restart or garbage, with its time (`stall@12.5`)."""
 
     def __init__(self, words: str = "") -> None:
         self.kind, _, at = words.partition("@")
@@ -51,12 +51,12 @@ class ArdupilotPeer:
         """Take the ports.
 
         Args:
-            port: Where servo packets go.
-            api_ports: Where its serial ports send MAVLink.
-            rate_hz: The rate it asks for.
-            parameters: Over its own; the frame is X here.
+            port: Destination of servo packets.
+            api_ports: Destinations of MAVLink on the serial ports.
+            rate_hz: Requested rate.
+            parameters: Override the defaults; the frame is X here.
             fault: See `Fault`.
-            position_s: When it uses GPS, at the earliest [s].
+            position_s: Earliest time of GPS use [s].
         """
         self.fault = Fault(fault)
         self.error: BaseException | None = None

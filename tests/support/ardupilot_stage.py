@@ -37,7 +37,7 @@ class Stage:
     def __init__(self, peer: ArdupilotPeer, bridge: ArdupilotBridge) -> None:
         self.peer, self.bridge = peer, bridge
         self.dies: Exception | None = None
-        """What looking after the process says once its thread has ended."""
+        """Error raised after the end of the process's thread."""
         bridge.wait_connected(20.0, self._alive)
         setup = EpisodeSetup(quad(), None, 1)
         self.simulation = Simulation(
@@ -61,7 +61,7 @@ class Stage:
 
     @contextmanager
     def flying(self, speed: float) -> Iterator[None]:
-        """Let time run on a thread of its own, at most at a multiple of the wall clock's."""
+        """Run simulated time in a separate thread, at most at a multiple of real time."""
         stop, errors = threading.Event(), []
 
         def fly() -> None:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 MAGIC = 18_458
 RESEND_S = 1.0
 _NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
-"""What scanf's %f reads."""
+"""Number accepted by scanf's %f."""
 
 
 class State(NamedTuple):
@@ -74,12 +74,12 @@ class JsonLink:
         self.time_us = 0
         """ArduPilot's own time."""
         self.stamps: list[float] = []
-        """Of the lines that moved time."""
+        """Timestamps of the lines that moved time."""
         self.resent = 0
         self.stalled_lines = 0
         """Lines that did not move time: less than 0, or 0.1 s and more."""
         self.stop: Callable[[], bool] = lambda: False
-        """Whether to stop waiting; set by who runs it."""
+        """Callback: return True to stop waiting. Set by the caller."""
         self._last_s = 0.0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.settimeout(0.1)

@@ -14,7 +14,7 @@ from airl_mav.envs.fleet import Fleet
 def fly_blown(
     winds: Winds, fleet: Fleet, ticks: int, advance: Callable[[np.ndarray], None]
 ) -> None:
-    """Fly vehicles of the same age for so many ticks, in stretches that end with their wind."""
+    """Fly vehicles of the same age for `ticks` ticks, in stretches of constant wind."""
     left = ticks
     while left > 0:
         winds.blow(fleet)

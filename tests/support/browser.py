@@ -110,7 +110,7 @@ class Page:
         return bool(found)
 
     def screenshot(self, path: Path) -> None:
-        """Write a picture of what is seen (PNG)."""
+        """Write a screenshot (PNG)."""
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot")["data"]))
 
 

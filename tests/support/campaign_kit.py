@@ -1,4 +1,4 @@
-"""Small campaigns at level gym; as a script, one that a test may kill."""
+"""Small campaigns at level gym; as a script, a campaign that a test may kill."""
 
 from __future__ import annotations
 

@@ -35,9 +35,9 @@ def errors_between(
 
 
 def autocorrelation(errors: Array, lag: int) -> Array:
-    """Return the correlation (9,) of errors (flights, samples, 9) with those `lag` samples on.
+    """Return the correlation (9,) of errors (flights, samples, 9) with errors `lag` samples later.
 
-    Their mean is taken as zero: what is constant over a flight is error too.
+    The mean is taken as zero: a constant offset over a flight is an error too.
     """
     later = np.mean(errors[:, lag:] * errors[:, : errors.shape[1] - lag], axis=(0, 1))
     power = np.mean(errors**2, axis=(0, 1))

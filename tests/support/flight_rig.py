@@ -26,7 +26,7 @@ SETPOINT_US = 50_000
 """MAVSDK repeats its setpoint at 20 Hz."""
 
 LOOK_US = 20_000
-"""How often a flight is looked at that waits for something."""
+"""Polling interval of a flight that waits for a condition."""
 
 CALM = WindSettings()
 NAN = math.nan
@@ -73,7 +73,7 @@ class Rig:
             EpisodeSetup(vehicle, arena, seed, asked), start_us=0, clock=SimClock()
         )
         self.texts: list[tuple[int, str]] = []
-        """Time [µs] and text of everything said so far."""
+        """Time [µs] and text of every message until now."""
         assert isinstance(self.sim.autopilot, BuiltinAutopilot)
         self.ap = self.sim.autopilot
         self.ap.on_message = lambda m: self.texts.append((self.sim.time_us, m.text))
@@ -105,9 +105,9 @@ class Rig:
         self._advance(self.sim.time_us)
 
     def _advance(self, until_us: float) -> None:
-        """Fly a tick, and on as long as nothing happens and no setpoint is due before `until_us`.
+        """Fly a tick, and further ticks until an event, a due setpoint or `until_us`.
 
-        Compiled ticks cost a fraction of those that Python flies one by one, and fly the same.
+        Compiled ticks cost a fraction of ticks in Python, and fly the same.
         """
         if self._setpoint is not None:
             if self.sim.time_us >= self._next_us:
@@ -130,9 +130,9 @@ class Rig:
                 each()
 
     def until(self, reached: Callable[[], bool], limit_s: float) -> float:
-        """Fly until something is so; return the time [s] it took. Fails after `limit_s`.
+        """Fly until `reached` returns True; return the time [s] it took. Fails after `limit_s`.
 
-        What no event tells of is noticed up to `LOOK_US` late.
+        Conditions without an event are detected up to `LOOK_US` late.
         """
         began = self.sim.time_us
         while not reached():
@@ -142,7 +142,7 @@ class Rig:
         return (self.sim.time_us - began) / US_PER_S
 
     def said(self, text: str) -> float:
-        """Return when [s] a text was last said; NaN when never."""
+        """Return the time [s] of the last message with a text; NaN without one."""
         return max((t / US_PER_S for t, said in self.texts if text in said), default=NAN)
 
     def boot(self) -> None:

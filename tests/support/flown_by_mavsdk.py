@@ -25,21 +25,21 @@ from tests.support.flight_rig import quad
 from tests.support.mavlink_clients import BOOT_UNIX_US, Companion, RawLane
 
 SLOW = 2.0
-"""Speed while nobody waits for simulated time."""
+"""Default speed, while no test waits for simulated time."""
 
 MOST_HZ = 10.0
-"""Of any stream: at the speed of the tests they would cost more than the flight."""
+"""Maximum rate of any stream: at the tests' speed, higher rates cost more than the flight."""
 
 AHEAD_S = 1.0
-"""So far simulated time may be ahead of what a test that waits has seen: on a busy machine a test
-that looked up late would else find the vehicle minutes later, landed by a failsafe."""
+"""Maximum lead [s] of simulated time over the last time read by a waiting test. Without this limit,
+a test on a busy machine could find the vehicle minutes later, landed by a failsafe."""
 
 _TURN_S = 0.01
-"""So long is the pause between two bursts of ticks [wall s]."""
+"""Pause between two bursts of ticks [wall s]."""
 
 
 class Flown:
-    """A vehicle in simulated time, on a thread of its own."""
+    """Vehicle in simulated time, run by a separate thread."""
 
     def __init__(self, companion: Companion, simulation: Simulation) -> None:
         self.companion = companion
@@ -49,14 +49,14 @@ class Flown:
 
     @property
     def waits(self) -> bool:
-        """Whether simulated time has to wait for the test."""
+        """True if simulated time has to wait for the test."""
         return self.simulation.time_us > self._until_s * US_PER_S
 
     @contextmanager
     def at(self, speed: float) -> Iterator[Callable[[float], None]]:
-        """Let simulated time run at a speed meanwhile.
+        """Run simulated time at a speed inside the context.
 
-        It waits for a test that calls what is yielded, with the time that it has seen [s].
+        Call the yielded function with the last time read [s]: the lead is limited to `AHEAD_S`.
         """
         before, self.speed = self.speed, speed
         try:
@@ -127,7 +127,7 @@ def flown(component: ComponentType = ComponentType.GROUND_STATION) -> Iterator[F
         thread.flown = Flown(companion, thread.simulation)
         yield thread.flown
     finally:
-        # Feed no more before MAVSDK goes.
+        # Stop the feed before MAVSDK is destroyed.
         thread.stop()
         if companion is None:
             mavsdk.destroy()

@@ -1,12 +1,11 @@
-"""A board in HITL at the far end of a pseudo-terminal, written from what PX4 was read to do.
+"""HITL board at the far end of a pseudo-terminal, written from PX4's source code.
 
-Real bytes: everything goes through the terminal's buffers. The built-in autopilot flies, behind its
-own MAVLink server; what makes it a board is around it (px4.md, HITL on real boards):
+All bytes pass through the terminal's buffers. The built-in autopilot flies, behind its own MAVLink
+server; the rest of the module imitates a board (px4.md, HITL on real boards):
 
 - HEARTBEAT at 1 Hz with the HIL bit, with or without sensors; then the streams of PX4's link;
-- HIL_SENSOR and HIL_GPS are taken as they come, their time_usec is not: the board has a clock of
-  its own, which starts when it boots;
-- HIL_ACTUATOR_CONTROLS whenever the motors were computed anew, at most 200 a second, flags 0, mode
+- HIL_SENSOR and HIL_GPS are used on arrival, without time_usec: the board's clock starts at boot;
+- HIL_ACTUATOR_CONTROLS after each computation of the motors, at most 200 a second, flags 0, mode
   with the HIL bit; motors are not forced to zero while disarmed;
 - PREFLIGHT_REBOOT_SHUTDOWN is refused while armed, else acknowledged; 0.4 s later it is down: its
   USB vanishes and comes back.
@@ -55,7 +54,7 @@ REBOOT_S = 0.4
 """From its answer until it goes down."""
 HEARTBEAT_CRC_EXTRA = 50
 DISARMED_OUTPUT = 0.05
-"""What the outputs say while disarmed: the stream does not force them to zero."""
+"""Outputs while disarmed: the stream does not force them to zero."""
 
 
 class Board:
@@ -165,7 +164,7 @@ class Board:
 
 
 class HitlPeer:
-    """The board's end of the line, on a thread of its own. Leave it by `close`."""
+    """Board's end of the line, run by a separate thread. Call `close` to stop it."""
 
     def __init__(self, folder: Path, *, hil: bool = True, down_s: float = 0.2) -> None:
         self.device = str(folder / "ttyBOARD")
@@ -178,32 +177,32 @@ class HitlPeer:
         """time_usec of each HIL_SENSOR."""
         self.boots = 0
         self.error: BaseException | None = None
-        # What can be wrong with it; set at any time.
+        # Faults; may be set at any time.
         self.mute = False
         """Says nothing at all."""
         self.garbled = False
         """Says noise: another baud rate."""
         self.noise = b""
-        """What comes before each frame."""
+        """Bytes before each frame."""
         self.controls = True
         """Sends motor commands."""
         self.flags = 0
-        """Of HIL_ACTUATOR_CONTROLS."""
+        """Flags of HIL_ACTUATOR_CONTROLS."""
         self.refuses = False
         """Does not take commands to reboot."""
         self.parameters: Callable[[], Parameters] = partial(
             Px4Parameters, quad(), outputs="HIL_ACT_FUNC{}"
         )
-        """What it is set to, from its next start on."""
+        """Parameters, used from the next boot."""
         self.vanishes = True
         """Its USB goes with it when it reboots; else it is behind a UART, and only silent."""
         self.down_s = down_s
-        """How long it is down when it reboots [s]."""
+        """Time from shutdown to boot [s]."""
         self._hil = hil
         self._up_s = math.inf
-        """When it comes up again."""
+        """Time of the next boot."""
         self._goes_s = math.inf
-        """When it goes down."""
+        """Time of the next shutdown."""
         self._rng = np.random.default_rng(0)
         self._master = self._slave = -1
         self._lock = threading.RLock()
@@ -219,7 +218,7 @@ class HitlPeer:
             self._hil = self.board.hil = False
 
     def reset(self) -> None:
-        """Start anew, at once and without vanishing."""
+        """Restart immediately, without disconnecting USB."""
         with self._lock:
             self._power_up()
 
@@ -268,7 +267,7 @@ class HitlPeer:
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
-                with suppress(OSError, ValueError):  # unplugged by the test meanwhile
+                with suppress(OSError, ValueError):  # unplugged by the test
                     select.select([self._master], [], [], PERIOD_S)
                 with self._lock:
                     self._turn()

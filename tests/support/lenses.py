@@ -18,16 +18,16 @@ AT_NIGHT_THE_FISHEYE: list[Any] = [
     "cylindrical",
     pytest.param("fisheye", marks=pytest.mark.nightly),
 ]
-"""Projections, where a fisheye has a renderer of its own that compiles for half a minute."""
+"""Projections; the fisheye's separate renderer compiles for half a minute."""
 
 BARREL: Distortion = (-0.05, 0.008, -0.0045, 0.0004)
-"""Of a lens of more than 180 degrees, denser towards its edge; to 95 degrees from its axis."""
+"""Lens of more than 180 degrees, denser towards its edge; valid to 95 degrees off axis."""
 
 OPENING: Distortion = (0.2, -0.06, 0.01, 0.001)
-"""Of one that is wider there than in its middle."""
+"""Lens with higher magnification at the edge than in the middle."""
 
 ENDING: Distortion = (0.34, -0.3, 0.05, -0.01)
-"""Of one that ends before: theta_d has its greatest value at 66 degrees."""
+"""Lens with a limited field of view: theta_d has its maximum at 66 degrees."""
 
 
 def published(theta: Any, k: Distortion) -> Any:

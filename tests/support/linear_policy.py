@@ -30,7 +30,7 @@ def weights() -> tuple[np.ndarray, np.ndarray]:
     # Wanted yaw rate: 1.2 rad/s times the sine of the bearing, less by the drift to the right.
     wanted_turn = np.zeros(PIXELS + 6)
     wanted_turn[PIXELS + 4], wanted_turn[PIXELS + 1] = 1.2, -0.5
-    # Wanted speed: more with what is free ahead, with the goal ahead and far.
+    # Desired speed: rises with free space ahead, and with a goal ahead and far away.
     ahead = np.zeros((SPEC.height_px, SPEC.width_px))
     ahead[8:14, 10:22] = 3.0 / (6 * 12)
     wanted_speed = np.zeros(PIXELS + 6)

@@ -24,7 +24,7 @@ SEED = 11
 """A short flight: two seconds to the goal."""
 
 BEGINS = "begins"
-"""Said by the script when a flight begins; its fingerprint follows at the end."""
+"""Printed by the script at the start of a flight; the fingerprint follows at the end."""
 
 
 class Speaking(Observer):
@@ -53,9 +53,9 @@ def fly_as_companion(
     start: Start = "arm",
     decided: Callable[[Decided], None] | None = None,
 ) -> MissionResult:
-    """Fly a mission on a stage with default settings; it is what `Stage.run` calls.
+    """Fly a mission on a stage with default settings; called by `Stage.run`.
 
-    `stop` ends it early; `phase` is told its phases, and `decided` its decisions.
+    `stop` ends it early; `phase` receives its phases, and `decided` its decisions.
     """
     return fly_mission(
         *(stage.link, stage.camera, policy, goal, stage.clock),
@@ -72,7 +72,7 @@ def fly_as_companion(
 
 def main(flights: int) -> None:
     resolved = demo_scenario()
-    fly(resolved, resolved.fresh_policy(3), 0, 3)  # what is compiled or loaded late is, now
+    fly(resolved, resolved.fresh_policy(3), 0, 3)  # compile and load everything now
     for _ in range(flights):
         policy = resolved.fresh_policy(SEED)
         record = fly(resolved, policy, 0, SEED, observer=Speaking()).record

@@ -203,7 +203,7 @@ class RawLane(MemoryEndpoint):
 
 
 class Companion:
-    """A MAVSDK instance and its first autopilot, with the plugins a test asks for."""
+    """MAVSDK instance and its first autopilot, with the plugins required by a test."""
 
     def __init__(self, mavsdk: Mavsdk) -> None:
         self.mavsdk = mavsdk
@@ -266,7 +266,7 @@ def _flying(mavsdk: Mavsdk, pacer: Pacer) -> Iterator[Companion]:
         companion = Companion(mavsdk)
         yield companion
     finally:
-        # Feed no more before MAVSDK goes.
+        # Stop the feed before MAVSDK is destroyed.
         pacer.stop()
         if companion is None:
             mavsdk.destroy()

@@ -9,7 +9,7 @@ from mavsdk.plugins.mission_raw import MissionItem as RawItem
 
 NAN = math.nan
 LATITUDE, LONGITUDE = 47.397743, 8.545594
-"""Where PX4's simulated vehicles stand [deg]."""
+"""Home position of PX4's simulated vehicles [deg]."""
 
 
 def waypoint(

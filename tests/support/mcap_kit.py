@@ -67,9 +67,9 @@ def xyz(vector: Any) -> np.ndarray:
 
 
 def distances_to(update: Any, points: np.ndarray) -> np.ndarray:
-    """Return how far points (n, 3) are from the nearest surface of a scene's bodies [m].
+    """Return the distances of points (n, 3) to the nearest surface of a scene's bodies [m].
 
-    Distances to a box and to a cylinder are those of signed distance functions, absolute.
+    Distances to boxes and cylinders are absolute values of signed distance functions.
     """
     nearest = np.full(len(points), np.inf)
     for entity in update.entities:

@@ -1,4 +1,4 @@
-"""A link in memory that several clients share, told apart as UDP addresses are."""
+"""Link in memory, shared by several clients with distinct addresses, as UDP addresses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.support.mavlink_clients import RawClient
 
 
 class _Lane(MemoryEndpoint):
-    """One client's two queues; what it sends lies in the hub, in order of arrival."""
+    """Two queues of one client; the hub stores its data in order of arrival."""
 
     def __init__(self, hub: MemoryHub, peer: Peer) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class MemoryHub:
         return self._lanes[peer]
 
     def client(self, port: int | None, ids: tuple[int, int] = (245, 190)) -> RawClient:
-        """Return a client at a port of its own; None: at the preset remote."""
+        """Return a client at a separate port; None = at the preset remote."""
         return RawClient(self.lane(None if port is None else ("127.0.0.1", port)), ids)
 
     def arrivals(self) -> Iterator[tuple[Peer, bytes]]:

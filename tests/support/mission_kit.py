@@ -118,7 +118,7 @@ class FakeFlight:
             self.executor.update(self.now)
 
     def arrive(self, *, landed: bool = False) -> None:
-        """Be where the executor leads, with the heading it asks for."""
+        """Move to the executor's target, with the requested heading."""
         triplet = self.executor.triplet
         yaw = None if math.isnan(triplet.yaw) else triplet.yaw
         self.be(triplet.target, landed=landed, yaw=yaw)

@@ -1,4 +1,4 @@
-"""Ports that nobody uses, so that tests run side by side."""
+"""Unused ports, so that tests run side by side."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def free_ports(udp: int, tcp: int) -> tuple[list[int], list[int]]:
 
 @contextmanager
 def reserved_instance() -> Iterator[int]:
-    """Reserve one of PX4's instance numbers, which fix its ports, and give it.
+    """Reserve one of PX4's instance numbers, which fix its ports, and yield it.
 
-    No other test has it meanwhile, of another worker or checkout either: between the search for
-    free ports and their use by a program that starts lie seconds. Instance 0 is never given:
-    somebody may fly it here.
+    No test of another worker or checkout gets the same instance: seconds pass between the search
+    for free ports and their use by a starting program. Instance 0 is never used: a developer may
+    fly it on this machine.
     """
     instances = list(range(1, CONDUCTED_INSTANCE))
     random.SystemRandom().shuffle(instances)
@@ -63,7 +63,7 @@ def reserved_conducted() -> Iterator[None]:
 
 
 def _lock_of(instance: int) -> TextIO:
-    """Open the file whose lock reserves an instance; whatever happens, it ends with the process."""
+    """Open the file whose lock reserves an instance; the lock always ends with the process."""
     return (Path(tempfile.gettempdir()) / f"airl-mav-tests-px4-{instance}.lock").open("a")
 
 
@@ -85,7 +85,7 @@ def _ports_are_free(instance: int) -> bool:
 class TestPorts:
     """The ports of one rehearsal."""
 
-    __test__ = False  # not a test class, whatever its name
+    __test__ = False  # not a test class, despite its name
 
     api: int
     api_local: int

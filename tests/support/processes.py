@@ -32,7 +32,7 @@ sitl.conclude = lambda *_: 0
 """
 """Before airl-sitl: pictures take longer than flights."""
 
-# Several suites share two cores, at many times real time: what tests judge is not the host.
+# Several suites share two cores, at many times real time: the tests do not judge the host.
 SITL = ("-m", "airl_mav.cli.sitl", "--no-validity")
 SITL_WITHOUT_REPORT = (
     "-c",
@@ -54,7 +54,7 @@ def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIE
 
 
 def run_alone(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a program in an interpreter of its own, where every warning is an error."""
+    """Run a program in a new interpreter with every warning as an error."""
     return subprocess.run(
         [sys.executable, "-W", "error", "-c", program],
         cwd=folder,
@@ -81,7 +81,7 @@ def state_of(pid: int) -> str:
 
 
 def is_running(pid: int) -> bool:
-    """Return whether a process still runs; a dead one that nobody has reaped does not."""
+    """Return True if a process still runs; an unreaped dead process does not."""
     return state_of(pid) not in "ZX"
 
 
@@ -91,7 +91,7 @@ def children_of(pid: int) -> dict[str, int]:
     for entry in Path("/proc").iterdir():
         if not entry.name.isdecimal():
             continue
-        # Gone meanwhile, or another program (git).
+        # Already ended, or another program (git).
         with suppress(OSError, IndexError, ValueError):
             if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) != pid:
                 continue
@@ -107,7 +107,7 @@ def allow_interrupt() -> None:
 
 
 class Running:
-    """A Python process of the project and what it prints."""
+    """Python process of the project, with its output."""
 
     def __init__(self, words: list[str], folder: Path, *, path: Path = ROOT) -> None:
         self.output = folder / f"output-{time.monotonic_ns()}.txt"
@@ -193,7 +193,7 @@ def running(words: list[str], folder: Path, *, path: Path = ROOT) -> Iterator[Ru
 
 
 class Ground:
-    """A listener on the ground station's port: what the vehicle says of itself, from outside."""
+    """Listener on the ground station's port: the vehicle's messages, seen from outside."""
 
     def __init__(self) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -245,7 +245,7 @@ class Ground:
 
     @property
     def armed(self) -> bool:
-        """Whether the last heartbeat said armed."""
+        """True if the last heartbeat reported armed."""
         beat = self.latest.get("HEARTBEAT")
         return beat is not None and bool(beat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
 
@@ -260,7 +260,7 @@ class Ground:
         return self.track[-1][2] if self.track else 0.0
 
     def heard(self, text: str) -> bool:
-        """Return whether the autopilot has said something."""
+        """Return True if a message of the autopilot contains a text."""
         return any(text in said for said in list(self.texts))
 
     def wait_flying(self, speed: float = 1.5, *processes: Running) -> None:

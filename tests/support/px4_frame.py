@@ -1,4 +1,4 @@
-"""Parameters of a stand-in for real PX4: the built-in autopilot's, and those of its airframe."""
+"""Parameters of a stand-in for real PX4: the built-in autopilot's and its airframe's."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SWAPPED = (2, 0, 1, 3)
 
 
 class Px4Parameters(Parameters):
-    """Those of PX4 that the project looks at, on airframe 10016."""
+    """PX4 parameters used by the project, on airframe 10016."""
 
     def __init__(
         self, vehicle: VehicleProfile, *, swapped: bool = False, outputs: str = "PWM_MAIN_FUNC{}"
@@ -34,7 +34,7 @@ class Px4Parameters(Parameters):
             frame[outputs.format(i + 1)] = 101 + i
         own = [spec.name for spec in SPECS]
         wanted = {} if vehicle.px4 is None else vehicle.px4.parameters
-        # What a vehicle wants set exists, and is something else before.
+        # Parameters set by a vehicle exist, with another value before.
         self._more = frame | {n: type(v)(0) for n, v in wanted.items() if n not in own}
         self._names = list(dict.fromkeys([*own, *self._more]))
 

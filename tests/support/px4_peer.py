@@ -45,7 +45,7 @@ SILENT_SAMPLES = 22
 
 STATE_INTERVAL_US = 5_000
 ANSWER_US = 8_000
-"""A command is answered so much later."""
+"""Delay of a command's answer."""
 RETRY_S = 0.005
 
 BATTERY = BatterySample(voltage_v=16.2, current_a=5.0, consumed_mah=0.0, remaining=1.0)
@@ -111,7 +111,7 @@ class Px4Peer:
 
     ports: Ports
     faults: dict[str, float] = field(default_factory=dict)
-    """Kind -> seconds of its own clock since it booted."""
+    """Kind -> seconds since boot, by the peer's clock."""
     vehicle: VehicleProfile = field(default_factory=lambda: load_vehicle("quad"))
     stop: threading.Event = field(default_factory=threading.Event)
     """Ends it, from another thread."""
@@ -224,7 +224,7 @@ class Flying:
         while not self.peer.stop.is_set():
             ready = [number for number, _ in self.waiter.poll(100)]
             if self.connection.fileno() not in ready:
-                # Its MAVLink is taken in by the wall clock, while its time stands still.
+                # While its simulated time is stopped, MAVLink is received by the wall clock.
                 if ready and self.samples > SILENT_SAMPLES + 1:
                     self.server.receive(self.now_us)
                 continue
@@ -324,7 +324,7 @@ class Flying:
         try:
             self.connection.sendall(data)
         except OSError:
-            return  # the next recv tells
+            return  # the next recv reports the error
 
 
 def _fix(message: Any) -> GpsFix:

@@ -1,8 +1,8 @@
-"""Flights whose truth is known, recorded as an aircraft records them: black box and vehicle's log.
+"""Flights with known truth, recorded as on an aircraft: black box and vehicle's log.
 
-They are flown in lockstep, so that they are the same every time. A companion in lockstep hears
-nothing between its turns; here its black box samples what the flight controller sends, at the rate
-of MAVSDK's telemetry, as that of a companion in real time does.
+They are flown in lockstep, so that they are the same every time. A companion in lockstep receives
+nothing between its turns. Here its black box samples the flight controller's messages at the rate
+of MAVSDK's telemetry, as on a companion in real time.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from companion.program import prepare, run_of
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 TELEMETRY_US = US_PER_S // 50
-"""MAVSDK's telemetry is asked for 50 times a second (companion.mavsdk_link)."""
+"""Interval of MAVSDK's telemetry, requested at 50 Hz (companion.mavsdk_link)."""
 
 
 @dataclass(frozen=True)
 class RecordedFlight:
-    """What a flight has left, and what is known of it beside that."""
+    """Files of a flight, and its known truth."""
 
     black_box: Path
     ulg: Path
@@ -54,7 +54,7 @@ its own, here a multiple of the tick [µs]."""
 
 
 class HeardLink:
-    """What the black box asks of a link: the telemetry as it is sent, not as it is taken."""
+    """Link for the black box: telemetry sampled when it is sent, not when it is received."""
 
     def __init__(self, link: MavsdkLink) -> None:
         self._link = link
@@ -91,10 +91,10 @@ def fly_recorded(
     """Fly an episode with a black box and the vehicle's log.
 
     Args:
-        scenario: What the companion believes of the aircraft, and all that is asked for.
-        seed: Of the episode.
+        scenario: The companion's assumed aircraft, and the other settings.
+        seed: Seed of the episode.
         folder: New; the files come into it.
-        vehicle: What flies in truth; None: what the scenario says.
+        vehicle: True vehicle; None = the scenario's.
     """
     folder.mkdir(parents=True, exist_ok=True)
     asked = scenario.scenario

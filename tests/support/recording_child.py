@@ -1,8 +1,8 @@
-"""A process that records a flight until it is killed, and tells what it has decided.
+"""Process that records a flight until it is killed, and reports its decisions.
 
     python -m tests.support.recording_child FILE
 
-What flies is a made-up path: the black box is what is tested, and how much of it a kill leaves.
+The path is synthetic: the tests check the black box, and how much of it a kill leaves.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Aircraft that are not as their profile says, in wind and late: what a refit has to find."""
+"""Perturbed aircraft in wind and with latency, for tests of a refit."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from tests.support.recorded_flights import RecordedFlight, fly_recorded
 
 @dataclass(frozen=True)
 class Truth:
-    """What is true of a flight, and not known to its companion."""
+    """True parameters of a flight, unknown to its companion."""
 
     seed: int
     mass: float
     """Share of the profile's mass."""
     thrust: float
-    """Share of the profile's greatest thrust."""
+    """Share of the profile's maximum thrust."""
     drag: float
     """Share of the profile's linear drag."""
     wind: tuple[float, float]
@@ -38,7 +38,7 @@ class Truth:
     t2_ms: float
     """Mean of a log-normal t2 [ms]; its standard deviation is a tenth of it."""
     uplink_ms: float
-    """How much later setpoints reach the flight controller [ms]."""
+    """Delay of setpoints to the flight controller [ms]."""
 
     def vehicle(self, profile: VehicleProfile) -> VehicleProfile:
         """Return what flies."""
@@ -50,7 +50,7 @@ class Truth:
 
     @property
     def scenario(self) -> Scenario:
-        """What the companion knows of, in the wind and on the link of the truth."""
+        """Scenario known to the companion, with the true wind and link."""
         north, east = self.wind
         return Scenario(
             level="lockstep",
@@ -97,8 +97,8 @@ def uplink_s(flight: RecordedFlight) -> float:
 def true_dead_time_s(flight: RecordedFlight) -> tuple[float, float] | None:
     """Return dead time and time constant [s] of the model on the simulator's own path.
 
-    From when the flight controller took each setpoint, with no telemetry and no link between. None
-    where not even that tells them: the flight was too short.
+    Times count from the flight controller's acceptance of each setpoint, without telemetry and
+    link. None if the flight is too short for an estimate.
     """
     path = Trajectory.from_arrays(flight.part("trajectory"))
     setpoints = flight.part("setpoints")
@@ -117,7 +117,7 @@ def true_dead_time_s(flight: RecordedFlight) -> tuple[float, float] | None:
 
 @dataclass(frozen=True)
 class RefitErrors:
-    """How far a refit is from the truth; None: it says that the flight does not tell."""
+    """Errors of a refit; None = reported as unobservable in the flight."""
 
     dead_s: float | None
     """Dead time [s]; without a log the link's time counts to it."""
@@ -132,7 +132,7 @@ class RefitErrors:
     t2: float | None
     """Mean t2, as a share of that which was injected."""
     inside: dict[str, bool]
-    """Whether the intervals hold the truth."""
+    """True for each interval that contains the truth."""
 
 
 def errors_of(
@@ -142,7 +142,7 @@ def errors_of(
 
     Args:
         found: The refit.
-        truth: What flew.
+        truth: True parameters of the flight.
         true_s: Its `true_dead_time_s`.
         flight: The flight.
     """

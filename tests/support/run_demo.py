@@ -92,7 +92,7 @@ def demo_episode(
         record_tick(
             recorder, now, position, velocity, [1.0, 0.0, 0.0, 0.0], power, keep=ended is not None
         )
-    # A recording goes on until the vehicle is down, off the way it flew.
+    # A recording continues until the vehicle has landed, away from its path.
     for _ in range(50):
         now, position = now + TICK_US, position + np.array([0.1, -0.1, 0.02])
         record_tick(recorder, now, position, [5.0, -5.0, 1.0], [1.0, 0.0, 0.0, 0.0], 430.0)

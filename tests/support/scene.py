@@ -1,4 +1,4 @@
-"""What a picture of the view's page shows."""
+"""Checks of screenshots of the view's page."""
 
 from __future__ import annotations
 

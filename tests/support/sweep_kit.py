@@ -1,4 +1,4 @@
-"""Small sweeps for tests: a file, and results that nobody has trained for."""
+"""Small sweeps for tests: a file, and fake results without training."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def write_sweep_file(folder: Path, text: str = TINY) -> Path:
 def fake_results(
     config: SweepConfig, trials: Sequence[Trial], successes: Sequence[int], episodes: int = 300
 ) -> list[TrialResult]:
-    """Return results with so many successes each."""
+    """Return results with `successes` successes of each trial."""
     results = []
     for trial, count in zip(trials, successes, strict=True):
         size = size_of(config, trial)

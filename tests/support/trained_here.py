@@ -1,4 +1,4 @@
-"""Policies that a test trains, and what they are shown when they fly."""
+"""Policies that a test trains, and their observations in flight."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.support.command_line import airl
 
 
 class Watching:
-    """A learned policy, and what it was shown."""
+    """Learned policy that stores its observations."""
 
     def __init__(self, policy: LearnedPolicy, seen: list[Observation]) -> None:
         self._policy, self._seen = policy, seen

@@ -1,4 +1,4 @@
-"""What the workers under test do; they import this module by itself."""
+"""Jobs of the workers under test, which import only this module."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def wait_for(condition: Callable[[], Any]) -> None:
 
 
 def doubles(stop: Stop) -> Callable[[int], list[tuple[int, int]]]:
-    """Each job gives its double, and who did it."""
+    """Return twice each job, with the worker's process id."""
     return lambda job: [(2 * job, os.getpid())]
 
 
@@ -77,7 +77,7 @@ def all_but_the_first(folder: Path, jobs: int, stop: Stop) -> Callable[[int], li
 
 
 def surroundings(stop: Stop) -> Callable[[int], list[dict[str, Any]]]:
-    """Tell of the process."""
+    """Return a job that reports the process's environment."""
 
     def work(_: int) -> list[dict[str, Any]]:
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, set())
@@ -91,7 +91,7 @@ def surroundings(stop: Stop) -> Callable[[int], list[dict[str, Any]]]:
 
 
 def dies(folder: Path, times: int, how: str, stop: Stop) -> Callable[[int], list[int]]:
-    """Job 3 ends its worker so many times."""
+    """Return a job that ends its worker at job 3, `times` times."""
 
     def work(job: int) -> list[int]:
         if job == 3 and (before := len(list(folder.iterdir()))) < times:
@@ -152,7 +152,7 @@ class PaperFlier:
         self.episodes, self.deadly, self.per_job = episodes, deadly, per_job
 
     def episodes_per_job(self, episodes: int, workers: int) -> int:
-        """Return as many as it was told."""
+        """Return the configured number."""
         return self.per_job
 
     def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:

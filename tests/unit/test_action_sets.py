@@ -56,7 +56,7 @@ def test_the_arcs() -> None:
     assert turns == [-72.0, -27.0, 0.0, 27.0, 72.0]
     assert len(np.unique(found, axis=0)) == 25, "every speed with every turn"
     assert not found[:, 1].any()
-    # Slowest first, left first: what a network was trained with must never be sorted anew.
+    # Slowest first, left first: trained networks depend on this order.
     np.testing.assert_allclose(found[0], [0.0, 0.0, math.radians(-72.0)])
     np.testing.assert_allclose(found[12], [2.0, 0.0, 0.0])
     np.testing.assert_allclose(found[24], [5.0, 0.0, math.radians(72.0)])
@@ -125,7 +125,7 @@ def test_velocities_stay_within_bounds(forward: float, right: float, speed: floa
     v_forward, v_right, turn = fly((forward, right), speed=speed)[0]
     assert math.hypot(v_forward, v_right) <= speed * (1 + 1e-9)
     assert abs(turn) <= math.pi / 2 + 1e-9
-    # The direction is that of the action cut to the square.
+    # The direction equals the direction of the action clipped to the square.
     cut = max(-1.0, min(1.0, forward)), max(-1.0, min(1.0, right))
     assert v_forward * cut[1] - v_right * cut[0] == pytest.approx(0.0, abs=1e-6 * speed)
     assert turn * v_right >= 0.0, "the nose turns to the course"

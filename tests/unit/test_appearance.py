@@ -1,4 +1,4 @@
-"""What a seed draws of an arena's look, beside closed forms; its geometry knows none of it."""
+"""Randomized appearance of arenas against closed forms; the geometry is unaffected."""
 
 from __future__ import annotations
 

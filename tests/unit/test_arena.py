@@ -604,7 +604,7 @@ def run_cli(*args: str) -> str:
 
 
 def test_cli_prints_the_arena_and_draws_it(tmp_path: Path) -> None:
-    # What looks like the terminal's markup is printed as it is.
+    # Text that resembles terminal markup is printed verbatim.
     png = tmp_path / "a[bold].png"
     text = run_cli("dynamic-obstacles", "--seed", "12", "--zone", "1", "--png", str(png))
     assert f"picture: {png}" in text

@@ -1,4 +1,4 @@
-"""Things made of parts: where the parts are, what they are made of, what sees and touches them."""
+"""Assets made of parts: poses and materials of the parts, sensing and contacts."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ def test_parts_share_a_draw_and_have_materials_of_their_own() -> None:
             assert textures == ["noise", *4 * ["foliage"]]
             bark = finish.albedo[rows[0], 0] / linear_of(BARK / 255.0)
             leaves = finish.albedo[rows[1], 0] / linear_of(FOLIAGE / 255.0)
-            np.testing.assert_allclose(bark, leaves)  # the same brightness and tint
+            np.testing.assert_allclose(bark, leaves)  # The same brightness and tint.
             factors.append(bark)
         elif name == "box":
             assert textures[0] in ("brick", "plain")

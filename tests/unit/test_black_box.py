@@ -1,4 +1,4 @@
-"""The black box: its file, what a crash leaves of it, and what a full disk does."""
+"""Black box: file format, recovery after a crash, and full disks."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def test_flipped_bits_are_told_and_raise_nothing_else(
             continue
         told += box.damaged or not box.whole
         assert not box.damaged or "its checksum is wrong" in record.notes[-1]
-    # The rest is in what lies behind the records: the index.
+    # The remaining flips are behind the records, in the index.
     assert told > 2 * flips // 3
 
 
@@ -245,8 +245,8 @@ def test_killed_at_any_moment_at_most_a_second_is_lost(k: int, tmp_path: Path) -
 
 
 FOXGLOVE_TYPES = {"boolean", "string", "number", "integer", "object", "array"}
-"""What parseJsonSchema.ts of foxglove/studio takes for the type of a property; it raises for any
-other, and shows nothing of the file."""
+"""Property types that parseJsonSchema.ts of foxglove/studio accepts. Any other type raises an
+error, and nothing of the file is shown."""
 
 
 def fields_of(schema: dict[str, Any]) -> dict[str, Any]:
@@ -308,7 +308,7 @@ def test_images_of_further_cameras_have_topics_of_their_own(tmp_path: Path) -> N
     assert images["/depth/down"]["encoding"] == "mono8"
     assert base64.b64decode(images["/depth/down"]["data"]) == bytes(range(8))
     assert base64.b64decode(images["/depth"]["data"]) == depth.tobytes()
-    # Who reads it as a flight sees the main camera's images.
+    # The file read as a flight contains the main camera's images.
     box = read_black_box(path)
     assert box.whole
     (image,) = box.all_of(RawImage)

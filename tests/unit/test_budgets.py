@@ -51,7 +51,7 @@ def test_sizes_and_prose_of_a_package(house: Path) -> None:
         "lines": 11,
         "modules": 1,
         "import_lines": 5,
-        # One of each in 5 + 6 words of docs and 4 words of a comment.
+        # Each occurs once in 5 + 6 words of docs and 4 words of a comment.
         "relatives_per_1000_words": 66.7,
         "banned_per_1000_words": 66.7,
         "clause_percent": 50.0,

@@ -54,8 +54,8 @@ def test_a_camera_that_sees_the_same_is_returned_as_it_is() -> None:
 def test_what_is_nearest_in_a_pixel_wins_and_holes_do_not_count() -> None:
     image = plane(WIDE, 9000)
     image[::2] = 0
-    image[300, 424] = 1500  # one thin return, in the wanted column 32 and row 22
-    image[:, :100] = 0  # nothing to match at the left
+    image[300, 424] = 1500  # One thin return, in the wanted column 32 and row 22.
+    image[:, :100] = 0  # Nothing to match at the left.
     image[5, 500] = MAX_MM
     fitted = Fitting(WIDE, WANTED).fit(image)
     assert set(np.unique(fitted[:, 8:])) <= {1500, 9000}
@@ -80,8 +80,8 @@ def test_every_ray_of_the_arena_ends_where_the_wanted_camera_sees_it(dense: Lens
     known = (fitted > 0) & (centre > 0)
     assert known.mean() > 0.5
     nearer_mm = centre[known].astype(int) - fitted[known].astype(int)
-    # What is nearest in a pixel is not behind what is at its centre, but for the rounding to rows
-    # and columns where a surface recedes.
+    # The nearest depth in a pixel is not behind the depth at its centre, except for rounding to
+    # rows and columns on receding surfaces.
     assert np.quantile(nearer_mm, 0.02) > -100
     assert np.median(np.abs(nearer_mm) / centre[known]) < 0.03
 
@@ -113,7 +113,7 @@ def test_a_fisheye_s_depth_along_its_axis_becomes_what_is_wanted(
 ) -> None:
     """The nearest return of 64 rays a pixel, by the ray caster, is the reference."""
     rays = np.nan_to_num(rays_of_fisheye(FISHEYE))
-    # What it sees as a camera of ROS has it: depth along the axis, none to the side.
+    # Images as from a ROS camera: depth along the axis, 0 to the side.
     along = np.rint(seen_by(FISHEYE) * np.maximum(rays[..., 0], 0.0)).astype(np.uint16)
     fitting = Fitting(Lens.of(FISHEYE), wanted)
     assert fitting.coverage >= least
@@ -150,11 +150,11 @@ def test_a_pinhole_serves_a_narrow_cylinder_and_no_wide_one() -> None:
 def test_rows_and_columns_have_a_focal_length_of_their_own() -> None:
     lens = Lens(800, 500, 400.0, 300.0, 380.0, 260.0)
     columns, rows = np.arange(lens.width), np.arange(lens.height)
-    # The image tells where each pixel looks.
+    # The pixel values encode the direction of each pixel.
     across = np.broadcast_to(30_000 + 10_000 * (columns - lens.cx) / lens.fx, (500, 800))
     down = np.broadcast_to((30_000 + 10_000 * (rows - lens.cy) / lens.fy)[:, None], (500, 800))
     fitting = Fitting(lens, WANTED)
-    half = 0.5 * 10_000 / WANTED.focal + 10_000 / lens.fy  # half a pixel, and a row of the lens
+    half = 0.5 * 10_000 / WANTED.focal + 10_000 / lens.fy  # Half a pixel, and a row of the lens.
     for told, at in (
         (across, (np.arange(64) - WANTED.cx)[None, :]),
         (down, (np.arange(48) - WANTED.cy)[:, None]),
@@ -168,9 +168,9 @@ def test_rows_and_columns_have_a_focal_length_of_their_own() -> None:
 @pytest.mark.parametrize(
     ("lens", "least", "most"),
     [
-        (Lens(848, 480, 446.8, 446.8, 423.5, 239.5), 0.66, 0.74),  # D435: 87 x 56 degrees
+        (Lens(848, 480, 446.8, 446.8, 423.5, 239.5), 0.66, 0.74),  # D435: 87 x 56 degrees.
         (Lens(1280, 720, 446.8, 446.8, 639.5, 359.5), 1.0, 1.0),
-        (Lens(64, 48, 32.0, 64.0, 31.5, 23.5), 0.49, 0.51),  # half as high
+        (Lens(64, 48, 32.0, 64.0, 31.5, 23.5), 0.49, 0.51),  # Half as high.
     ],
 )
 def test_coverage_is_the_share_of_rays_inside_the_image(
@@ -203,7 +203,7 @@ def test_an_image_of_another_size_or_type_is_no_image(image: NDArray[Any]) -> No
 
 
 class Scripted:
-    """A driver that returns images when it is told to."""
+    """Driver that returns the images passed to `give`."""
 
     lens = WIDE
 

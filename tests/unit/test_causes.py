@@ -1,4 +1,4 @@
-"""Why flights fail: each cause on a flight made for it, and what the camera had of the obstacle."""
+"""Failure causes on constructed flights, and visibility of the obstacle to the camera."""
 
 from __future__ import annotations
 
@@ -366,7 +366,7 @@ def test_decisions_act_when_the_motors_answer() -> None:
     assert decisions_in_effect({}, 36).size == 0
 
 
-# --- Flights that never arrive, or take long ---
+# --- flights without arrival, and long flights
 
 
 def test_swinging_is_found_counted_and_timed() -> None:

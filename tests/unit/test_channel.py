@@ -77,7 +77,7 @@ def messages(*kinds: type[channel._Line]) -> st.SearchStrategy[channel._Line]:
 
 
 class Listener:
-    """A channel's child end on two pipes, and what came out of it."""
+    """Child end of a channel on two pipes, with the received requests."""
 
     def __init__(self, fail_on: type | None = None) -> None:
         read, self._write = os.pipe()
@@ -117,7 +117,7 @@ def test_all_messages_are_covered() -> None:
 @given(message=messages(*EVENTS))
 def test_every_event_survives(message: channel._Line) -> None:
     line = message.to_line()
-    # One line, whatever a text holds.
+    # Any text is encoded in a single line.
     assert line.endswith(b"\n")
     assert len(line.splitlines()) == 1
     assert parse_event(line) == message
@@ -156,7 +156,7 @@ def test_other_bytes_are_no_event(line: bytes) -> None:
         b'{"type":"ready","more":1}',
         b'{"more":1}',
         b'{"type":"text","time_us":"soon","severity":1,"text":""}',
-        b'{"type":"shutdown"}',  # a request is no event
+        b'{"type":"shutdown"}',  # A request is no event.
     ],
 )
 def test_other_json_is_no_event(line: bytes) -> None:
@@ -185,7 +185,7 @@ def test_a_line_cut_short_by_the_end_is_no_request(capfd: pytest.CaptureFixture[
 
 
 def test_a_handler_that_fails_is_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody would listen any more: the child must not live on without its harness."""
+    """A failed handler ends the channel: the child must not outlive its harness."""
     failures: queue.Queue[Any] = queue.Queue()
     monkeypatch.setattr(threading, "excepthook", failures.put)
     listener = Listener(fail_on=Shutdown)
@@ -240,7 +240,7 @@ sys.exit(7)
 
 
 def test_child_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a library prints goes to the log; closing the pipe ends the child."""
+    """Output of libraries goes to the log; closing the pipe ends the child."""
     (tmp_path / "chatterbox.py").write_text(CHATTERBOX, encoding="utf-8")
     root = str(Path(__file__).resolve().parents[2])
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([root, str(tmp_path)]))
@@ -255,7 +255,7 @@ def test_child_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert events.get(timeout=10.0) == ("c", Progress(phase="gone", time_us=1))
     assert events.get(timeout=10.0) == ("c", Exited(7))
     assert child.log_tail() == "banner of a library\nprinted"
-    child.send(FinishEpisode())  # to a dead child: no error
+    child.send(FinishEpisode())  # To a dead child: no error.
     child.stop()
 
 

@@ -1,4 +1,4 @@
-"""The two processes of a rehearsal, told something else than a scenario: they say so and end."""
+"""Child processes of a rehearsal: they report any input other than a scenario, and exit."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ sys.stdin.readline()
 
 
 def state_of(pid: int) -> str:
-    """Return the kernel's letter for what a process does; T: it is stopped."""
+    """Return the kernel's letter for the state of a process; T = stopped."""
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
 
 
@@ -98,7 +98,7 @@ def test_a_suspended_child_waits_until_it_is_resumed(tmp_path: Path) -> None:
         wait_until(lambda: state_of(child.pid) == "T", "stopped")
         child.resume()
         wait_until(lambda: state_of(child.pid) != "T", "going on")
-        child.resume()  # harmless
+        child.resume()  # Harmless.
         child.suspend()
         child.kill()
         assert child.wait().code == -signal.SIGKILL

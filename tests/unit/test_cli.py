@@ -1,4 +1,4 @@
-"""The commands: `airl` finds its subcommands, and each says what it is for and how it is used."""
+"""`airl` command: discovery of subcommands, their descriptions and usage."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NAMES = [name for name in SUBCOMMANDS if name not in OLD]
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
-    """Run `airl WORDS`; return exit status and what it printed."""
+    """Run `airl WORDS`; return exit status, stdout and stderr."""
     with pytest.raises(SystemExit) as end:
         main(words)
     out, err = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""Two clocks related by exchanges: the error must lie within the bound, whatever the delays."""
+"""Clock offset from message exchanges: the error is within the bound for any delay."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ def autopilot(port: int, ahead_ns: int) -> Iterator[None]:
                 if time.monotonic_ns() >= beat_ns:
                     beat_ns = time.monotonic_ns() + 200_000_000
                     send(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3))
-                    # A question of its own: no answer.
+                    # An independent request, not a response.
                     send(dialect.MAVLink_timesync_message(0, time.monotonic_ns()))
                 try:
                     data = own.recv(4096)

@@ -11,7 +11,7 @@ def test_thresholds_stand_again_afterwards(before: tuple[int, int, int]) -> None
     gc.set_threshold(*before)
     try:
         with pytest.raises(ValueError, match="in between"), seldom_collected():
-            # One who collects more seldom, or never, goes on doing so.
+            # A less frequent or disabled collection is kept.
             wanted = before[0] if before[0] in (0, 90_000) else YOUNG_OBJECTS
             assert gc.get_threshold() == (wanted, *before[1:])
             raise ValueError("in between")

@@ -98,7 +98,7 @@ def expect(picture: Picture, row: int, column: int, linear: float) -> None:
 @pytest.mark.parametrize("azimuth", [120.0, 150.0, 180.0, 225.0, 250.0])
 @pytest.mark.parametrize("elevation", [15.0, 45.0, 70.0])
 def test_a_wall_shines_by_lamberts_cosine(azimuth: float, elevation: float) -> None:
-    """The north wall faces south: the cosine is that of two angles of the sun."""
+    """The north wall faces south: the cosine follows from two angles of the sun."""
     # The far south wall throws its shadow 5 m / tan(elevation) far at most: not up to here.
     scene = arena(bodies(), sun=sun(azimuth, elevation, 0.9), sky=sky(0.0), floor=BLACK_FLOOR)
     cosine = math.cos(math.radians(elevation)) * -math.cos(math.radians(azimuth))
@@ -228,7 +228,7 @@ def rays_of(k: Intrinsics, attitude: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def surface_gap(o: Obstacles, i: int, p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far points (n, 3) are from the surface of an obstacle [m]."""
+    """Return the distance of points (n, 3) from the surface of an obstacle [m]."""
     q, half = p - o.center[i], o.half_size[i]
     if o.shape[i] == Shape.SPHERE:
         return np.abs(np.linalg.norm(q, axis=1) - half[0])
@@ -249,7 +249,7 @@ def test_every_point_lies_on_what_the_segmentation_names(projection: Projection)
         for position, attitude in poses(seed, 12):
             seen = see(scene, position, attitude, k)
             if not seen.rgb.any():
-                continue  # inside an obstacle
+                continue  # Inside an obstacle.
             points = np.array(position) + seen.depth_m[..., None] * rays_of(k, attitude)
             gaps = {
                 primitives.FLOOR: np.abs(points[..., 2]),
@@ -266,9 +266,9 @@ def test_every_point_lies_on_what_the_segmentation_names(projection: Projection)
 
 
 def hidden(o: Obstacles, i: int, p: NDArray[np.float64], s: NDArray[np.float64]) -> Any:
-    """Whether the way from points (n, 3) along s meets an obstacle: by its nearest approach.
+    """Return True for each point (n, 3) whose ray along s meets an obstacle.
 
-    In float64 and by sampling the way, which knows nothing of slabs or quadratics.
+    Samples the ray in float64, independent of slabs and quadratics.
     """
     steps = np.linspace(0.01, 40.0, 4000)
     inside = np.zeros(len(p), bool)
@@ -359,7 +359,7 @@ def test_checks_lie_where_they_should() -> None:
     checks = np.floor(-north) + np.floor(east)
     floor = seen.seen == primitives.FLOOR
     found = seen.rgb[..., 0] > 0
-    assert (found == (checks % 2 == 1))[floor].mean() > 0.97  # edges of checks
+    assert (found == (checks % 2 == 1))[floor].mean() > 0.97  # Edges of checks.
 
 
 def test_far_textures_fade_into_their_mean() -> None:
@@ -427,7 +427,7 @@ def test_same_arena_same_image() -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(8, 6), (9, 7), (10, 9), (11, 8)])
 def test_packed_pixels_are_unpacked_whatever_their_number(width: int, height: int) -> None:
-    """Words of four pixels, and what is no whole number of them, beside numpy's bytes."""
+    """Words of four pixels, and an incomplete last word, against numpy's bytes."""
     colours = np.random.default_rng(width).integers(0, 1 << 24, width * height, dtype=np.int32)
     rgb = np.zeros((height, width, 3), np.uint8)
     unpack(rgb, colours, False)

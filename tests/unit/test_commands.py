@@ -1,4 +1,4 @@
-"""What a policy commands: a velocity, an attitude, or body rates; each told from the others."""
+"""Policy commands: velocity, attitude or body rates, each distinguishable from the others."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_a_card_from_before_there_were_body_rates_stays_as_it_was() -> None:
     assert ActionSpec(max_rate_deg_s=90.0).model_dump()["max_rate_deg_s"] == 90.0
 
 
-# --- what a network is told
+# --- network inputs
 
 
 def state_of(turns: Rotation, rates: np.ndarray | None) -> Kinematics:
@@ -186,7 +186,7 @@ def test_a_setpoint_that_no_motor_has_flown_is_not_in_the_record() -> None:
     assert not log.arrays()["accepted_us"].size
 
 
-# --- how it is flown
+# --- execution
 
 
 def piloting(policy: PolicyInfo, **asked: Any) -> tuple[Any, Any]:
@@ -281,7 +281,7 @@ def test_an_overdue_turn_or_lean_is_ended_before_the_stop(
 def test_an_attitude_accelerates_as_it_is_asked_to(
     forward: float, right: float, down: float, yaw: float, hover: float
 ) -> None:
-    """By scipy's rotations, and by the PX4 mathematics that the flight controllers here fly."""
+    """Against scipy's rotations and the PX4 mathematics of the flight controllers."""
     asked = np.array([forward, right, down])
     made = Attitude.accelerating(*asked, yaw_rad=yaw, hover_thrust=hover)
     body = Rotation.from_euler("ZYX", [made.yaw_rad, made.pitch_rad, made.roll_rad])

@@ -18,7 +18,7 @@ HEAVY = (
     "matplotlib",
     "numba",
     "onnx",
-    "onnxruntime",  # only with a learned policy
+    "onnxruntime",  # Only with a learned policy.
     "pybullet",
     "pymavlink",
     "scipy",

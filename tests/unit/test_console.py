@@ -1,4 +1,4 @@
-"""What commands print is what they say: brackets and colons of paths and names stay."""
+"""Console output: brackets and colons in paths and names are printed verbatim."""
 
 from __future__ import annotations
 

@@ -133,8 +133,8 @@ def test_outputs_are_commands(thrust: float, torque: Vec) -> None:
 def test_thrust_is_lowered_never_raised(thrust: float, torque: Vec) -> None:
     motors, _ = mix(thrust, torque, GAINS)
     asked_without_limits = ALLOCATION @ [*torque, thrust]
-    # Clipping the last bit of a motor at 0 may add lift that nobody asked for, but no more than
-    # the negative command that it removes.
+    # Clipping the last bit of a motor at 0 may add lift beyond the request. The excess is at most
+    # the removed negative command.
     clipped = np.clip(-asked_without_limits, 0.0, None).sum() / 4
     assert EFFECT[3] @ motors <= thrust + clipped + 1e-9
 
@@ -169,7 +169,7 @@ def test_roll_and_pitch_are_kept_at_full_thrust(thrust: float, roll: float, pitc
 def test_some_yaw_is_left_at_full_thrust() -> None:
     motors, _ = mix(1.0, (0.0, 0.0, 0.5), GAINS)
     delivered = EFFECT @ motors
-    assert delivered[2] == pytest.approx(0.15, abs=0.01)  # PX4's MINIMUM_YAW_MARGIN
+    assert delivered[2] == pytest.approx(0.15, abs=0.01)  # PX4's MINIMUM_YAW_MARGIN.
     assert delivered[3] == pytest.approx(0.85, abs=0.01)
 
 
@@ -284,7 +284,7 @@ def test_small_tilt_errors_are_turned_back_proportionally(
     error = Rotation.from_rotvec([*tilt, 0.0])
     goal = (scipy_of(q) * error).as_quat()
     rates = rate_setpoint(q, (goal[3], *goal[:3]), 0.0, GAINS)
-    expected = 2 * GAINS.att_p_roll * error.as_quat()[:3]  # 2 sin(angle / 2) along the axis
+    expected = 2 * GAINS.att_p_roll * error.as_quat()[:3]  # 2 sin(angle / 2) along the axis.
     np.testing.assert_allclose(rates, expected, atol=1e-6)
 
 
@@ -351,13 +351,13 @@ def test_position_comes_before_feed_forward(position: Vec, feed: Vec) -> None:
 def test_nan_axes_take_no_part() -> None:
     sp = velocity_setpoint((1.0, 2.0, 3.0), (NAN, 4.0, NAN), (1.5, NAN, NAN), GAINS)
     np.testing.assert_allclose(sp, [1.5, 0.95 * 2.0, 0.0])
-    # Nothing is said of the horizontal: it is not controlled.
+    # Without a horizontal setpoint the horizontal axes are not controlled.
     open_sp = velocity_setpoint((1.0, 2.0, 3.0), NAN3, (NAN, NAN, 0.5), GAINS)
     np.testing.assert_array_equal(open_sp, [NAN, NAN, 0.5])
 
 
 def test_what_is_not_controlled_stays_level() -> None:
-    """PX4's FlightTaskDescend: no horizontal acceleration, whatever the velocity and its past."""
+    """PX4's FlightTaskDescend: no horizontal acceleration at any velocity or integral."""
     sp, slope = (NAN, NAN, 0.75), (0.3, -0.2, 0.0)
     thrust, integral = velocity_control((3.0, -2.0, 0.75), slope, sp, (0.4, 0.1, 0.2), GAINS, 0.008)
     assert thrust[:2] == (0.0, 0.0)
@@ -382,10 +382,10 @@ def test_tilt_limit(acceleration: Vec) -> None:
 @given(st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-5, 5)))
 def test_acceleration_becomes_the_thrust_that_makes_it(acceleration: Vec) -> None:
     thrust = np.array(thrust_from_acceleration(acceleration, GAINS))
-    # A body whose hover thrust is 0.52 gets g from 0.52: what this thrust makes of it.
+    # A body with a hover thrust of 0.52 accelerates by g at 0.52.
     produced = thrust / 0.52 * GRAVITY_M_S2 + [0, 0, GRAVITY_M_S2]
     assert produced[2] == pytest.approx(acceleration[2], abs=1e-9)
-    # Horizontally the tilt is that of flight at constant height; the vertical part scales it.
+    # The tilt assumes flight at constant height. The vertical part scales the horizontal part.
     scale = 1.0 - acceleration[2] / GRAVITY_M_S2
     np.testing.assert_allclose(produced[:2], np.array(acceleration[:2]) * scale, atol=1e-9)
 
@@ -394,7 +394,7 @@ def test_acceleration_becomes_the_thrust_that_makes_it(acceleration: Vec) -> Non
 def test_thrust_stays_inside_its_limits(velocity: Vec, dot: Vec, sp: Vec) -> None:
     thrust, integral = velocity_control(velocity, dot, sp, ZERO, GAINS, TICK_S)
     norm = np.linalg.norm(thrust)
-    # thrust_min is the least collective; the tilt takes from its vertical part.
+    # `thrust_min` is the minimum collective thrust. The tilt reduces its vertical part.
     assert 0.12 - 1e-9 <= norm <= 1.0 + 1e-9
     assert thrust[2] <= -0.12 * math.cos(45 * DEG) + 1e-9
     assert all(math.isfinite(i) for i in integral)
@@ -402,7 +402,7 @@ def test_thrust_stays_inside_its_limits(velocity: Vec, dot: Vec, sp: Vec) -> Non
 
 def test_full_climb_leaves_a_horizontal_margin() -> None:
     thrust, _ = velocity_control(ZERO, ZERO, (12.0, 0.0, -3.0), (0, 0, -9.0), GAINS, TICK_S)
-    assert thrust[0] == pytest.approx(0.3, abs=1e-9)  # MPC_THR_XY_MARG
+    assert thrust[0] == pytest.approx(0.3, abs=1e-9)  # MPC_THR_XY_MARG.
     assert thrust[2] == pytest.approx(-math.sqrt(1 - 0.09), abs=1e-9)
 
 
@@ -417,7 +417,7 @@ def test_p_i_and_d_have_their_signs_and_gains() -> None:
 
 @pytest.mark.parametrize(("sign", "bound"), [(1.0, GRAVITY_M_S2), (-1.0, GRAVITY_M_S2)])
 def test_vertical_integral_stops_at_the_thrust_limits(sign: float, bound: float) -> None:
-    """Held down (or up) for a minute: an integral that goes on would take as long to unwind."""
+    """Held down (or up) for a minute: an unlimited integral would take as long to unwind."""
     integral = ZERO
     thrust = ZERO
     for _ in range(60 * 250):
@@ -433,11 +433,11 @@ def test_vertical_integral_stops_at_the_thrust_limits(sign: float, bound: float)
 
 
 def test_horizontal_integral_is_pulled_back_in_saturation() -> None:
-    """Pinned against a wall with 12 m/s asked: the integral settles, it does not run away."""
+    """Pinned against a wall at a setpoint of 12 m/s: the integral settles."""
     integral = ZERO
     for _ in range(60 * 250):
         _, integral = velocity_control(ZERO, ZERO, (12.0, 0.0, 0.0), integral, GAINS, TICK_S)
-    # Equilibrium of e - 2/P (a - a_max) = 0 with a = P e + i and a_max = g tan 45 deg
+    # Equilibrium of e - 2/P (a - a_max) = 0 with a = P e + i and a_max = g tan 45 deg.
     a = GRAVITY_M_S2 + 12.0 * 1.8 / 2
     assert integral[0] == pytest.approx(a - 1.8 * 12.0, abs=1e-6)
     assert integral[1] == 0.0
@@ -488,7 +488,7 @@ def test_no_integration_in_fast_flips() -> None:
     assert integral == ZERO
 
 
-# --- the whole
+# --- the whole cascade
 
 
 @cache
@@ -603,7 +603,7 @@ def test_a_weight_is_an_alpha_filters() -> None:
 
 
 def test_heading_is_kept_without_a_heading() -> None:
-    """Neither yaw nor yaw rate commanded: no heading error, no rate asked."""
+    """Without a yaw or yaw rate setpoint, heading error and rates are zero."""
     yaw = 1.1
     q = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
     demand = Demand(NAN3, ZERO, NAN, NAN)

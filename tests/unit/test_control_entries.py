@@ -1,4 +1,4 @@
-"""Where the cascade can be entered: acceleration, attitude, body rates."""
+"""Entry points of the control cascade: acceleration, attitude, body rates."""
 
 from __future__ import annotations
 

@@ -144,7 +144,7 @@ def test_refused_without_the_controller(tmp_path: Path) -> None:
 
 def test_refused_where_no_group_can_be_made(tmp_path: Path) -> None:
     root = fake_root(tmp_path, "3:cpu,cpuacct:/a\n", "c /sys/fs/cgroup/cpu cgroup rw,cpu 0 0\n")
-    # A file where the hierarchy should be: nobody, not even root, makes a folder in it.
+    # A file in place of the hierarchy: even root cannot create a folder in it.
     (root / "sys/fs/cgroup").mkdir(parents=True)
     (root / "sys/fs/cgroup/cpu").write_text("")
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""Kannala and Brandt's coefficients: beside OpenCV, beside scipy's solver, and who refuses them."""
+"""Kannala-Brandt coefficients against OpenCV and scipy's solver, and their rejection."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ PROJECTED: dict[Distortion, list[list[float]]] = {
         [319.5309999997933, 239.56199999958667],
     ],
 }
-"""By OpenCV 5.0.0 the pixels on which POINTS fall: `cv2.fisheye.projectPoints(POINTS, 0, 0, K, D)`
-with the coefficients D and K of LENS."""
+"""Pixels of POINTS by OpenCV 5.0.0: `cv2.fisheye.projectPoints(POINTS, 0, 0, K, D)` with the
+coefficients D and K of LENS."""
 
 SEEN: dict[Distortion, list[list[float]]] = {
     BARREL: [
@@ -81,8 +81,8 @@ SEEN: dict[Distortion, list[list[float]]] = {
         [0.0016129043447175577, 0.0016129043447175577],
     ],
 }
-"""By OpenCV right and down of what PIXELS see, at 1 ahead: `cv2.fisheye.undistortPoints(PIXELS, K,
-D, criteria=(3, 100, 1e-15))`."""
+"""Right and down components of the rays of PIXELS, at 1 ahead, by OpenCV:
+`cv2.fisheye.undistortPoints(PIXELS, K, D, criteria=(3, 100, 1e-15))`."""
 
 
 @pytest.mark.parametrize("k", [BARREL, OPENING])

@@ -1,4 +1,4 @@
-"""The documentation: the site builds without a network, and what it names exists."""
+"""Documentation: the site builds without a network, and all names in it exist."""
 
 import importlib
 import importlib.util

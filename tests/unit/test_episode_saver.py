@@ -30,7 +30,7 @@ def folder(tmp_path: Path) -> RunFolder:
 
 
 class Watched(RunFolder):
-    """Notes how many episodes are saved at a time, and fails when told to."""
+    """Run folder that records the number of episodes per save, and fails on request."""
 
     def __init__(self, path: Path, fail_at: int | None = None) -> None:
         super().__init__(path)

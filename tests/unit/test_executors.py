@@ -1,4 +1,4 @@
-"""Executors: what they carry out, and what they survive."""
+"""Executors: execution of jobs, and recovery from failures."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def executor(request: pytest.FixtureRequest) -> Iterator[Executor]:
             yield processes
 
 
-# --- what all executors do
+# --- all executors
 
 
 def test_every_job_gives_all_its_results_once(executor: Executor) -> None:
@@ -176,7 +176,7 @@ def test_a_worker_lives_on_over_the_runs_and_starts_each_anew(tmp_path: Path) ->
         start = partial(worker_jobs.counted, tmp_path)
         assert sorted(executor.run(range(3), start)) == [(job, job) for job in range(3)]
         assert [path.name for path in tmp_path.glob("start-*")] == [f"start-{first}"]
-        # One that is lost without work is replaced when its turn comes, and no job's fault.
+        # A worker lost while idle is replaced at its next turn. No job counts as failed.
         os.kill(first, signal.SIGKILL)
         # All of its threads: a zombie may still have some, and is not to be waited for then.
         alive = multiprocessing.active_children
@@ -271,7 +271,7 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
         parent.process.send_signal(signal.SIGKILL)
         for pid in pids:
             wait_until(partial(has_ended, pid), "an orphan to end", 30.0)
-        # Nothing but what it was: no trace of a worker that was surprised.
+        # The output stays empty: no traceback of an interrupted worker.
         assert parent.text() == ""
 
 

@@ -41,7 +41,7 @@ def test_the_knee_is_where_the_curve_has_that_share_of_its_roof(
 
 def test_the_greatest_acceleration_is_the_lesser_of_two() -> None:
     quad = load_vehicle("quad")
-    assert max_acceleration(quad) == pytest.approx(9.80665)  # its tilt limit is 45 degrees
+    assert max_acceleration(quad) == pytest.approx(9.80665)  # Its tilt limit is 45 degrees.
     # Hovers at half thrust: tilts 60 degrees and keeps its height.
     body = quad.body.model_copy(update={"mass_kg": quad.thrust_n / (2.0 * 9.80665)})
     heavy = quad.model_copy(update={"body": body, "parameters": {"MPC_TILTMAX_AIR": 80.0}})

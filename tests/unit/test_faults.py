@@ -167,7 +167,7 @@ def test_what_a_level_cannot_do_is_refused(fields: dict[str, Any], line: str) ->
         resolve(Scenario.model_validate(fields))
 
 
-# --- when they act
+# --- activation times
 
 
 def fault(text: str) -> Fault:

@@ -1,4 +1,4 @@
-"""Files: whole or not at all, and nothing that was damaged is taken for what was written."""
+"""Files: writes are atomic, and damaged files are detected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The first start compiles in a step of its own: shown, resumed after Ctrl-C, silent when done."""
+"""First start: compilation is a separate, visible step, resumed after Ctrl-C, silent when done."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fisheye: where directions fall, what its pixels show, and who refuses it."""
+"""Fisheye cameras: projection, rendered pixels, and rejection."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_an_image_from_elsewhere_is_that_of_the_camera_there(distortion: Distort
     both = (found > 0) & (wanted > 0)
     off_m = np.abs(found[both].astype(float) - wanted[both]) / 1e3
     assert both.mean() > 0.3
-    # It is off by what lies between two pixels, on slopes and edges.
+    # Errors on slopes and edges come from the distance between pixels.
     assert np.median(off_m) < 0.05
     assert np.abs(first[both].astype(float) - wanted[both]).mean() / 1e3 > 2.0 * off_m.mean()
 

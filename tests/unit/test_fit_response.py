@@ -107,7 +107,7 @@ def test_the_shipped_quad_has_what_the_script_prints(
     [("north", "accepted: with north-2 or"), ("yawspeed-30", "accepted: with yawspeed-30, up to")],
 )
 def test_without_its_steps_nothing_is_found(left_out: str, words: str) -> None:
-    """A step that did not get to 90 % is none."""
+    """A step that does not reach 90 % does not count."""
     horizontal = ("north", "east", "forward")
     left = horizontal if left_out == "north" else (left_out,)
     all_steps = {

@@ -56,7 +56,7 @@ def test_a_step_has_the_peak_of_a_gaussians_slope_and_its_energy() -> None:
     assert jerk is not None
     peak = 2.0 * np.exp(-0.5) / (np.sqrt(2 * np.pi) * SIGMA_S**2)
     assert jerk.peak_m_s3 == pytest.approx(peak, rel=0.05)
-    energy = 2.0**2 / (4.0 * np.sqrt(np.pi) * SIGMA_S**3)  # Parseval
+    energy = 2.0**2 / (4.0 * np.sqrt(np.pi) * SIGMA_S**3)  # Parseval.
     assert jerk.rms_m_s3 == pytest.approx(np.sqrt(energy / (1000 * STEP_S)), rel=0.06)
 
 

@@ -73,7 +73,7 @@ def followed(
     [
         ("pinhole", UNDISTORTED),
         ("cylindrical", UNDISTORTED),
-        # A fisheye has a renderer of its own, which compiles for half a minute.
+        # The fisheye has a separate renderer, which takes half a minute to compile.
         pytest.param("fisheye", UNDISTORTED, marks=pytest.mark.nightly),
         pytest.param("fisheye", BARREL, marks=pytest.mark.nightly),
         pytest.param("fisheye", OPENING, marks=pytest.mark.nightly),
@@ -100,7 +100,7 @@ def test_flow_is_that_of_points_that_are_followed(
         centers = scene.centers_at(elapsed_us)
         picture = render_picture(scene, centers, k, motion.position, motion.quaternion)
         if (picture.depth_m[picture.depth_m > 0.0] < 0.3).any():
-            continue  # beside an obstacle, or inside: differences are coarse there
+            continue  # Beside an obstacle, or inside: differences are coarse there.
         velocities = velocities_of(scene, elapsed_us)
         flow = optical_flow(picture, k, motion, velocities)
         wanted = followed(scene, k, picture, motion, elapsed_us)

@@ -93,7 +93,7 @@ def test_colours_go_out_pixel_by_pixel_under_their_own_magic(
     wire = Frame(7, 123_456, image, lens).to_bytes()
     assert wire[:4] == magic
     assert wire[48:] == bytes(range(6 * channels))
-    # A receiver that knows depth alone, as those before there was colour, says what came.
+    # A receiver of depth only, as before colour was added, reports the received data.
     with pytest.raises(FrameError, match="bytes do not hold 3x2 pixels of depth"):
         Frame.from_bytes(b"ADF1" + wire[4:])
     with pytest.raises(FrameError, match="magic b'ARX1', expected b'ADF1'"):

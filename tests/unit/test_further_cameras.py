@@ -1,4 +1,4 @@
-"""Further cameras of a vehicle profile, and how a camera is mounted."""
+"""Additional cameras of a vehicle profile, and camera mounting."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_too_many_are_refused(tmp_path: Path) -> None:
 
 
 def test_what_was_written_before_reads_as_it_did() -> None:
-    """A profile of one camera that looks ahead says nothing of what came with further ones."""
+    """A profile with a single forward camera omits the fields of additional cameras."""
     for name in list_profiles("vehicles"):
         vehicle = load_vehicle(name)
         dumped = vehicle.model_dump()

@@ -23,11 +23,11 @@ FILES = 12
 @pytest.mark.parametrize("kind", READERS)
 def test_a_damaged_file_is_read_or_refused_in_one_line(kind: str) -> None:
     came = {read_damaged_file(number, kind) for number in range(FILES)}
-    assert f"{kind} refused" in came  # the wounds are felt
+    assert f"{kind} refused" in came  # Corruption is detected.
 
 
 def test_a_companion_decides_on_sound_frames_alone() -> None:
-    for number in range(12):  # all lenses, of one camera and of two
+    for number in range(12):  # All lenses, of one camera and of two.
         refused = int(see_hostile_frames(number).split()[0])
         assert 5 < refused < 50
 

@@ -13,7 +13,7 @@ MESHES = 12
 
 def test_a_damaged_mesh_is_refused_in_one_line_or_taken() -> None:
     came = {read_damaged("mesh", number) for number in range(MESHES)}
-    assert "asset refused" in came  # the wounds are felt
+    assert "asset refused" in came  # Corruption is detected.
 
 
 @pytest.mark.nightly

@@ -56,7 +56,7 @@ def arenas(spec: ArenaSpec) -> list[Arena]:
     return [made(spec, seed) for seed in SEEDS]
 
 
-# --- what is drawn
+# --- random draws
 
 
 def test_openings_are_uniform_within_the_profiles_ranges(
@@ -128,17 +128,17 @@ def test_one_number_is_always_that_height() -> None:
 
 
 def test_profiles_without_them_say_nothing_of_them() -> None:
-    """What a profile is dumped as is what its digest is of: it must not change."""
+    """The digest covers the dumped profile, so the dump must not change."""
     dumped = load_profile("arenas", "static-obstacles", ArenaSpec).model_dump()
     assert "gates" not in dumped
     assert "height_m" not in dumped["goal"]
 
 
-# --- what stands
+# --- obstacles
 
 
 def inside(arena: Arena, place: np.ndarray) -> bool:
-    """Return whether a place is in one of an arena's boxes, which are not turned."""
+    """Return True if a place is in any box of an arena; the boxes are not rotated."""
     boxes = arena.obstacles
     return bool((np.abs(place - boxes.center) < boxes.half_size).all(axis=1).any())
 
@@ -253,7 +253,7 @@ def test_obstacles_keep_off_the_gates(spec: ArenaSpec) -> None:
             assert "gate" not in arena.name_of(int(i))
 
 
-# --- what is refused
+# --- rejected input
 
 
 @pytest.mark.parametrize(
@@ -293,7 +293,7 @@ def test_a_policy_that_is_told_the_height_flies_only_where_there_is_one() -> Non
         check_goal_height(find_policy("gates"), (20.0, 5.0), "goal", "20 5")
 
 
-# --- how far the goal is
+# --- distance to the goal
 
 
 def test_distances_to_a_goal() -> None:

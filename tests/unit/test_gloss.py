@@ -158,7 +158,7 @@ def test_a_mirror_shows_what_a_mirrored_camera_sees() -> None:
     nothing = scene(box((0.0, 15.0, 3.0), (0.1, 0.1, 0.1)))
     behind = see(nothing, (12.0, 0.0, -2.5), yaw=math.pi)
     expected = behind.rgb[:, ::-1]
-    # The box throws its shadow to the north, away from what it mirrors.
+    # The box throws its shadow to the north, away from the mirrored scene.
     apart = np.abs(seen.rgb.astype(int) - expected)[shown]
     assert np.mean(apart.max(axis=-1) <= 1) > 0.99
 
@@ -221,7 +221,7 @@ def test_what_is_behind_clear_glass_is_seen_through_both_panes() -> None:
     assert seen.seen[24, 32] == 4
     assert bare.seen[24, 32] in (2, 3)
     behind, front = (linear_of(p.rgb[24, 32] / 255.0) for p in (bare, seen))
-    # What both panes mirror is the other walls, as bright as this one.
+    # Both panes mirror the other walls, which are as bright as this one.
     back = pane_reflects(1.0)
     inner = (1.0 - back) ** 2 / (1.0 - back**2)
     np.testing.assert_allclose(front, behind * (inner + back + back * inner), rtol=0.03)
@@ -245,7 +245,7 @@ def test_rays_between_mirrors_end() -> None:
         roll, pitch = rng.normal(0.0, 0.3, 2)
         attitude = quat_from_euler(roll, pitch, rng.uniform(-3.0, 3.0))
         picture = render_picture(world, world.centers_at(0), CAMERA, at, attitude)
-        if (picture.depth_m > 0.01).all(where=picture.depth_m > 0.0):  # not within an obstacle
+        if (picture.depth_m > 0.01).all(where=picture.depth_m > 0.0):  # Not within an obstacle.
             assert picture.rgb.std() > 5.0
             looked += 1
     assert looked > 4
@@ -290,7 +290,7 @@ def test_the_twin_has_the_surfaces_of_the_rehearsal() -> None:
 
 # In every run: the rows of the twin, above, and its images of matt surfaces in test_colour_env.py.
 @pytest.mark.nightly
-@pytest.mark.timeout(600)  # compiles kernels
+@pytest.mark.timeout(600)  # Compiles kernels.
 def test_the_twins_images_are_those_of_the_rehearsal() -> None:
     worlds = shiny_worlds()
     n = len(worlds)

@@ -148,7 +148,7 @@ def test_near_points_agree_with_scipy(pitch: float, roll: float, band: float, se
 @pytest.mark.parametrize("roll", [-0.4, 0.0, 0.4])
 def test_the_floor_is_no_obstacle_however_the_vehicle_tilts(pitch: float, roll: float) -> None:
     seen = look(arena(), (30.0, 0.0), pitch=pitch, roll=roll)
-    assert (seen.depth_m > 0).any()  # the floor is in view
+    assert (seen.depth_m > 0).any()  # The floor is in view.
     assert len(near_points(seen, S.band_m)) == 0
 
 
@@ -184,13 +184,13 @@ def test_all_round_a_goal_behind_is_flown_to_at_once() -> None:
     action = GreedyPolicy().act(look(arena(), (-12.0, 1.0), lens=lens))
     assert abs(course_of(action)) > math.radians(90.0)
     assert math.hypot(action.forward_m_s, action.right_m_s) > 1.0
-    assert action.yaw_rate_rad_s > 0.0  # and turns to it meanwhile
+    assert action.yaw_rate_rad_s > 0.0  # Turns toward the goal at the same time.
 
 
 def test_what_is_above_or_below_flight_height_is_left_out() -> None:
     low = arena((8.0, 0.0, 1.0, 1.5))
     low.obstacles.half_size[0, 2] = 0.5
-    low.obstacles.center[0, 2] = -0.5  # 1 m high; the vehicle flies at 2 m
+    low.obstacles.center[0, 2] = -0.5  # 1 m high; the vehicle flies at 2 m.
     assert len(near_points(look(low, (30.0, 0.0)), 0.6)) == 0
     assert len(near_points(look(low, (30.0, 0.0)), 1.5)) > 0
 
@@ -275,8 +275,8 @@ def test_steers_around_a_box_straight_ahead(east: float, north: float) -> None:
     corners = np.array([[north - 0.5, east - half], [north - 0.5, east + half]])
     across = corners @ [-math.sin(course), math.cos(course)]
     assert np.abs(across).min() > S.half_width_m - 1.5 * pixel
-    assert across[0] * across[1] > 0  # both on one side: it does not fly through the face
-    assert course * east < 0  # round the nearer side
+    assert across[0] * across[1] > 0  # Both on one side: it does not fly through the face.
+    assert course * east < 0  # Round the nearer side.
 
 
 def test_flies_around_the_box_to_the_goal_without_touching_it() -> None:
@@ -295,7 +295,7 @@ def test_flies_around_the_box_to_the_goal_without_touching_it() -> None:
         if np.hypot(*(position - [16.0, 0.0])) < 1.0:
             break
     assert np.hypot(*(position - [16.0, 0.0])) < 1.0
-    assert nearest > 0.275  # half the width of the quad
+    assert nearest > 0.275  # Half the width of the quad.
 
 
 @pytest.mark.parametrize("depth_m", [2.0, 3.0, 5.0, 8.0])
@@ -324,7 +324,7 @@ def test_stops_and_turns_where_everything_is_nearer_than_the_stop_distance(depth
     assert (action.forward_m_s, action.right_m_s) == (0.0, 0.0)
     assert action.yaw_rate_rad_s != 0.0
     again = policy.act(look(arena((depth_m + 1.0, 0.0, 1.0, 40.0)), (30.0, 0.0)))
-    assert again == action  # no dithering
+    assert again == action  # No dithering.
 
 
 def test_turns_on_to_the_side_on_which_the_goal_was() -> None:
@@ -338,7 +338,7 @@ def test_turns_on_to_the_side_on_which_the_goal_was() -> None:
 def test_slows_for_a_near_goal() -> None:
     far = GreedyPolicy().act(blank((20.0, 0.0)))
     near = GreedyPolicy().act(blank((1.5, 0.0)))
-    assert near.forward_m_s == pytest.approx(1.5)  # covers it in two periods
+    assert near.forward_m_s == pytest.approx(1.5)  # Covers it in two periods.
     assert far.forward_m_s == pytest.approx(S.max_speed_m_s)
 
 

@@ -1,4 +1,4 @@
-"""`airl-companion --check`: what is wrong on the ground is found there."""
+"""`airl-companion --check`: detection of faults on the ground."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Textures from files: where they lie, what they look like beside Mitsuba, what is refused."""
+"""Textures from files: placement, comparison with Mitsuba, and rejected files."""
 
 from __future__ import annotations
 
@@ -93,10 +93,10 @@ def named(path: Path) -> ImageFile:
 
 
 def test_the_floor_shows_the_picture_where_it_lies(arena: Arena) -> None:
-    """From above, every pixel's place on the floor in the picture, worked out by itself."""
+    """Independently computed picture position of every floor pixel, seen from above."""
     camera = Intrinsics.from_fov(64, 64, 1.2)
     down = quat_from_euler(0.0, -np.pi / 2, 0.0)
-    place, checked = np.array([12.0, 0.0, -2.4]), 0  # beyond the shadow of the south wall
+    place, checked = np.array([12.0, 0.0, -2.4]), 0  # Beyond the shadow of the south wall.
     seen = render_picture(arena, arena.centers_at(0), camera, place, down)
     v, u = np.mgrid[:64, :64]
     # Looking down, north at the top: right is east, the image's down is south.
@@ -132,7 +132,7 @@ def test_images_are_those_of_mitsuba(arena: Arena) -> None:
 
 
 def test_levels_are_means_of_light(tmp_path: Path) -> None:
-    """Of the picture itself, block by block: in linear light, not of its numbers."""
+    """Texels are block means of the picture in linear light, not of pixel values."""
     rng = np.random.default_rng(4)
     pixels = rng.integers(0, 256, (512, 512, 3)).astype(np.uint8)
     file = named(written(tmp_path, pixels))
@@ -185,7 +185,7 @@ def test_arenas_side_by_side_have_the_same_images(arena: Arena, tmp_path: Path) 
         looks.put(1, generate(spec, 1, name="other", vehicle_width_m=0.55))
 
 
-# --- what is refused
+# --- rejected files
 
 
 def test_one_that_is_gone_or_has_changed_is_told_in_one_line(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""How colour images are formed, beside closed forms: blur, metering, noise, mosaic, JPEG."""
+"""Colour image formation against closed forms: blur, metering, noise, mosaic, JPEG."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def line_of(image: NDArray[np.uint8]) -> NDArray[np.float32]:
     return LIGHT_OF[image[24, :, 0]]
 
 
-# --- nothing of it
+# --- all effects off
 
 
 @pytest.mark.parametrize("kind", ["rgb", "grey"])
@@ -135,7 +135,7 @@ def test_a_vehicle_that_moves_sideways_draws_the_edge_out(samples: int, speed: f
     light = line_of(image)
     share = (light - light[0]) / (light[-1] - light[0])
     wanted = ramp(FOCAL * speed * 0.04 / 5.0)
-    # One of so many short exposures more or less; a number is rounded to 1/100 of this light.
+    # Half a short exposure more or less. Pixel values are rounded to 1/100 of this light.
     assert np.abs(share - wanted).max() <= 0.5 / samples + 0.01
 
 
@@ -165,10 +165,10 @@ def test_what_moves_is_drawn_out_before_a_camera_at_rest(speed: float) -> None:
 # --- rolling shutter
 
 ROWS = np.arange(9, 35)
-"""Those in which the sheet is seen."""
+"""Image rows that show the sheet."""
 
 LATER_S = 0.05 * ((ROWS + 0.5) / 49.0 - 0.5)
-"""When each is exposed, after the stamp, in a readout of 50 ms."""
+"""Exposure time of each row after the stamp [s], in a readout of 50 ms."""
 
 
 def begins(image: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -187,7 +187,7 @@ def rolled(scene: Arena, motion: Motion, *, at_us: int = 0, **asked: Any) -> NDA
 @pytest.mark.parametrize("bands", [1, 4, 480])
 @pytest.mark.parametrize("speed", [-30.0, 30.0])
 def test_an_edge_leans_where_the_vehicle_moves_sideways(speed: float, bands: int) -> None:
-    """By f v / z pixels a second; a band's rows are off by half its time at most."""
+    """The edge moves f v / z pixels a second; rows are off by at most half a band's time."""
     found = begins(rolled(edge(), moving((0.0, speed, 0.0)), readout_bands=bands))
     passes = -FOCAL * speed / 5.0
     off = abs(passes) * 0.05 / (2.0 * bands) if bands < 49 else 0.0
@@ -238,7 +238,7 @@ def test_a_rolling_shutter_at_rest_changes_no_bit_and_a_global_one_is_not_writte
 
 @pytest.mark.parametrize("gain", [0.25, 2.0])
 def test_a_gain_is_as_much_light(gain: float) -> None:
-    """As if sun and sky were so many times as bright."""
+    """A gain equals sun and sky that are brighter by the same factor."""
     image, _ = ImageFormation(camera(gain=gain)).take(edge(irradiance=0.4), 0, AT_REST, 0, 0)
     brighter, _ = ImageFormation(camera()).take(edge(irradiance=0.4 * gain), 0, AT_REST, 0, 0)
     assert np.abs(image.astype(int) - brighter.astype(int)).max() <= 1
@@ -276,7 +276,7 @@ def test_the_gain_follows_with_its_time_constant() -> None:
     passed_s = np.arange(1, 25) / 20.0
     wanted = before * 0.5 ** (1.0 - np.exp(-passed_s / 0.4))
     np.testing.assert_allclose(gains, wanted, rtol=0.02)
-    # Frames that nobody takes pass, too; a new episode begins settled.
+    # The time of skipped frames counts, too. A new episode begins settled.
     forming.restart()
     forming.take(edge(irradiance=0.3), 0, AT_REST, 0, 0)
     forming.take(edge(irradiance=0.6), 0, AT_REST, 0, 24)
@@ -343,7 +343,7 @@ def test_noise_is_that_of_seed_and_frame() -> None:
 
 
 def test_interpolated_colours_are_means_of_the_nearest_pixels_that_measure_them() -> None:
-    """Each pixel by itself, in loops."""
+    """Reference: every pixel computed separately, in loops."""
     rng = np.random.default_rng(5)
     raw = rng.random((7, 10)).astype(np.float32)
     colour = np.array([[(0, 1), (1, 2)][v % 2][u % 2] for v in range(7) for u in range(10)])
@@ -417,7 +417,7 @@ def test_a_jpeg_that_is_none_or_another_is_no_frame() -> None:
             Frame.from_bytes(damaged)
 
 
-# --- what is refused
+# --- rejected settings
 
 
 @pytest.mark.parametrize(

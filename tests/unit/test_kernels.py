@@ -121,7 +121,7 @@ def parts_of(hint: Any) -> set[Any]:
 
 
 def test_no_kernel_that_borrows_arrays_returns_one() -> None:
-    """Its caller would let go of an array that nobody has counted it as a holder of."""
+    """The caller would release an array whose references are not counted."""
     assert np.ndarray in parts_of(tuple[int, Work])
     borrowing = {
         each

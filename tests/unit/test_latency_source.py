@@ -90,7 +90,7 @@ def test_a_source_and_a_workload_are_one_too_many() -> None:
 
 
 def test_replay_keeps_histogram_and_autocorrelation() -> None:
-    """An AR(1) trace of 0.9: what is drawn over many episodes has its moments, and its memory."""
+    """Draws over many episodes keep moments and autocorrelation of an AR(1) trace of 0.9."""
     rng = np.random.default_rng(5)
     noise = rng.standard_normal(4000)
     level = np.zeros(4000)

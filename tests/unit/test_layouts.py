@@ -101,7 +101,7 @@ def test_the_paper_sees_white_where_nothing_is(depth_m: float | None) -> None:
         (0.039, 0),  # 255 * 0.039 / 20 = 0.497
         (0.040, 1),  # 0.51
         (5.0, 64),  # 63.75
-        (10.0, 128),  # 127.5, rounded to even
+        (10.0, 128),  # 127.5, rounded to even.
         (15.0, 191),  # 191.25
         (19.99, 255),  # 254.87
         (20.0, 255),
@@ -196,7 +196,7 @@ def test_vectors_against_scipy(
     turned = Rotation.from_quat(q, scalar_first=True)
     nose = turned.apply([1.0, 0.0, 0.0])
     if math.hypot(nose[0], nose[1]) < 1e-3:
-        return  # straight up or down: there is no heading
+        return  # Straight up or down: there is no heading.
     level = Rotation.from_euler("z", math.atan2(nose[1], nose[0]))
     state = Kinematics(np.array([position]), np.array([velocity]), q[None])
     image = np.zeros((1, 24, 32), np.uint16)
@@ -211,7 +211,7 @@ def test_vectors_against_scipy(
         assert body["goal"][0, :2] == pytest.approx(ahead[:2], abs=1e-4)
     assert body["goal"][0, 2] == pytest.approx(distance / 20.0, abs=1e-5)
 
-    # World frame: what was put in comes out, whatever the attitude.
+    # World frame: values are passed through unchanged at any attitude.
     paper = encode_layout(spec("paper", 34), looked)
     assert paper["velocity"][0] == pytest.approx(velocity, abs=1e-3)
     assert paper["goal"][0] == pytest.approx([away[0], away[1], distance], abs=1e-3)
@@ -268,7 +268,7 @@ def test_the_goal_to_the_right_has_a_positive_sine() -> None:
         (179.99, (253, 255)),
         (180.0, (253, 255)),
         (-179.99, (0, 2)),
-        (-178.0, (0, 2)),  # column 1.4
+        (-178.0, (0, 2)),  # Column 1.4.
         (-177.0, (1, 3)),  # 2.1
     ],
 )
@@ -434,7 +434,7 @@ def test_the_compiled_images_are_those_of_numpy(rows: int, columns: int) -> None
 
 @pytest.mark.parametrize("range_m", [3.0, 5.0, 10.0, 12.5, 18.0, 20.0, 30.0, 65.0])
 def test_the_compiled_images_in_proportion_are_those_of_the_table(range_m: float) -> None:
-    """Of every depth that there is, at ranges that single precision serves and one (18 m) not."""
+    """Every depth value, at ranges supported by single precision and at 18 m, which is not."""
     depth = np.arange(1 << 16, dtype=np.uint16).reshape(1, 256, 256)
     layout = spec(height=256, width=256, range_m=range_m)
     found = encode_layout(layout, seen(depth), encoding.COMPILED)["depth"]

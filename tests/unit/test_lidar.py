@@ -1,4 +1,4 @@
-"""A planar lidar: a cylinder of one row, how it measures, and who is told of its ranges."""
+"""Planar lidar: single-row cylindrical camera, measurements, and receivers of its ranges."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_ranges_are_those_to_the_walls_of_a_square_room() -> None:
     bearing = np.radians(np.arange(360) - 179.5)
     wanted = 5000.0 / np.maximum(np.abs(np.cos(bearing)), np.abs(np.sin(bearing)))
     assert np.abs(ranges(room(5.0)) - wanted).max() <= 0.6
-    # What is farther than it measures gives no return.
+    # Surfaces beyond the maximum range give no return.
     far = ranges(room(11.0))
     np.testing.assert_array_equal(far == 0, wanted * 11.0 / 5.0 > 12_000.0)
 

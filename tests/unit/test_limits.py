@@ -1,7 +1,7 @@
-"""Which lies of flight controller and camera end a flight, how soon, and that nothing else does.
+"""Detection of false flight controller and camera data, its delay, and no false alarms.
 
-The honest flight is a closed form: a circle with a gentle climb, seen by a camera over level
-ground. Every lie changes one thing that is told of it, from a moment on.
+The correct flight is a closed form: a circle with a gentle climb, seen by a camera over level
+ground. Every falsification changes a single reported value from a given time.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ PERIODS_S = (0.1, 0.5, 1.5)
 
 @dataclass(frozen=True)
 class Told:
-    """What the companion is told at a time."""
+    """Data received by the companion at a time."""
 
     state: Kinematics
     frame: Frame
@@ -64,7 +64,7 @@ class Told:
 
 
 def honest(t_s: float) -> Told:
-    """A circle flown to the left at 4 m/s, and what a camera sees over level ground."""
+    """Return correct data: a circle to the right at 4 m/s, and images over level ground."""
     angle = SPEED_M_S / RADIUS_M * t_s
     position = np.array(
         [RADIUS_M * math.sin(angle), RADIUS_M * (1.0 - math.cos(angle)), -HEIGHT_M - 0.01 * t_s]
@@ -78,7 +78,7 @@ def honest(t_s: float) -> Told:
 
 
 Lie = Callable[[Told, Told, float], Told]
-"""From what is true, what was true when the lie began, and since when [s], to what is told."""
+"""Map from correct data, correct data at onset and time since onset [s] to received data."""
 
 
 def of_state(name: str, change: Callable[[np.ndarray, np.ndarray, float], np.ndarray]) -> Lie:

@@ -1,4 +1,4 @@
-"""What a vehicle carries: mass, centre of mass and inertia against point masses summed by numpy."""
+"""Vehicle payload: mass, centre of mass and inertia against point masses summed by numpy."""
 
 from __future__ import annotations
 
@@ -71,9 +71,9 @@ def test_what_the_rotors_do_not_carry_is_refused_with_the_numbers() -> None:
 @pytest.mark.parametrize(
     ("payload", "field"),
     [
-        (Payload(mass_g=300.0, forward_m=0.9), "payload.forward_m"),  # outside the rotors
+        (Payload(mass_g=300.0, forward_m=0.9), "payload.forward_m"),  # Outside the rotors.
         (Payload(mass_g=300.0, right_m=-0.9), "payload.right_m"),
-        (Payload(mass_g=500.0, forward_m=0.25), "payload.forward_m"),  # too much for the front
+        (Payload(mass_g=500.0, forward_m=0.25), "payload.forward_m"),  # Too much for the front.
     ],
 )
 def test_what_two_rotors_would_have_to_carry_alone_is_refused(payload: Payload, field: str) -> None:

@@ -1,4 +1,4 @@
-"""A log that cannot be written any more ends with its last whole record, and says so once."""
+"""Log files on a full disk: they end with the last whole record and report this once."""
 
 from __future__ import annotations
 

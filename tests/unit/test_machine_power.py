@@ -58,7 +58,7 @@ def metered(root: Path) -> tuple[PowerMeter, SimClock, str]:
 
 
 def powered(root: Path, files: dict[str, str], seconds: float = 2.0) -> tuple[float, str]:
-    """Return the mean power of a machine whose files stand still, and its source."""
+    """Return the mean power of a machine with constant files, and its source."""
     meter, clock, name = metered(write(root, files))
     clock.advance(round(seconds * 1e6))
     watts = meter.sample()
@@ -137,7 +137,7 @@ def test_rapl_adds_package_and_memory_over_an_overflow(tmp_path: Path) -> None:
     clock.advance(2_000_000)
     assert meter.sample() == pytest.approx((25.0 + 3.0) / 2.0)
     assert meter.mean_w == pytest.approx((1e-6 * (RANGE_UJ - 2_000_000) + 28.0) / 3.0)
-    assert meter.sample() is None  # no time has passed
+    assert meter.sample() is None  # No time has passed.
 
 
 def test_the_whole_platform_counts_before_its_parts(tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_counters_that_cannot_be_read_are_named(tmp_path: Path) -> None:
 def test_power_that_changes_is_averaged_over_time(tmp_path: Path) -> None:
     meter, clock, _ = metered(write(tmp_path, BATTERY))
     now = tmp_path / SUPPLY / "BAT0/power_now"
-    for second in range(1, 11):  # 9.5 W rising by 1 W a second: 14.5 W on average
+    for second in range(1, 11):  # 9.5 W rising by 1 W a second: 14.5 W on average.
         now.write_text(f"{9_500_000 + 1_000_000 * second}")
         clock.advance(1_000_000)
         assert meter.sample() == pytest.approx(9.0 + second)

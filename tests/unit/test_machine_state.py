@@ -25,7 +25,7 @@ CPU = "sys/devices/system/cpu"
 def sensors(
     monkeypatch: pytest.MonkeyPatch, mhz: list[tuple[float, float]], celsius: dict[str, list[float]]
 ) -> None:
-    """Let psutil tell what it tells on another machine."""
+    """Make psutil report the readings of another machine."""
     cores = [SimpleNamespace(current=now, max=limit) for now, limit in mhz]
     found = {name: [SimpleNamespace(current=c) for c in each] for name, each in celsius.items()}
     monkeypatch.setattr(psutil, "cpu_freq", lambda percpu: cores)

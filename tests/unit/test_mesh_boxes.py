@@ -41,7 +41,7 @@ def limits(made: MeshBoxes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def held(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return whether each point (m, 3) is in one of the boxes."""
+    """Return True for each point (m, 3) in any box."""
     # Parts are written to a tenth of a millimetre.
     inside = (points[:, None] >= low - 1e-4) & (points[:, None] <= high + 1e-4)
     found: np.ndarray = np.any(np.asarray(np.all(inside, axis=2)), axis=1)
@@ -95,7 +95,7 @@ MESHES: dict[str, tuple[trimesh.Trimesh, Inside]] = {
     "pipe": (pipe(), in_pipe),
     "bracket": (bracket(), in_bracket),
 }
-"""Each with what is inside of it, in closed form."""
+"""Meshes, each with its interior in closed form."""
 
 
 @pytest.mark.parametrize("name", MESHES)
@@ -115,7 +115,7 @@ def test_boxes_cover_the_mesh_and_reach_no_further_than_is_told(
     place, mirror = np.array([*bounds.mean(axis=0)[:2], bounds[0, 2]]), np.array([1.0, -1.0, 1.0])
     points = np.asarray(trimesh.sample.sample_surface(own, SAMPLES, seed=1)[0])
     assert held((points - place) * mirror, low, high).all()
-    # Every corner of a box is near the surface, or inside of what is closed.
+    # Every corner of a box is near the surface, or inside the closed mesh.
     masks = product((True, False), repeat=3)
     corners = np.concatenate([np.where(mask, low, high) for mask in masks]) * mirror + place
     away_m = np.asarray(cKDTree(points).query(corners)[0])
@@ -157,7 +157,7 @@ def test_joined_boxes_are_exactly_the_cells(bits: int) -> None:
     filled = np.zeros((3, 3, 3), np.int64)
     for low, high in boxes:
         filled[tuple(map(slice, low, high))] += 1
-    assert np.array_equal(filled, cells)  # none twice
+    assert np.array_equal(filled, cells)  # None twice.
     if boxes:
         assert joined(cells, len(boxes) - 1) is None
 
@@ -190,7 +190,7 @@ def test_cameras_see_the_mesh_in_the_place_of_its_boxes(
     for each in arenas[0].meshes:
         assert each.first == ends
         ends += each.count
-        # Every corner is in one of the boxes that stand for the mesh.
+        # Every corner is in a box that represents the mesh.
         places, _ = standing(each)
         own = slice(each.first, ends)
         cos, sin = np.cos(o.yaw[own]), np.sin(o.yaw[own])
@@ -212,10 +212,10 @@ def test_a_mesh_that_has_changed_or_gone_is_told_in_one_line(tmp_path: Path) -> 
     for name in ("brackets.toml", "brackets.npz"):
         (moved / name).write_bytes((tmp_path / name).read_bytes())
     other = load_profile("arenas", str(moved / "brackets.toml"), ArenaSpec)
-    # What an arena is does not depend on where it lies.
+    # The digest of an arena is independent of its folder.
     assert profile_digest(other) == profile_digest(spec)
     assert other.assets["bracket"].mesh != spec.assets["bracket"].mesh
-    # Nor on meshes, where there are none.
+    # An asset without a mesh has no such field.
     assert "mesh" not in asset(path, out, "--seen", "boxes").model_dump_json()
     data = bytearray((moved / "brackets.npz").read_bytes())
     data[200] ^= 1

@@ -101,7 +101,7 @@ def pose_in(rng: np.random.Generator, arena: Arena) -> tuple[Floats, Floats]:
 # --- depth
 
 
-@pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
+@pytest.mark.timeout(600)  # Compiles kernels, on a busy machine for minutes.
 @pytest.mark.parametrize("projection", AT_NIGHT_THE_FISHEYE)
 def test_depth_is_that_of_rays_in_float64(projection: Projection, tmp_path: Path) -> None:
     file = kept(triangles(ring()), tmp_path / "ring.npz")
@@ -157,7 +157,7 @@ def test_no_ray_passes_between_triangles(tmp_path: Path) -> None:
 
 
 @pytest.mark.nightly
-@pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
+@pytest.mark.timeout(600)  # Compiles kernels, on a busy machine for minutes.
 @pytest.mark.parametrize("projection", PROJECTIONS)
 def test_a_mesh_of_a_box_is_the_box(projection: Projection, tmp_path: Path) -> None:
     half = np.array([0.6, 0.9, 0.75])
@@ -198,7 +198,7 @@ def test_a_mesh_of_a_box_is_the_box(projection: Projection, tmp_path: Path) -> N
 @pytest.mark.parametrize("projection", ["pinhole", "fisheye"])
 def test_shadows_are_those_of_rays_in_float64(projection: Projection, tmp_path: Path) -> None:
     file = kept(triangles(ring()), tmp_path / "ring.npz")
-    # White surfaces under a sun alone: what is dark is in shadow or turned away.
+    # White surfaces under a sun alone: dark pixels are in shadow or face away.
     # A black floor throws no light onto the meshes.
     plain = {"brightness": [1, 1], "tint": 0.0}
     looks = [
@@ -235,15 +235,15 @@ def test_shadows_are_those_of_rays_in_float64(projection: Projection, tmp_path: 
         dark = render_picture(black, arena.obstacles.center, k, position, attitude).rgb
         mesh_lit = dark.reshape(-1, 3).max(axis=1) > 40
         on_mesh, on_floor = seen >= OBSTACLE, seen == 1
-        # The wall's own shadow falls on the floor as well: that of the room without meshes.
+        # The wall's shadow falls on the floor as well, as in the room without meshes.
         bare = without_meshes(arena)
         room = render_picture(bare, bare.obstacles.center, k, position, attitude).rgb
         by_wall = room.reshape(-1, 3).max(axis=1) <= 40
         wrong = on_floor & (lit != ~(hidden | by_wall))
         # Where a ray passes an edge, rounding decides.
         assert np.count_nonzero(wrong) <= 3
-        # What is lit of a mesh is not hidden. What is dark and not hidden faces away: the next
-        # test looks at that.
+        # Lit pixels of a mesh are not hidden. Pixels that are dark and not hidden face away: the
+        # next test checks them.
         assert np.count_nonzero(on_mesh & mesh_lit & hidden) <= 3
         assert np.count_nonzero(on_mesh & mesh_lit) > 30
         own += int(np.count_nonzero(on_mesh & ~mesh_lit & hidden))
@@ -291,9 +291,9 @@ def test_a_ball_is_as_bright_as_the_cosine_law_says(tmp_path: Path) -> None:
 def test_the_tree_holds_every_triangle_once_and_nodes_hold_what_is_below() -> None:
     rng = np.random.default_rng(2)
     middle = rng.normal(0.0, 2.0, (700, 1, 3))
-    middle[:100] = middle[0]  # many in one place
+    middle[:100] = middle[0]  # Many in one place.
     corners = (middle + rng.normal(0.0, 0.1, (700, 3, 3))).astype(np.float32)
-    corners[3] = corners[3, 0]  # without an area
+    corners[3] = corners[3, 0]  # Without an area.
     held = Triangles(corners.reshape(-1, 3), np.arange(2100, dtype=np.int32).reshape(-1, 3))
     tree = build_bvh(held)
     expected = np.delete(corners, 3, axis=0).reshape(-1, 9)

@@ -70,7 +70,7 @@ def arena(name: str, seed: int, **appearance: Any) -> Arena:
 
 
 def edges(seen: NDArray[np.int32], width: int = 1) -> NDArray[np.bool_]:
-    """Pixels beside an edge of what is seen: theirs are means over a pixel."""
+    """Return pixels beside an edge of the segmentation: Mitsuba averages over a pixel."""
     found = np.zeros(seen.shape, bool)
     for axis in (0, 1):
         step = np.diff(seen, axis=axis) != 0
@@ -88,9 +88,9 @@ def difference(
     rays: int = 1,
     camera: Intrinsics = CAMERA,
 ) -> tuple[float, float]:
-    """Mean absolute difference away from edges, in shares of full scale, and that of all of it.
+    """Return the mean absolute difference away from edges and overall, in shares of full scale.
 
-    `rays`: ours a pixel, each way.
+    `rays`: rays per pixel along each axis, of this project's renderer.
     """
     attitude = quat_from_euler(0.03, -0.08, yaw)
     centers = scene.centers_at(0)
@@ -145,7 +145,7 @@ def test_textures_lie_where_they_do_in_the_reference() -> None:
 
 
 def test_a_blue_sky_is_theirs() -> None:
-    """Radiance from horizon to zenith, and what it makes of plain surfaces."""
+    """Radiance from horizon to zenith, and the resulting light on plain surfaces."""
     inner, _ = difference(arena("static-obstacles", 7, **PLAIN), (0.0, 0.0, -2.5), 0.2)
     assert inner < 0.03
 
@@ -162,7 +162,7 @@ INDOORS = [
 def test_rooms_below_a_ceiling_are_within_three_percent(
     seed: int, position: tuple[float, float, float], yaw: float
 ) -> None:
-    """The same ceiling lights both; one of them follows its light from wall to wall."""
+    """The same ceiling lights both; only Mitsuba follows its light from wall to wall."""
     scene = generate(
         load_profile("arenas", "rooms", ArenaSpec), seed, name="rooms", vehicle_width_m=0.55
     )
@@ -244,7 +244,7 @@ ALL_ROUND = [
     "camera", [*(pytest.param(each, marks=pytest.mark.nightly) for each in FISHEYES), *ALL_ROUND]
 )
 def test_cylinders_and_fisheyes_are_within_three_percent(camera: Intrinsics) -> None:
-    """Resampled from the faces of a cube: what is not where it is would differ by shadows."""
+    """Resampled from the faces of a cube: misplaced pixels would differ by shadows."""
     scene = arena("dense-obstacles", 3, **LIGHT, **PLAIN)
     inner, whole = difference(scene, (20.0, 5.0, -3.0), 2.2, camera=camera, rays=4)
     assert inner < 0.03
@@ -273,7 +273,7 @@ def test_a_face_of_the_cube_is_what_a_pinhole_sees() -> None:
     rows = quat_to_matrix(attitude).T
     images = []
     for face in cube.faces:
-        # A face as a pinhole of its own, turned there and cut out.
+        # Each face as a separate pinhole, rotated and cropped.
         turn = Rotation.from_matrix((face.axes @ rows).T).as_quat()
         own = Intrinsics.from_fov(face.pixels, face.pixels, 0.5 * math.pi)
         shown = path_traced(scene, centers, own, place, np.roll(turn, 1), samples=4)
@@ -304,10 +304,10 @@ def test_the_same_seed_draws_the_same_bent_image() -> None:
 
 
 @pytest.mark.nightly
-@pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
+@pytest.mark.timeout(600)  # Compiles kernels, on a busy machine for minutes.
 @pytest.mark.parametrize("material", [pytest.param("earth", marks=pytest.mark.nightly), "grass"])
 def test_hills_are_theirs(material: str) -> None:
-    """Triangles above the floor in its material, whose pattern goes on over them."""
+    """Triangles above the floor in its material, with a continuous pattern."""
     scene = arena("hills", 3, **{**LIGHT, **PLAIN, "floor": {"materials": [material]}})
     inner, _ = difference(scene, (-2.0, 0.0, -4.0), 0.2, rays=4)
     assert inner < 0.03

@@ -1,4 +1,4 @@
-"""The page of a policy: what its card says, in the form that model hubs read."""
+"""Model page of a policy: the contents of its card in the format of model hubs."""
 
 from __future__ import annotations
 

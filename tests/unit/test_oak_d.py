@@ -116,7 +116,7 @@ def test_images_that_were_lost_are_counted_and_the_policy_gets_the_size_of_its_c
     opened: Opener,
 ) -> None:
     thin = np.full((400, 640), 9000, np.uint16)
-    thin[::2] = 0  # holes of the matcher
+    thin[::2] = 0  # Holes of the matcher.
     thin[200, 320] = 1500
     camera, matcher = opened(frame(thin, 3))
     wanted = Intrinsics.of(load_vehicle("quad-oak-d").camera)

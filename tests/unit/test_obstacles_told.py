@@ -1,4 +1,4 @@
-"""OBSTACLE_DISTANCE from depth images: against closed forms, and what becomes of it in MAVLink."""
+"""OBSTACLE_DISTANCE from depth images, against closed forms and in MAVLink."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_the_flight_controller_s_map_has_it_there() -> None:
 
 
 class Link:
-    """What is sent, and an attitude."""
+    """Link that records sent messages and reports an attitude."""
 
     def __init__(self) -> None:
         self.sent: list[Mapping[str, Any]] = []
@@ -97,7 +97,7 @@ class Link:
 
 
 class Frames:
-    """A camera whose image is as old as it is asked to be."""
+    """Camera with an image of a given reception time."""
 
     def __init__(self, received_us: int) -> None:
         depth: NDArray[np.uint16] = np.full((192, 256), 3000, np.uint16)

@@ -142,7 +142,7 @@ def test_reading_a_file_that_names_code_runs_none(package: Path) -> None:
 
 
 def test_a_card_names_no_code(package: Path) -> None:
-    """A folder that was sent by somebody: reading and flying it imports nothing."""
+    """Reading and flying a received policy folder imports nothing."""
     (package / "policy.py").write_text("raise SystemExit('run')\n")
     folder = package.parent / "sent"
     shutil.copytree(profiles_dir() / "policies/no-obstacles", folder)
@@ -153,7 +153,7 @@ def test_a_card_names_no_code(package: Path) -> None:
         (folder / "card.json").write_text(json.dumps(evil))
         with pytest.raises(UsageError, match=rf"{table}\.{field} = 'their_parts.policy:Evil'"):
             find_policy(str(folder))
-    # What trained it is a note: nobody loads it.
+    # The training configuration is only recorded, never loaded.
     plain["training"]["config"]["environment"]["reward"] = "their_parts.policy:Evil"
     (folder / "card.json").write_text(json.dumps(plain))
     load_policy(str(folder), 0.5)

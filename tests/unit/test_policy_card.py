@@ -1,4 +1,4 @@
-"""The policy card: it belongs to one file, and says what that file takes and gives."""
+"""Policy card: belongs to a single file and describes its inputs and outputs."""
 
 from __future__ import annotations
 
@@ -327,7 +327,7 @@ def test_cameras_that_do_not_fit(folder: Path, changes: dict[str, Any], words: l
 
 
 def test_facts_and_card_share_their_fields() -> None:
-    """The card adds what the file tells, and nothing that its maker says is lost."""
+    """The card adds the facts read from the file and keeps all facts of its author."""
     extra = set(PolicyCard.model_fields) - set(type(facts()).model_fields)
     assert extra == {
         *("sha256", "torch_sha256", "state", "network", "parameters", "macs", "quantisation")

@@ -1,4 +1,4 @@
-"""A learned policy in flight: one rule for training and rehearsal, and what it refuses."""
+"""Learned policy in flight: one rule for training and rehearsal, and rejected input."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def scene(seed: int = 1, lens: Intrinsics = LENS) -> Observation:
 
 
 class Answers:
-    """A network that gives what it is told, and remembers what it was shown."""
+    """Network that returns given outputs and records its inputs."""
 
     def __init__(self, outputs: Any) -> None:
         self.outputs = np.asarray(outputs, np.float32)
@@ -362,7 +362,7 @@ def test_sitl_flies_as_the_card_says_unless_told_otherwise(exported: Path) -> No
     assert (pilot.hold_s, pilot.altitude_m, pilot.goal_radius_m) == (0.4, 2.0, 2.5)
     policy = resolved.setup.policy
     assert (policy.name, policy.description) == ("discrete", "random weights")
-    # The companion goes closer than the referee asks for.
+    # The companion flies closer to the goal than the referee requires.
     assert resolved.companion_pilot == replace(pilot, goal_radius_m=2.0)
     pilot = resolve(Scenario(policy=path, hold_s=0.7, goal_radius_m=4.0)).pilot
     assert (pilot.hold_s, pilot.altitude_m, pilot.goal_radius_m) == (0.7, 2.0, 4.0)
@@ -401,13 +401,13 @@ def test_what_was_measured_for_this_policy_is_injected(exported: Path, tmp_path:
     guess = resolve(Scenario(policy=path, computer="ras-pi-4", workload="estimate"))
     assert guess.injection.origin == "estimated"
 
-    # By itself the companion runs on that very computer, but in lockstep no computer counts.
+    # Stand-alone, the companion runs on that very computer. In lockstep no computer counts.
     asked, policy = StandAloneCompanion(policy=path, computer=str(computer)), resolved.policy
     assert select_latency(asked, policy, on_this_computer=True).origin == "measured"
     assert select_latency(asked, policy, on_this_computer=False) == resolved.injection
 
 
-# --- refused before anything flies
+# --- rejected before a flight
 
 
 @pytest.fixture
@@ -501,7 +501,7 @@ def test_the_companion_looks_at_its_camera_before_take_off(exported: Path) -> No
     with pytest.raises(UsageError, match="--policy discrete: camera with a horizontal field"):
         check_camera(policy, Camera(wide, 3), stop)
     check_camera(load_policy("greedy", 0.5), Camera(wide), stop)
-    # No frame: what to do about that is the pilot's business, not the card's.
+    # A missing frame is handled by the pilot, not by the card check.
     check_camera(policy, Camera(wide, 1000), stop)
     stop.set()
     waits = Camera(wide, 1000)

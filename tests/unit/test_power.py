@@ -108,8 +108,8 @@ def test_induced_velocity_solves_glauerts_equation(ideal: float, u: float, climb
         ((8.0, 0.0, 0.0), ZERO, -12.0),
         ((8.0, -3.0, 1.0), (2.0, 1.0, -0.5), -15.0),
         ((0.0, 0.0, -3.0), ZERO, 0.0),
-        ((0.0, 0.0, 3.0), ZERO, 0.0),  # a descent takes what the hover takes
-        ((5.0, 0.0, 0.0), ZERO, 20.0),  # braking: the air comes from below
+        ((0.0, 0.0, 3.0), ZERO, 0.0),  # A descent takes what the hover takes.
+        ((5.0, 0.0, 0.0), ZERO, 20.0),  # Braking: the air comes from below.
     ],
 )
 def test_power_in_flight_is_the_formula_with_scipys_root(
@@ -139,7 +139,7 @@ def test_level_flight_saves_first_and_costs_then() -> None:
 
 
 def test_drag_is_paid_for_by_the_thrust_against_it() -> None:
-    """Level at 12 m/s with 0.05 N/(m/s)²: the thrust leans as far as the drag asks."""
+    """Level at 12 m/s with 0.05 N/(m/s)²: the tilt of the thrust balances the drag."""
     fast = AIRFRAME._replace(drag_linear=0.0, drag_quadratic=0.05)
     drag, weight, speed = 0.05 * 12.0**2, 1.5 * G, 12.0
     lean = math.atan2(drag, weight)
@@ -149,7 +149,7 @@ def test_drag_is_paid_for_by_the_thrust_against_it() -> None:
     )
     assert level_power_w(speed, fast, MODEL) == pytest.approx(flown, rel=1e-9)
     without = level_power_w(speed, fast._replace(drag_quadratic=0.0), MODEL)
-    # The parasite power over the drive's efficiency, and what the greater thrust takes besides.
+    # Parasite power over drive efficiency, plus additional power for the higher thrust.
     assert 1.0 < (flown - without) / (drag * speed / 0.68) < 1.4
 
 
@@ -181,7 +181,7 @@ def test_rotors_that_stand_still_take_nothing(thrust: float, vx: float, vz: floa
         ((0.0, 0.0, -2.0), ZERO, ZERO, 0.0, 470.15),
         ((0.0, 0.0, 2.0), (0.0, 0.0, -1.0), ZERO, 0.0, 564.593),  # 36.25 + 96.613 - 2.17
         ((3.0, 4.0, 0.0), ZERO, (1.0, -2.0, 0.0), 0.0, 419.61),  # v.w = 3 - 8 = -5
-        ((100.0, 0.0, 0.0), ZERO, (-50.0, 0.0, 0.0), 0.0, 0.0),  # never negative
+        ((100.0, 0.0, 0.0), ZERO, (-50.0, 0.0, 0.0), 0.0, 0.0),  # Never negative.
     ],
 )
 def test_regression_by_hand(v: Vec, a: Vec, wind: Vec, payload_kg: float, watts: float) -> None:

@@ -1,4 +1,4 @@
-"""What is carried forward: motion against an ODE solver, images against the renderer."""
+"""Forward prediction: motion against an ODE solver, images against the renderer."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def starts(rng: np.random.Generator) -> np.ndarray:
 
 
 def test_motion_is_that_of_the_equations() -> None:
-    """Exactly so once the turn is there, whatever was flown before."""
+    """Exact once the turn is established, after any previous motion."""
     rng = np.random.default_rng(1)
     rows, seconds = starts(rng), rng.uniform(0.0, 1.5, len(COMMANDS))
     flown = flat(flown_on(motion_of(rows), COMMANDS, RESPONSE, seconds))
@@ -141,7 +141,7 @@ def sight(
     pitch: float = 0.0,
     lens: Intrinsics = LENS,
 ) -> Sight:
-    """Return what a level camera, or one that looks down a little, sees 2.5 m above the ground."""
+    """Return the view of a level or slightly lowered camera 2.5 m above the ground."""
     position = np.array([north, east, -2.5])
     quaternion = quat_from_euler(0.0, pitch, heading)
     centers = arena.centers_at(0)
@@ -162,9 +162,9 @@ def test_from_where_it_was_taken_an_image_is_as_it_is() -> None:
 
 
 def shown_by(seen: Sight, pose: CameraPose) -> np.ndarray:
-    """Return the pixels of a view that an image shows: those that its depths make a difference to.
+    """Return the pixels of a view that depend on the depths of an image.
 
-    Two walls of the image's own frame, near and far, tell.
+    Compares two walls in the image's frame, near and far.
     """
     views = []
     for depth_mm in (1000, 9000):
@@ -184,11 +184,11 @@ def nearest_in_blocks(depth_mm: np.ndarray) -> np.ndarray:
 
 
 def test_carried_forward_it_is_what_the_camera_sees_there() -> None:
-    """A decision's way on: 1.2 m ahead, turned by 20 degrees, the nose lowered.
+    """One decision later: 1.2 m ahead, turned by 20 degrees, the nose lowered.
 
-    Of all within half the camera's range, of which half a pixel is not much; what comes into view
-    at the side the image before had seen. What has come nearer has holes, but never is anything
-    nearer than it is.
+    Covers depths within half the camera's range, where half a pixel is not much. The previous
+    image shows the area that enters the view at the side. Approached surfaces have holes, but
+    depths are not too small.
     """
     agree, without, blocks, nearer = [], [], [], []
     for seed in range(8):
@@ -240,7 +240,7 @@ def test_the_newest_image_decides_and_older_ones_fill_what_it_did_not_see() -> N
     assert np.array_equal(both[seen], alone[seen])
     assert np.array_equal(both[~seen], other[~seen])
     assert 0.2 < seen.mean() < 0.8
-    # What is nearer in an older image does not stand before the newest.
+    # Nearer depths of an older image do not occlude the newest.
     stale = Sight(np.full_like(newest.depth_mm, 500), newest.pose)
     assert np.array_equal(REPROJECTOR.image([newest, stale], newest.pose), newest.depth_mm)
 
@@ -253,7 +253,7 @@ def test_all_round_an_image_is_as_it_is_from_where_it_was_taken() -> None:
 
 @pytest.mark.parametrize("columns", [1, 40, 64, 127])
 def test_all_round_a_turn_shifts_the_image(columns: int) -> None:
-    """What leaves at one end comes in at the other."""
+    """Columns that leave at one end enter at the other."""
     arena = arena_of("static-obstacles", 5)
     here = sight(arena, 1.0, -2.0, 0.6, lens=ROUND)
     turned = sight(arena, 1.0, -2.0, 0.6 + columns / ROUND.focal, lens=ROUND)

@@ -29,7 +29,7 @@ def test_processor_time_is_that_of_all_threads() -> None:
         thread.join()
     use, after = meter.end(), psutil.Process().cpu_times()
     by_psutil = after.user + after.system - before.user - before.system
-    assert use.cpu_s == pytest.approx(by_psutil, abs=0.05)  # psutil counts in steps of 10 ms
+    assert use.cpu_s == pytest.approx(by_psutil, abs=0.05)  # psutil counts in steps of 10 ms.
     assert use.cpu_s > 0.0
     assert use.cores == pytest.approx(use.cpu_s / use.wall_s)
 

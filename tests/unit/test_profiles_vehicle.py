@@ -48,7 +48,7 @@ REQUIRED = [path for path, field in NUMBERS.items() if field.is_required()]
 
 
 def bounds(field: FieldInfo) -> tuple[float, float]:
-    """Return the least and greatest bound, read from the constraints themselves."""
+    """Return the minimum and maximum, read from the constraints."""
     low, high = -math.inf, math.inf
     for bound in field.metadata:
         low = max([low, *(getattr(bound, n) for n in ("ge", "gt") if hasattr(bound, n))])
@@ -69,7 +69,7 @@ def edit(path: str, line: str | None) -> str:
 
 
 def refusal(folder: Path, text: str | bytes) -> str:
-    """Load a file that must be refused; return what is said after its name."""
+    """Load a file that must be rejected; return the message after its name."""
     path = folder / "mine.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(UsageError) as error:
@@ -301,7 +301,7 @@ def test_the_quads_facts() -> None:
     body, rotor, battery, camera = QUAD.body, QUAD.rotor, QUAD.battery, QUAD.camera
     assert 4 * rotor.thrust_max_n / (body.mass_kg * 9.80665) == pytest.approx(1.92, abs=0.01)
     inertia = sorted([body.inertia_xx_kg_m2, body.inertia_yy_kg_m2, body.inertia_zz_kg_m2])
-    assert inertia[2] < inertia[0] + inertia[1]  # as for every real body
+    assert inertia[2] < inertia[0] + inertia[1]  # As for every real body.
     assert body.width_m > 2 * rotor.arm_right_m
     assert battery.cell_empty_v < battery.cell_full_v
     assert (camera.width_px, camera.height_px) == (64, 48)
@@ -362,7 +362,7 @@ def test_a_value_is_stored_as_given_and_flown_in_bounds(spec: ParameterSpec, val
     assert stored.value == (math.trunc(value) if whole else value)
     assert store.by_name(spec.name) == stored
     flown = store[spec.name]
-    assert heard == [flown]  # once, after the change
+    assert heard == [flown]  # Once, after the change.
     assert store.value(spec.name) == flown
     off = spec.zero_is_off and stored.value == 0.0
     assert off or spec.flown_low <= flown <= spec.flown_high
@@ -376,7 +376,7 @@ def test_all_of_px4s_parameters_exist_with_their_types() -> None:
     specs = [spec for spec in SPECS if spec.name not in of_missions]
     assert (len(specs), len(SPECS)) == (877, 879)
     types = [type(spec.default) for spec in specs]
-    assert (types.count(int), types.count(float)) == (275, 602)  # as a PX4 1.16 SITL has them
+    assert (types.count(int), types.count(float)) == (275, 602)  # As a PX4 1.16 SITL has them.
 
 
 def test_what_is_used_has_flown_bounds_that_are_numbers_around_the_default() -> None:
@@ -391,7 +391,7 @@ def test_that_a_value_is_not_flown_as_stored_is_told_once() -> None:
     store = Parameters()
     store.set("MPC_TILTMAX_AIR", 500.0)
     store.set("MPC_TILTMAX_AIR", 600.0)
-    store.set("WV_YRATE_MAX", -1e9)  # has no effect here: nothing is bounded
+    store.set("WV_YRATE_MAX", -1e9)  # Has no effect here: nothing is bounded.
     assert [text.text for text in store.take_texts()] == ["MPC_TILTMAX_AIR 500 is flown as 89"]
     assert store.take_texts() == []
     store.set("MPC_TILTMAX_AIR", 45.0)
@@ -409,7 +409,7 @@ def test_a_filter_is_off_at_zero_and_never_slower_than_can_be_flown() -> None:
 def test_a_bound_that_a_float_reaches_is_not_told() -> None:
     store = Parameters()
     single = struct.unpack("<f", struct.pack("<f", 0.1))[0]
-    store.set("MC_ROLLRATE_D", single)  # a hair above 0.1, the greatest that is flown
+    store.set("MC_ROLLRATE_D", single)  # Slightly above 0.1, the maximum.
     assert store.take_texts() == []
 
 
@@ -590,7 +590,7 @@ def test_a_table_of_coefficients_from_before_there_was_a_choice_is_a_regression(
     start, end = QUAD_TOML.index("[power]"), QUAD_TOML.index("[camera]")
     for text in (
         QUAD_TOML[:start] + OLD_POWER + QUAD_TOML[end:],
-        f'base = "quad"\n{OLD_POWER}',  # of the base's model nothing is left
+        f'base = "quad"\n{OLD_POWER}',  # No field of the base's model is left.
     ):
         path.write_text(text)
         power = load_profile("vehicles", str(path), VehicleProfile).power

@@ -1,4 +1,4 @@
-"""Progress: what is drawn, and what is printed where nobody looks."""
+"""Progress: bars on a terminal, and lines printed elsewhere."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def drawn(*, terminal: bool) -> str:
 def test_a_bar_shows_count_pace_and_postfix() -> None:
     text = drawn(terminal=True)
     last = Text.from_ansi(text).plain.rsplit("no-obstacles", 1)[1]
-    # What had been done before does not count for the pace, nor the time up to the first ones.
+    # The pace excludes earlier work and the time up to the first episodes.
     assert "1,010/2,000 4.5 episodes/s" in last
     # Nine in the two seconds since the first one: 990 are left.
     assert "90.0 % [reached]" in last and "0:00:06 0:03:40 left" in last
@@ -112,7 +112,7 @@ def test_programs_hear_lines_of_json() -> None:
     bar.advance()
     bar.close()
     lines: list[dict[str, Any]] = [json.loads(line) for line in out.getvalue().splitlines()]
-    # Of a work no more often than once a second, and what was not told is told at the end.
+    # At most one progress line a second for each task. The last state is reported at the end.
     assert [line["event"] for line in lines] == [
         *("status", "progress", "progress", "progress"),
         *("note", "landed", "progress"),

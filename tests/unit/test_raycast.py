@@ -29,7 +29,7 @@ from airl_mav.profiles.distortion import UNDISTORTED, sees_to
 from tests.support.lenses import BARREL, ENDING, OPENING, rays_of_fisheye
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
-RIGHT_ANGLE = Intrinsics.from_fov(33, 25, math.pi / 2)  # odd: the centre pixel is the optical axis
+RIGHT_ANGLE = Intrinsics.from_fov(33, 25, math.pi / 2)  # Odd: the centre pixel is the optical axis.
 
 
 @dataclass
@@ -103,7 +103,7 @@ class Rays:
         self.d = camera.reshape(-1, 3) @ attitude.T
         self.o = np.array([*scene.position[:2], min(scene.position[2], -MIN_DEPTH_M)])
         self.t = np.full(len(self.d), np.inf)
-        self.body = np.full(len(self.d), -1)  # which was hit: -1 nothing or the room, else number
+        self.body = np.full(len(self.d), -1)  # Which was hit: -1 nothing or the room, else number.
         self.number = -1
 
     def hit(self, t: np.ndarray, where: np.ndarray) -> None:
@@ -140,7 +140,7 @@ class Rays:
         return bool(np.all(np.abs(o) <= half))
 
     def quadratic(self, a: Any, b: np.ndarray, c: float) -> tuple[np.ndarray, np.ndarray]:
-        """Both roots of a t² + 2 b t + c; NaN where there is none."""
+        """Return both roots of a t² + 2 b t + c; NaN if they are not real."""
         root = np.sqrt(b * b - a * c)
         return (-b - root) / a, (-b + root) / a
 
@@ -199,11 +199,11 @@ def random_scene(rng: np.random.Generator) -> Scene:
     center = rng.uniform([-north, -east, -6.0], [north, east, 0.0], (n, 3))
     position = rng.uniform([-north, -east, -0.9 * bounds.height], [north, east, -0.05])
     where = rng.random()
-    if where < 0.2:  # above the walls
+    if where < 0.2:  # Above the walls.
         position[2] = -bounds.height - rng.uniform(0.0, 6.0)
-    elif where < 0.3:  # anywhere around, also outside and below the floor
+    elif where < 0.3:  # Anywhere around, also outside and below the floor.
         position = rng.uniform([-40.0, -40.0, -15.0], [40.0, 40.0, 0.1])
-    elif where < 0.5 and n:  # beside or inside an obstacle
+    elif where < 0.5 and n:  # Beside or inside an obstacle.
         position = center[0] + rng.uniform(-1.5, 1.5, 3) * half[0]
     if rng.random() < 0.5:
         roll, pitch = rng.normal(0.0, 0.2, 2)
@@ -284,7 +284,7 @@ def points_on(shape: Shape, half: np.ndarray) -> np.ndarray:
         turn = np.linspace(0.0, 2.0 * np.pi, 160, endpoint=False)
         rim = np.stack([np.cos(turn), np.sin(turn), np.ones_like(turn)], axis=1)
         return half * np.concatenate([rim, rim * [1.0, 1.0, -1.0]])
-    i = np.arange(4000)  # a Fibonacci sphere
+    i = np.arange(4000)  # A Fibonacci sphere.
     z, angle = 1.0 - (2.0 * i + 1.0) / len(i), i * np.pi * (3.0 - math.sqrt(5.0))
     ring = np.sqrt(1.0 - z * z)
     return half * np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
@@ -368,7 +368,7 @@ def test_agrees_with_pybullet_tiny_renderer(seed: int) -> None:
         for _ in range(12):
             position = rng.uniform([-9, -11, -3.5], [9, 11, -0.3])
             if np.min(np.linalg.norm(center - position, axis=1)) < 2.5:
-                continue  # inside, or nearer than pybullet's near plane
+                continue  # Inside, or nearer than pybullet's near plane.
             roll, pitch = rng.normal(0.0, 0.25, 2)
             attitude = quat_from_euler(roll, pitch, rng.uniform(-np.pi, np.pi))
             w, h = 64, 48
@@ -392,7 +392,7 @@ def test_agrees_with_pybullet_tiny_renderer(seed: int) -> None:
 
 
 def test_depth_is_planar_not_along_the_ray() -> None:
-    depth = seen()  # a wall 20 m ahead, square to the optical axis
+    depth = seen()  # A wall 20 m ahead, square to the optical axis.
     np.testing.assert_allclose(depth[12], 20.0, rtol=1e-6)
 
 
@@ -400,7 +400,7 @@ def test_floor_depth_follows_the_row() -> None:
     depth = seen(position=(0.0, 0.0, -2.0))
     k = RIGHT_ANGLE
     for v in range(14, k.height):
-        expected = 2.0 * k.focal / (v - k.cy)  # height / slope
+        expected = 2.0 * k.focal / (v - k.cy)  # Height / slope.
         if expected < 20.0:
             np.testing.assert_allclose(depth[v], expected, rtol=1e-6)
 
@@ -415,7 +415,7 @@ def test_ray_over_the_walls_has_no_return() -> None:
 def test_walls_are_seen_from_outside_and_over() -> None:
     assert seen(position=(-30.0, 0.0, -2.0))[12, 16] == pytest.approx(10.0)
     over = seen(position=(-30.0, 0.0, -6.0))
-    assert over[12, 16] == 0.0  # level, 1 m over the wall
+    assert over[12, 16] == 0.0  # Level, 1 m over the wall.
     # Steeper, a ray goes over the near wall to the far one, 50 m away; then it meets the near
     # wall; at last it passes below the floor, which ends at the walls.
     k = RIGHT_ANGLE
@@ -552,12 +552,12 @@ def test_camera_pose_agrees_with_scipy() -> None:
 
 def test_mount_pitched_up_looks_up() -> None:
     _, q = camera_pose((0.0, 0.0, -2.0), (1.0, 0.0, 0.0, 0.0), Mount((0.1, 0.0, 0.0), 0.4))
-    assert quat_to_matrix(np.array(q))[2, 0] == pytest.approx(-math.sin(0.4))  # down is positive
+    assert quat_to_matrix(np.array(q))[2, 0] == pytest.approx(-math.sin(0.4))  # Down is positive.
 
 
 # --- all round -----------------------------------------------------------------------------------
 
-PANORAMA = Intrinsics.from_fov(72, 41, 2.0 * math.pi, "cylindrical")  # 5 degrees a column
+PANORAMA = Intrinsics.from_fov(72, 41, 2.0 * math.pi, "cylindrical")  # 5 degrees a column.
 STRAIGHT_AHEAD = 35.5
 """Column of the optical axis, between two pixels."""
 
@@ -587,7 +587,7 @@ def test_a_pillar_is_seen_at_its_bearing(degrees: int) -> None:
     changed = np.flatnonzero((found != empty).any(axis=0))
     angles = np.radians((np.arange(72) - STRAIGHT_AHEAD) * 5.0)
     off = np.remainder(angles - bearing + math.pi, 2.0 * math.pi) - math.pi
-    half = math.asin(1.0 / 8.0)  # of a circle of 1 m, 8 m away
+    half = math.asin(1.0 / 8.0)  # Of a circle of 1 m, 8 m away.
     np.testing.assert_array_equal(changed, np.flatnonzero(np.abs(off) < half))
     # The near side of a circle along a ray; depth is that in the horizontal plane.
     near = 8.0 * np.cos(off[changed]) - np.sqrt(1.0 - (8.0 * np.sin(off[changed])) ** 2)
@@ -595,7 +595,7 @@ def test_a_pillar_is_seen_at_its_bearing(degrees: int) -> None:
 
 
 def test_the_seam_is_where_the_image_s_ends_meet() -> None:
-    """A turn of a column to the right moves the image by one, and what leaves comes in again."""
+    """A turn by one column to the right shifts the image by one column, with wrap-around."""
     bodies = [
         (Shape.BOX, (-9.0, 0.3, -1.5), (0.7, 1.8, 1.5), 0.4),
         (Shape.SPHERE, (4.0, 5.0, -2.5), (1.2, 1.2, 1.2), 0.0),

@@ -74,8 +74,8 @@ def test_the_widest_matching_stream_is_read_newest_only_with_its_age() -> None:
     ("stamp_ms", "domain"),
     [
         (1234.5, "hardware_clock"),
-        (NOW_US / 1000 + 50.0, "global_time"),  # the calendar was set back
-        (NOW_US / 1000 - 86_400_000.0, "system_time"),  # a recording of yesterday
+        (NOW_US / 1000 + 50.0, "global_time"),  # The calendar was set back.
+        (NOW_US / 1000 - 86_400_000.0, "system_time"),  # A recording of yesterday.
     ],
 )
 def test_a_stamp_of_another_clock_says_nothing_of_the_age(stamp_ms: float, domain: str) -> None:

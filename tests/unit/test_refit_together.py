@@ -1,4 +1,4 @@
-"""Several flights of one vehicle: what is averaged of them, against closed forms and simulation."""
+"""Averages over flights of one vehicle, against closed forms and simulation."""
 
 from __future__ import annotations
 

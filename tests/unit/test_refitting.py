@@ -68,7 +68,7 @@ def test_marzullo_finds_what_most_ranges_hold() -> None:
     assert marzullo(ranges[:1]) == (8.0, 12.0, 1)
 
 
-# --- a flight that is made up
+# --- a synthetic flight
 
 
 def flown(path: Trajectory, sent_us: np.ndarray, setpoints: np.ndarray) -> Flown:
@@ -154,7 +154,7 @@ def test_drag_and_wind_are_those_of_the_equations_of_motion(
 
 
 def test_an_accelerometer_tells_the_wind_where_the_attitude_is_wrong() -> None:
-    """Half a degree of tilt is 0.4 m/s of wind to who sees the lean alone, at this drag."""
+    """From the tilt alone, half a degree of error equals 0.4 m/s of wind at this drag."""
     wind = (3.0, -2.0)
     made = logged(0.2, wind, bias_m_s2=(0.03, -0.02), tilt_rad=np.radians(0.5))
     air = fit_air(made, QUAD, np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""`airl render` as a user runs it: the pictures that it writes, and what it refuses."""
+"""`airl render` from the command line: written pictures and rejected options."""
 
 from __future__ import annotations
 

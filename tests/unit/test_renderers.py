@@ -1,4 +1,4 @@
-"""Every compiled renderer of pictures: what an arena has none of changes no pixel."""
+"""Compiled picture renderers: features that an arena lacks change no pixel."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _arrays(look: Any) -> ColourArrays:
 
 @contextmanager
 def rendered_as(*, meshes: bool, gloss: bool) -> Iterator[None]:
-    """Render all arenas meanwhile with meshes and glossy surfaces, empty where there are none."""
+    """Render all arenas in this context with meshes and glossy surfaces, empty if absent."""
     with pytest.MonkeyPatch.context() as patch:
         for module in (picture, depth_images) if meshes else ():
             patch.setattr(module, "meshes_of", _meshes)

@@ -1,4 +1,4 @@
-"""Requirements: what is read, and when flights show that they are met."""
+"""Requirements: parsing, and decisions from flights."""
 
 from __future__ import annotations
 

@@ -180,7 +180,7 @@ def test_every_room_opens_on_the_corridor(corridors: list[Arena]) -> None:
 
 @pytest.mark.parametrize(("share", "corridor"), [(0.0, False), (1.0, False), (1.0, True)])
 def test_the_share_of_doors_is_kept(spec: ArenaSpec, share: float, corridor: bool) -> None:
-    """None beyond a tree; or one between all neighbours that share enough of a wall for it."""
+    """No doors beyond a tree, or doors between all neighbours that share enough wall."""
     base = with_corridor(spec) if corridor else spec
     asked = changed(base, rooms={"extra_doors": share}, static={"count": [0, 0]})
     for seed in range(12):
@@ -204,7 +204,7 @@ def test_the_share_of_doors_is_kept(spec: ArenaSpec, share: float, corridor: boo
                     for by in (3, -3)
                 ]  # fmt: skip
                 pairs += CELL_M * max(shared) >= asked.rooms.door_width_m[0] + 0.2
-        assert abs(arena.building.doors - pairs) <= 1  # one that nearly fits, by a cell
+        assert abs(arena.building.doors - pairs) <= 1  # A door may nearly fit, by a cell.
 
 
 def _moved(cells: NDArray[np.bool_], axis: int, by: int) -> NDArray[np.bool_]:
@@ -240,7 +240,7 @@ def test_doors_are_within_their_ranges_and_use_them(spec: ArenaSpec) -> None:
 def test_walls_fill_what_is_no_room_and_no_door(
     spec: ArenaSpec, arenas: list[Arena], seed: int
 ) -> None:
-    """The volume of the boxes is that of the walls less the doors: no part is there twice."""
+    """The boxes have the volume of the walls minus the doors: no part is counted twice."""
     plan, bounds = plan_of(spec, seed)
     floor = (bounds.north_max - bounds.north_min) * (bounds.east_max - bounds.east_min)
     rooms = sum(room.side(0) * room.side(1) for room in plan.rooms)
@@ -317,7 +317,7 @@ def test_a_fixed_goal_is_in_no_wall(spec: ArenaSpec) -> None:
         assert room[row - 13 : row + 13, column - 13 : column + 13].all()
 
 
-# --- the ceiling in the twin
+# --- the ceiling in the vectorized simulator
 
 
 def hit(arena: Arena, place: tuple[float, float, float]) -> tuple[int, float]:
@@ -354,7 +354,7 @@ def test_the_twin_touches_floor_walls_doors_and_ceiling_as_closed_forms_say(
             place = rng.uniform(
                 [b.north_min, b.east_min, -b.height], [b.north_max, b.east_max, 0.0]
             )
-            if rng.random() < 0.5:  # at a wall or a lintel
+            if rng.random() < 0.5:  # At a wall or a lintel.
                 i = rng.integers(len(boxes))
                 place = boxes.center[i] + rng.uniform(-1.2, 1.2, 3) * (boxes.half_size[i] + 0.2)
                 place[2] = np.clip(place[2], -b.height, 0.0)
@@ -405,11 +405,11 @@ def test_over_a_gate_there_is_a_ceiling(spec: ArenaSpec) -> None:
         assert hit(arena, (float(wall[0]), float(wall[1]), -6.2))[0] == wanted
 
 
-# --- old arenas are what they were
+# --- arenas without rooms are unchanged
 
 
 def digest(name: str) -> str:
-    """Return a digest of a shipped arena's profile and of what twenty seeds draw of it."""
+    """Return a digest of a shipped arena's profile and its draws for twenty seeds."""
     spec, told = load_profile("arenas", name, ArenaSpec), hashlib.sha256()
     told.update(profile_digest(spec).encode())
     for seed in range(20):
@@ -442,7 +442,7 @@ BEFORE = {
     "varied-looks": "ab7d97e5851cfe13",
     "varied-looks-clear": "3b2b4795f806b948",
 }
-"""Of the version before there were rooms."""
+"""Digests from the version before rooms were added."""
 
 
 @pytest.mark.parametrize("name", BEFORE)
@@ -456,7 +456,7 @@ def test_profiles_without_them_say_nothing_of_them() -> None:
     assert "ceiling" not in dumped["size"]
 
 
-# --- what people see
+# --- views and pictures
 
 
 def test_what_a_view_is_told_is_the_arena(arenas: list[Arena]) -> None:
@@ -488,7 +488,7 @@ def test_the_table_tells_of_them(spec: ArenaSpec, arenas: list[Arena]) -> None:
 
 
 def test_a_camera_sees_the_ceiling_where_it_is(arenas: list[Arena]) -> None:
-    """Its height, its colour, and its grey in a picture of what is seen."""
+    """Height and colour of the ceiling, and its grey in a segmentation picture."""
     camera = Intrinsics.from_fov(48, 32, 1.6)
     arena, place = arenas[2], np.array([0.0, 0.0, -2.5])
     seen = render_picture(arena, arena.centers_at(0), camera, place, np.array([1.0, 0, 0, 0]))
@@ -507,7 +507,7 @@ def test_a_camera_sees_the_ceiling_where_it_is(arenas: list[Arena]) -> None:
 
 
 def test_the_ceilings_view_factor_is_that_of_rays() -> None:
-    """Of two squares: cosine-weighted rays from one, and how many of them meet the other."""
+    """Two squares: share of cosine-weighted rays from the first that meet the second."""
     rng = np.random.default_rng(5)
     for x in (0.7, 2.0, 9.0):
         n = 200_000
@@ -519,7 +519,7 @@ def test_the_ceilings_view_factor_is_that_of_rays() -> None:
         assert seen_across(x) == pytest.approx(share, abs=5.0 * math.sqrt(0.25 / n))
 
 
-# --- what is refused
+# --- rejected input
 
 
 @pytest.mark.parametrize(

@@ -221,7 +221,7 @@ def test_a_topic_that_falls_silent_has_failed(topic: str) -> None:
         camera._images = heard
         while camera.read(1.0) is None:
             pass
-        # An image ends the silence: the next seconds begin anew.
+        # An image resets the timeout.
         camera._images = silent
         assert camera.read(0.01) is None
         camera._silence.lasted(4.9)

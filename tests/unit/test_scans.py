@@ -215,12 +215,12 @@ def test_a_row_a_frame_each_carried_to_the_present() -> None:
     found = encode_layout(spec, seen)
     assert list(found) == list(boxes(spec)) == ["depth", "velocity", "goal"]
     assert found["depth"].shape == (1, *boxes(spec)["depth"].shape) == (1, 1, 3, 80)
-    # What stands is in the same bearings, and as far, in every row.
+    # Static obstacles have the same bearings and distances in every row.
     rows = found["depth"][0, 0]
     near = (rows < 200).all(axis=0)
     assert near.sum() >= 2
     assert np.ptp(rows[:, near].astype(int), axis=0).max() <= 12
-    # Either end once more, so that there is no seam behind.
+    # Both ends are repeated to avoid a seam at the rear.
     np.testing.assert_array_equal(rows[:, :8], rows[:, 64:72])
     np.testing.assert_array_equal(rows[:, -8:], rows[:, 8:16])
     # One decision that nothing came before: no return in the other rows.

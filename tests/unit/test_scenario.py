@@ -31,7 +31,7 @@ from tests.support.processes import ROOT
 
 
 def fields_of(model: type[BaseModel], table: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Yield all fields with their dotted names, those of the tables too."""
+    """Yield all fields with their dotted names, including fields of tables."""
     for name, field in model.model_fields.items():
         yield f"{table}{name}", field
         kind = field.annotation
@@ -86,7 +86,7 @@ def test_a_resolved_scenario_survives_json_bit_by_bit(fields: dict[str, Any]) ->
     again = adapter.validate_json(text)
     assert again == resolved
     assert adapter.dump_json(again) == text
-    # What flies is decided the same way on both sides of the pipe.
+    # Both sides of the pipe derive the same settings.
     assert (again.companion_pilot, again.setup, again.rules) == (
         resolved.companion_pilot,
         resolved.setup,
@@ -380,4 +380,4 @@ def test_movers_are_at_the_same_places_when_navigation_begins_at_every_level() -
     takeoff_us = round(lockstep.takeoff_s * 1e6)
     for time_us in (0, 1_000_000, 70_000_000):
         there, here = after_takeoff.centers_at(takeoff_us + time_us), begins.centers_at(time_us)
-        assert abs(there - here).max() < 3e-6  # of a microsecond's rounding, at 2.5 m/s
+        assert abs(there - here).max() < 3e-6  # From a microsecond of rounding, at 2.5 m/s.

@@ -37,7 +37,7 @@ def test_a_process_gives_way_as_a_session_too(leads: bool) -> None:
     assert int(niceness) == min(19, os.getpriority(os.PRIO_PROCESS, 0) + 7)
     assert session == "True"
     if before:
-        # "/autogroup-1412 nice 7"; that of whoever has started it stays as it is.
+        # "/autogroup-1412 nice 7"; the caller's autogroup is unchanged.
         assert group[1:] == ["nice", "7"] and group[0] != before.split()[0]
         assert AUTOGROUP.read_text() == before
 

@@ -132,7 +132,7 @@ def test_what_is_far_from_the_threshold_is_soon_decided(threshold: float) -> Non
 def test_the_first_look_that_decides_is_the_verdict() -> None:
     test = RateTest(0.95)
     assert test.decide([False] * 20) is Decision.NOT_MET
-    # What is flown for another requirement's sake does not take it back.
+    # Flights for another requirement do not revoke the verdict.
     assert test.decide([False] * 20 + [True] * 980) is Decision.NOT_MET
     assert test.decide([True] * 1000) is Decision.MET
     # Only the planned looks count: nineteen failures have not been looked at.
@@ -149,7 +149,7 @@ def test_so_many_flights_of_that_rate_decide(rate: float) -> None:
     expected = Decision.MET if rate > 0.95 else Decision.NOT_MET
     assert test.decide(flown(needed, round((1.0 - rate) * needed))) is expected
     assert test.decide(flown(before, round((1.0 - rate) * before))) is Decision.UNDECIDED
-    # Of those that have been flown, none is needed again.
+    # Only looks after the flights already flown count.
     later = test.flights_needed(rate, needed)
     assert later is not None
     assert later > needed

@@ -71,7 +71,7 @@ def test_pymavlink_accepts_what_is_signed_here() -> None:
         assert decoded.get_signed()
         assert decoded.to_dict() == message.to_dict()
     assert theirs.signing.goodsig_count == len(messages())
-    assert ours.sign(frame, 0) == frame  # once is enough
+    assert ours.sign(frame, 0) == frame  # Once is enough.
 
 
 def test_what_pymavlink_signs_is_accepted_here() -> None:
@@ -85,7 +85,7 @@ def test_every_bit_of_a_signed_frame_counts() -> None:
     frame = messages()[0].pack(peer())
     for position in range(len(frame) * 8):
         if position // 8 == 0:
-            continue  # without its marker it is no frame
+            continue  # Without its marker it is no frame.
         forged = bytearray(frame)
         forged[position // 8] ^= 1 << position % 8
         assert not signing().accepts(bytes(forged)), position
@@ -214,7 +214,7 @@ def test_key_and_newest_time_stamp_outlive_the_program(tmp_path: Path) -> None:
     clock.advance(SAVE_EVERY_US)
     stored.save_due()
     assert int(stamp.read_text()) == NOW * 3
-    # What was heard long before the newest of then is too old for a new program, too.
+    # Messages from long before the stored timestamp are too old for a new program, too.
     late = StoredSigning(path, clock)
     assert late.signing.timestamp == NOW * 3
     assert not late.signing.accepts(messages()[0].pack(peer(timestamp=NOW * 2)))
@@ -229,12 +229,12 @@ def test_a_time_stamp_that_cannot_be_written_ends_nothing(tmp_path: Path) -> Non
     path = tmp_path / "key"
     write_key(path, KEY)
     stored = StoredSigning(path)
-    (tmp_path / "key.timestamp").mkdir()  # nothing can take its place
+    (tmp_path / "key.timestamp").mkdir()  # Nothing can take its place.
     stored.save()
     assert stored.signing.key == KEY
 
 
-# --- where nobody would sign
+# --- settings without signing
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What `make sitl` installs, the extra `sim` without any other, flies and draws its report."""
+"""Installation by `make sitl` (only the extra `sim`): flights and reports work."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Thermal soak: what is seen of a computer that slows down, against what it was made to do."""
+"""Thermal soak: measured slowdown of a computer against its scripted slowdown."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_computer_that_gets_slower_is_seen_to() -> None:
     assert soaked.throttled
     ends = soaked.ends("temperature_c")
     assert ends is not None
-    assert ends == pytest.approx((43.0, 67.0), abs=0.2)  # means over 0 to 60 s, 240 to 300 s
+    assert ends == pytest.approx((43.0, 67.0), abs=0.2)  # Means over 0 to 60 s, 240 to 300 s.
     assert soaked.sentence() == (
         "soak of 5.0 min: t2 from the first to the last minute: p50 1.000 to 1.500 ms (+50%), p99 "
         "2.000 to 3.000 ms (+50%); frequency dropped (1500 to 1200 MHz); temperature "

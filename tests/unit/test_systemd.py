@@ -1,4 +1,4 @@
-"""What a service manager hears of the companion, on a socket of its own making."""
+"""Service manager notifications of the companion, on a socket created by the test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hills: their surface against matplotlib's, what cameras see of them, contacts, arenas, ways."""
+"""Hills: surface against matplotlib's, camera images, contacts, arenas and paths."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_the_surface_is_that_of_its_triangles(seed: int) -> None:
     )
     heights = [ground.height_at(n, e) for n, e in zip(north, east, strict=True)]
     np.testing.assert_allclose(heights, reference(ground, north, east), atol=1e-12)
-    # Its slopes are those of the heights around.
+    # The slopes match the surrounding heights.
     for n, e in zip(north[:100], east[:100], strict=True):
         height, up, across = plane_at(ground.relief, n, e)
         step = 1e-7
@@ -112,7 +112,7 @@ def test_the_extremes_in_a_disc_are_those_of_many_points_in_it(sign: float) -> N
         inside &= (east >= b.east_min) & (east <= b.east_max)
         sampled = float((sign * reference(ground, north[inside], east[inside])).max())
         found = extreme_within(ground.relief, n, e, radius, sign)
-        # No point is beyond it, and one of so many is near it.
+        # No sampled point exceeds the extreme, and one sample is near it.
         assert sampled - 1e-12 <= found <= sampled + 0.03 * radius
 
 
@@ -182,7 +182,7 @@ def test_hills_change_no_other_draw() -> None:
         assert other.ground is not None
 
 
-# --- what stands on them
+# --- obstacles on hills
 
 
 def test_obstacles_stand_on_the_lowest_ground_below_them() -> None:
@@ -196,7 +196,7 @@ def test_obstacles_stand_on_the_lowest_ground_below_them() -> None:
         for thing, name in enumerate(statics.names):
             own = np.flatnonzero(statics.of == thing)
             base = bottom[own].min()
-            if name == "tree":  # all of its parts are lifted alike
+            if name == "tree":  # All of its parts are lifted alike.
                 assert len(own) > 1
             for i in own:
                 low, high = o.center[i, :2] - half[i], o.center[i, :2] + half[i]
@@ -232,7 +232,7 @@ def test_the_height_of_a_goal_is_that_above_the_ground_below_it() -> None:
     assert above > 0
 
 
-# --- ways
+# --- paths
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -265,7 +265,7 @@ def test_a_ridge_across_the_arena_is_in_the_way() -> None:
     assert way(ridge, before)
     assert not way(ridge, beyond)
     assert way(ridge, beyond, most_m=6.0)
-    # A gap of 4 m is wide enough; one of no width at its foot, and 1.3 m at the height, is not.
+    # A gap of 4 m is wide enough. A gap of 0 m at its foot and 1.3 m at the height is not.
     gap = ridge.copy()
     gap[20:23, 30:34] = 0.0
     assert way(gap, beyond)
@@ -285,7 +285,7 @@ def pose_in(rng: np.random.Generator, arena: Arena) -> tuple[Floats, Floats]:
     return np.array([*at, -above]), quat_from_euler(roll, pitch - 0.2, rng.uniform(-np.pi, np.pi))
 
 
-@pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
+@pytest.mark.timeout(600)  # Compiles kernels, on a busy machine for minutes.
 @pytest.mark.parametrize("projection", AT_NIGHT_THE_FISHEYE)
 def test_depth_of_hills_is_that_of_rays_in_float64(projection: Projection) -> None:
     rng = np.random.default_rng(4)
@@ -459,7 +459,7 @@ def test_nothing_is_touched_within_the_clearance_over_hills() -> None:
     assert near > 100
 
 
-# --- what is refused
+# --- rejected input
 
 
 @pytest.mark.parametrize(

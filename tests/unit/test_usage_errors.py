@@ -1,4 +1,4 @@
-"""Input that cannot be used: one line that says what is accepted, exit code 2, nothing left."""
+"""Unusable input: one line with the accepted values, exit code 2, nothing left behind."""
 
 from __future__ import annotations
 

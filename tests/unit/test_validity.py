@@ -1,4 +1,4 @@
-"""Which flights are no test of the policy, and why."""
+"""Flights that are not a valid test of the policy, and the reasons."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PERIOD_US = 33_333
 
 
 def figures(**changes: object) -> HostFigures:
-    """Return the figures of a flight of 10 s at speed 4, in step, with what is changed."""
+    """Return the figures of a flight of 10 s at speed 4, in step, with `changes` applied."""
     infer = np.arange(10, dtype=np.int64) * 550_000
     settings: dict[str, object] = {
         "flight_us": 10_000_000,
@@ -79,7 +79,7 @@ def test_late_ticks_are_those_of_the_hundredth() -> None:
 
 def test_what_a_fault_makes_late_is_not_the_host_s() -> None:
     infer = np.arange(10, dtype=np.int64) * 550_000
-    infer[5:] += 2_000_000  # the companion stood still from 2.3 s to 4.6 s
+    infer[5:] += 2_000_000  # The companion stood still from 2.3 s to 4.6 s.
     decisions = {
         "capture_us": infer - 20_000,
         "infer_start_us": infer,

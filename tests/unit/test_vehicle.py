@@ -81,10 +81,10 @@ def test_thrust_and_torque_follow_from_the_geometry(
 @pytest.mark.parametrize(
     ("rotor", "signs"),
     [
-        (0, (-1, 1, 1)),  # front right: rolls left, nose up, turns right
-        (1, (1, -1, 1)),  # rear left: rolls right, nose down, turns right
-        (2, (1, 1, -1)),  # front left: rolls right, nose up, turns left
-        (3, (-1, -1, -1)),  # rear right: rolls left, nose down, turns left
+        (0, (-1, 1, 1)),  # Front right: rolls left, nose up, turns right.
+        (1, (1, -1, 1)),  # Rear left: rolls right, nose down, turns right.
+        (2, (1, 1, -1)),  # Front left: rolls right, nose up, turns left.
+        (3, (-1, -1, -1)),  # Rear right: rolls left, nose down, turns left.
     ],
 )
 def test_what_each_rotor_alone_does(rotor: int, signs: tuple[int, int, int]) -> None:
@@ -304,7 +304,7 @@ def test_a_centred_mass_changes_no_bit(speeds: list[float]) -> None:
 
 @given(st.floats(-0.9, 0.9), st.floats(-0.9, 0.9))
 def test_hover_speeds_carry_the_weight_without_torque(forward: float, right: float) -> None:
-    share = 0.5 / max(0.5, abs(forward) + abs(right))  # inside the rotors
+    share = 0.5 / max(0.5, abs(forward) + abs(right))  # Inside the rotors.
     off = QUAD._replace(
         com_forward=share * forward * QUAD.arm_forward, com_right=share * right * QUAD.arm_right
     )
@@ -328,7 +328,7 @@ def test_voltage_at_the_ends() -> None:
     assert terminal_voltage(16.0, 0.02, 0.0) == 16.0
     assert terminal_voltage(16.0, 0.0, 500.0) == 16.0
     assert terminal_voltage(16.0, 0.02, 1e9) == 8.0
-    # 16 V, 20 mohm, 300 W: V² - 16 V + 6 = 0
+    # 16 V, 20 mohm, 300 W: V² - 16 V + 6 = 0.
     assert terminal_voltage(16.0, 0.02, 300.0) == pytest.approx(15.6158, abs=1e-4)
 
 
@@ -340,7 +340,7 @@ def test_coulombs_are_counted() -> None:
     remaining, current, capacity = 1.0, 25.0, 5200.0
     for _ in range(2500):
         remaining = drain(remaining, current, capacity, TICK_S)
-    # 25 A for 10 s = 250 C = 69.44 mAh
+    # 25 A for 10 s = 250 C = 69.44 mAh.
     assert (1.0 - remaining) * capacity == pytest.approx(250.0 / 3.6, rel=1e-9)
     assert drain(0.001, 1000.0, 100.0, 10.0) == 0.0
 

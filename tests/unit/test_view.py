@@ -1,4 +1,4 @@
-"""The live view without a browser: messages, what is shown, pace, latency by hand, the scene."""
+"""Live view without a browser: messages, display, pace, manual latency, the scene."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def ends() -> Iterator[Ends]:
 
 
 class Watchers:
-    """Somebody who asks for the same thing all the time."""
+    """Viewer that repeats the same request continuously."""
 
     def __init__(self, ends: Ends) -> None:
         self.wanted = Steering(speed=None)
@@ -181,7 +181,7 @@ def test_a_view_that_is_gone_holds_nobody_up(ends: Ends) -> None:
     feed.send(Flight(index=0, seed=1, goal=(1.0, 2.0)))
     (first,) = ends.take(10.0)
     assert first == (Flight(index=0, seed=1, goal=(1.0, 2.0)), None)
-    for _ in range(100 * QUEUED):  # Nobody takes them: what does not fit is dropped.
+    for _ in range(100 * QUEUED):  # Without a receiver, messages beyond the queue are dropped.
         feed.send(Picture(captured_us=5, shape=(3, 4)), DEPTH_MM)
     feed.close()
 
@@ -193,7 +193,7 @@ def test_what_a_view_asks_for_holds_until_it_is_gone(ends: Ends) -> None:
     with Watchers(ends) as watchers:
         watchers.wanted = Steering(paused=True, speed=2.0)
         wait_until(lambda: asked.newest(0.1) == watchers.wanted, "the steering")
-    while asked._socket.poll(200):  # what is still on its way
+    while asked._socket.poll(200):  # Messages still in transit.
         asked.newest()
     clock.advance(4_000_000)
     assert asked.newest().paused
@@ -202,7 +202,7 @@ def test_what_a_view_asks_for_holds_until_it_is_gone(ends: Ends) -> None:
     asked.close()
 
 
-# --- what is shown
+# --- display
 
 
 def test_the_command_ages_until_the_next_decision_acts() -> None:
@@ -239,7 +239,7 @@ def test_a_new_episode_forgets_the_old_one() -> None:
     shown.take(episode(), None)
     for step in range(5):
         shown.take(vehicle(0.1 * step, north=float(step)), None)
-    shown.take(vehicle(0.5, north=4.01), None)  # too near to be a point of its own
+    shown.take(vehicle(0.5, north=4.01), None)  # Too near for a separate trail point.
     shown.take(decided(1.0, t2_ms=1.0), DEPTH_MM)
     assert len(shown.trail) == 5
     shown.take(episode(), None)
@@ -360,7 +360,7 @@ def test_compensation_is_switched_in_flight() -> None:
     compensator.decided(one, np.array([[3.0, 0.0, 0.0, 0.0]]), np.array([400_000]), np.array([0]))
 
     def look() -> tuple[Any, Any]:
-        hand.t2_us()  # as every decision begins
+        hand.t2_us()  # As every decision begins.
         age, now = np.array([20_000]), np.array([1_000_000])
         return compensator.foresee(one, depth_mm, age, now, state)
 
@@ -373,7 +373,7 @@ def test_compensation_is_switched_in_flight() -> None:
     assert seen is state
 
 
-# --- who may watch
+# --- access control
 
 
 @pytest.mark.parametrize(
@@ -385,7 +385,7 @@ def test_compensation_is_switched_in_flight() -> None:
         ("http://example.org", False),
         ("http://127.0.0.1.example.org:{port}", False),
         ("https://example.org:{port}", False),
-        ("null", False),  # a file, or a sandboxed frame of any page
+        ("null", False),  # A file, or a sandboxed frame of any page.
     ],
 )
 def test_pages_of_other_sites_are_turned_away(origin: str | None, taken: bool) -> None:
@@ -471,7 +471,7 @@ def test_no_tunnel_is_opened_whoever_asks(monkeypatch: pytest.MonkeyPatch) -> No
     assert not opened.is_set()
 
 
-# --- the scene, on a server that nobody watches
+# --- the scene, on a server without viewers
 
 
 def test_an_image_of_all_sides_hangs_unrolled_above_the_vehicle() -> None:

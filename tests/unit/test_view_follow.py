@@ -1,4 +1,4 @@
-"""The camera that follows: nothing hides the vehicle, and who turns it finds it turned."""
+"""Follow camera: the vehicle stays visible, and manual rotation is kept."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_close_by_is_close_enough() -> None:
 
 
 class Page:
-    """A page that tells of its camera one drawing late, as a browser does."""
+    """Page that reports its camera one drawing late, as a browser does."""
 
     def __init__(self) -> None:
         self.client_id = 7
@@ -118,7 +118,7 @@ def test_the_camera_goes_back_to_its_place_once_nothing_hides_the_vehicle(watche
     watchers.follow(shown(0.0, hides))
     near = page.offset
     assert np.linalg.norm(near) < 2.0 < np.linalg.norm(before)
-    # The page tells of where the camera was before, then of where it is.
+    # The page reports the previous camera position, then the current position.
     page.camera.position = page.camera.look_at + before
     watchers.follow(shown(0.5, hides))
     page.camera.position = page.camera.look_at + near

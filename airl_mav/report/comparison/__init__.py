@@ -1,1 +1,1 @@
-"""Any number of runs compared: one model, its tables and figures, and the kinds of comparison."""
+"""Comparison of any number of runs: common model, tables, figures, and kinds of comparison."""

@@ -1,4 +1,4 @@
-"""From run folders to a comparison."""
+"""Construction of a comparison from run folders."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from airl_mav.report.comparison import model
 from airl_mav.report.run_tables import setup_rows
 
 SHORT_NAME = 14
-"""Runs whose names are all this short or shorter need no letters."""
+"""Maximum length of names that are used as marks."""
 
 LONGEST_PART = 24
-"""The parts of runs in a comparison stand for them where all are this short or shorter."""
+"""Maximum length of roles that are used as marks."""
 
 UNCOMPARED = ("sha256 of the flights",)
-"""Terms that always differ, and explain nothing."""
+"""Terms that always differ and explain no difference."""
 
 MACHINE_TERMS = ("cpu", "os")
-"""Entries of `run.json` about the machine that a comparison shows."""
+"""Entries of `run.json` about the machine that are shown in a comparison."""
 
 
 def compare(
@@ -40,7 +40,7 @@ def compare(
     facts: Mapping[str, Any] | None = None,
     entries: Sequence[model.RunEntry] = (),
 ) -> model.Comparison:
-    """Compare runs, in the order of the tables; without contrasts each with the first."""
+    """Compare runs in the order of the tables; by default, each with the first."""
     if not runs:
         raise UsageError(f"no run here; accepted: a {kind} of one run or more")
     by_name = {entry.name: entry for entry in entries}
@@ -68,24 +68,24 @@ def compare(
 
 
 def tests_of(run: LoadedRun) -> list[EpisodeRecord]:
-    """Return the flights that say something of the policy: the valid ones."""
+    """Return the valid flights."""
     return [episode for episode in run.episodes if not episode.invalid]
 
 
 def samples_of(run: LoadedRun) -> dict[str, Samples]:
-    """Return the durations of all stages [µs], without those of invalid flights."""
+    """Return the durations of all stages [µs] in valid flights."""
     tests = tests_of(run)
     return pool(stage_samples(run.latency[e.index]) for e in tests if e.index in run.latency)
 
 
 def letter(index: int) -> str:
-    """Return A to Z, then AA, AB and so on."""
+    """Return the letters of an index: A to Z, then AA, AB and so on."""
     rest, last = divmod(index, 26)
     return ("" if not rest else letter(rest - 1)) + chr(ord("A") + last)
 
 
 def _marks(entries: Sequence[model.RunEntry]) -> dict[str, str]:
-    """Return what stands for each run: its part in the comparison, or a short name, or a letter."""
+    """Return the mark of each run: a short name, its role in the comparison, or a letter."""
     if all(len(entry.label or entry.name) <= SHORT_NAME for entry in entries):
         return {entry.name: entry.label or entry.name for entry in entries}
     parts = {entry.name: model.part_of(entry) for entry in entries}
@@ -142,7 +142,7 @@ def _contrast(
 
 
 def _task(episode: EpisodeRecord) -> tuple[str, int, Goal]:
-    """Return what makes two flights of one seed the same task."""
+    """Return the task of a flight; equal for flights of one seed that form a pair."""
     return episode.arena, episode.arena_seed, episode.goal
 
 
@@ -174,7 +174,7 @@ def _commit(git: Mapping[str, Any] | None) -> str:
 
 
 def _hold(config: Mapping[str, Any]) -> float | None:
-    """Return the hold time, in whatever table the level writes it down [s]."""
+    """Return the hold time [s] from the table in which the level stores it."""
     held = config.get("hold_s")
     if isinstance(held, (int, float)):
         return float(held)

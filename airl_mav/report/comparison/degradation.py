@@ -1,4 +1,4 @@
-"""The degradation curve: what injected latency costs a policy, on the same seeds."""
+"""Degradation curve: the cost of injected latency for a policy, on the same seeds."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from airl_mav.report.theme import Picture
 
 @dataclass(frozen=True)
 class Series:
-    """One line."""
+    """Line of a figure."""
 
     name: str
     points: Sequence[tuple[float, Estimate]]
-    """Where along the axis, and what was found there; those of no value are left out."""
+    """Position on the x axis and estimate of each point; points without a value are skipped."""
 
 
 def curves_picture(
@@ -41,7 +41,7 @@ def curves_picture(
     series: Sequence[Series],
     paper: Sequence[tuple[float, float]] = (),
 ) -> theme.Picture:
-    """Draw series with their known intervals, and the paper's points, over a common axis."""
+    """Draw series with their known intervals and the paper's points over a common axis."""
     figure = theme.new_figure(4.2, 3.0 + 0.2 * (len(series) + bool(paper)))
     ax: Axes = figure.subplots()
     for index, line in enumerate(series):
@@ -77,18 +77,18 @@ def curves_picture(
 
 
 AGAINST_FIRST, STEP = "against-first", "step"
-"""Keys of the contrasts with the first latency, and with the one before."""
+"""Keys of the contrasts with the first latency and with the previous latency."""
 
 LOSSES = (FLIGHT_TIME, DISTANCE, ENERGY)
 
 FEWEST = 10
-"""Pairs from which on a step says something."""
+"""Minimum number of pairs for a conclusion about a step."""
 
 
 def build_degradation(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Return a degradation curve for every policy (`group`), by growing latency (`label`)."""
+    """Compare the latencies (`label`, increasing) of each policy (`group`)."""
     contrasts: list[ContrastEntry] = []
     for policy in dict.fromkeys(entry.group for entry in entries):
         line = [entry for entry in entries if entry.group == policy]
@@ -107,7 +107,7 @@ def build_degradation(
 
 
 def contrasts_by_key(comparison: Comparison, policy: str, key: str) -> list[Contrast]:
-    """Return the contrasts of a policy with the first latency, or with the one before each."""
+    """Return a policy's contrasts with the first or the previous latency, by `key`."""
     return [c for c in comparison.contrasts_of(policy) if c.entry.key == key]
 
 
@@ -115,7 +115,7 @@ def contrasts_by_key(comparison: Comparison, policy: str, key: str) -> list[Cont
 
 
 def _verdict(comparison: Comparison, policy: str) -> list[str]:
-    """Return whether every step costs more, and how much all of them."""
+    """Return sentences on the cost of each step and on its monotonicity."""
     steps = contrasts_by_key(comparison, policy, STEP)
     lines = [f"{policy}, {measure.title}: {_monotone(measure, steps)}" for measure in LOSSES]
     rates = [run.quality.success_rate.value or 0.0 for run in comparison.group(policy)]
@@ -153,7 +153,7 @@ def _monotone(measure: Measure, steps: Sequence[Contrast]) -> str:
 
 
 def latency_quality_table(comparison: Comparison, policy: str) -> TableView:
-    """Return every latency by itself."""
+    """Return the results at each latency."""
     columns = (
         Column("latency", number=False),
         Column("t2", "ms"),
@@ -174,7 +174,7 @@ def latency_quality_table(comparison: Comparison, policy: str) -> TableView:
 
 
 def published_curve_table() -> TableView:
-    """Return the published curve, its losses worked out as ours."""
+    """Return the published curve, with losses computed in the same way."""
     columns = (
         Column("the paper", number=False),
         *(Column(measure.title, measure.unit) for measure in LOSSES),
@@ -203,7 +203,7 @@ def _published_losses(number: int) -> tuple[float, ...]:
 
 
 def curve_pictures(comparison: Comparison) -> list[Picture]:
-    """Draw success, and the losses of time, distance and energy, over the mean t2."""
+    """Draw success rate and losses of time, distance and energy over the mean t2."""
     at_ms = {run.name: (run.stages["t2"].mean or 0.0) / US_PER_MS for run in comparison.runs}
     success = [
         Series(
@@ -249,7 +249,7 @@ def curve_pictures(comparison: Comparison) -> list[Picture]:
 
 
 def policy_tables(comparison: Comparison, policy: str) -> tuple[TableView, ...]:
-    """Return every latency by itself, against the first, and against the one before."""
+    """Return tables of each latency: results, contrasts with the first and the previous one."""
     return (
         latency_quality_table(comparison, policy),
         *(
@@ -263,7 +263,7 @@ def policy_tables(comparison: Comparison, policy: str) -> tuple[TableView, ...]:
 
 
 def curves_section(comparison: Comparison) -> Section:
-    """Return the curves, the published one beside them."""
+    """Return the section of the curves, including the published curve."""
     return Section(
         "Over latency",
         tables=(published_curve_table(),),
@@ -273,7 +273,7 @@ def curves_section(comparison: Comparison) -> Section:
 
 
 def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
-    """Return everything that a degradation curve says."""
+    """Return the document of a degradation curve."""
     return comparison_document(
         comparison,
         runs,

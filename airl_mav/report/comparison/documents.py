@@ -1,4 +1,4 @@
-"""What the documents of all kinds of comparison share."""
+"""Common parts of the documents of all kinds of comparison."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from airl_mav.report.comparison.model import Comparison
 from airl_mav.report.document import Document, Facts, Section, provenance_facts, run_link
 
 WORST = 6
-"""Seeds that are looked at one by one."""
+"""Number of worst seeds listed."""
 
 WIDEST = 3
-"""Pairs that are named for differing most."""
+"""Number of pairs with the largest differences listed."""
 
 
 def worst_seeds(reference: Sequence[EpisodeRecord], target: Sequence[EpisodeRecord]) -> list[int]:
-    """Return the seeds that lost most: half failures, half the slowest against the reference."""
+    """Return the worst seeds: half failures, half the slowest relative to the reference."""
     failed: list[int] = []
     slower: dict[int, float] = {}
     for first, second in pair_by_seed(reference, target):
@@ -40,7 +40,7 @@ def worst_seeds(reference: Sequence[EpisodeRecord], target: Sequence[EpisodeReco
 
 
 def split_seeds(runs: Mapping[str, LoadedRun]) -> list[dict[str, Any]]:
-    """Return `seed` and `outcomes` by run of the seeds that only some runs completed."""
+    """Return `seed` and `outcomes` by run for seeds that only some runs completed."""
     flights: dict[int, dict[str, EpisodeRecord]] = {}
     for name, run in runs.items():
         for episode in tests_of(run):
@@ -79,7 +79,7 @@ def comparison_document(
     lead: str = "",
     facts_title: str = "What flew",
 ) -> Document:
-    """Return the document of a comparison, dated, with links to the runs relative to `folder`."""
+    """Return the dated document of a comparison, with run links relative to `folder`."""
     first = comparison.runs[0]
     made = runs[first.name].info
     created = made.created_utc.replace("T", " ").replace("+00:00", " UTC")

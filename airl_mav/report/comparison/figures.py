@@ -1,4 +1,4 @@
-"""The figures of a comparison: contrasts, distributions of latency, energy, single seeds."""
+"""Figures of a comparison: contrasts, latency distributions, energy, single seeds."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from airl_mav.report.table import NONE, OUTCOME_LABELS
 ROW_IN = 0.5
 
 CDF_STAGES = ("t2", "end_to_end")
-"""Stages whose distributions are drawn over each other."""
+"""Stages with a figure of cumulative distributions."""
 
 CDF_POINTS = 400
-"""A drawn distribution has at most this many steps: more are not seen, and weigh."""
+"""Maximum number of steps of a distribution; more add size without visible benefit."""
 
 NAME_COLUMNS = 26
-"""A name beside an axis is broken into lines of so many letters."""
+"""Maximum line length of a name beside an axis [characters]."""
 
 Runs = Mapping[str, LoadedRun]
 
@@ -47,7 +47,7 @@ def contrast_pictures(
     *,
     medians: bool = False,
 ) -> list[theme.Picture]:
-    """Draw contrasts with intervals, one picture per measure, published values beside them."""
+    """Draw contrasts with intervals and published values, one picture per measure."""
     names = [contrast_head(comparison, each) for each in contrasts]
     pictures = []
     for measure in MEASURES:
@@ -75,7 +75,7 @@ def contrast_pictures(
 
 
 def _draw_estimate(ax: Axes, row: int, estimate: Estimate) -> list[float]:
-    """Draw an estimate with its interval and its figures; return what the axis must hold."""
+    """Draw an estimate with its interval and numbers; return the values the axis must include."""
     n = f"n = {estimate.n:,}"
     ax.annotate(
         n if estimate.value is None else f"{estimate.value:+.2f}, {n}",
@@ -97,11 +97,11 @@ def _draw_estimate(ax: Axes, row: int, estimate: Estimate) -> list[float]:
 
 
 def _finish_rows(ax: Axes, names: Sequence[str], ends: Sequence[float]) -> None:
-    """Set up the axis of rows: names from top to bottom, zero as a line, all ends inside."""
+    """Set up axes of rows: names from top to bottom, a line at zero, limits around all ends."""
     ax.axvline(0.0, color=theme.MUTED, lw=1.0, zorder=1)
     ax.set_yticks(range(len(names)), names)
     ax.set_ylim(len(names) - 0.5, -0.65)
-    # A row without any difference still has an axis.
+    # Rows without a difference still require a non-zero axis range.
     room = 0.08 * (max(ends) - min(ends)) or 1.0
     ax.set_xlim(min(ends) - room, max(ends) + room)
     theme.plain_axes(ax)
@@ -114,7 +114,7 @@ def _finish_rows(ax: Axes, names: Sequence[str], ends: Sequence[float]) -> None:
 
 
 def latency_pictures(comparison: Comparison, runs: Runs) -> list[theme.Picture]:
-    """Draw the cumulated distributions of all runs, one picture a stage that has samples."""
+    """Draw the cumulative distributions of all runs, one picture per stage with samples."""
     pooled = {name: samples_of(run) for name, run in runs.items()}
     pictures = []
     for stage in (stage for stage in ALL_STAGES if stage.key in CDF_STAGES):
@@ -151,7 +151,7 @@ def latency_pictures(comparison: Comparison, runs: Runs) -> list[theme.Picture]:
 
 
 def cumulated(samples: Samples) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the steps of a distribution of durations (n,) [µs]: at how many ms what share [%]."""
+    """Return the cumulative distribution of durations (n,) [µs]: times [ms] and shares [%]."""
     values = np.sort(samples) / US_PER_MS
     count = min(len(values), CDF_POINTS)
     rank = np.unique(np.linspace(0, len(values) - 1, count).astype(int))
@@ -209,7 +209,7 @@ def energy_picture(comparison: Comparison) -> theme.Picture:
 def flight_panels(
     compared: Sequence[ComparedRun], runs: Runs, most: int | None = None
 ) -> list[Panel]:
-    """Return the flights of each run, or the first of them, for a picture from above."""
+    """Return map panels with the first `most` flights of each run; None = all flights."""
     panels = []
     for figures in compared:
         run = runs[figures.name]
@@ -232,7 +232,7 @@ def flight_panels(
 def seed_picture(
     name: str, compared: Sequence[ComparedRun], runs: Runs, seed: int
 ) -> theme.Picture:
-    """Draw the flights of a seed by several runs from above."""
+    """Draw a map of several runs' flights of a seed."""
     figure = theme.new_figure(4.2, 4.6)
     ax: Axes = figure.subplots()
     flights = [

@@ -1,4 +1,4 @@
-"""The hardware gap: what a policy loses on a computer, with and without mitigation."""
+"""Hardware gap: loss of a policy's quality on a computer, with and without mitigation."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ COMPENSATED = "compensated"
 
 
 def gap_sentence(comparison: Comparison, arena: str) -> str:
-    """Return what the gap of an arena is; empty without its reference or its target."""
+    """Return a sentence on the gap of an arena; empty without reference or target."""
     gaps = {c.entry.key: c for c in reversed(comparison.contrasts_of(arena))}
     if (gap := gaps.get(WITHOUT)) is None:
         return ""
@@ -82,7 +82,7 @@ def _computer(run: ComparedRun) -> str:
 
 
 def _longer(contrast: Contrast) -> str:
-    """Return a gap of the flight time as a comparative, without its `than`."""
+    """Return a gap of the flight time as a comparative without `than`."""
     difference = measures.FLIGHT_TIME.change(contrast.paired).difference
     if difference.value is None:
         return "(no goal that both reached) longer"
@@ -101,17 +101,17 @@ def _rate(run: ComparedRun) -> str:
 
 
 OVERLAID = 100
-"""Flights of a run that are drawn over each other: the first seeds."""
+"""Maximum number of flights drawn in one map, from the first seed on."""
 
 WORST_ROLES = ("reference", "target", "mitigated")
 
 COST, HELP = "cost-on-reference", "mitigation-on-target"
 
 PARTS_OF_ENERGY = (measures.ENERGY, measures.COMPUTER_ENERGY)
-"""In the terminal there is room for their sum."""
+"""Parts of the energy for the page; the terminal has room only for their sum."""
 
 HEADLINED = (WITHOUT, COMPENSATED, WITH, WITH_TRAINED)
-"""Gaps whose figures head an arena."""
+"""Gaps shown as headlines of an arena."""
 
 
 _UNDELAYED = "mitigation, reference undelayed"
@@ -155,14 +155,14 @@ GAP_KINDS = (
         "mitigated, undelayed",
     ),
 )
-"""Which two roles make a gap; the runs that have them take their places. Of `training` there may be
-several runs: one for each source of latency."""
+"""Pairs of roles that form gaps; runs with these roles replace them. The role `training` may have
+several runs, one per source of latency."""
 
 
 def build_gap(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Return the gaps by `role` and arena (`group`) beside published ones, and the worst seeds."""
+    """Return the gaps by `role` and arena (`group`), with published gaps and the worst seeds."""
     contrasts = [
         replace(kind, target=target.name, reference=reference.name)
         for group in dict.fromkeys(entry.group for entry in entries)
@@ -207,7 +207,7 @@ def build_gap(
 
 
 def _published_columns(comparison: Comparison, arena: str) -> tuple[str, dict[str, PublishedRun]]:
-    """Return title and published columns, by our runs' names, of the same computers and latency."""
+    """Return title and columns, by run name, of the published table for the same setup."""
     facts = comparison.facts
     asked = facts.get("computer"), facts.get("reference"), facts.get("latency")
     if asked == ("ras-pi-4", "workstation", None):
@@ -226,7 +226,7 @@ def _published_columns(comparison: Comparison, arena: str) -> tuple[str, dict[st
 
 
 def _as_late(t2_us: float | None, published_ms: float) -> bool:
-    """Return whether decisions come as late as published, for the purpose of a comparison."""
+    """Return True if the latency is close enough to the published latency for a comparison."""
     if t2_us is None:
         return False
     return abs(t2_us / US_PER_MS - published_ms) <= max(0.2 * published_ms, 20.0)
@@ -236,7 +236,7 @@ def _as_late(t2_us: float | None, published_ms: float) -> bool:
 
 
 def runs_table(comparison: Comparison, arena: str) -> TableView:
-    """Return all runs of an arena by themselves, one a row, published ones below theirs."""
+    """Return the results of an arena's runs, one per row, each followed by published values."""
     columns = (
         Column("", number=False),
         Column("t2, mean\n[ms]"),
@@ -277,7 +277,7 @@ def runs_table(comparison: Comparison, arena: str) -> TableView:
 
 
 def gaps_table(comparison: Comparison, arena: str) -> TableView:
-    """Return all gaps of an arena with their intervals, published ones below each."""
+    """Return all gaps of an arena with intervals, each followed by the published gap."""
     notes = []
     runs = comparison.group(arena)
     by_rules: dict[str, list[str]] = {}
@@ -305,7 +305,7 @@ def gaps_table(comparison: Comparison, arena: str) -> TableView:
 
 
 def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
-    """Return everything that a hardware gap says."""
+    """Return the document of a hardware gap."""
     sections = [
         section
         for arena in comparison.groups

@@ -1,4 +1,4 @@
-"""The fidelity ladder: the same policy and seeds at several levels, the first as the reference."""
+"""Fidelity ladder: the same policy and seeds at several levels; the first is the reference."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from airl_mav.report.measures import MEASURES, count_successes
 from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView, columns_of, ms
 
 MAX_SPLIT = 50
-"""Seeds in the table of flights that did not end alike."""
+"""Maximum number of seeds in the table of different outcomes."""
 
 
 def build_ladder(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Compare a ladder of levels with the first; see `show.build_comparison`."""
+    """Compare the levels of a ladder with the first; see `show.build_comparison`."""
     title = f"{facts.get('policy')} in {facts.get('arena')}"
     comparison = compare(runs, kind="ladder", title=title, facts=facts, entries=entries)
     widest = {
@@ -38,7 +38,7 @@ def build_ladder(
 
 
 def start_table(comparison: Comparison) -> TableView:
-    """Return where navigation begins at each level, and how well the place is known."""
+    """Return the start of navigation and the position error at each level."""
     columns = columns_of(
         "<level | flights | take-off [s] | its energy [kJ] | "
         "aside [m] | height [m] | speed [m/s] | position error [m]"
@@ -67,7 +67,7 @@ def _start_row(run: ComparedRun) -> tuple[str, ...]:
 
 
 def split_table(comparison: Comparison) -> TableView:
-    """Return the flights that did not end alike, seed by seed."""
+    """Return the flights with different outcomes, one seed per row."""
     columns = (
         Column("seed"),
         *(Column(run.mark, number=False) for run in comparison.runs),
@@ -93,7 +93,7 @@ def split_table(comparison: Comparison) -> TableView:
 
 
 def other_differences(comparison: Comparison) -> tuple[str, ...]:
-    """Return what else differs between the levels, in sentences: from stamps and paths."""
+    """Return sentences on other differences between the levels, from stamps and paths."""
 
     def across(what: str, text: Callable[[ComparedRun], str | None]) -> str:
         told = [(run.mark, text(run)) for run in comparison.runs]
@@ -139,7 +139,7 @@ def _start_sentence(run: ComparedRun) -> str | None:
 
 
 def _pace_sentence(comparison: Comparison, contrast: Contrast) -> str:
-    """Return mean speed and mean power of both on the common successes; empty without any."""
+    """Return mean speed and power of both runs on common successes; empty without any."""
     p = contrast.paired
     time, distance, energy = p.flight_time_s, p.distance_m, p.energy_j
     parts = [
@@ -167,7 +167,7 @@ def _widest_sentence(comparison: Comparison, contrast: Contrast) -> str:
 
 
 def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
-    """Return everything that a ladder says."""
+    """Return the document of a ladder."""
     reference = comparison.runs[0].mark
     contrasts = comparison.contrasts
     levels = tables.runs_table(comparison.runs, title="Levels", head="level", measures=MEASURES)

@@ -1,4 +1,4 @@
-"""Several policies in several arenas: who flies well where it was not trained."""
+"""Evaluation of several policies in several arenas, including arenas not used in training."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from airl_mav.report.table import NONE, Column, TableView
 def build_matrix(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Return a table of policies (`label`) by arenas (`group`); see `show.build_comparison`."""
+    """Compare policies (`label`) across arenas (`group`); see `show.build_comparison`."""
     title = "Policies by arenas"
     return compare(runs, (), kind="matrix", title=title, facts=facts, entries=entries)
 
 
 def matrix_tables(runs: Sequence[ComparedRun]) -> list[TableView]:
-    """Return one table a measure: policies down, arenas across."""
+    """Return a table per measure with policies in rows and arenas in columns."""
     policies = list(dict.fromkeys(run.label for run in runs))
     arenas = list(dict.fromkeys(run.entry.group for run in runs))
     at = {(run.label, run.entry.group): run for run in runs}
@@ -53,7 +53,7 @@ def _cell(run: ComparedRun | None, measure: Measure) -> str:
 
 
 def trained_here(run: ComparedRun) -> bool:
-    """Return whether a policy was trained in the arena that it flew in."""
+    """Return True if a policy was trained in the arena of its run."""
     return run.entry.group == run.entry.trained_in
 
 
@@ -69,7 +69,7 @@ def _notes(runs: Sequence[ComparedRun], measure: Measure) -> tuple[str, ...]:
 
 
 def success_map(runs: Sequence[ComparedRun]) -> HeatMap:
-    """Return the success rates as a heat map, the first policy on top."""
+    """Return the success rates as a heat map with the first policy at the top."""
     policies = list(dict.fromkeys(run.label for run in runs))[::-1]
     return HeatMap(
         title="success; a star: trained there",
@@ -90,7 +90,7 @@ def success_map(runs: Sequence[ComparedRun]) -> HeatMap:
 
 
 def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
-    """Return everything that a table of policies x arenas says."""
+    """Return the document of a table of policies x arenas."""
     alt = "Success rate of every policy in every arena"
     return comparison_document(
         comparison,

@@ -1,4 +1,4 @@
-"""The comparison model: runs, and contrasts of two of them over pairs of flights."""
+"""Comparison model: runs, and contrasts between two runs over pairs of flights."""
 
 from __future__ import annotations
 
@@ -19,96 +19,96 @@ from airl_mav.profiles.published import PublishedGap, PublishedRun
 T = TypeVar("T")
 
 SCHEMA = 2
-"""Version of the files of a comparison; docs/run-folder.md describes them."""
+"""Schema version of a comparison's files, described in docs/run-folder.md."""
 
 Kind = Literal["compare", "gap", "ladder", "matrix", "degradation"]
-"""Names the files: `gap.json`, `gap.html`, `gap.md`."""
+"""Kind of comparison and stem of its files: `gap.json`, `gap.html`, `gap.md`."""
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 
 @dataclass(frozen=True)
 class RunEntry:
-    """A run of a comparison: what it is called and where it lies."""
+    """Name and folder of a run in a comparison."""
 
     name: str
-    """No two runs of a comparison share it."""
+    """Name, unique within the comparison."""
     folder: str
-    """From the folder of the comparison, or absolute."""
+    """Path relative to the comparison's folder, or absolute."""
     label: str = ""
-    """One line for people; empty: the name."""
+    """Display name on one line; empty = the name."""
     role: str = ""
-    """What the run is for: `reference`, `target`, ..."""
+    """Role of the run: `reference`, `target`, ..."""
     group: str = ""
-    """Runs of one group share tables and figures: an arena, or a policy."""
+    """Arena or policy; runs of one group share tables and figures."""
     planned: int | None = None
-    """Number of episodes asked for; None: as many as its run planned."""
+    """Number of requested episodes; None = the number planned by the run."""
     rules: str = ""
-    """Goal radius, hold, height and time limit."""
+    """Rules of judging: goal radius, hold, height and time limit."""
     trained_in: str | None = None
-    """Arena that its policy was trained in, if it was."""
+    """Training arena of the policy, if trained."""
 
 
 @dataclass(frozen=True)
 class ContrastEntry:
-    """Which run is compared with which reference."""
+    """Names of a run and the reference for its contrast."""
 
     target: str
     reference: str
     key: str = ""
     title: str = ""
-    """One line that names the reference."""
+    """Title on one line that names the reference."""
     short: str = ""
 
 
 def part_of(entry: RunEntry) -> str:
-    """Return a run's name without its group, as words, so that narrow columns can break it."""
+    """Return a run's name without its group, as words that narrow columns can wrap."""
     return entry.name.removeprefix(f"{Path(entry.group).stem}-").replace("-", " ")
 
 
 @dataclass(frozen=True)
 class NavigationStart:
-    """Where navigation begins: means over the flights in which it did."""
+    """Start of navigation: means over the flights with navigation."""
 
     n: int
     takeoff_s: float
-    """Time from the reset to the start of navigation [s]; 0: the level begins in a hover."""
+    """Time from the reset to the start of navigation [s]; 0 = the level starts in a hover."""
     takeoff_distance_m: float
     takeoff_energy_j: float | None
-    """None: not measured in all of them [J]."""
+    """Take-off energy [J]; None if not measured in all flights."""
     aside_m: float
-    """Distance from the vehicle's place at the reset, seen from above [m]."""
+    """Horizontal distance from the vehicle's position at the reset [m]."""
     height_m: float
     speed_m_s: float
 
 
 @dataclass(frozen=True)
 class ComparedRun:
-    """One run in figures."""
+    """Figures of one run."""
 
     entry: RunEntry
     mark: str
-    """Stands for the run where there is little room: its part in the comparison (`target`), a short
+    """Abbreviation of the run for narrow columns: its role in the comparison (`target`), a short
     name, or a letter."""
     setup: Setup
     planned: int
     flown: int
     facts: dict[str, str]
-    """What was flown on what as text, by term."""
+    """Setup of the run as text, by term."""
     quality: Aggregate
     stages: dict[str, Summary]
-    """Durations of the stages of a decision by stage key [µs]; invalid flights left out."""
+    """Durations of decision stages by stage key [µs], without invalid flights."""
     slipped_us: int
-    """Simulated time given up because the host could not keep pace [µs]."""
+    """Simulated time skipped by a host too slow for real time [µs]."""
     start: NavigationStart | None
-    """None where navigation never began."""
+    """Start of navigation; None if navigation never started."""
     position_error_m: float | None
-    """Mean distance, seen from above, between the estimated and the true position during
-    navigation [m]; None where no estimate is recorded."""
+    """Mean horizontal distance between estimated and true position during navigation [m]; None
+    without recorded estimates."""
     sha256: str | None
-    """Fingerprint of all flights; None where flights are never the same, or not all are there."""
+    """Checksum of all flights; None if flights are not reproducible or missing."""
     published: PublishedRun | None = None
-    """The same column of a publication, if it has one."""
+    """Corresponding column of a publication, if any."""
 
     @property
     def name(self) -> str:
@@ -117,7 +117,7 @@ class ComparedRun:
 
     @property
     def label(self) -> str:
-        """One line for people."""
+        """Display name on one line."""
         return self.entry.label or self.entry.name
 
     @property
@@ -127,16 +127,16 @@ class ComparedRun:
 
     @property
     def named(self) -> bool:
-        """Whether its mark is what it is in the comparison, as those of all runs are then."""
+        """True if the mark is the run's role in the comparison, for all runs alike."""
         return bool(self.entry.role) and self.mark == part_of(self.entry)
 
     @property
     def modelled(self) -> bool:
-        """Whether its times come from a model and were not measured: level gym."""
+        """True if times come from a model instead of measurements: level gym."""
         return self.setup.level == "gym"
 
     def has_stage(self, stage: Stage) -> bool:
-        """Return whether the run has durations of a stage that its level tells apart."""
+        """Return True if the run has durations of a stage that its level distinguishes."""
         if self.modelled and stage.key in ("send", "link", "control"):
             return False
         return self.stages[stage.key].n > 0 and (self.modelled or stage != SETPOINT_TO_MOTOR)
@@ -144,48 +144,48 @@ class ComparedRun:
 
 @dataclass(frozen=True)
 class Contrast:
-    """A run against a reference on the same seeds."""
+    """Differences between a run and a reference on the same seeds."""
 
     entry: ContrastEntry
     paired: PairedComparison
     unmatched: int
-    """Flights of a seed that the reference flew in another arena, or to another goal: no pairs."""
+    """Flights without a pair: the reference flew their seed in another arena or to another goal."""
     t2_percent: float | None
-    """Difference of the mean t2 [%]: over all decisions, not paired."""
+    """Difference of the mean t2 [%] over all decisions, unpaired."""
     published: PublishedGap | None = None
-    """The same difference of a publication's columns, if it has both of them."""
+    """Corresponding difference of a publication, if it has both columns."""
 
     @property
     def pairs(self) -> int:
-        """Number of flights of the same episode."""
+        """Number of pairs of flights of the same episode."""
         return self.paired.agreement.n
 
     @property
     def successes(self) -> int:
-        """Number of pairs of which both reached the goal."""
+        """Number of pairs in which both flights reached the goal."""
         return self.paired.flight_time_s.difference.n
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs, and which of them is how much better or worse than which."""
+    """Runs and the contrasts between them."""
 
     kind: Kind
     title: str
     facts: dict[str, Any]
-    """What was asked for; all runs share it."""
+    """Settings of the comparison, shared by all runs."""
     runs: tuple[ComparedRun, ...]
-    """In the order of the tables."""
+    """Runs in the order of the tables."""
     contrasts: tuple[Contrast, ...]
     answers: tuple[str, ...] = ()
-    """The verdict in whole sentences."""
+    """Verdict in full sentences."""
     extra: dict[str, Any] = field(default_factory=dict)
-    """What only this kind has: worst seeds by group, seeds with different outcomes, ..."""
+    """Data of this kind only: worst seeds by group, seeds with different outcomes, ..."""
     schema: int = SCHEMA
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """The groups in the order of the runs."""
+        """Groups in the order of the runs."""
         return tuple(dict.fromkeys(run.entry.group for run in self.runs))
 
     def group(self, name: str) -> tuple[ComparedRun, ...]:
@@ -198,7 +198,7 @@ class Comparison:
         return tuple(c for c in self.contrasts if c.entry.target in names)
 
     def run(self, name: str) -> ComparedRun:
-        """Return the run of a name. Raises KeyError."""
+        """Return the run with a name. Raises KeyError."""
         for run in self.runs:
             if run.name == name:
                 return run
@@ -210,13 +210,13 @@ class Comparison:
 
     @property
     def different(self) -> tuple[str, ...]:
-        """The terms in which the facts of the runs differ."""
+        """Terms in which the facts of the runs differ."""
         terms = dict.fromkeys(term for run in self.runs for term in run.facts)
         return tuple(term for term in terms if len({r.facts.get(term) for r in self.runs}) > 1)
 
     @property
     def same(self) -> dict[str, str]:
-        """The facts that all runs share, by term."""
+        """Facts shared by all runs, by term."""
         different = set(self.different)
         return {term: text for term, text in self.runs[0].facts.items() if term not in different}
 
@@ -228,7 +228,7 @@ class _StoredRun:
 
 @dataclass(frozen=True)
 class _StoredQuestion:
-    """The part of a file that all else is worked out from again, with the runs."""
+    """Part of a file from which, with the runs, a comparison is recomputed."""
 
     facts: dict[str, Any]
     runs: tuple[_StoredRun, ...]
@@ -252,12 +252,12 @@ def comparison_file(folder: Path, kind: Kind) -> Path:
 
 
 def kind_of(folder: Path) -> Kind | None:
-    """Return the kind of comparison that a folder holds; None: none."""
+    """Return the kind of a folder's comparison; None without one."""
     return next((kind for kind in KINDS if comparison_file(folder, kind).exists()), None)
 
 
 def save_comparison(comparison: Comparison, folder: Path) -> None:
-    """Write a comparison's data, whole or not at all."""
+    """Write a comparison's data atomically."""
     folder.mkdir(parents=True, exist_ok=True)
     write_json(
         comparison_file(folder, comparison.kind), _COMPARISON.dump_python(comparison, mode="json")
@@ -265,12 +265,12 @@ def save_comparison(comparison: Comparison, folder: Path) -> None:
 
 
 def load_comparison(folder: Path, kind: Kind) -> Comparison:
-    """Read a comparison's data; its runs are not needed. Raises UsageError."""
+    """Read a comparison's data; does not require the runs. Raises UsageError."""
     return _read(folder, kind, _COMPARISON)
 
 
 def load_entries(folder: Path, kind: Kind) -> tuple[dict[str, Any], tuple[RunEntry, ...]]:
-    """Read what a comparison is worked out from: its facts, and its runs. Raises UsageError."""
+    """Read the facts and runs of a comparison, for recomputing it. Raises UsageError."""
     held = _read(folder, kind, _QUESTION)
     return held.facts, tuple(run.entry for run in held.runs)
 

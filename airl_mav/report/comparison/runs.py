@@ -1,4 +1,4 @@
-"""`airl report RUN RUN`: any runs beside each other, the first as the reference."""
+"""Comparison of any runs with the first as the reference: `airl report RUN RUN`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from airl_mav.report.document import Document, Section
 from airl_mav.report.flights_above import flight_pictures
 
 NAMING = ("policy", "arena", "computer", "level", "vehicle")
-"""Parts of a setup that may tell runs apart."""
+"""Parts of a setup used to distinguish runs."""
 
 LONGEST_NAME = 48
-"""Runs are called by their folders where what tells them apart is longer than this."""
+"""Maximum length of a name derived from differences; longer names are replaced by folders."""
 
 
 def compare_folders(
@@ -28,12 +28,12 @@ def compare_folders(
     """Read runs and compare all others with the first.
 
     Args:
-        paths: Run folders; the folder of a comparison stands for its runs.
-        names: Names of the runs, in the same order; empty = derived from the folders.
+        paths: Run folders; the folder of a comparison selects its runs.
+        names: Names of the runs in the same order; empty = derived from setups or folders.
 
     Raises:
-        UsageError: A folder is no run or has no flights; fewer than two runs; one twice; names that
-            do not fit.
+        UsageError: A folder is no run or has no flights; fewer than two runs; a duplicate run;
+            invalid names.
     """
     folders = [folder for path in paths for folder in run_folders(path)]
     if len(folders) < 2:
@@ -55,7 +55,7 @@ def build_runs(
 
 
 def run_folders(path: Path) -> list[Path]:
-    """Return the run folders that a folder stands for: itself, or those of its comparison."""
+    """Return the run folders for a path: the folder itself, or its comparison's run folders."""
     kind = kind_of(path)
     if kind is None:
         return [path]
@@ -63,7 +63,7 @@ def run_folders(path: Path) -> list[Path]:
 
 
 def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
-    """Return everything that a comparison of runs says."""
+    """Return the document of a comparison of runs."""
     paired = [contrast for contrast in comparison.contrasts if contrast.pairs]
     reference = comparison.runs[0].mark
     facts = tables.facts_table(comparison)
@@ -119,7 +119,7 @@ def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: P
 
 
 def _checked(names: Sequence[str], runs: Sequence[LoadedRun]) -> list[str]:
-    """Return the names of runs: those given, or else what tells them apart."""
+    """Return the given names of runs, or names from their differences."""
     if not names:
         return _names(runs)
     if len(names) != len(runs):

@@ -1,4 +1,4 @@
-"""Work a comparison out, write its files, print it: the same for every kind."""
+"""Building, writing and printing of comparisons of every kind."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from airl_mav.report.verdict import (
 Runs = Mapping[str, LoadedRun]
 
 FLOWN_UNTIL = "flown_until"
-"""Fact of a comparison whose flights were added until the success rate was decided. The rate is
-judged by the test that they were stopped by."""
+"""Fact of a comparison with a sequential test, which stops once the success rate is decided. The
+same test judges the rate."""
 
 _BUILD: dict[
     model.Kind, Callable[[Mapping[str, Any], Sequence[model.RunEntry], Runs], model.Comparison]
@@ -60,7 +60,7 @@ def build_comparison(
 
 
 def rebuild_comparison(folder: Path) -> tuple[model.Comparison, dict[str, LoadedRun]]:
-    """Work the comparison of a folder out again from its runs. Raises UsageError."""
+    """Recompute the comparison of a folder from its runs. Raises UsageError."""
     kind = model.kind_of(folder)
     if kind is None:
         accepted = ", ".join(model.KIND_NAMES.values())
@@ -71,10 +71,10 @@ def rebuild_comparison(folder: Path) -> tuple[model.Comparison, dict[str, Loaded
 def judge_comparison(
     comparison: model.Comparison, loaded: Runs, requirements: Sequence[Requirement] = ()
 ) -> OverallVerdict:
-    """Return the verdict of a comparison; FieldError if a gap is required without any reference.
+    """Return the verdict of a comparison; raise FieldError for a required gap without a reference.
 
-    A hardware gap is judged by the run to deploy. That is the mitigated policy on the onboard
-    computer if flown, otherwise the policy. In other comparisons every run is judged.
+    The verdict on a hardware gap judges the run to deploy: the mitigated policy on the onboard
+    computer if flown, otherwise the policy. Other comparisons judge every run.
     """
     against = {c.entry.target: c for c in reversed(comparison.contrasts)}
     if not against and (gaps := [each for each in requirements if each.gap]):
@@ -97,7 +97,7 @@ def judge_comparison(
             part = replace(part, findings=tuple(settle(each, reached) for each in part.findings))
         parts.append(part)
     verdict = join_verdicts(parts, f"{len(parts)} runs")
-    # Whoever is compared must be valid as well.
+    # All compared runs must be valid, not only the judged runs.
     invalid = {name: invalid_flights(run.episodes) for name, run in loaded.items()}
     lines = tuple(f"{name}, {line}" for name, flights in invalid.items() for line in flights)
     sentences = comparison.answers or verdict.sentences
@@ -129,7 +129,7 @@ def write_comparison(
 def _saved(
     comparison: model.Comparison, loaded: Runs, folder: Path, verdict: OverallVerdict | None
 ) -> Document:
-    """Write the figures and the verdict of a comparison; return its document."""
+    """Write the data and the verdict of a comparison; return its document."""
     verdict = verdict or judge_comparison(comparison, loaded, requirements_of(folder))
     try:
         model.save_comparison(comparison, folder)
@@ -142,7 +142,7 @@ def _saved(
 def comparison_to_document(
     comparison: model.Comparison, loaded: Runs, folder: Path, verdict: OverallVerdict
 ) -> Document:
-    """Return everything that a comparison says; nothing is drawn yet."""
+    """Return the document of a comparison without drawing its pictures."""
     document = _DOCUMENT[comparison.kind](comparison, loaded, folder)
     return replace(document, answers=verdict.lines, status=verdict.status)
 
@@ -155,7 +155,7 @@ def show_comparison(
     verdict: OverallVerdict | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """Print a comparison, then draw its page and print where it lies; as `write_comparison`."""
+    """Print a comparison, write its files as `write_comparison`, and print the page's path."""
     progress = progress or Progress()
     document = _saved(comparison, loaded, folder, verdict)
     print_document(document, console)

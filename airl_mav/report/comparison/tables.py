@@ -1,4 +1,4 @@
-"""The tables of a comparison as text cells: terminal, page and Markdown show the same ones."""
+"""Tables of a comparison as text cells, shared by terminal, page and Markdown."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from airl_mav.report.measures import (
 )
 
 SIDE_BY_SIDE = 4
-"""Up to so many runs stand beside each other, more of them below each other."""
+"""Maximum number of runs in columns; more runs are listed in rows."""
 
 STAGES = (*SHOWN_STAGES[:-1], SETPOINT_TO_MOTOR, SHOWN_STAGES[-1])
-"""Stages of a decision, in the order of the table."""
+"""Stages of a decision in the order of the table."""
 
 THE_PAPER = "the paper"
 
@@ -35,13 +35,13 @@ _PUBLISHED = {
     "distance_m": ("distance_m", "distance_percent"),
     "energy_j": ("energy_kj", "energy_percent"),
 }
-"""Fields of a published run (in the unit that is shown) and of a published gap, by our measure."""
+"""Fields of a published run (in the displayed unit) and a published gap, by measure key."""
 
 _NARROW = "Bootstrap intervals of fewer than {} {} are too narrow."
 
 
 def published_value(run: ComparedRun, measure: Measure) -> float | None:
-    """Return the published figure of a measure, in the unit that is shown."""
+    """Return the published value of a measure in the displayed unit."""
     if run.published is None or measure.key not in _PUBLISHED:
         return None
     value: float | None = getattr(run.published, _PUBLISHED[measure.key][0])
@@ -57,7 +57,7 @@ def published_change(contrast: Contrast, measure: Measure) -> float | None:
 
 
 def signed(value: float | None, digits: int = 1) -> str:
-    """Return a difference with its sign; there is no -0."""
+    """Return a difference with its sign, never as -0."""
     return table.NONE if value is None else f"{round(value, digits) + 0.0:+,.{digits}f}"
 
 
@@ -68,14 +68,14 @@ def versus(comparison: Comparison, contrast: Contrast) -> str:
 
 
 def contrast_head(comparison: Comparison, contrast: Contrast) -> str:
-    """Return the runs of a contrast on lines of their own, and what stands for it if letters do."""
+    """Return the heading of a contrast; without role marks, it includes the short title."""
     target, reference = comparison.pair(contrast)
     if target.named:
         return f"{target.mark}\nagainst {reference.mark}"
     return f"{versus(comparison, contrast)}\n{contrast.entry.short}".rstrip()
 
 
-# --- runs by themselves
+# --- single runs
 
 
 def runs_table(
@@ -85,7 +85,7 @@ def runs_table(
     head: str = "run",
     measures: Sequence[Measure] = (*MEASURES, COMPUTER_ENERGY),
 ) -> table.TableView:
-    """Return every run by itself, one a row."""
+    """Return the results of each run, one per row."""
     columns = (
         table.Column(head, number=False),
         table.Column("flights"),
@@ -111,7 +111,7 @@ def runs_table(
 
 
 def conduct_table(runs: Sequence[ComparedRun]) -> tuple[table.TableView, ...]:
-    """Return deadlines and smoothness of every run by itself; empty where none recorded them."""
+    """Return deadlines and smoothness of each run; empty if no run recorded them."""
     if not any(measure.of(run.quality).n for run in runs for measure in CONDUCT):
         return ()
     view = runs_table(runs, title="Deadlines and smoothness", measures=CONDUCT)
@@ -119,7 +119,7 @@ def conduct_table(runs: Sequence[ComparedRun]) -> tuple[table.TableView, ...]:
 
 
 def facts_table(comparison: Comparison) -> table.TableView:
-    """Return what differs in what was flown, and nothing else; many runs in rows."""
+    """Return only the differences between the setups; many runs are listed in rows."""
     terms, runs = comparison.different, comparison.runs
     note = f"Only what differs. The reference: {runs[0].heading}."
     if len(runs) > SIDE_BY_SIDE:
@@ -150,7 +150,7 @@ def stages_table(runs: Sequence[ComparedRun]) -> table.TableView:
     rows: list[tuple[str, ...]] = []
     mixed = any(run.modelled for run in runs)
     for stage in STAGES:
-        # Where one run has link and control in one, that sum is shown of all.
+        # If one run has link and control in one stage, show that sum for all runs.
         joint = mixed and stage == SETPOINT_TO_MOTOR
         having = [r for r in runs if r.has_stage(stage) or (joint and r.stages[stage.key].n)]
         for number, run in enumerate(having):
@@ -179,7 +179,7 @@ def stages_table(runs: Sequence[ComparedRun]) -> table.TableView:
 def contrast_table(
     comparison: Comparison, contrast: Contrast, measures: Sequence[Measure] = MEASURES
 ) -> table.TableView:
-    """Return one contrast, measure by measure."""
+    """Return a contrast with one row per measure."""
     target, reference = comparison.pair(contrast)
     columns = [
         table.Column("same seeds", number=False),
@@ -242,7 +242,7 @@ def _contrast_row(
 def contrasts_table(
     comparison: Comparison, contrasts: Sequence[Contrast], title: str, notes: Sequence[str] = ()
 ) -> table.TableView:
-    """Return contrasts with their intervals, one a row; published ones below each."""
+    """Return contrasts with intervals, one per row, each followed by the published values."""
     columns = (
         table.Column("", number=False),
         *(table.Column(measure.title, measure.difference_unit) for measure in MEASURES),
@@ -299,7 +299,7 @@ def contrast_headlines(contrast: Contrast, digits: int = 2) -> tuple[Headline, .
 
 
 def pair_sentences(comparison: Comparison) -> tuple[str, ...]:
-    """Return how many pairs there are of every contrast, and why no more."""
+    """Return sentences with the number of pairs of each contrast, and reasons for missing ones."""
     sentences = []
     for contrast in comparison.contrasts:
         target, reference = (run.mark for run in comparison.pair(contrast))
@@ -320,7 +320,7 @@ def pair_sentences(comparison: Comparison) -> tuple[str, ...]:
 
 
 def flights_fact(comparison: Comparison) -> Facts:
-    """Return how many flights each run has, of how many planned."""
+    """Return the number of flown and planned flights of each run."""
     counts = ", ".join(
         f"{run.flown:,} at {run.mark}"
         if run.flown == run.planned
@@ -331,13 +331,13 @@ def flights_fact(comparison: Comparison) -> Facts:
 
 
 def common_rules(comparison: Comparison) -> Facts:
-    """Return the rules that the flights were judged by."""
+    """Return the rules for judging the flights."""
     rules = dict.fromkeys(run.entry.rules for run in comparison.runs if run.entry.rules)
     return (("rules", "; ".join(rules)),) if rules else ()
 
 
 def plain_facts(comparison: Comparison) -> Facts:
-    """Return what was asked for, without what has a place of its own."""
+    """Return the settings of a comparison, except remarks, which are listed separately."""
     return tuple(
         (key.replace("_", " "), f"{value}")
         for key, value in comparison.facts.items()

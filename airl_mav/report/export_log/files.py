@@ -1,4 +1,4 @@
-"""The files of a run's flights."""
+"""Export files of a run's flights."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def flight_of(run: ReplayedRun, index: int) -> RecordedFlight:
 
 
 def write_flight(flight: RecordedFlight, run: Path, out: Path, kind: Format) -> Path:
-    """Write a flight's file into a folder and return its path; a recorded ULog is copied."""
+    """Write a flight to a folder and return the file's path; a recorded ULog is copied."""
     name = f"flight-{flight.replayed.record.index:03d}"
     if kind == "mcap":
         # Imported here: MCAP and Foxglove's messages are extras.

@@ -1,4 +1,4 @@
-"""A recorded flight on Foxglove's WebSocket, at its own pace."""
+"""Playback of a recorded flight in real time over Foxglove's WebSocket."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from airl_mav.report.export_log.recorded import RecordedFlight
 from airl_mav.report.export_log.told import FlightMessages
 
 PAUSE_US = 2_000_000
-"""Between the end of a flight and its next beginning [wall µs]."""
+"""Pause between repetitions of a flight [wall µs]."""
 
 
 SETTLED_S = 0.3
-"""A viewer has subscribed to its topics when no other follows for so long [wall s]."""
+"""Time without a new subscription after which a viewer's subscriptions are complete [wall s]."""
 
 BACKLOG = 1024
-"""Messages that may wait for a viewer, at least (Foxglove's default); the oldest go first."""
+"""Minimum queue length per viewer (Foxglove's default); the oldest messages are dropped first."""
 
 
 class LiveFlight(ServerListener):
-    """Server of a flight from its first viewer on; later ones get each topic's newest message."""
+    """Server that starts playback with its first viewer; later ones get the newest messages."""
 
     def __init__(self, flight: RecordedFlight, port: int) -> None:
-        """Serve on a loopback TCP port, 0 = any free one; raise FieldError if it is taken."""
+        """Serve on a loopback TCP port, 0 = any free port; raise FieldError if it is in use."""
         messages = FlightMessages(flight)
         self._began_unix_us = messages.began_unix_us
         self._told = list(messages)
         self._context = foxglove.Context()
         self._channels: dict[Channel, foxglove.Channel] = {}
         self._newest: dict[int, tuple[foxglove.Channel, bytes, int]] = {}
-        """By the channel's number: channel, message, time [ns]."""
+        """Newest message by channel number: channel, data, time [ns]."""
         self._lock = threading.Lock()
         self._watched, self._another = threading.Event(), threading.Event()
         for channel in dict.fromkeys(message.channel for message in self._told):
@@ -49,13 +49,13 @@ class LiveFlight(ServerListener):
                 port=port,
                 server_listener=self,
                 context=self._context,
-                # A viewer that falls behind keeps the scene, which is told once: room for all.
+                # Room for all messages: a slow viewer must not lose the scene, which is sent once.
                 message_backlog_size=max(BACKLOG, len(self._told)),
             )
         except RuntimeError:
             raise FieldError("port", port, problem="it is taken; accepted: a free one") from None
         self.port = int(self._server.port)
-        """Of the server."""
+        """TCP port of the server."""
 
     def _new(self, channel: Channel) -> foxglove.Channel:
         schema = foxglove.Schema(
@@ -69,7 +69,7 @@ class LiveFlight(ServerListener):
         )
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002
-        """Send the newest message of the channel again; called from the server's thread."""
+        """Resend the newest message of the channel; called from the server's thread."""
         with self._lock:
             newest = self._newest.get(channel.id)
             if newest is not None:
@@ -82,7 +82,7 @@ class LiveFlight(ServerListener):
         channel.log(data, log_time=time_ns)
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until a viewer has subscribed to its topics; return whether there is one."""
+        """Wait until a viewer has subscribed to its topics; return False on timeout."""
         if not self._watched.wait(timeout_s):
             return False
         while self._another.wait(SETTLED_S):
@@ -90,7 +90,7 @@ class LiveFlight(ServerListener):
         return True
 
     def play(self, clock: Clock | None = None) -> None:
-        """Publish the flight once, from its beginning to its end."""
+        """Publish the flight once from start to end."""
         clock = clock or WallClock()
         later_us = clock.time_us() - self._told[0].time_us
         for message in self._told:
@@ -102,7 +102,7 @@ class LiveFlight(ServerListener):
                 self._log(channel, message.data, time_ns)
 
     def run(self, ended: Callable[[], None], clock: Clock | None = None) -> None:
-        """Publish the flight again and again, until interrupted; `ended` is called after each."""
+        """Publish the flight repeatedly until interrupted; `ended` is called after each."""
         clock = clock or WallClock()
         while not self.wait(0.5):
             pass
@@ -112,7 +112,7 @@ class LiveFlight(ServerListener):
             clock.sleep_until(clock.time_us() + PAUSE_US)
             with self._lock:
                 self._newest.clear()
-            # Time begins anew: viewers drop what they have.
+            # Time restarts: viewers must discard their data.
             self._server.clear_session()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""A flight as an MCAP file."""
+"""Export of a flight to an MCAP file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def write_mcap(flight: RecordedFlight, path: Path) -> None:
 
 
 def run_of(flight: RecordedFlight) -> dict[str, Any]:
-    """Return what flew, as a black box says it: the run's settings, with those of this flight."""
+    """Return the run's description as in a black box, with the settings of this flight."""
     record, info = flight.replayed.record, flight.info
     config = info.config
     pilot, limits = dict(config.get("pilot") or {}), dict(config.get("limits") or {})
@@ -45,7 +45,7 @@ def run_of(flight: RecordedFlight) -> dict[str, Any]:
 
 
 def _hold_s(flight: RecordedFlight) -> float:
-    """Return how long actions were held, where the run does not say it: older ones [s]."""
+    """Return the median hold time of actions [s], for older runs without this setting."""
     columns = flight.decisions
     if not len(columns.get("sent_us", ())):
         return 0.0

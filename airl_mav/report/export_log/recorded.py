@@ -1,4 +1,4 @@
-"""What the messages and topics of an exported flight are made of, by the times of its recording."""
+"""Data of a recorded flight for export: estimates, decisions, battery."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from airl_mav.report.replay.flight import ReplayedFlight
 from airl_mav.vehicle.power import drain, open_circuit, terminal_voltage
 
 RECORDED_LEVEL = "flight"
-"""Level of a run that a companion has recorded: nobody knew the truth."""
+"""Level of a run recorded by a companion, without a true path."""
 
 
 @dataclass(frozen=True)
 class RecordedFlight:
-    """A flight, and the run that it belongs to. Times are simulated µs."""
+    """Flight and its run. Times are simulated [µs]."""
 
     replayed: ReplayedFlight
     info: RunInfo
 
     @property
     def truth(self) -> Trajectory | None:
-        """The true path; None: it is not known."""
+        """True path; None if unknown."""
         return None if self.info.setup.level == RECORDED_LEVEL else self.replayed.path
 
     @property
     def estimate(self) -> Trajectory | None:
-        """What the flight controller believed; None: it is not recorded beside the path."""
+        """Path estimated by the flight controller; None if not recorded."""
         stamps = self.replayed.stamps
         if "estimate/time_us" not in stamps or not len(stamps["estimate/time_us"]):
             return None
@@ -47,12 +47,12 @@ class RecordedFlight:
 
     @property
     def believed(self) -> Trajectory:
-        """What the companion was told; the true path where no estimate is recorded."""
+        """Path reported to the companion; the recorded path without estimates."""
         return self.estimate or self.replayed.path
 
     @property
     def decisions(self) -> dict[str, NDArray[Any]]:
-        """The columns of the decisions that were sent, one row each."""
+        """Columns of the sent decisions, one row each."""
         stamps = self.replayed.stamps
         columns = {
             name: stamps[name]
@@ -65,17 +65,17 @@ class RecordedFlight:
 
 @dataclass(frozen=True)
 class Charge:
-    """The battery over time, (n,) at the times of the path."""
+    """Battery state (n,) at the times of the path."""
 
     voltage_v: NDArray[np.float64]
     current_a: NDArray[np.float64]
     discharged_mah: NDArray[np.float64]
     remaining: NDArray[np.float64]
-    """1 full to 0 empty."""
+    """Remaining charge, 1 full to 0 empty."""
 
 
 def charge_of(flight: RecordedFlight) -> Charge | None:
-    """Return the battery, computed from simulated power as in the simulator, otherwise None."""
+    """Return the battery state computed as in the simulator; None without the true path."""
     path, battery = flight.truth, flight.replayed.vehicle.battery
     if path is None:
         return None

@@ -1,6 +1,6 @@
-"""The scene of a flight in Foxglove's primitives: arena, goal, path, vehicle, velocities.
+"""Scene of a flight in Foxglove's primitives: arena, goal, path, vehicle, velocities.
 
-Viewers that seek load the newest message of each topic. Foxglove's frame `world` is ENU: x east, y
+Seeking viewers load the newest message of each topic. Foxglove's frame `world` is ENU: x east, y
 north, z up. Bodies are FLU: x forward, y left, z up. `core.frames` converts.
 """
 
@@ -27,8 +27,8 @@ from airl_mav.view.messages import VehicleShape
 Floats = NDArray[np.float64]
 
 WORLD, VEHICLE, ESTIMATE, CAMERA = "world", "vehicle", "estimate", "camera"
-"""Names of the frames: the arena; the vehicle, truly and as its flight controller believes; the
-depth camera, an optical frame (x right, y down, z forward)."""
+"""Frame names: the arena; the true and the estimated vehicle; the camera's optical frame (x right,
+y down, z forward)."""
 
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -39,7 +39,7 @@ _CHANNELS: dict[tuple[str, Any], Channel] = {}
 
 
 def channel(topic: str, message: Any) -> Channel:
-    """Return the channel of a topic with messages such as this one."""
+    """Return the channel of a topic for messages of this type."""
     key = topic, type(message)
     if key not in _CHANNELS:
         schema = message.get_schema()
@@ -49,45 +49,45 @@ def channel(topic: str, message: Any) -> Channel:
 
 
 def timestamp(unix_us: int) -> messages.Timestamp:
-    """Return a calendar time [µs since 1970]."""
+    """Convert a calendar time [µs since 1970]."""
     seconds, rest_us = divmod(unix_us, US_PER_S)
     return messages.Timestamp(seconds, rest_us * NS_PER_US)
 
 
 def vector(v: Floats) -> messages.Vector3:
-    """Return a vector (3,) of any frame."""
+    """Convert a vector (3,) without changing its frame."""
     x, y, z = v.tolist()
     return messages.Vector3(x=x, y=y, z=z)
 
 
 def quaternion(q: Floats) -> messages.Quaternion:
-    """Return a rotation (4,) [w, x, y, z] of any frames."""
+    """Convert a rotation (4,) [w, x, y, z] without changing its frames."""
     w, x, y, z = q.tolist()
     return messages.Quaternion(x=x, y=y, z=z, w=w)
 
 
 def place(ned: Floats) -> messages.Vector3:
-    """Return a place (3,) NED [m] in `world`."""
+    """Convert a position (3,) NED [m] to `world`."""
     return vector(frames.ned_to_enu(np.asarray(ned, np.float64)))
 
 
 def attitude(ned_from_frd: Floats) -> messages.Quaternion:
-    """Return an attitude (4,) FRD -> NED as FLU -> `world`."""
+    """Convert an attitude (4,) FRD -> NED to FLU -> `world`."""
     return quaternion(frames.quat_ned_frd_to_enu_flu(ned_from_frd))
 
 
 def pose(ned: Floats, ned_from_frd: Floats = UNTURNED) -> messages.Pose:
-    """Return a pose NED [m], FRD -> NED, in `world`."""
+    """Convert a pose NED [m], FRD -> NED, to `world`."""
     return messages.Pose(position=place(ned), orientation=attitude(ned_from_frd))
 
 
 def points(ned: Floats) -> list[messages.Point3]:
-    """Return places (n, 3) NED [m] in `world`."""
+    """Convert positions (n, 3) NED [m] to `world`."""
     return [messages.Point3(x=x, y=y, z=z) for x, y, z in frames.ned_to_enu(ned).tolist()]
 
 
 def colour(rgb: style.Colour, opacity: float = 1.0) -> messages.Color:
-    """Return a colour."""
+    """Convert a colour with an opacity, 0 to 1."""
     red, green, blue = (part / 255.0 for part in rgb)
     return messages.Color(r=red, g=green, b=blue, a=opacity)
 
@@ -95,7 +95,7 @@ def colour(rgb: style.Colour, opacity: float = 1.0) -> messages.Color:
 _ORIGIN = messages.Pose(position=vector(np.zeros(3)), orientation=quaternion(UNTURNED))
 
 THIN_M = 0.02
-"""Floor, walls and discs."""
+"""Thickness of floor, walls and discs [m]."""
 
 Size = tuple[float, float, float]
 
@@ -107,7 +107,7 @@ def _entity(name: str, at: messages.Timestamp, **primitives: Any) -> messages.Sc
 def arena_scene(
     arena: Arena | None, goal: Goal, goal_radius_m: float, at: messages.Timestamp
 ) -> messages.SceneUpdate:
-    """Return what stands still: floor, hills, walls, obstacles, goal and start."""
+    """Return the static scene: floor, hills, walls, obstacles, goal and start."""
     bounds = style.OPEN if arena is None else arena.bounds
     ground = None if arena is None else arena.ground
     base_m = 0.0 if ground is None else ground.height_at(goal[0], goal[1])
@@ -134,7 +134,7 @@ def arena_scene(
 
 
 def movers_scene(arena: Arena, from_us: int, at: messages.Timestamp) -> messages.SceneUpdate:
-    """Return the moving obstacles, so long after the reset [µs]."""
+    """Return the moving obstacles at a time after the reset [µs]."""
     centers = arena.centers_at(from_us)
     moving = range(arena.n_static, len(arena.obstacles))
     return messages.SceneUpdate(
@@ -143,7 +143,7 @@ def movers_scene(arena: Arena, from_us: int, at: messages.Timestamp) -> messages
 
 
 def path_scene(way: Floats, at: messages.Timestamp) -> messages.SceneUpdate:
-    """Return the whole way (n, 3) NED [m] as a line."""
+    """Return the complete path (n, 3) NED [m] as a line."""
     line = messages.LinePrimitive(
         type=messages.LinePrimitiveLineType.LineStrip,
         pose=_ORIGIN,
@@ -158,7 +158,7 @@ def path_scene(way: Floats, at: messages.Timestamp) -> messages.SceneUpdate:
 def velocity_scene(
     position: Floats, flown: Floats, commanded: Floats | None, at: messages.Timestamp
 ) -> messages.SceneUpdate:
-    """Return the velocities (3,) NED [m/s] as arrows from the vehicle's position (3,) NED [m]."""
+    """Return velocities (3,) NED [m/s] as arrows from the vehicle's position (3,) NED [m]."""
     arrows = [_arrow(position, flown, style.FLOWN)]
     if commanded is not None:
         arrows.append(_arrow(position, commanded, style.COMMANDED))
@@ -169,7 +169,7 @@ def velocity_scene(
 def vehicle_scene(
     shape: VehicleShape, frame: str, look: style.Look, at: messages.Timestamp
 ) -> messages.SceneUpdate:
-    """Return a vehicle of its parts, which moves with its frame."""
+    """Return a vehicle built from primitives that move with its frame."""
     forward, right = shape.arm_forward_m, shape.arm_right_m
     height, size = max(0.04, 0.5 * shape.height_m), 0.45 * min(forward, right)
     opacity = 1.0 if look.whole else 0.4
@@ -198,7 +198,7 @@ def vehicle_scene(
 def obstacle(
     arena: Arena, i: int, center: Floats, rgb: style.Colour, name: str, at: messages.Timestamp
 ) -> messages.SceneEntity:
-    """Return obstacle i, whose centre (3,) NED [m] is there now."""
+    """Return obstacle i with its current centre (3,) NED [m]."""
     half_size = arena.obstacles.half_size[i]
     yaw = frames.quat_from_euler(0.0, 0.0, float(arena.obstacles.yaw[i]))
     glass = arena.clear is not None and bool(arena.clear[i])
@@ -252,7 +252,7 @@ def _walls(b: Bounds, rgb: style.Colour) -> list[messages.CubePrimitive]:
 def _ends(
     goal: Goal, radius_m: float, pole_m: tuple[float, float], at: messages.Timestamp
 ) -> messages.SceneEntity:
-    """Return the goal with its name and its pole, from a height to another, and the start."""
+    """Return start and goal; `pole_m` are the lower and upper height of the goal's pole."""
 
     def disc(place: Size, radius: float, rgb: style.Colour) -> messages.CylinderPrimitive:
         return _cylinder(pose(np.array(place) - [0.0, 0.0, THIN_M]), radius, THIN_M, rgb, 0.45)
@@ -293,13 +293,13 @@ def _cube(
 
 
 def _in_body(frd: Floats, yaw: float = 0.0) -> messages.Pose:
-    """Return a place FRD [m] on the body, turned by an angle to the right [rad]."""
+    """Return the pose of a part at FRD [m] on the body, rotated right by `yaw` [rad]."""
     turned = frames.quat_from_euler(0.0, 0.0, -yaw)
     return messages.Pose(position=vector(frames.frd_to_flu(frd)), orientation=quaternion(turned))
 
 
 def _arrow(position: Floats, velocity: Floats, rgb: style.Colour) -> messages.ArrowPrimitive | None:
-    """Return the arrow of a velocity NED [m/s]; None: it is too short."""
+    """Return the arrow of a velocity NED [m/s]; None if too short."""
     length = style.ARROW_S * float(np.linalg.norm(velocity))
     if length < style.LEAST_ARROW_M:
         return None

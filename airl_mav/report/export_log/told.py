@@ -1,4 +1,4 @@
-"""A flight as messages: those of a black box, and Foxglove's for what can be seen."""
+"""Messages of a flight: black-box messages, and Foxglove's for scene and camera."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ from airl_mav.view.shown import OFFBOARD
 from airl_mav.view.style import FIRST, OTHER
 
 ENDED = "ended"
-"""The phase after navigation."""
+"""Phase after navigation."""
 
 SAMPLES_A_SCENE = 5
-"""Rows of the path for one message about what moves in the scene: 10 Hz."""
+"""Path samples per scene message: 10 Hz."""
 
 SAMPLES_A_STATUS = 25
-"""Rows of the path for one message about the battery: 2 Hz, as in a black box."""
+"""Path samples per status message: 2 Hz, as in a black box."""
 
 REFEREE = "referee"
 
@@ -76,11 +76,11 @@ IMAGES: dict[CameraKind, tuple[str, str]] = {
     "rgb": ("rgb8", "/camera/image"),
     "grey": ("mono8", "/camera/image"),
 }
-"""Encoding of a camera's images, and their topic."""
+"""Encoding and topic of a camera's images."""
 
 
 class Told(NamedTuple):
-    """A message, ready to be written or sent."""
+    """Encoded message for a file or a server."""
 
     time_us: int
     channel: Channel
@@ -88,10 +88,10 @@ class Told(NamedTuple):
 
 
 class FlightMessages:
-    """All messages of a flight, in the order of their times."""
+    """Messages of a flight in order of time."""
 
     def __init__(self, flight: RecordedFlight) -> None:
-        """Take a flight."""
+        """Store a flight and its creation time."""
         self.flight = flight
         self._replayed = flight.replayed
         self._record = flight.replayed.record
@@ -100,7 +100,7 @@ class FlightMessages:
         """Calendar time of simulated time 0 [µs since 1970]: the run's creation."""
 
     def __iter__(self) -> Iterator[Told]:
-        """Give them."""
+        """Yield the messages."""
         parts = [self._still(), self._moving(), self._seen(), self._decided(), self._said()]
         parts += [self._state(), self._commanded()]
         return heapq.merge(*parts, key=itemgetter(0))
@@ -122,7 +122,7 @@ class FlightMessages:
     def _camera(self) -> PolicyCamera:
         return PolicyCamera.of(self._replayed.vehicle.camera)
 
-    # --- what is seen in three dimensions
+    # --- 3D scene
 
     def _still(self) -> Iterator[Told]:
         record, time_us = self._record, int(self._path.time_us[0])
@@ -162,7 +162,7 @@ class FlightMessages:
                 )
             ]
             if frame == VEHICLE:
-                # With every pose of the vehicle: a viewer that jumps loads the newest message.
+                # Repeated with every vehicle pose: seeking viewers load only the newest message.
                 transforms.append(
                     messages.FrameTransform(
                         timestamp=at,
@@ -191,8 +191,7 @@ class FlightMessages:
     def _calibration(self, time_us: int) -> messages.CameraCalibration:
         k = self._camera.intrinsics
         f, cx, cy = k.focal, k.cx, k.cy
-        # Foxglove's name of the lens that is OpenCV's fisheye; that of a pinhole without
-        # distortion is left out.
+        # Foxglove's name for OpenCV's fisheye model; a pinhole without distortion has no model.
         bent = k.projection == "fisheye"
         return messages.CameraCalibration(
             timestamp=timestamp(self._unix_us(time_us)),
@@ -255,7 +254,7 @@ class FlightMessages:
     def _commanded(self) -> Iterator[Told]:
         columns = self.flight.decisions
         if not len(columns.get(SETPOINT, ())):
-            return  # no velocity is commanded
+            return  # The policy commands no velocity.
         velocities = self._commands(self._path.time_us)
         which = np.searchsorted(columns["sent_us"], self._path.time_us, side="right") - 1
         rates = np.where(which < 0, 0.0, columns[SETPOINT][np.maximum(which, 0), 3])

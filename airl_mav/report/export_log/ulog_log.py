@@ -1,4 +1,4 @@
-"""Flights as ULog, with the topics of `flight_log.topics`; unknown fields are NaN or 0."""
+"""Export of flights to ULog with the topics of `flight_log.topics`; unknown fields are NaN or 0."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TRAJECTORY_SETPOINT = Topic(
         *("float yaw", "float yawspeed"),
     ),
 )
-"""What the companion asks for; PX4 logs it every 200 ms."""
+"""Setpoint of the companion; PX4 logs it every 200 ms."""
 
 SETPOINT_US = 200_000
 
@@ -58,7 +58,7 @@ Sample = tuple[int, str, Values]
 
 
 def write_ulog(flight: RecordedFlight, path: Path) -> None:
-    """Write a flight as ULog, whose times are shifted if the vehicle's log begins before 0."""
+    """Write a flight as ULog; times are shifted if the path starts before time 0."""
     began_us = int(flight.replayed.path.time_us[0])
     later_us = max(0, -began_us)
     writer = UlogWriter(
@@ -86,14 +86,14 @@ def write_ulog(flight: RecordedFlight, path: Path) -> None:
 
 
 def _later(topic: str, values: Values, later_us: int) -> Values:
-    """Return a topic's values with the time of what was sampled so much later [µs]."""
+    """Return a topic's values with its `timestamp_sample`, if any, shifted by `later_us` [µs]."""
     if not later_us or "uint64_t timestamp_sample" not in EXPORTED[_NUMBER[topic]].fields[:1]:
         return values
     return (values[0] + later_us, *values[1:])
 
 
 def samples(flight: RecordedFlight) -> Iterator[Sample]:
-    """Give what is logged, topic by topic."""
+    """Yield the samples to be logged, topic by topic."""
     path, truth = flight.replayed.path, flight.truth
     yield from _motion(flight.believed, "")
     if truth is not None:
@@ -104,7 +104,7 @@ def samples(flight: RecordedFlight) -> Iterator[Sample]:
 
 
 def row(topic: str, **known: Any) -> Values:
-    """Return the values of a topic's fields, unknown ones as defaults; check names and lengths."""
+    """Return a topic's field values with defaults for missing ones; check names and lengths."""
     values: list[float | int | bool] = []
     for field in EXPORTED[_NUMBER[topic]].fields:
         kind, name = field.split()
@@ -122,7 +122,7 @@ def row(topic: str, **known: Any) -> Values:
 
 
 def _every(path: Trajectory, interval_us: int) -> list[int]:
-    """Return rows of a path that are at least so far apart [µs]."""
+    """Return the row numbers of path samples at least `interval_us` apart [µs]."""
     kept, due_us = [], int(path.time_us[0])
     for i, time_us in enumerate(path.time_us.tolist()):
         if time_us >= due_us:
@@ -132,7 +132,7 @@ def _every(path: Trajectory, interval_us: int) -> list[int]:
 
 
 def _motion(path: Trajectory, suffix: str) -> Iterator[Sample]:
-    """Give attitude, position and velocity, NED; `suffix` is that of the topics' names."""
+    """Yield attitude, position and velocity, NED; `suffix` is appended to the topic names."""
     attitude, position = f"vehicle_attitude{suffix}", f"vehicle_local_position{suffix}"
     for i in _every(path, _LOGGED[attitude].interval_us):
         time_us = int(path.time_us[i])
@@ -184,7 +184,7 @@ def _velocity_setpoints(
 
 
 def _commanded(flight: RecordedFlight, interval_us: int) -> Iterator[tuple[int, int]]:
-    """Give times of the path [µs] at which the policy flies, and its newest decision then."""
+    """Yield path times [µs] during navigation with the number of the newest decision."""
     path = flight.replayed.path
     which = np.searchsorted(flight.decisions["sent_us"], path.time_us, side="right") - 1
     for i in _every(path, interval_us):
@@ -212,7 +212,7 @@ def _battery(flight: RecordedFlight) -> Iterator[Sample]:
 
 
 def _states(flight: RecordedFlight, path: Trajectory) -> Iterator[Sample]:
-    """Give who flies and whether it flies, when that changes and every half second."""
+    """Yield mode, arming and landed state on every change and every half second."""
     last, due_us = None, 0
     for time_us, position in zip(path.time_us.tolist(), path.position, strict=True):
         navigates = flight.replayed.record.navigates(time_us)

@@ -1,1 +1,1 @@
-"""Why a flight failed, or took long: causes worked out from what was recorded."""
+"""Causes of failed and long flights, derived from recorded data."""

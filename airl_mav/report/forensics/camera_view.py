@@ -1,4 +1,4 @@
-"""How much of an obstacle a frame of the camera shows, and where the obstacle lies."""
+"""Visibility and direction of an obstacle in a camera frame."""
 
 from __future__ import annotations
 
@@ -21,71 +21,71 @@ from airl_mav.profiles.camera import Camera
 Floats = NDArray[np.float64]
 
 NOTHING_M = 1e-6
-"""Half extents of an obstacle that is not there [m]."""
+"""Half extents of a removed obstacle [m]."""
 
 SAME_DEPTH_M = 1e-3
-"""Two depths closer than this show the same thing."""
+"""Tolerance for depths of the same surface."""
 
 
 @dataclass(frozen=True)
 class PolicyCamera:
-    """The camera that the policy looked through."""
+    """Camera of the policy."""
 
     intrinsics: Intrinsics
     range_m: float
-    """Farthest depth that gives a return [m]; of a colour camera farther than every arena."""
+    """Maximum depth with a return [m]; for a colour camera, larger than any arena."""
     mount: Mount
 
     @classmethod
     def of(cls, camera: Camera) -> PolicyCamera:
-        """Return the camera of a vehicle."""
+        """Create the policy camera from a profile's camera."""
         range_m = camera.range_m if camera.kind == "depth" else RANGE_M
         return cls(Intrinsics.of(camera), range_m, Mount.of(camera))
 
     @property
     def half_angle_rad(self) -> float:
-        """Return how far to either side it sees [rad]."""
+        """Half of the horizontal field of view [rad]."""
         return 0.5 * self.intrinsics.horizontal_fov_rad
 
     def aside_rad(self, bearing_rad: float) -> float:
-        """Return how far beside the optical axis a bearing from the heading lies [rad]."""
+        """Return the horizontal angle [rad] from the optical axis to a bearing from the heading."""
         return abs(math.remainder(bearing_rad - self.mount.yaw, math.tau))
 
 
 @dataclass(frozen=True)
 class ObstacleView:
-    """Where the spot that was hit lay, seen from the vehicle when a frame was taken."""
+    """Point of impact as seen from the vehicle at the exposure of a frame."""
 
     distance_m: float
-    """From the vehicle's centre, seen from above [m]."""
+    """Horizontal distance from the vehicle's centre [m]."""
     bearing_rad: float
-    """From the vehicle's heading, positive to the right [rad]."""
+    """Bearing from the vehicle's heading, positive to the right [rad]."""
     share: float | None
-    """Part of the picture that showed the obstacle, 0 to 1; None for a wall or the floor."""
+    """Share of the image that shows the obstacle, 0 to 1; None for a wall or the floor."""
     hidden: bool
-    """The obstacle would have been in the picture, but something nearer covered all of it."""
+    """True if the obstacle is within the image but completely occluded."""
 
 
 def passes_through(arena: Arena, i: int, camera: PolicyCamera) -> bool:
-    """Return whether obstacle i is of glass, and the camera measures through it."""
+    """Return True if obstacle i is glass and the camera measures through it."""
     clear = _clear(arena, camera)
     return clear is not None and bool(clear[i])
 
 
 def _clear(arena: Arena, camera: PolicyCamera) -> NDArray[np.bool_] | None:
-    """Return the obstacles (n,) that a camera sees nothing of; None: it sees all."""
+    """Return a mask (n,) of obstacles invisible to a camera; None if all are visible."""
     return arena.clear if camera.intrinsics.kind == "depth" else None
 
 
 def heading_rad(quaternion: Floats) -> float:
-    """Return the heading [rad] of an attitude, 0 north, positive to the east."""
+    """Return the heading [rad] of an attitude, 0 = north, positive to the east."""
     w, x, y, z = (float(part) for part in quaternion)
     cos, sin = heading_of((w, x, y, z))
     return math.atan2(sin, cos)
 
 
 def headings(quaternions: Floats) -> Floats:
-    """Return the headings (n,) [rad] of attitudes (n, 4), without jumps."""
+    """Return the unwrapped headings (n,) [rad] of attitudes (n, 4)."""
     w, x, y, z = quaternions.T
     angle = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     unwrapped: Floats = np.unwrap(angle)
@@ -93,13 +93,13 @@ def headings(quaternions: Floats) -> Floats:
 
 
 def bearing(quaternion: Floats, offset: Floats) -> float:
-    """Return the bearing [rad] from the heading, positive right, of an offset NED [m]."""
+    """Return the bearing [rad] of an offset NED [m] from the heading, positive to the right."""
     angle = math.atan2(offset[1], offset[0]) - heading_rad(quaternion)
     return math.remainder(angle, 2.0 * math.pi)
 
 
 def nearest_spot(obstacles: Obstacles, i: int, center: Floats, position: Floats) -> Floats:
-    """Return the point (2,) of obstacle i's outline from above nearest to a position NED [m]."""
+    """Return the point (2,) of obstacle i's outline nearest to a position NED [m]."""
     offset = position[:2] - center[:2]
     if obstacles.shape[i] == Shape.BOX:
         cos, sin = math.cos(float(obstacles.yaw[i])), math.sin(float(obstacles.yaw[i]))
@@ -121,7 +121,7 @@ def view_obstacle(
     i: int,
     camera: PolicyCamera,
 ) -> ObstacleView:
-    """Return the direction and visibility of obstacle i on a frame; it moves since `began_us`."""
+    """Return direction and visibility of obstacle i in a frame; it may move since `began_us`."""
     position, _, quaternion = pose_at(path, frame_us)
     centers, centers_then = (
         arena.centers_at(frame_us - began_us),
@@ -138,13 +138,13 @@ def view_obstacle(
     def depth(
         keep: slice, meshes: tuple[PlacedMesh, ...], ground: Ground | None = None
     ) -> NDArray[np.float32]:
-        """Return the depth image (h, w) of the arena with some of its obstacles only."""
+        """Return the depth image (h, w) of the arena with only the kept obstacles."""
         o, half = arena.obstacles, arena.obstacles.half_size
         if clear is not None:
-            # Without an extent nothing of it is seen, and all keep their numbers.
+            # A negligible size makes glass invisible and keeps the obstacle numbers.
             half = np.where(clear[:, None], NOTHING_M, half)
         some = Obstacles(o.shape[keep], o.center[keep], half[keep], o.yaw[keep])
-        # What is left is as solid as it is seen, whichever look these would draw.
+        # Without appearance and statics, all remaining obstacles are opaque.
         bare = replace(
             arena, obstacles=some, tours=(), meshes=meshes, ground=ground, appearance=DEFAULT,
             statics=None,
@@ -169,7 +169,7 @@ def view_obstacle(
 
 
 def view_wall(path: Trajectory, frame_us: int, hit_us: int, arena: Arena) -> ObstacleView:
-    """Return where the spot of a wall that was hit lay when a frame was taken."""
+    """Return the direction of a wall's point of impact at the exposure of a frame."""
     b = arena.bounds
     north, east = pose_at(path, hit_us)[0][:2]
     spots = np.array(

@@ -1,4 +1,4 @@
-"""The cause of a failure or of a long flight, in plain sentences, from what was recorded."""
+"""Cause of a failure or a long flight as sentences, derived from recorded data."""
 
 from __future__ import annotations
 
@@ -30,45 +30,45 @@ from airl_mav.report.forensics.camera_view import (
 from airl_mav.report.forensics.long_flights import cause_of_long_flight
 
 LOOK_BACK = 5
-"""Decisions before the collision whose frames are looked at."""
+"""Number of decisions before a collision with examined frames."""
 
 SEEN_SHARE = 0.002
-"""An obstacle on a smaller part of the picture counts as not seen: 6 pixels of 64 x 48."""
+"""Minimum share of the image for a visible obstacle: 6 pixels of 64 x 48."""
 
 _THING = re.compile(r"hit (?:(?:static|moving)-)?([a-z]+(?:-[a-z]+)*(?:[- ](\d+))?)")
 
 
 @dataclass(frozen=True)
 class Collision:
-    """A collision, taken apart."""
+    """Analysis of a collision."""
 
     what: str
-    """As the plant calls it: `static-box-3`, `wall`, `floor`."""
+    """Obstacle as named by the plant: `static-box-3`, `wall`, `floor`."""
     speed_m_s: float
-    """At the collision."""
+    """Speed at the collision."""
     off_heading_rad: float
-    """Direction of flight at the collision, from the heading, positive to the right."""
+    """Direction of flight at the collision relative to the heading, positive to the right."""
     before_s: float | None
-    """Exposure of the last frame that still moved the motors, before the collision [s]; None when
-    no decision ever did."""
+    """Time from the exposure of the last effective frame to the collision [s]; None if no decision
+    took effect."""
     blind_m: float | None
-    """Way flown since then."""
+    """Distance flown since that exposure."""
     lag_s: float | None
-    """Of it: until the motors answered to that frame."""
+    """Time from that exposure to the motors' response."""
     lag_m: float | None
-    """Way flown meanwhile."""
+    """Distance flown before the motors' response."""
     answer_m_s: float | None
-    """Speed at which the motors answered."""
+    """Speed at the motors' response."""
     view: ObstacleView | None
-    """Where the spot that was hit lay on that frame; None where arena or camera is not known."""
+    """Point of impact as seen in that frame; None without the arena or the camera."""
     glass: bool
-    """It is of glass, and the camera measured through it."""
+    """True if the obstacle is glass and the camera measures through it."""
     seen: tuple[bool, ...]
-    """Whether the obstacle was in the picture in each of the last frames decided on, old to new."""
+    """Visibility of the obstacle in each of the last frames with a decision, oldest first."""
 
 
 def decisions_in_effect(stamps: Mapping[str, NDArray[Any]], ended_us: int) -> NDArray[np.int64]:
-    """Return the decisions that moved the motors before a time; otherwise those sent."""
+    """Return the decisions that moved the motors before a time, or the sent ones if unknown."""
     if "sent_us" not in stamps or "capture_us" not in stamps:
         return np.zeros(0, np.int64)
     acts = stamps["sent_us"]
@@ -80,7 +80,7 @@ def decisions_in_effect(stamps: Mapping[str, NDArray[Any]], ended_us: int) -> ND
 
 
 def hit_number(reason: str, arena: Arena | None) -> int | None:
-    """Return the number of the obstacle that a verdict names; None for walls, floor, unknown."""
+    """Return the obstacle number in a verdict; None for walls, floor and unknown obstacles."""
     found = _THING.match(reason)
     if found is None or found[2] is None or arena is None:
         return None
@@ -89,7 +89,7 @@ def hit_number(reason: str, arena: Arena | None) -> int | None:
 
 
 def examine_collision(flight: evidence.Evidence) -> Collision | None:
-    """Take a collision apart; None for a flight that hit nothing, or that has no recording."""
+    """Return the analysis of a collision; None without a collision or a recording."""
     record, path, stamps, arena = flight.record, flight.path, flight.stamps, flight.arena
     if record.outcome is not Outcome.COLLISION or not len(path):
         return None
@@ -142,17 +142,17 @@ def examine_collision(flight: evidence.Evidence) -> Collision | None:
 
 
 SLOW_EXCESS = 0.25
-"""A flight is slow, or long, when it takes this much more than the run's usual one."""
+"""Excess over the run's median, as a fraction, above which a flight is slow or long."""
 
 ACT_S = 0.2
-"""A multicopter has to tilt before it brakes or swerves. With less time than this after the motors
-answered, nothing of the decision shows in its path."""
+"""Minimum time from the motors' response to an effect on the path [s]: a multicopter has to tilt
+before it brakes or swerves."""
 
 USUAL = "as usual"
 
 
 def cause_of(flight: evidence.Evidence, usual: evidence.UsualFlight) -> evidence.Cause:
-    """Return the cause of a failure, or of a flight that took longer than is usual."""
+    """Return the cause of a failure or of a longer flight than usual."""
     outcome = flight.record.outcome
     if outcome is Outcome.ABORTED:
         return evidence.Cause("aborted", (f"{flight.record.reason}.",))
@@ -171,7 +171,7 @@ def cause_of(flight: evidence.Evidence, usual: evidence.UsualFlight) -> evidence
 
 
 def _slow(record: EpisodeRecord, usual: evidence.UsualFlight) -> bool:
-    """Return whether a flight took clearly longer, or a longer way, than is usual."""
+    """Return True if time or distance of a flight clearly exceeds the run's median."""
     lost, excess = evidence.time_lost_s(record, usual), evidence.path_excess(record)
     if lost is None or excess is None or usual.pace_s_m is None or usual.path_ratio is None:
         return False
@@ -220,7 +220,7 @@ def _cause_of_collision(flight: evidence.Evidence, crash: Collision) -> evidence
 
 
 def _seen(crash: Collision, view: ObstacleView, braking_m: Callable[[float], float] | None) -> str:
-    """Return what became of an obstacle in the picture: was there room to act, and to stop?"""
+    """Return the cause for a visible obstacle, by the time to act and the distance to stop."""
     if crash.lag_m is None or crash.lag_s is None or crash.before_s is None:
         return "seen and flown into"
     if crash.before_s - crash.lag_s < ACT_S:
@@ -233,7 +233,7 @@ def _seen(crash: Collision, view: ObstacleView, braking_m: Callable[[float], flo
 
 
 def _where(crash: Collision, camera: PolicyCamera | None) -> str:
-    """Say where the thing that was hit lay on the last frame that moved the motors."""
+    """Return a sentence on the obstacle's position in the last effective frame."""
     view = crash.view
     if view is None or camera is None:
         return ""

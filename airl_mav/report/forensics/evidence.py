@@ -1,4 +1,4 @@
-"""What is known of one flight and of its run: causes are worked out from it."""
+"""Data of a flight and its run from which causes are derived."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ if TYPE_CHECKING:
 
 
 HALF_WIDTH_M = 0.3
-"""Room that a vehicle takes to either side."""
+"""Half-width of a vehicle [m]."""
 
 NO_CAUSE = "no cause found in the data"
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Everything that is known of one flight."""
+    """Available data of one flight."""
 
     record: EpisodeRecord
     path: Trajectory
-    """Up to the verdict; empty where nothing was recorded."""
+    """Path up to the verdict; empty if not recorded."""
     stamps: Mapping[str, NDArray[Any]]
-    """Its decisions by column; empty where there is none."""
+    """Decisions by column; empty without decisions."""
     arena: Arena | None = None
     camera: PolicyCamera | None = None
     braking_m: Callable[[float], float] | None = None
-    """The vehicle's way from a speed [m/s] to a stand [m]."""
+    """Function of the vehicle's stopping distance [m] from a speed [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -46,30 +46,30 @@ class UsualFlight:
     """Medians of a run over the flights that reached the goal."""
 
     pace_s_m: float | None
-    """Flight time by metre of the straight way to the goal's edge."""
+    """Flight time per metre of the straight line to the goal's edge."""
     path_ratio: float | None
-    """Distance flown by the length of that way."""
+    """Ratio of the flown distance to the straight line."""
     speed_m_s: float | None
     """Mean speed of a flight."""
 
 
 @dataclass(frozen=True)
 class Cause:
-    """Why a flight failed, or took long."""
+    """Cause of a failed or long flight."""
 
     kind: str
-    """A few words, the same for all flights with this cause."""
+    """Short name of the cause, equal for all flights with this cause."""
     sentences: tuple[str, ...]
-    """Sentences with the numbers behind it."""
+    """Sentences with the supporting numbers."""
 
 
 def straight_m(record: EpisodeRecord) -> float:
-    """Return the length of the straight level way from the start to the goal's edge [m]."""
+    """Return the horizontal straight distance from the start to the goal's edge [m]."""
     return max(0.1, math.hypot(*record.goal[:2]) - record.goal_radius_m)
 
 
 def usual_flight(records: tuple[EpisodeRecord, ...]) -> UsualFlight:
-    """Return the medians of a run; None where no flight reached the goal."""
+    """Return the medians of a run; all None if no flight reached the goal."""
     good = [(r, r.quality) for r in records if r.outcome is Outcome.SUCCESS and r.quality]
     if not good:
         return UsualFlight(None, None, None)
@@ -81,21 +81,21 @@ def usual_flight(records: tuple[EpisodeRecord, ...]) -> UsualFlight:
 
 
 def time_lost_s(record: EpisodeRecord, usual: UsualFlight) -> float | None:
-    """Return how much longer a flight took than its way takes at the run's median pace [s]."""
+    """Return the time lost relative to the run's median pace [s]."""
     if record.quality is None or usual.pace_s_m is None:
         return None
     return record.quality.flight_time_s - usual.pace_s_m * straight_m(record)
 
 
 def path_excess(record: EpisodeRecord) -> float | None:
-    """Return by how much the way flown exceeds the straight one, as a fraction of it."""
+    """Return the excess of the flown distance over the straight line, as a fraction."""
     if record.quality is None:
         return None
     return record.quality.distance_m / straight_m(record) - 1.0
 
 
 def ranked(run: LoadedRun) -> list[EpisodeRecord]:
-    """Return all flights, worst first: failures, then successes, each by the time they lost."""
+    """Return all flights, worst first: failures, then successes, each by time lost."""
     usual = usual_flight(run.episodes)
 
     def key(e: EpisodeRecord) -> tuple[bool, float, int]:

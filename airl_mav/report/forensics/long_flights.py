@@ -1,4 +1,4 @@
-"""Why a flight never arrived, or took long on its way: swings, stops, circles, passes, detours."""
+"""Causes of timeouts and long flights: swings, stops, circles, missed goals, detours."""
 
 from __future__ import annotations
 
@@ -29,41 +29,41 @@ from airl_mav.report.forensics.evidence import (
 )
 
 MIN_TURNS = 6
-"""Changes of side in a stretch of swinging: fewer are an evasion."""
+"""Minimum number of sign changes of a limit cycle; fewer are an evasive manoeuvre."""
 
 MAX_APART = 4
-"""Greatest number of decisions between two changes of side of one stretch."""
+"""Maximum number of decisions between sign changes of one limit cycle."""
 
 STILL_COMMAND = 0.02
-"""A command smaller than this [m/s, rad/s] has no side."""
+"""Dead band of a command's sign [m/s, rad/s]."""
 
 SPOT_M = 2.0
-"""A limit cycle is on the spot while the vehicle stays this close to where it ends."""
+"""Maximum distance from the end position in a limit cycle on the spot [m]."""
 
 _SIDES = {"yaw": 3, "side": 1}
-"""Column of the setpoint."""
+"""Setpoint column by kind of limit cycle."""
 
 
 @dataclass(frozen=True)
 class LimitCycle:
-    """A stretch of decisions whose side changes over and over."""
+    """Sequence of decisions with repeated sign changes of a command."""
 
     kind: str
-    """`yaw`: of the yaw rate; `side`: of the sideways speed."""
+    """Alternating command: `yaw` for the yaw rate, `side` for the sideways speed."""
     turns: int
     start_us: int
     end_us: int
     on_the_spot: bool
-    """Led nowhere: the vehicle stayed within `SPOT_M` of where it ended."""
+    """True if the vehicle stayed within `SPOT_M` of its end position."""
 
     @property
     def time_s(self) -> float:
-        """Return how long it took [s]."""
+        """Duration [s]."""
         return (self.end_us - self.start_us) / US_PER_S
 
 
 def swinging_stretches(command: NDArray[np.floating[Any]]) -> list[NDArray[np.int64]]:
-    """Return the stretches in which a command (n,) swings: the decisions that change its side."""
+    """Return the limit cycles of a command (n,) as arrays of decisions with a sign change."""
     sided = np.flatnonzero(np.abs(command) > STILL_COMMAND)
     turns = sided[1:][np.sign(command[sided[1:]]) != np.sign(command[sided[:-1]])]
     runs = np.split(turns, np.flatnonzero(np.diff(turns) > MAX_APART) + 1)
@@ -73,7 +73,7 @@ def swinging_stretches(command: NDArray[np.floating[Any]]) -> list[NDArray[np.in
 def longest_limit_cycle(
     stamps: Mapping[str, NDArray[Any]], path: Trajectory, ended_us: int
 ) -> LimitCycle | None:
-    """Return the longest limit cycle on the spot, or else the longest one; None without any."""
+    """Return the longest limit cycle, preferably on the spot; None without any."""
     if "setpoint" not in stamps or "sent_us" not in stamps or not len(path):
         return None
     sent = stamps["sent_us"]
@@ -82,7 +82,7 @@ def longest_limit_cycle(
     swings = []
     for kind, column in _SIDES.items():
         for turns in swinging_stretches(setpoints[:, column]):
-            # The last command flies until the next one, or to the end.
+            # The last command holds until the next command or the end.
             end = int(turns[-1]) + 1
             end_us = int(times[end]) if end < len(times) else ended_us
             swings += _swings(kind, times[turns], end_us, path)
@@ -92,7 +92,7 @@ def longest_limit_cycle(
 def _swings(
     kind: str, turns_us: NDArray[np.int64], end_us: int, path: Trajectory
 ) -> list[LimitCycle]:
-    """Return a stretch as a whole, and the part of it on the spot if there is one."""
+    """Return the complete limit cycle and, if any, its part on the spot."""
     start_us = int(turns_us[0])
     swings = [LimitCycle(kind, len(turns_us), start_us, end_us, on_the_spot=False)]
     part = path.between(start_us, end_us)
@@ -106,32 +106,32 @@ def _swings(
 
 
 STILL_M_S = 0.2
-"""Slower than this the vehicle stands."""
+"""Speed below which the vehicle counts as stationary [m/s]."""
 
 STOOD_SHARE = 0.25
-"""A flight that stood for more of its time than this has that for a cause."""
+"""Minimum share of stationary time for the cause "stood still"."""
 
 CIRCLES = 3.0
-"""As many whole turns in one direction make a flight that circled."""
+"""Minimum number of full turns in one direction for the cause "circled"."""
 
 NEAR_MISS = 2.0
-"""Passing the goal within so many of its radii, and leaving again, is a miss."""
+"""Maximum distance of a missed goal, in goal radii."""
 
 MISS_M = 1.0
-"""How far it must have left again."""
+"""Minimum increase of the goal distance after a missed goal [m]."""
 
 PAUSE_PERIODS = 3.0
-"""A gap between two commands that is so many times the usual one is a pause."""
+"""Minimum gap between commands for a late decision, as a multiple of the median gap."""
 
 SLOW_SHARE = 0.15
-"""A mean speed lower than usual by this much of it is slow."""
+"""Minimum reduction of the mean speed for a slow flight, as a fraction of the median."""
 
 DETOUR_EXCESS = 0.25
-"""A way that is longer than the straight one by this much of it is a detour."""
+"""Minimum excess over the straight line for a detour, as a fraction."""
 
 
 def cause_of_long_flight(flight: Evidence, usual: UsualFlight) -> Cause:
-    """Return why a flight took long, or never arrived."""
+    """Return the cause of a long flight or of a missed goal."""
     record, path = flight.record, flight.path
     start_us = record.zero_us
     part = path.between(start_us, record.ended_us)
@@ -220,7 +220,7 @@ def _late_decision(
 
 def _passed_goal(record: EpisodeRecord, part: Trajectory, start_us: int) -> Cause | None:
     away = _goal_distance(record, part)
-    # What is still to come of the greatest distance: a pass is a dip before it.
+    # Maximum distance still to come: a pass is a minimum with a clear increase after it.
     later = np.maximum.accumulate(away[::-1])[::-1]
     near = (away < NEAR_MISS * record.goal_radius_m) & (later > away + MISS_M)
     if not near.any():

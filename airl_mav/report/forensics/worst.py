@@ -1,4 +1,4 @@
-"""The flights that went worst, and why."""
+"""Worst flights of a run and their causes."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from airl_mav.report.forensics.causes import cause_of
 from airl_mav.report.table import NONE, OUTCOME_LABELS, TableView, columns_of
 
 EXAMINED = 100
-"""Flights whose cause is looked for: the worst."""
+"""Maximum number of flights with a derived cause, worst first."""
 
 LISTED = 12
-"""Rows of the table of worst flights."""
+"""Maximum number of rows in the table of worst flights."""
 
 NAMED = 6
-"""Flights named beside each cause."""
+"""Maximum number of flights listed per cause."""
 
 NOT_RECORDED = Trajectory(
     np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0)
@@ -38,18 +38,18 @@ NOT_RECORDED = Trajectory(
 
 @dataclass(frozen=True)
 class ExaminedFlight:
-    """A flight and its cause."""
+    """Flight and its cause."""
 
     record: EpisodeRecord
     cause: evidence.Cause
     lost_s: float | None
-    """Against the run's median pace over the same straight way [s]."""
+    """Time lost relative to the run's median pace over the same straight line [s]."""
     excess: float | None
-    """Of the way flown over the straight one, as a fraction."""
+    """Excess of the flown distance over the straight line, as a fraction."""
 
 
 def flown_path(run: LoadedRun, record: EpisodeRecord) -> Trajectory | None:
-    """Return a flight's path up to the verdict; what is recorded after it is the landing."""
+    """Return a flight's path up to the verdict, without the landing recorded after it."""
     path = run.trajectories.get(record.index)
     if path is None or not len(path):
         return None
@@ -59,7 +59,7 @@ def flown_path(run: LoadedRun, record: EpisodeRecord) -> Trajectory | None:
 def examine_worst(
     run: LoadedRun, arenas: Mapping[int, Arena], vehicle: VehicleProfile | None
 ) -> list[ExaminedFlight]:
-    """Return the worst flights, at most `EXAMINED`, with their causes as far as data allow."""
+    """Return up to `EXAMINED` worst flights with their causes, as far as data allow."""
     usual = evidence.usual_flight(run.episodes)
     camera = None if vehicle is None else PolicyCamera.of(vehicle.camera)
     brake = None if vehicle is None else partial(_braking_m, vehicle)
@@ -97,7 +97,7 @@ def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView:
 def _row(judged: ExaminedFlight) -> tuple[str, ...]:
     record = judged.record
     arrived = record.outcome is Outcome.SUCCESS
-    # What ended early has not saved time.
+    # Time lost is meaningless for flights that ended early.
     whole = arrived or record.outcome is Outcome.TIMEOUT
     return (
         f"{record.index}",
@@ -111,7 +111,7 @@ def _row(judged: ExaminedFlight) -> tuple[str, ...]:
 
 
 def causes_table(judged: Sequence[ExaminedFlight], run: LoadedRun) -> TableView | None:
-    """Return how often each cause made a flight fail; None where fewer than two failed."""
+    """Return the number of failed flights by cause; None for fewer than two failures."""
     failed = [j for j in judged if j.record.outcome is not Outcome.SUCCESS]
     if len(failed) < 2:
         return None

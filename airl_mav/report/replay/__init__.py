@@ -1,1 +1,1 @@
-"""A run that was flown, in the scene of the live view."""
+"""Replay of a recorded run in the scene of the live view."""

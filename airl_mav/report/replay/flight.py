@@ -1,4 +1,4 @@
-"""A recorded flight at any moment: what a view would have shown then."""
+"""State of a recorded flight at any time, as a live view shows it."""
 
 from __future__ import annotations
 
@@ -20,49 +20,49 @@ from airl_mav.view import messages
 from airl_mav.view.shown import OFFBOARD, STRIP_S, TRAIL_STEP_M, Shown
 
 INFO, WARNING = 6, 4
-"""MAV_SEVERITY."""
+"""Levels of MAV_SEVERITY."""
 
 STANDING_M = 0.2
-"""Lower than this a vehicle that does not navigate stands [m]."""
+"""Maximum height of a landed vehicle outside navigation [m]."""
 
 TURNING = (0.5, 0.5, 0.5, 0.5)
-"""Rotors of a vehicle that flies: their speeds are not recorded."""
+"""Displayed rotor speeds of a flying vehicle; real speeds are not recorded."""
 
 PARTED = 0.05
-"""Setpoints that differ by more are different decisions [m/s, rad/s]."""
+"""Tolerance for equal setpoints [m/s, rad/s]."""
 
 AGE_STEP_US = 40_000
-"""The strip has a point so often [µs]."""
+"""Period of the points of the latency strip [µs]."""
 
 
 @dataclass(frozen=True)
 class ReplayedFlight:
-    """One flight of a run. Times are those of its record: simulated µs."""
+    """Flight of a run. Times are simulated, as in its record [µs]."""
 
     record: EpisodeRecord
     path: Trajectory
-    """To the end of the recording; one sample or more."""
+    """Path to the end of the recording, one or more samples."""
     stamps: Arrays
-    """Of its decisions, by column; empty where none were recorded."""
+    """Decisions by column; empty if not recorded."""
     arena: Arena | None
     vehicle: VehicleProfile
     compensated: bool
-    """Whether the companion compensated its latency."""
+    """True if the companion compensated latency."""
 
     @property
     def label(self) -> str:
-        """What the flight is called."""
+        """Name of the flight."""
         record = self.record
         return f"{record.index:03d}, seed {record.seed}, {record.outcome.value}"
 
     @property
     def duration_s(self) -> float:
-        """From the reset to the end of the recording [s]."""
+        """Time from the reset to the end of the recording [s]."""
         return (int(self.path.time_us[-1]) - self.record.started_us) / US_PER_S
 
     @cached_property
     def episode(self) -> messages.Episode:
-        """Its scene."""
+        """Message with the flight's scene."""
         return messages.Episode(
             seed=self.record.seed,
             started_us=self.record.started_us,
@@ -74,7 +74,7 @@ class ReplayedFlight:
 
     @cached_property
     def trail(self) -> list[tuple[float, float, float]]:
-        """The whole way (n, 3) NED [m]."""
+        """Complete path (n, 3) NED [m]."""
         way, kept = self.path.position, [0]
         for i, step in enumerate(way):
             if np.linalg.norm(step - way[kept[-1]]) >= TRAIL_STEP_M:
@@ -83,7 +83,7 @@ class ReplayedFlight:
 
     @cached_property
     def sent_us(self) -> NDArray[np.int64]:
-        """When each decision was sent (n,), increasing; n = 0: none is recorded."""
+        """Send times of the decisions (n,), increasing; n = 0 without recorded decisions."""
         return np.asarray(self.stamps.get("sent_us", np.zeros(0)), np.int64)
 
     @cached_property
@@ -99,19 +99,19 @@ class ReplayedFlight:
         return np.stack([(times - self.record.started_us) / US_PER_S, ages, t2s], axis=1)
 
     def time_us(self, seconds: float) -> int:
-        """Return the time so long after the reset [µs]."""
+        """Convert seconds after the reset to simulated time [µs]."""
         return self.record.started_us + round(seconds * US_PER_S)
 
     def decision(self, time_us: int) -> int | None:
-        """Return the number of the decision that acts at a time; None: none yet."""
+        """Return the number of the newest decision at a time; None before the first."""
         number = int(np.searchsorted(self.sent_us, time_us, side="right")) - 1
         return None if number < 0 else number
 
     def image(self, time_us: int) -> messages.Image | None:
-        """Return what the camera saw at a time, without noise; None: no arena."""
+        """Return the camera image at a time, without noise; None without an arena."""
         if self.arena is None:
             return None
-        # Imported here: with them comes numba, and a flight is shown before its arena.
+        # Imported here, as they load numba and a flight is shown before its arena.
         from airl_mav.camera.exposure import expose
         from airl_mav.camera.render import camera_pose
         from airl_mav.report.forensics.camera_view import PolicyCamera
@@ -124,7 +124,7 @@ class ReplayedFlight:
         return expose(self.arena, centers, camera.intrinsics, camera.range_m, at, attitude)
 
     def show(self, shown: Shown, seconds: float) -> None:
-        """Make `shown` what it was so long after the reset [s]; episode and arena are there."""
+        """Set `shown` to a time after the reset [s]; its episode and arena remain."""
         record, time_us = self.record, self.time_us(seconds)
         position, velocity, quaternion = pose_at(self.path, time_us)
         navigates = record.navigates(time_us)
@@ -180,7 +180,7 @@ class ReplayedFlight:
         )
 
     def begin(self, shown: Shown) -> None:
-        """Make `shown` this flight's, instead of another's."""
+        """Reset `shown` to this flight."""
         record = self.record
         shown.take(self.episode, None)
         shown.is_surrounded = True
@@ -197,10 +197,10 @@ class ReplayedFlight:
         shown.texts.append(messages.Said(time_us=record.ended_us, severity=INFO, text=how))
 
     def surround(self, shown: Shown) -> None:
-        """Add the arena to `shown`, which began as this flight without it."""
+        """Add the arena to `shown`, which so far shows this flight without an arena."""
         shown.episode, shown.arena = self.episode, self.arena
         shown.is_surrounded = True
-        shown.decided = None  # What the policy saw is shown with the next moment.
+        shown.decided = None  # The next update shows the policy's image.
 
 
 def parting_s(first: ReplayedFlight, other: ReplayedFlight) -> float | None:

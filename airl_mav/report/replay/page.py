@@ -1,4 +1,4 @@
-"""The page on which a run is replayed: the live view's scene and panel, and a slider of time."""
+"""Replay page of a run: the live view's scene and panel with a time slider."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ from airl_mav.view.style import OTHER
 from airl_mav.view.watchers import Watchers
 
 DRAW_US = 33_000
-"""Time between two drawings [wall µs]."""
+"""Period of scene updates [wall µs]."""
 
 LATE_US = 500_000
-"""A page that was busy for longer goes on from where it was [wall µs]."""
+"""Maximum time step of the replay [wall µs]; the rest of a longer delay is skipped."""
 
 PANEL_S = 0.2
-"""Time between two drawings of the panel and the camera's image [wall s]."""
+"""Period of updates of the panel and the camera's image [wall s]."""
 
 GLIDE_S = 0.1
-"""In so much time the scene follows the slider [wall s]. A page without a GPU tells of it
-every 0.09 s."""
+"""Duration of the transition to the slider's time [wall s]. A page without a GPU reports the
+slider every 0.09 s."""
 
 STEP_S = 0.02
-"""Step of the slider: that of the recording [s]."""
+"""Step of the slider [s], equal to the recording's period."""
 
 SPEEDS = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "5 x": 5.0}
 
 ALONE = "none"
-"""What is chosen to fly beside where nothing shall."""
+"""Menu entry for a replay without a second run."""
 
 BEFORE_S = 0.5
-"""It begins so long before the policy takes over [s]."""
+"""Time shown before the start of navigation [s]."""
 
 
 class ReplayPage:
-    """Replays flights of a run, with those of another run beside them."""
+    """Page that replays flights of a run, optionally with the flights of a second run."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class ReplayPage:
         first: EpisodeRecord | None = None,
         runs: ReplayedRuns | None = None,
     ) -> None:
-        """Build the page at the start of a flight: of `first`, or the worst."""
+        """Build the page at the start of flight `first`; None = the worst flight."""
         self._run, self._beside, self._runs = run, beside, runs
         self._shown, self._others = Shown(), Shown()
         self._scene = FlightScene(server)
@@ -69,17 +69,17 @@ class ReplayPage:
         self._playing = True
         self._dirty = True
         self._behind = False
-        """Whether the panel shows an earlier moment than the scene."""
+        """True if the panel shows an earlier time than the scene."""
         self._since_panel_s = PANEL_S
         self._slid = False
-        """Whether the slider is where it is because somebody drags it."""
+        """True if a viewer moved the slider to the current time."""
         self._slid_to_s = 0.0
-        """Where it was dragged."""
+        """Target time of the slider [s]."""
         self._glides_s = 0.0
-        """In how much time the scene is there [wall s]; 0: it does not follow it."""
+        """Remaining time of the transition to the slider's time [wall s]; 0 = no transition."""
         self._drawn = 0
         self._other: ReplayedFlight | None = None
-        """What flies beside."""
+        """Flight of the second run."""
         self._open(run.way(first or run.records[0]))
 
     def _add_head(self) -> None:
@@ -137,7 +137,7 @@ class ReplayPage:
 
     @staticmethod
     def _told(event: Any, act: Callable[[], None]) -> bool:
-        """Do something; where that cannot be, tell it on the page and return False."""
+        """Run an action; on UsageError, show a notification on the page and return False."""
         try:
             act()
         except UsageError as error:
@@ -145,7 +145,7 @@ class ReplayPage:
             return False
         return True
 
-    # --- where it is
+    # --- position in time
 
     def _open(self, way: ReplayedFlight) -> None:
         """Show a flight at once and add its arena when ready; late viewers get both."""
@@ -158,7 +158,7 @@ class ReplayPage:
         self._watchers.expect(self._shown)
         self._panel.draw_title(self._shown)
         flight = self._run.flight(way.record)
-        if self._flight is way:  # Nobody has chosen another one meanwhile.
+        if self._flight is way:  # No other flight was chosen while the arena was generated.
             self._flight = flight
             flight.surround(self._shown)
             self._accompany(way.record)
@@ -192,7 +192,7 @@ class ReplayPage:
         self._accompany(record)
 
     def _accompany(self, record: EpisodeRecord) -> None:
-        """Let the other run's flight fly beside, and set the panel to their beginning."""
+        """Add the second run's flight of the same seed and go to the start of the flight."""
         self._other = None
         if self._beside is not None and (same := self._beside.same(record)) is not None:
             self._other = self._beside.flight(same)
@@ -230,7 +230,7 @@ class ReplayPage:
     # --- drawing
 
     def run(self, clock: Clock | None = None) -> None:
-        """Play until interrupted."""
+        """Run the replay until interrupted."""
         clock = clock or WallClock()
         before_us = clock.time_us()
         while True:
@@ -240,7 +240,7 @@ class ReplayPage:
             before_us = now_us
 
     def advance(self, wall_s: float) -> None:
-        """Play so much wall time, and draw; nothing happens while nobody watches."""
+        """Advance by `wall_s` of wall time and draw; does nothing without viewers."""
         if not self._watchers.there:
             return
         if self._playing:
@@ -262,7 +262,7 @@ class ReplayPage:
         self._watchers.follow(self._shown)
 
     def draw(self, *, panel: bool = True) -> None:
-        """Draw the present moment; the panel only where `panel` says so."""
+        """Draw the current time; with `panel`, including the panel."""
         self._dirty = False
         self._behind = True
         self._drawn += 1
@@ -275,10 +275,10 @@ class ReplayPage:
             self._draw_panel()
 
     def _draw_panel(self) -> None:
-        """Draw the panel and the camera's image, which take a page longer than the scene."""
+        """Draw the panel and the camera's image, which a page draws slower than the scene."""
         self._behind, self._since_panel_s = False, 0.0
         self._scene.draw_picture(self._shown)
-        if not self._slid:  # Else it would be pulled back from under the hand that drags it.
+        if not self._slid:  # An update would move the slider while a viewer drags it.
             self._time.value = round(self._seconds, 2)
         self._panel.draw(self._shown)
         self._panel.draw_strip(self._shown)

@@ -1,4 +1,4 @@
-"""The flights of a run, ready to be replayed, the worst first."""
+"""Flights of runs for replay, worst first."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from airl_mav.report.replay.flight import ReplayedFlight
 
 
 def run_folders(path: Path) -> list[Path]:
-    """Return a campaign's run folders, or the path itself; UsageError if it is empty."""
+    """Return a campaign's run folders, or the path itself; raise UsageError if it is empty."""
     if not (path / CAMPAIGN_FILE).is_file():
         return [path]
     found = sorted(file.parent for file in path.glob(f"*/{RUN_FILE}"))
@@ -26,10 +26,10 @@ def run_folders(path: Path) -> list[Path]:
 
 
 class ReplayedRuns:
-    """Runs that can be chosen, each read when it is asked for."""
+    """Selectable runs, each read on first use."""
 
     def __init__(self, folders: Iterable[Path]) -> None:
-        """Name them by their folders; by all of their paths where two have the same name."""
+        """Name the runs by their folders, or by full paths if folder names are not unique."""
         paths = list(dict.fromkeys(folders))
         short = [path.name for path in paths]
         names = short if len(set(short)) == len(short) else [str(path) for path in paths]
@@ -38,11 +38,11 @@ class ReplayedRuns:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the runs."""
         return tuple(self._folders)
 
     def name_of(self, run: ReplayedRun) -> str:
-        """Return what one of them is called."""
+        """Return the name of a run."""
         return next(name for name, path in self._folders.items() if path == run.path)
 
     def at(self, folder: Path) -> ReplayedRun:
@@ -50,32 +50,32 @@ class ReplayedRuns:
         return self.run(next(name for name, path in self._folders.items() if path == folder))
 
     def run(self, name: str) -> ReplayedRun:
-        """Return one of them. Raises UsageError as `ReplayedRun`."""
+        """Return the run with a name. Raises UsageError as `ReplayedRun`."""
         if name not in self._read:
             self._read[name] = ReplayedRun(self._folders[name])
         return self._read[name]
 
 
 class ReplayedRun:
-    """A run folder; what a flight needs beside its record is made when it is asked for."""
+    """Run folder with flights for replay, each prepared on first use."""
 
     def __init__(self, path: Path) -> None:
-        """Read a run folder; UsageError if no flight was recorded or a profile is missing."""
+        """Read a run folder; raise UsageError without recorded flights or with missing profiles."""
         self._run: LoadedRun = load(path)
         self._vehicle: VehicleProfile = vehicle_of(self._run.info)
         self.path, self.info = path, self._run.info
         self.title = f"{self._run.info.setup.policy.name} in {self._run.info.setup.arena.name}"
-        """Flights and their arenas."""
+        """Title of the run: policy and arena."""
         paths = self._run.trajectories
         recorded = [e for e in ranked(self._run) if e.index in paths and len(paths[e.index])]
         if not recorded:
             raise UsageError(f"{path}: no flight is recorded")
         self.records: tuple[EpisodeRecord, ...] = tuple(recorded)
-        """Those that can be replayed, the worst first."""
+        """Records of flights with a path, worst first."""
         self._made: dict[int, ReplayedFlight] = {}
 
     def record(self, index: int) -> EpisodeRecord:
-        """Return the record of a flight. Raises FieldError where it is not there."""
+        """Return the record of a flight. Raises FieldError if the flight is not recorded."""
         found = next((each for each in self.records if each.index == index), None)
         if found is None:
             numbers = sorted(each.index for each in self.records)
@@ -83,12 +83,12 @@ class ReplayedRun:
         return found
 
     def check(self, record: EpisodeRecord) -> None:
-        """Raise UsageError unless the arena of a flight can be made."""
+        """Raise UsageError if the arena of a flight cannot be generated."""
         if record.arena != NO_ARENA:
             spec_of(record.arena)
 
     def way(self, record: EpisodeRecord) -> ReplayedFlight:
-        """Return a flight without its arena, which takes longer to make than all the rest."""
+        """Return a flight without its arena, which is slow to generate."""
         index, run = record.index, self._run
         return ReplayedFlight(
             record,
@@ -100,7 +100,7 @@ class ReplayedRun:
         )
 
     def flight(self, record: EpisodeRecord) -> ReplayedFlight:
-        """Return a flight. Raises UsageError where its arena cannot be made any more."""
+        """Return a flight with its arena. Raises UsageError if the arena cannot be generated."""
         index = record.index
         if index not in self._made:
             arena = arenas_of([record], self._vehicle).get(index)
@@ -108,7 +108,7 @@ class ReplayedRun:
         return self._made[index]
 
     def same(self, record: EpisodeRecord) -> EpisodeRecord | None:
-        """Return the flight of the same seed and arena as another run's; None: there is none."""
+        """Return the flight with the seed and arena of another run's flight; None without one."""
         key = (record.seed, record.arena, record.arena_seed, record.zone)
         for each in self.records:
             if (each.seed, each.arena, each.arena_seed, each.zone) == key:

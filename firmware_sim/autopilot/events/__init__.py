@@ -1,1 +1,1 @@
-"""MAVLink events, as PX4 sends them: numbers that ground stations have words for."""
+"""MAVLink events as sent by PX4: ids with texts in ground stations."""

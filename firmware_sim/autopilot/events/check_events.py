@@ -1,6 +1,6 @@
-"""Events of the health and arming checks: what keeps the vehicle from arming, mode by mode.
+"""Events of the health and arming checks: reasons against arming, by mode.
 
-Names, words, parts of the vehicle and levels: PX4 1.16, commander/HealthAndArmingChecks.
+Names, texts, components and levels: PX4 1.16, commander/HealthAndArmingChecks.
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ from firmware_sim.autopilot.events.definition import Argument, Definition, Level
 from firmware_sim.autopilot.events.enumerations import Component
 
 _ABOUT = arguments("navigation_mode_group_t modes, uint8_t health_component_index")
-"""What every check says first: modes it is about, part of the vehicle."""
+"""First arguments of every check: affected modes and component."""
 
 _FIRST = arguments("uint8_t instance")
 
 
 class CheckEvent(NamedTuple):
-    """The event of a check, and what it is about."""
+    """Event of a check, with its component."""
 
     definition: Definition
     component: Component
     values: tuple[float, ...] = ()
-    """Further arguments."""
+    """Additional arguments."""
 
     @property
     def is_health(self) -> bool:
-        """Whether it is about broken hardware; else about what arming asks for."""
+        """True for a hardware fault, False for an unmet arming requirement."""
         return self.definition.group == "health"
 
 
@@ -38,7 +38,7 @@ def _check(
     description: str = "",
     parameters: str = "",
 ) -> CheckEvent:
-    """Return a check; `parameters` configure it, where the description does not say more."""
+    """Return a check; `parameters` configure it if there is no description."""
     if parameters:
         named = " and ".join(f"<param>{each}</param>" for each in parameters.split())
         description = f"Configured by {named}."
@@ -126,7 +126,7 @@ _MAG_INTERFERENCE = Definition(
     group="arming_check",
 )
 MAG_INTERFERENCE = CheckEvent(_MAG_INTERFERENCE, _ESTIMATE, (float("nan"),) * 4)
-"""Field strength [gauss] and inclination [deg], measured and expected: not given here."""
+"""Field strength [gauss] and inclination [deg], measured and expected: not available here."""
 ROLLED = _check(
     "check_failure_detector_roll",
     "Attitude failure detected",

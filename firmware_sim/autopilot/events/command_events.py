@@ -1,6 +1,6 @@
-"""Events of commands and setpoints that are refused, and of calibrations.
+"""Events of rejected commands and setpoints, and of calibrations.
 
-Names, words, arguments and levels: PX4 1.16, commander/Commander.cpp, commander/rc_calibration.cpp,
+Source: PX4 1.16, commander/Commander.cpp, commander/rc_calibration.cpp,
 mavlink/mavlink_receiver.cpp, navigator/navigator_main.cpp, flight_mode_manager/tasks/Orbit.
 """
 

@@ -1,4 +1,4 @@
-"""Events: a definition with words, and one that happened, as it is sent.
+"""Event definitions with texts, and events in wire format.
 
 Source: https://mavlink.io/en/services/events.html, and PX4 1.16,
 platforms/common/include/px4_platform_common/events.h.
@@ -15,9 +15,9 @@ from typing import NamedTuple
 from firmware_sim.autopilot.events.enumerations import ENUMERATIONS
 
 _AUTOPILOT = 1
-"""Component id in the uppermost byte of an event's id."""
+"""Component id in the most significant byte of an event's id."""
 _FNV_BASIS, _FNV_PRIME = 0x811C9DC5, 0x01000193
-"""Of the hash FNV-1a with 32 bits (http://www.isthe.com/chongo/tech/comp/fnv/)."""
+"""Constants of the 32-bit FNV-1a hash (http://www.isthe.com/chongo/tech/comp/fnv/)."""
 
 _FLOAT_MAX = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
 
@@ -32,11 +32,11 @@ FORMATS = {
     "int64_t": "q",
     "float": "f",
 }
-"""Types of arguments, as `struct` has them."""
+"""Argument types and their `struct` formats."""
 
 
 class Level(IntEnum):
-    """Urgency of an event. PROTOCOL is for ground stations' own use."""
+    """Severity of an event. PROTOCOL events are for internal use of ground stations."""
 
     EMERGENCY = 0
     ALERT = 1
@@ -51,25 +51,25 @@ class Level(IntEnum):
 
 
 class Argument(NamedTuple):
-    """One argument of a definition."""
+    """Argument of an event definition."""
 
     kind: str
-    """One of `FORMATS`, or an enumeration of `ENUMERATIONS`."""
+    """Key of `FORMATS` or `ENUMERATIONS`."""
     name: str
 
 
 class Event(NamedTuple):
-    """An event that happened."""
+    """Event instance in wire format."""
 
     number: int
-    """MAVLink's id of the event: component and hash of its name."""
+    """MAVLink event id: component and hash of the name."""
     levels: int
     """Internal level << 4 | external level."""
     arguments: bytes
 
 
 class Definition(NamedTuple):
-    """A kind of event."""
+    """Definition of an event type."""
 
     name: str
     message: str
@@ -77,23 +77,22 @@ class Definition(NamedTuple):
     arguments: tuple[Argument, ...] = ()
     level: Level = Level.INFO
     internal: Level | None = None
-    """Level in PX4's own log; None = as `level`."""
+    """Level in PX4's log; None = same as `level`."""
     description: str = ""
     group: str = "default"
     kind: str = ""
-    """What ground stations do with it beyond telling it; "" = nothing."""
+    """Handling by ground stations beyond display; "" = none."""
 
     @property
     def number(self) -> int:
-        """MAVLink's id of the event."""
+        """MAVLink id of the event."""
         return _AUTOPILOT << 24 | sub_id(self.name)
 
     def event(self, *values: float, level: Level | None = None) -> Event:
-        """Return an event of this kind; `level` overrides its levels.
+        """Return an event of this type; `level` overrides its levels.
 
-        A value that does not fit its argument becomes the nearest that does: what a vehicle says
-        may not depend on whether its home is 3e38 m high. Raises struct.error for another number of
-        values than there are arguments.
+        Values outside the range of an argument are clipped, so that a home 3e38 m high causes no
+        error. Raises struct.error if the number of values differs from the number of arguments.
         """
         external = self.level if level is None else level
         internal = external if self.internal is None or level is not None else self.internal
@@ -104,7 +103,7 @@ class Definition(NamedTuple):
 
 
 def sub_id(name: str) -> int:
-    """Return the part of an event's id that its name decides: 24 bits of FNV-1a."""
+    """Return the name-dependent part of an event id: 24 bits of FNV-1a."""
     value = _FNV_BASIS
     for byte in name.encode("ascii"):
         value = (value ^ byte) * _FNV_PRIME & 0xFFFFFFFF
@@ -112,7 +111,7 @@ def sub_id(name: str) -> int:
 
 
 def arguments(listed: str) -> tuple[Argument, ...]:
-    """Return the arguments of "type name, type name"."""
+    """Return the arguments of a "type name, type name" list."""
     return tuple(Argument(*text.split()) for text in listed.split(", ") if text)
 
 
@@ -125,7 +124,7 @@ def define(
     description: str = "",
     kind: str = "",
 ) -> Definition:
-    """Return a definition with arguments of "type name, type name"."""
+    """Return a definition with the arguments of a "type name, type name" list."""
     return Definition(
         name, message, arguments(listed), level, internal, description=description, kind=kind
     )
@@ -138,9 +137,9 @@ warning = partial(define, level=Level.WARNING, internal=Level.INFO)
 
 
 def _fitted(value: float, of: str) -> float:
-    """Return the nearest value that a field of a `struct` format holds; NaN is 0 in whole ones."""
+    """Return a value clipped to a field of a `struct` format; NaN becomes 0 in integer fields."""
     if of == "f":
-        # As a cast in C: beyond its range it is infinite.
+        # As a cast in C: infinite beyond its range.
         return math.copysign(math.inf, value) if abs(value) > _FLOAT_MAX else value
     bits = 8 * struct.calcsize(of)
     low, high = (0, 2**bits - 1) if of.isupper() else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)

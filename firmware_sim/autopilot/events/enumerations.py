@@ -1,4 +1,4 @@
-"""Enumerations that arguments of events are of: PX4's names and numbers.
+"""Enumerations of event arguments: PX4's names and numbers.
 
 Source: PX4 1.16, src/lib/events/enums.json.
 """
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class ModeGroup(IntEnum):
-    """Flight modes as bits of what a check is about: 1 << PX4's navigation state."""
+    """Flight modes affected by a check, as bits: 1 << PX4's navigation state."""
 
     MANUAL = 1 << 0
     ALTCTL = 1 << 1
@@ -31,7 +31,7 @@ class ModeGroup(IntEnum):
 
 
 class Component(IntEnum):
-    """Parts of the vehicle; an argument of a check is the place of the bit."""
+    """Components of the vehicle; the argument of a check is the bit index."""
 
     NONE = 1 << 0
     ABSOLUTE_PRESSURE = 1 << 1
@@ -67,7 +67,7 @@ class Component(IntEnum):
 
     @property
     def place(self) -> int:
-        """The place of its bit."""
+        """Bit index of the component."""
         return self.value.bit_length() - 1
 
 
@@ -78,11 +78,11 @@ ArmingReason = IntEnum(
     "FAILURE_DETECTOR SHUTDOWN UNIT_TEST RC_BUTTON FAILSAFE",
     start=0,
 )
-"""Why the vehicle was armed or disarmed."""
+"""Reason of arming or disarming."""
 
 
 class NavigationMode(IntEnum):
-    """Flight modes that a message names."""
+    """Flight modes in texts."""
 
     MANUAL = 0
     ALTCTL = 1
@@ -117,15 +117,15 @@ FailsafeAction = IntEnum(
     "DISARM TERMINATE",
     start=0,
 )
-"""Actions of a failsafe: the numbers of `failsafes.actions.Action`."""
+"""Actions of a failsafe, numbered as in `failsafes.actions.Action`."""
 
 
 SensorType = IntEnum("SensorType", "ACCEL GYRO MAG", start=0)
-"""Inertial sensors that a message names."""
+"""Inertial sensors in texts."""
 
 
 class SensorFailure(IntEnum):
-    """Why a sensor has failed, as bits."""
+    """Reasons of a sensor failure, as bits."""
 
     NO_DATA = 1
     STALE_DATA = 2
@@ -140,11 +140,11 @@ FailsafeCause = IntEnum(
     "EMERGENCY_BATTERY_LEVEL LOW_REMAINING_FLIGHT_TIME",
     start=0,
 )
-"""Causes in a failsafe's message: in the order of `failsafes.actions.Cause`."""
+"""Causes in a failsafe's text, in the order of `failsafes.actions.Cause`."""
 
 
 class Enumeration(NamedTuple):
-    """One enumeration of the metadata."""
+    """Enumeration of the event metadata."""
 
     base: str
     """Type on the wire."""
@@ -212,10 +212,10 @@ _WORDS: Mapping[tuple[type[IntEnum], int], str] = {
         (FailsafeCause.GCS_CONNECTION_LOSS, "GCS connection loss"),
     )
 }
-"""Members whose words are not their names: members of two enumerations may be equal numbers."""
+"""Texts that differ from the member's name; keyed by type, as numbers are not unique."""
 
 
 def words(member: IntEnum) -> str:
-    """Return what operators read for a member of an enumeration."""
+    """Return the operator text of an enumeration member."""
     named = member.name.replace("_", " ").capitalize()
     return _WORDS.get((type(member), member.value), named)

@@ -2,7 +2,7 @@
 
 Names, arguments and levels: PX4 1.16, commander/Commander.cpp, commander/failsafe/framework.cpp,
 commander/HealthAndArmingChecks/checks/rcAndDataLinkCheck.cpp, sensors/voted_sensors_update.cpp and
-its kin, navigator/*.cpp, mavlink/mavlink_mission.cpp.
+related files, navigator/*.cpp, mavlink/mavlink_mission.cpp.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from firmware_sim.autopilot.events.definition import (
 )
 
 _APPENDED = "append_health_and_arming_messages"
-"""Ground stations add the failing checks to the message."""
+"""Event kind for which ground stations append the failing checks to the message."""
 
 ARMED_BY = define("commander_armed_by", "Armed by {1}", "arm_disarm_reason_t calling_reason")
 DISARMED_BY = define(
@@ -113,7 +113,7 @@ RTL_MISSION_LAND = define(
 RTL_LAND = define("rtl_land_at_destination", "RTL: land at destination")
 RTL_LOITERING = define("rtl_completed_loiter", "RTL: completed, loitering")
 
-# What a failsafe says depends on whether it waits first, and whether its cause has words.
+# The failsafe event depends on a delay in Hold and on a specific cause.
 _failsafe = partial(define, level=Level.CRITICAL, internal=Level.WARNING)
 FAILSAFE_HOLD_GENERIC = _failsafe(
     "commander_failsafe_enter_generic_hold",
@@ -176,7 +176,7 @@ FAILSAFE = _failsafe(
 )
 
 
-# --- missions that are rejected, and transfers that go wrong
+# --- rejected missions and failed transfers
 
 
 def _rejected(name: str, words: str, listed: str = "", internal: Level = Level.INFO) -> Definition:

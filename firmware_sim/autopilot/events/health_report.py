@@ -1,7 +1,7 @@
-"""The health and arming report: which checks fail, and in which modes the vehicle can arm or fly.
+"""Health and arming report: failing checks, and the modes available for arming and flight.
 
-A report is an arming summary, one event for each failing check, and a health summary. Source: PX4
-1.16, commander/HealthAndArmingChecks/Common.cpp.
+A report has an arming summary, one event per failing check, and a health summary. Source: PX4 1.16,
+commander/HealthAndArmingChecks/Common.cpp.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ from firmware_sim.autopilot.readiness import SUPPLY_CHECK_OFF, Readiness
 ALL_MODES = 0xFFFFFFFF
 
 EXTERNAL_MODES = 0xFF << 23
-"""Eight modes that programs beside the autopilot may add: there are none."""
+"""Eight external modes, which are not supported."""
 
 REPORT_US = 2 * US_PER_S
-"""Shortest time between two reports of changes [µs] (PX4's reporting interval)."""
+"""Minimum time between two reports of changes [µs] (PX4's reporting interval)."""
 
 MAX_CHECKS = 14
-"""PX4 tells no more checks in one report."""
+"""Maximum number of checks in a report, as in PX4."""
 
 
 class HealthReport(NamedTuple):
     """Findings of the checks; equal reports are sent once."""
 
     can_arm: int
-    """Bits of the modes in which the vehicle can be armed."""
+    """Bits of the modes that permit arming."""
     can_run: int
-    """Bits of the modes that can be chosen in flight."""
+    """Bits of the modes available in flight."""
     checks: tuple[Event, ...]
-    """Those that fail."""
+    """Events of the failing checks."""
     arming_error: int = 0
-    """Bits of `Component`, as of all below."""
+    """Bits of `Component`, like the four fields below."""
     arming_warning: int = 0
     present: int = 0
     health_error: int = 0
     health_warning: int = 0
 
     def events(self) -> tuple[Event, ...]:
-        """Return what is sent, in order."""
+        """Return the events of the report in order."""
         whole = 0
         return (
             ARMING_SUMMARY.event(
@@ -62,7 +62,7 @@ class HealthReport(NamedTuple):
 
 @lru_cache(maxsize=256)
 def health_report(readiness: Readiness) -> HealthReport:
-    """Return what the checks find, for all modes at once."""
+    """Return the findings of the checks for all modes."""
     in_modes = {mode: readiness._replace(mode=mode) for mode in Mode}
     told: list[Event] = []
     blocked = arming_error = arming_warning = health_error = health_warning = 0
@@ -98,7 +98,7 @@ def health_report(readiness: Readiness) -> HealthReport:
 def _blocked_modes(
     check: Check, readiness: Readiness, in_modes: dict[Mode, Readiness]
 ) -> int | None:
-    """Return the modes in which a check keeps the vehicle from arming; None = it passes."""
+    """Return the modes in which a check prevents arming; None = passed."""
     if check.of_present_mode and not check.fails(readiness):
         return None
     failing = [mode for mode, there in in_modes.items() if check.fails(there)]
@@ -129,7 +129,7 @@ def _bits(modes: Iterable[Mode]) -> int:
 
 
 def _present(r: Readiness) -> int:
-    """Return the parts of the vehicle that are there, whether they work or not."""
+    """Return the components that are present, healthy or not."""
     there = {
         Component.GYRO: True,  # PX4 reports it for the accelerometer, too
         Component.ABSOLUTE_PRESSURE: bool(r.settings.sys_has_baro),
@@ -144,10 +144,10 @@ def _present(r: Readiness) -> int:
 
 
 class HealthReporter:
-    """Tells a report when it differs from the last one told, and on demand."""
+    """Sender of health reports, on change and on demand."""
 
     def __init__(self, tell: Callable[[Event], None]) -> None:
-        """Take what sends an event."""
+        """Store the callback that sends an event."""
         self._tell = tell
         self._seen: Readiness | None = None
         self._report: HealthReport | None = None
@@ -156,11 +156,11 @@ class HealthReporter:
 
     @property
     def is_told(self) -> bool:
-        """Whether the newest report is the one that was told."""
+        """True if the newest report has been sent."""
         return self._report == self._told
 
     def update(self, readiness: Readiness, now_us: int, *, force: bool = False) -> None:
-        """Look at what the checks look at; tell at most every `REPORT_US`, unless forced."""
+        """Update the report; send changes at most every `REPORT_US`, or now with `force`."""
         if readiness != self._seen or self._report is None:
             self._seen, self._report = readiness, health_report(readiness)
         due = self._report != self._told and now_us >= self._told_us + REPORT_US

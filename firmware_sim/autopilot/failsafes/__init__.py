@@ -1,5 +1,5 @@
-"""Failsafes: what the autopilot does by itself when something fails, as PX4 does it.
+"""Failsafes: automatic responses to failures, as in PX4.
 
-`conditions` is what may fail, `table` which action follows, `framework` which of several actions
-flies and when, `watch` where the conditions come from.
+`conditions` lists the failures, `table` their actions, `framework` selects and times the active
+action, and `watch` detects the conditions.
 """

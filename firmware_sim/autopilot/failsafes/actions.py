@@ -1,4 +1,4 @@
-"""The vocabulary of failsafes: actions, what ends them, who may take over.
+"""Enumerations of failsafes: actions, end conditions, pilot takeover, causes.
 
 Source: PX4 1.16, commander/failsafe/framework.h.
 """
@@ -10,47 +10,47 @@ from typing import NamedTuple
 
 
 class Action(IntEnum):
-    """Action of a failsafe. The greatest of several counts."""
+    """Action of a failsafe. The highest of several takes effect."""
 
     NONE = 0
     WARN = 1
     FALLBACK_POSITION = 2
-    """Fall back to Position mode, which a pilot flies."""
+    """Fall back to Position mode, flown by the pilot."""
     FALLBACK_ALTITUDE = 3
     FALLBACK_STABILIZED = 4
     HOLD = 5
     RETURN = 6
     LAND = 7
     DESCEND = 8
-    """Come down level, without knowing where."""
+    """Descend level without a position estimate."""
     DISARM = 9
     TERMINATE = 10
-    """Stop the motors for good: only a restart ends it."""
+    """Stop the motors permanently: only a restart ends it."""
 
 
 class Clear(Enum):
-    """When an action ends after what caused it is over."""
+    """End of an action after its condition has cleared."""
 
     WITH_CONDITION = auto()
-    """At once."""
+    """Immediately."""
     ON_MODE_CHANGE = auto()
-    """When the user chooses a mode, or at disarming."""
+    """Upon a mode selection by the user, or at disarming."""
     NEVER = auto()
 
 
 class Takeover(IntEnum):
-    """Who may end an action by flying on. The strictest of several counts."""
+    """Rule for pilot takeover during an action. The strictest of several takes effect."""
 
     ALWAYS = 0
     MODE_SWITCH = 1
-    """By choosing a mode, not with the sticks."""
+    """Takeover by mode selection, not by sticks."""
     AUTO = 2
-    """As ALWAYS after COM_FAIL_ACT_T in Hold; MODE_SWITCH where that time is zero."""
+    """Like ALWAYS after COM_FAIL_ACT_T in Hold; like MODE_SWITCH if that time is zero."""
     NEVER = 3
 
 
 class Cause(Enum):
-    """Cause, as texts name it."""
+    """Cause in operator texts."""
 
     GENERIC = auto()
     MANUAL_CONTROL_LOSS = auto()
@@ -62,7 +62,7 @@ class Cause(Enum):
 
 
 class Options(NamedTuple):
-    """One failsafe's answer to its condition."""
+    """Response of a failsafe to its condition."""
 
     action: Action
     clear: Clear = Clear.WITH_CONDITION

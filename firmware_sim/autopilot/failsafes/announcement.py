@@ -1,4 +1,4 @@
-"""What operators are told when a failsafe begins: PX4's text, and the event with its cause.
+"""Operator texts at the start of a failsafe: PX4's text, and the event with its cause.
 
 Source: PX4 1.16, commander/failsafe/framework.cpp.
 """
@@ -19,7 +19,7 @@ _WARNINGS = {
     Cause.BATTERY_EMERGENCY: events.FAILSAFE_BATTERY_EMERGENCY,
     Cause.FLIGHT_TIME_LOW: events.FAILSAFE_TIME_LOW,
 }
-"""Warnings with words of their own."""
+"""Warnings with a specific text."""
 
 _DISENGAGING = (Action.DESCEND, Action.FALLBACK_ALTITUDE, Action.FALLBACK_STABILIZED)
 
@@ -29,14 +29,14 @@ _CAUSES = dict(zip(Cause, FailsafeCause, strict=True))
 def announcement(
     action: Action, delayed: Action, cause: Cause, intended: Mode, delay_us: int
 ) -> Message:
-    """Return what is told of an action that begins.
+    """Return the message for an action that starts.
 
     Args:
-        action: What is done now.
-        delayed: What follows the wait in Hold; NONE = it is no wait.
-        cause: What is named as the cause.
-        intended: The mode that the user asked for.
-        delay_us: How long the wait still lasts [µs].
+        action: Active action.
+        delayed: Action after the delay in Hold; NONE = no delay.
+        cause: Cause named in the text.
+        intended: Mode requested by the user.
+        delay_us: Remaining delay [µs].
     """
     waits = action is Action.HOLD and delayed is not Action.NONE
     seconds = (delay_us + US_PER_S // 2) // US_PER_S

@@ -1,4 +1,4 @@
-"""What may fail, as one typed snapshot, and which modes can fly in spite of it.
+"""Failure conditions as one typed snapshot, and the modes that remain available.
 
 Source: PX4 1.16, msg/FailsafeFlags.msg and commander/ModeUtil/mode_requirements.cpp.
 """
@@ -12,7 +12,7 @@ from firmware_sim.autopilot.autopilot_state import Mode
 
 
 class BatteryWarning(IntEnum):
-    """How urgent the charge of the battery is."""
+    """Battery warning level."""
 
     NONE = 0
     LOW = 1
@@ -21,32 +21,32 @@ class BatteryWarning(IntEnum):
 
 
 class FenceBreach(NamedTuple):
-    """Which limits of the geofence are violated."""
+    """Violated limits of the geofence."""
 
     distance: bool = False
     """Farther from home than GF_MAX_HOR_DIST."""
     altitude: bool = False
     """Higher above home than GF_MAX_VER_DIST."""
     custom: bool = False
-    """Outside the uploaded fence, or inside what it excludes."""
+    """Outside the uploaded fence, or inside an exclusion zone."""
 
 
 NO_BREACH = FenceBreach()
 
 
 class Conditions(NamedTuple):
-    """What is wrong now; the defaults are a healthy vehicle in flight without a pilot or mission.
+    """Current failures; defaults: a healthy vehicle in flight without pilot or mission.
 
-    The names are those of PX4's failsafe flags.
+    Names follow PX4's failsafe flags.
     """
 
     angular_velocity_invalid: bool = False
     attitude_invalid: bool = False
     local_altitude_invalid: bool = False
     local_position_invalid: bool = False
-    """Not valid, or less accurate than COM_POS_FS_EPH."""
+    """Invalid, or less accurate than COM_POS_FS_EPH."""
     local_position_invalid_relaxed: bool = False
-    """Not valid at any accuracy."""
+    """Invalid at any accuracy."""
     local_velocity_invalid: bool = False
     global_position_invalid: bool = False
     local_position_accuracy_low: bool = False
@@ -65,14 +65,14 @@ class Conditions(NamedTuple):
     wind_limit_exceeded: bool = False
     flight_time_limit_exceeded: bool = False
     fd_critical_failure: bool = False
-    """The failure detector sees an attitude or altitude that no flight has."""
+    """Attitude or altitude outside the flight envelope, from the failure detector."""
     fd_esc_arming_failure: bool = False
     fd_imbalanced_prop: bool = False
     fd_motor_failure: bool = False
 
 
 class Need(IntFlag):
-    """What a mode needs to fly."""
+    """Requirements of flight modes."""
 
     ANGULAR_VELOCITY = auto()
     ATTITUDE = auto()
@@ -84,11 +84,11 @@ class Need(IntFlag):
     MISSION = auto()
     OFFBOARD_SIGNAL = auto()
     MANUAL_CONTROL = auto()
-    """No pilot is no reason to leave a mode: that is a failsafe of its own."""
+    """Pilot input. Its loss does not end a mode: a separate failsafe handles it."""
     CALM_AND_TIME = auto()
-    """Wind and flight time within their limits: failsafes of their own, too."""
+    """Wind and flight time within limits; separate failsafes handle violations."""
     NOT_ARMING = auto()
-    """The vehicle cannot be armed in this mode."""
+    """Arming is not possible in this mode."""
 
 
 _LEVEL = Need.ANGULAR_VELOCITY | Need.ATTITUDE
@@ -113,9 +113,9 @@ NEEDS: dict[Mode, Need] = {
     Mode.TERMINATION: Need.NOT_ARMING,
     Mode.PRECISION_LAND: _GUIDED | Need.NOT_ARMING,
 }
-"""What each mode needs."""
+"""Requirements of each mode."""
 
-# Plain numbers: members of a flag are slow to combine.
+# Plain integers: combining flag members is slow.
 _FLYING = int(~(Need.MANUAL_CONTROL | Need.CALM_AND_TIME | Need.NOT_ARMING))
 _NEEDS = {mode: int(needs) for mode, needs in NEEDS.items()}
 _LACKED_BY: dict[str, int] = {
@@ -136,7 +136,7 @@ _PLACES = tuple((Conditions._fields.index(name), bit) for name, bit in _LACKED_B
 
 
 def missing(conditions: Conditions) -> int:
-    """Return what no mode can have now, as bits of `Need`."""
+    """Return the requirements that are currently unmet, as bits of `Need`."""
     lacks = 0
     for place, bit in _PLACES:
         if conditions[place]:
@@ -145,10 +145,10 @@ def missing(conditions: Conditions) -> int:
 
 
 def can_run(mode: Mode, conditions: Conditions) -> bool:
-    """Return whether a failsafe may choose a mode, or leave the vehicle in it."""
+    """Return whether a failsafe may select a mode or keep it."""
     return not _NEEDS[mode] & missing(conditions) & _FLYING
 
 
 def lacking(mode: Mode, conditions: Conditions) -> Need:
-    """Return what a mode lacks for the user to choose it in flight; nothing = it is available."""
+    """Return the unmet requirements of a mode in flight; nothing = available."""
     return Need(_NEEDS[mode] & missing(conditions))

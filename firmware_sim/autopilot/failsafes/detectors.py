@@ -1,4 +1,4 @@
-"""Small detectors over simulated time: what must last before it counts."""
+"""Detectors with hysteresis and duration over simulated time."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from airl_mav.core.kernels import kernel
 from firmware_sim.autopilot.error_state import Q
 
 VALID_AFTER_US = US_PER_S
-"""An estimate that was invalid counts again after it has been good for so long."""
+"""Time an estimate must be good again before it counts as valid [µs]."""
 
 HYSTERESIS = 2.5
-"""An estimate that is valid stays so up to this many times the accuracy that it needed."""
+"""Factor on the required accuracy up to which a valid estimate stays valid."""
 
 
 class Validity:
-    """Whether an estimate is good enough, with hysteresis in level and time.
+    """Validity of an estimate with hysteresis in accuracy and time.
 
     Source: PX4 1.16, EstimatorChecks::checkPosVelValidity.
     """
 
     def __init__(self) -> None:
-        """Begin invalid; the first good estimate counts at once."""
+        """Start invalid; the first good estimate is valid immediately."""
         self.valid = False
         self._failed_us: int | None = None
 
     def update(self, now_us: int, *, good: bool, accuracy: float, needed: float) -> bool:
-        """Take the newest estimate; `accuracy` is its standard deviation, `needed` its limit."""
+        """Update with the newest estimate: its standard deviation `accuracy`, limit `needed`."""
         if good and accuracy < (HYSTERESIS * needed if self.valid else needed):
             failed_us = self._failed_us
             self.valid = self.valid or failed_us is None or now_us > failed_us + VALID_AFTER_US
@@ -38,13 +38,13 @@ class Validity:
 
 
 class Lasting:
-    """Whether something has been so for some time."""
+    """Duration check for a condition."""
 
     def __init__(self) -> None:
         self.since_us: int | None = None
 
     def update(self, now_us: int, seconds: float, *, true: bool) -> bool:
-        """Return whether it is true now and has been at every update for `seconds`."""
+        """Return whether the condition has been true at every update for `seconds`."""
         if not true:
             self.since_us = None
             return False
@@ -55,13 +55,13 @@ class Lasting:
 
 @kernel
 def roll_and_pitch(w: float, x: float, y: float, z: float) -> tuple[float, float]:
-    """Return the magnitudes of both angles of an attitude [rad]."""
+    """Return the absolute roll and pitch angles of an attitude [rad]."""
     roll = abs(math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)))
     return roll, abs(math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x)))))
 
 
 class AttitudeFailure:
-    """The failure detector's roll and pitch: FD_FAIL_R, FD_FAIL_P for FD_FAIL_R_TTRI, _P_TTRI.
+    """Roll and pitch failure detector: FD_FAIL_R, FD_FAIL_P for FD_FAIL_R_TTRI, _P_TTRI.
 
     Source: PX4 1.16, FailureDetector::updateAttitudeStatus.
     """
@@ -72,7 +72,7 @@ class AttitudeFailure:
 
     @property
     def is_calm(self) -> bool:
-        """Whether both angles were within their limits at the newest update."""
+        """True if both angles were within limits at the newest update."""
         return self._roll.since_us is None and self._pitch.since_us is None
 
     def update(
@@ -82,7 +82,7 @@ class AttitudeFailure:
         limits_deg: tuple[float, float],
         lasting_s: tuple[float, float],
     ) -> bool:
-        """Return whether roll or pitch of the nominal state is out of limits [deg], 0 = none."""
+        """Return whether roll or pitch of the nominal state exceeds its limit [deg], 0 = off."""
         roll, pitch = roll_and_pitch(*state[Q : Q + 4].tolist())
         roll_max, pitch_max = math.radians(abs(limits_deg[0])), math.radians(abs(limits_deg[1]))
         self.roll = self._roll.update(now_us, lasting_s[0], true=0.0 < roll_max < roll)

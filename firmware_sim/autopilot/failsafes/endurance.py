@@ -1,4 +1,4 @@
-"""How long the battery lasts.
+"""Remaining flight time of the battery.
 
 Source: PX4 1.16, Battery::computeRemainingTime.
 """
@@ -18,7 +18,7 @@ _MA_PER_A = 1000.0
 
 
 class Endurance:
-    """Averages the current while armed, and says how long the charge lasts."""
+    """Estimator of the remaining flight time from the mean current while armed."""
 
     def __init__(self) -> None:
         self._current_a: float | None = None
@@ -33,14 +33,14 @@ class Endurance:
         *,
         armed: bool,
     ) -> float:
-        """Return how long the battery lasts [s], infinite where its capacity is not set.
+        """Return the remaining battery time [s], infinite if the capacity is not set.
 
         Args:
-            time_us: Of the sample [µs].
-            battery: What the power module reads.
+            time_us: Time of the sample [µs].
+            battery: Reading of the power module.
             capacity_mah: BAT1_CAPACITY; 0 or less: not set.
-            expected_a: BAT_AVRG_CURRENT, the mean to begin with.
-            armed: Whether the motors draw current: only then it counts.
+            expected_a: BAT_AVRG_CURRENT, the initial mean.
+            armed: True if armed; the mean is only updated while armed.
         """
         if capacity_mah <= 0.0:
             return math.inf

@@ -1,4 +1,4 @@
-"""What flies when the intended mode, or the action of a failsafe, cannot: the chains of fallbacks.
+"""Fallback chains for modes and failsafe actions that cannot run.
 
 Source: PX4 1.16, Failsafe::checkModeFallback and FailsafeBase::getSelectedAction.
 """
@@ -20,8 +20,8 @@ MODE_OF_ACTION = {
     Action.DESCEND: Mode.DESCEND,
     Action.TERMINATE: Mode.TERMINATION,
 }
-"""The mode that an action flies; the others leave the intended one. Ascending: an action whose mode
-cannot fly gives way to the next."""
+"""Mode of each action; other actions keep the intended mode. In ascending order: if a mode cannot
+run, the next action replaces it."""
 
 OFFBOARD_LOSS: dict[int, tuple[Action, Mode | None]] = {
     0: (Action.FALLBACK_POSITION, Mode.POSITION),
@@ -33,16 +33,16 @@ OFFBOARD_LOSS: dict[int, tuple[Action, Mode | None]] = {
     6: (Action.TERMINATE, Mode.TERMINATION),
     7: (Action.DISARM, None),
 }
-"""COM_OBL_RC_ACT: the action, and the mode whose own needs decide from there on."""
+"""COM_OBL_RC_ACT: action, and the mode whose requirements apply from there on."""
 
 
 def mode_of(action: Action, intended: Mode) -> Mode:
-    """Return what flies: the action's mode, else what the user asked for."""
+    """Return the action's mode, or the intended mode if the action has none."""
     return MODE_OF_ACTION.get(action, intended)
 
 
 def possible(action: Action, conditions: Conditions) -> Action:
-    """Return the action, or the next that can be flown: at the latest Terminate."""
+    """Return the action, or the next possible one in the chain, which ends at Terminate."""
     if action not in MODE_OF_ACTION:
         return action
     chain = (a for a in MODE_OF_ACTION if a >= action)
@@ -50,7 +50,7 @@ def possible(action: Action, conditions: Conditions) -> Action:
 
 
 def mode_fallback(conditions: Conditions, settings: Settings, intended: Mode) -> Action:
-    """Return what replaces an intended mode that cannot fly on; NONE = it can."""
+    """Return the replacement of an intended mode that cannot run; NONE = it can."""
     action, mode = Action.NONE, intended
     if conditions.offboard_control_signal_lost and NEEDS[mode] & Need.OFFBOARD_SIGNAL:
         action, next_mode = OFFBOARD_LOSS.get(settings.com_obl_rc_act, OFFBOARD_LOSS[0])

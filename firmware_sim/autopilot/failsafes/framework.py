@@ -1,8 +1,8 @@
-"""Which of the active failsafes flies, from when, until when: a pure state machine.
+"""Failsafe framework: selects and times the active action. A pure state machine.
 
-What has failed is held until it clears as its row says. Of the actions held the greatest is taken;
-one that lets the user take over waits in Hold for COM_FAIL_ACT_T first. An action whose mode cannot
-fly gives way to the next in the chain. Source: PX4 1.16, commander/failsafe/framework.cpp.
+A triggered failsafe is held until its row's end condition. The highest held action takes effect. An
+action that permits takeover waits in Hold for COM_FAIL_ACT_T first. If the action's mode cannot
+run, the next in the chain replaces it. Source: PX4 1.16, commander/failsafe/framework.cpp.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from firmware_sim.autopilot.failsafes.table import Situation, Trigger, answers
 
 
 class Vehicle(NamedTuple):
-    """What the failsafes must know of the flight."""
+    """Flight state used by the failsafes."""
 
     armed: bool
     intended: Mode
@@ -28,69 +28,69 @@ class Vehicle(NamedTuple):
 
 
 class Intervention(NamedTuple):
-    """What the user did since the last update."""
+    """User actions since the last update."""
 
     mode_chosen: bool = False
-    """A mode was asked for, also the one that is intended already."""
+    """A mode was requested, including the current intended mode."""
     sticks_moved: bool = False
-    """The pilot takes over with the sticks."""
+    """The pilot takes over by moving the sticks."""
 
 
 NO_INTERVENTION = Intervention()
 
 
 class Held(NamedTuple):
-    """An action that is active."""
+    """Active action."""
 
     trigger: Trigger
     options: Options
     failing: bool
-    """Whether its condition still lasts."""
+    """True while the condition persists."""
 
 
 class FailsafeState(NamedTuple):
-    """All that the failsafes remember."""
+    """State of the failsafe framework."""
 
     held: tuple[Held, ...] = ()
     action: Action = Action.NONE
-    """The action taken."""
+    """Active action."""
     taken_over: bool = False
-    """The user flies on in spite of it."""
+    """The user continues to fly despite the failsafe."""
     time_us: int | None = None
-    """Of the last update."""
+    """Time of the last update [µs]."""
     armed: bool = False
     intended: Mode | None = None
     start_delay_us: int | None = None
-    """How long the next wait in Hold lasts; None = as COM_FAIL_ACT_T says."""
+    """Duration of the next delay in Hold [µs]; None = COM_FAIL_ACT_T."""
     delay_us: int = 0
-    """How long the present wait in Hold still lasts."""
+    """Remaining time of the current delay in Hold [µs]."""
     armed_us: int | None = None
     manual_control_lost_at_arming: bool = False
     battery_at_arming: BatteryWarning = BatteryWarning.NONE
 
     @property
     def active(self) -> bool:
-        """Whether a failsafe decides what flies."""
+        """True if a failsafe determines the mode."""
         return self.action > Action.WARN
 
 
 class Outcome(NamedTuple):
-    """The result of an update."""
+    """Result of an update."""
 
     state: FailsafeState
     mode: Mode
-    """What flies."""
+    """Active mode."""
     intended: Mode
-    """What the user wants; the sticks may have changed it."""
+    """Mode intended by the user; the sticks may have changed it."""
     text: Message | None
-    """What the operator is told; None = nothing new."""
+    """New message for the operator; None = no change."""
     delayed: Action = Action.NONE
-    """What follows the wait in Hold."""
+    """Action after the delay in Hold."""
     cause: Cause = Cause.GENERIC
 
 
 class _Choice(NamedTuple):
-    """The action selected, and how."""
+    """Selected action with its attributes."""
 
     action: Action
     intended: Mode
@@ -107,15 +107,15 @@ def update(
     settings: Settings,
     intervention: Intervention = NO_INTERVENTION,
 ) -> Outcome:
-    """Return what flies now.
+    """Return the active mode and action.
 
     Args:
-        state: As the last update left it; a new one after boot.
-        time_us: Simulated time, never less than at the last update [µs].
-        vehicle: State of the vehicle, and the mode that the user wants.
-        conditions: What is wrong now.
-        settings: The parameters.
-        intervention: What the user did since the last update.
+        state: State after the last update; a new one after boot.
+        time_us: Simulated time, not decreasing [µs].
+        vehicle: State of the vehicle, and the intended mode.
+        conditions: Current failures.
+        settings: Parameters.
+        intervention: User actions since the last update.
     """
     elapsed_us = 0 if state.time_us is None else time_us - state.time_us
     chosen = intervention.mode_chosen or (
@@ -138,7 +138,7 @@ def update(
         )
     intended = choice.intended
     if state.active and mode_of(choice.action, intended) is Mode.ORBIT:
-        intended = Mode.HOLD  # A circle that was interrupted is not resumed.
+        intended = Mode.HOLD  # Orbit does not resume after an interruption.
     state = state._replace(
         action=choice.action,
         taken_over=choice.taken_over,
@@ -154,7 +154,7 @@ def update(
 def _begin(
     state: FailsafeState, time_us: int, elapsed_us: int, vehicle: Vehicle, conditions: Conditions
 ) -> FailsafeState:
-    """Let the delays run, and note what was wrong at arming."""
+    """Advance the delays, and store the failures present at arming."""
     state = state._replace(delay_us=max(0, state.delay_us - elapsed_us))
     lost = conditions.manual_control_signal_lost
     if vehicle.armed and not state.armed:
@@ -172,7 +172,7 @@ def _begin(
 
 
 def _released(held: tuple[Held, ...]) -> tuple[Held, ...]:
-    """Return what is held after the user chose a mode."""
+    """Return the held actions after a mode selection by the user."""
     return tuple(h for h in held if h.failing or h.options.clear is not Clear.ON_MODE_CHANGE)
 
 
@@ -183,7 +183,7 @@ def _hold(
     conditions: Conditions,
     settings: Settings,
 ) -> tuple[FailsafeState, bool]:
-    """Add what fails now, let go what is over; return also whether a warning is new."""
+    """Add new failures, drop cleared ones; return also whether a warning is new."""
     situation = Situation(
         time_us,
         conditions,
@@ -199,7 +199,7 @@ def _hold(
     for item in state.held:
         now = failing.pop(item.trigger, None)
         if now is not None:
-            # The action may change; when it clears and who may take over stay.
+            # The action may change; end condition and takeover rule stay.
             held.append(Held(item.trigger, item.options._replace(action=now.action), True))
         elif item.options.clear is not Clear.WITH_CONDITION:
             held.append(item._replace(failing=False))
@@ -227,7 +227,7 @@ def _next_delay(state: FailsafeState, settings: Settings) -> int:
 def _start_delay(
     state: FailsafeState, settings: Settings, elapsed_us: int, delayed: Action
 ) -> int | None:
-    """Return how long the next wait lasts: a condition that comes and goes shortens it."""
+    """Return the duration of the next delay: an intermittent condition shortens it."""
     left = _next_delay(state, settings)
     if delayed is not Action.NONE:
         return max(0, left - elapsed_us)
@@ -261,7 +261,7 @@ def _select(
         and action not in (Action.DISARM, Action.TERMINATE, Action.HOLD)
     ):
         delayed, action, strictest = action, Action.HOLD, Takeover.MODE_SWITCH
-    # A mode switch in the same update as the action's beginning is no wish to end the action.
+    # A mode switch in the update that starts the action does not end the action.
     by_mode = intervention.mode_chosen and state.action is action
     wanted = state.taken_over or by_mode
     if strictest is Takeover.ALWAYS:
@@ -283,9 +283,9 @@ def _select(
 def _already_on_the_way(
     intended: Mode, action: Action, delayed: Action, conditions: Conditions
 ) -> bool:
-    """Return whether a return is asked of a vehicle that lands or returns as it is.
+    """Return whether Return is redundant as the vehicle already lands or returns.
 
-    A precision landing is not given up for an ordinary one either.
+    A precision landing also continues instead of an ordinary landing.
     """
     needless = {Action.RETURN}
     if intended is Mode.PRECISION_LAND:

@@ -1,4 +1,4 @@
-"""The tables of failsafes and pre-arm checks as the documentation prints them (Markdown)."""
+"""Tables of failsafes and pre-arm checks for the documentation (Markdown)."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _CLEAR = {
 
 
 def failsafes() -> str:
-    """Return every failsafe: condition, parameter, action for each of its values."""
+    """Return the failsafes: condition, parameter, and action for each parameter value."""
     head = ("failsafe", "when", "action", "take over", "ends")
     return _table(head, (_failsafe(row) for row in TABLE))
 
@@ -65,7 +65,7 @@ def _failsafe(row: Row) -> Sequence[str]:
 
 
 def _shown(row: Row) -> Options | None:
-    """Return the answer whose end is told: the default, else the mildest that acts."""
+    """Return the response listed with its end: the default, or the mildest active one."""
     value = 0 if row.parameter is None else int(SPEC_BY_NAME[row.parameter].default)
     acting = [options for options in row.answers.values() if options.action > Action.WARN]
     chosen = row.answers.get(value)
@@ -87,7 +87,7 @@ def _parameter(name: str) -> str:
 
 
 def offboard_loss() -> str:
-    """Return what replaces Offboard when its setpoints stop."""
+    """Return the replacements of Offboard after setpoint loss."""
     default = int(SPEC_BY_NAME["COM_OBL_RC_ACT"].default)
     rows = (
         (f"**{value}**" if value == default else f"{value}", ACTION_NAMES[action])
@@ -97,12 +97,12 @@ def offboard_loss() -> str:
 
 
 def fallbacks() -> str:
-    """Return the chain of actions, each given way to by the one before it."""
+    """Return the chain of actions, each the replacement of the one before."""
     return " → ".join(ACTION_NAMES[action] for action in MODE_OF_ACTION)
 
 
 def needs() -> str:
-    """Return what each mode needs."""
+    """Return the requirements of each mode."""
 
     def words(mode: Mode) -> str:
         names = [need.name or "" for need in NEEDS[mode]]
@@ -112,7 +112,7 @@ def needs() -> str:
 
 
 def checks() -> str:
-    """Return the pre-arm checks in the order in which they are told."""
+    """Return the pre-arm checks in reporting order."""
     rows = (
         (
             check.text,

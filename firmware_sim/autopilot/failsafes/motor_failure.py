@@ -1,7 +1,7 @@
-"""The failure detector's motors: FD_ACT_*, by the currents that the speed controllers report.
+"""Motor failure detector: FD_ACT_*, based on the current reported by speed controllers.
 
-Source: PX4 1.16, FailureDetector::updateMotorStatus. What it does about controllers that stop to
-report is left out: here they never do.
+Source: PX4 1.16, FailureDetector::updateMotorStatus. Its timeout for silent speed controllers is
+not implemented, as they always report here.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from firmware_sim.autopilot.esc import current_a
 
 
 class Undercurrent(NamedTuple):
-    """When a motor draws too little."""
+    """Undercurrent thresholds of a motor."""
 
     throttle: float
-    """FD_ACT_MOT_THR: it is looked at above this command 0..1."""
+    """FD_ACT_MOT_THR: minimum command 0..1 for the check."""
     per_throttle_a: float
-    """FD_ACT_MOT_C2T: it has to draw this times its command [A]."""
+    """FD_ACT_MOT_C2T: minimum current per command [A]."""
     lasting_ms: float
-    """FD_ACT_MOT_TOUT: it has failed after so long."""
+    """FD_ACT_MOT_TOUT: duration until failure [ms]."""
 
 
 class MotorFailure:
-    """Motors that draw too little current for what they are told; for good, while armed."""
+    """Detector of motors with too little current for their command; latched while armed."""
 
     def __init__(self) -> None:
-        """Begin with all of them healthy."""
+        """Start with all motors healthy."""
         self.failed = False
-        """Whether one of them has."""
+        """True if a motor has failed."""
         self._since_us: dict[int, int] = {}
 
     def take(
@@ -40,13 +40,13 @@ class MotorFailure:
         outputs: Sequence[float],
         limits: Undercurrent,
     ) -> None:
-        """Look at all motors.
+        """Check all motors.
 
         Args:
-            time_us: When [µs].
-            told: What each is told, 0..1.
-            outputs: What each does, as its speed controller reports it.
-            limits: When one draws too little.
+            time_us: Time [µs].
+            told: Commands of the motors, 0..1.
+            outputs: Outputs of the motors, as reported by the speed controllers.
+            limits: Undercurrent thresholds.
         """
         for motor, (throttle, output) in enumerate(zip(told, outputs, strict=True)):
             least_a = throttle * limits.per_throttle_a
@@ -58,6 +58,6 @@ class MotorFailure:
                 self.failed = True
 
     def rest(self) -> None:
-        """Forget it all: the vehicle is disarmed."""
+        """Reset the detector: the vehicle is disarmed."""
         self.failed = False
         self._since_us.clear()

@@ -1,4 +1,4 @@
-"""The parameters of the failsafes, read once and again after every change."""
+"""Parameters of the failsafes, read at start and after every change."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 LONGEST_S = 1e6
-"""Bound of every number: no time overflows in microseconds [s]."""
+"""Limit of every value, so that times in microseconds do not overflow [s]."""
 
 
 class Settings(NamedTuple):
-    """Each field is the parameter of that name in capitals; numbers are PX4's defaults.
+    """Failsafe parameters: the field name in capitals; defaults are PX4's.
 
     PX4's simulated airframe sets COM_LOW_BAT_ACT to 3 and COM_RC_IN_MODE to 1.
     """
@@ -35,7 +35,7 @@ class Settings(NamedTuple):
 
     @classmethod
     def read(cls, value: Callable[[str], float]) -> Settings:
-        """Read them by a lookup of PX4 parameter names, bounded by `LONGEST_S`."""
+        """Read the parameters with a look-up by PX4 name, clipped to `LONGEST_S`."""
         defaults = cls._field_defaults.values()
         return cls(
             *(
@@ -46,4 +46,4 @@ class Settings(NamedTuple):
 
 
 FLIGHT_TERMINATION_OFF = 121212
-"""CBRK_FLIGHTTERM at this value switches the termination by the failure detector off."""
+"""Value of CBRK_FLIGHTTERM that disables flight termination by the failure detector."""

@@ -1,7 +1,7 @@
-"""Puts the failsafes together for one vehicle: look, decide, tell.
+"""Failsafe supervisor of one vehicle: check, decide, report.
 
-It looks at 10 Hz, as PX4's commander, and whenever the user does something; the state machine runs
-only when something has changed or a delay is running.
+It runs at 10 Hz, like PX4's commander, and upon user actions. The state machine runs only after a
+change or during a delay.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from firmware_sim.autopilot.sensor_monitor import NO_DATA_US
 from firmware_sim.interfaces import SensorSample
 
 LOOK_US = 100_000
-"""Time between two looks [µs] (PX4's commander: 10 Hz): a loss is noticed that much later."""
+"""Check period [µs] (PX4's commander: 10 Hz): the maximum delay until a loss is detected."""
 
 CHECK_US = 100_000
-"""Time between two runs of the pre-arm checks [µs] (PX4: 10 Hz)."""
+"""Period of the pre-arm checks [µs] (PX4: 10 Hz)."""
 
 _GROUND = Phase.GROUND
 
@@ -49,11 +49,11 @@ class Decision(NamedTuple):
     flight: Flight
     text: Message | None
     disarm: bool
-    """The motors stop now."""
+    """True if the motors must stop now."""
 
 
 class Supervisor:
-    """The failsafes and pre-arm checks of one vehicle."""
+    """Failsafes and pre-arm checks of one vehicle."""
 
     def __init__(
         self,
@@ -61,76 +61,76 @@ class Supervisor:
         estimator: Estimator,
         tell: Callable[[Event], None] = lambda _event: None,
     ) -> None:
-        """Take a lookup of PX4 parameter names, the estimator, and what sends an event."""
+        """Store the look-up for PX4 parameters, the estimator and the event callback."""
         self._value = value
         self._estimator = estimator
         self.watch = Watch(value, estimator)
-        """Signals and measurements."""
+        """Monitors for signals and measurements."""
         self.sensors = self.watch.sensors
-        """Which sensors can be believed."""
+        """Sensor validity."""
         self.next_us = 0
-        """When to look next: any earlier look does no harm."""
+        """Time of the next check [µs]; earlier checks are harmless."""
         self.conditions = Conditions()
-        """Conditions at the last look."""
+        """Conditions at the last check."""
         self.changes = 0
-        """Number of looks at which conditions or readiness had changed."""
+        """Number of checks with changed conditions or readiness."""
         self.failing: tuple[Check, ...] = ()
-        """Pre-arm checks that failed at the last look."""
+        """Pre-arm checks that failed at the last check."""
         self._ready: Readiness | None = None
-        """What the pre-arm checks looked at last."""
+        """Last input of the pre-arm checks."""
         self._armable = False
         self._state = FailsafeState()
         self._decided: tuple[object, ...] = ()
         self._told: tuple[Check, ...] | None = None
-        """Checks that were told as failing; None: nothing is told before the vehicle is ready."""
+        """Checks reported as failing; None: reporting starts when the vehicle is ready."""
         self._told_us = 0
         self._tell = tell
         self._pilot_us: int | None = None
-        """When a pilot was heard at the last look that heard one [µs]."""
+        """Time of the newest pilot input at the last check with a pilot [µs]."""
         self._reporter = HealthReporter(tell)
         self._asked = False
-        """Whether somebody wants the checks told anew."""
+        """True if a report of all failing checks is requested."""
         self._check_us = 0
         self._checked = Phase.BOOT
-        """Phase of the flight that was checked last."""
+        """Flight phase at the last check."""
         self._calm_flight: Flight | None = None
-        """State at a look that found nothing new; None = it did, or the next one might."""
+        """Flight state at a check without findings that stays valid; None = there were findings."""
         self.read_parameters()
 
     def read_parameters(self) -> None:
-        """Read the parameters anew."""
+        """Read the parameters again."""
         self.watch.read_parameters()
         self._settings = Settings.read(self._value)
         self._arming = ArmingSettings.read(self._value)
         self.next_us, self._calm_flight = 0, None
 
-    # --- what is heard
+    # --- inputs
 
     def setpoint(self, setpoint: Setpoint | None, time_us: int) -> None:
-        """Note a valid offboard setpoint; None = one of attitude or body rates."""
+        """Record a valid offboard setpoint; None = attitude or body rates."""
         self.watch.hear_setpoint(setpoint, time_us)
         if self.conditions.offboard_control_signal_lost:
             self.next_us = 0
 
     def gcs_heartbeat(self, time_us: int) -> None:
-        """Note a ground station's heartbeat."""
+        """Record a ground station's heartbeat."""
         self.watch.hear_gcs(time_us)
         if self.conditions.gcs_connection_lost:
             self.next_us = 0
 
     def tell_checks(self) -> None:
-        """Tell all failing checks at the next look, also those that were told before."""
+        """Report all failing checks at the next check, including reported ones."""
         self._asked, self.next_us, self._check_us, self._calm_flight = True, 0, 0, None
 
     # --- looking
 
     @property
     def is_calm(self) -> bool:
-        """Whether the newest look found nothing new or unusual."""
+        """True if the newest check found nothing new or unusual."""
         return self._calm_flight is not None
 
     def is_unchanged(self, now_us: int, flight: Flight) -> bool:
-        """Return whether a look finds what the newest one found; then it counts as one."""
+        """Return whether a check would repeat the newest result; if so, it counts as done."""
         if flight is not self._calm_flight or not self.watch.is_unchanged(now_us):
             self._calm_flight = None
             return False
@@ -138,7 +138,7 @@ class Supervisor:
         return True
 
     def look(self, sample: SensorSample, flight: Flight) -> list[Message]:
-        """Find out what is wrong; return what the operator is told of it."""
+        """Run the checks; return new messages for the operator."""
         now_us = sample.time_us
         self.next_us = now_us + LOOK_US
         before = self.conditions
@@ -160,7 +160,7 @@ class Supervisor:
         return texts
 
     def _tell_of_pilot(self, now_us: int, *, was_lost: bool) -> None:
-        """Tell that a pilot is heard no more, or again; PX4 has no text for it."""
+        """Report that pilot input was lost or regained; PX4 has no text for it."""
         lost, heard_us = self.conditions.manual_control_signal_lost, self._pilot_us
         if lost is not was_lost and heard_us is not None:
             silent_s = (now_us - heard_us) / US_PER_S
@@ -169,7 +169,7 @@ class Supervisor:
             self._pilot_us = now_us
 
     def readiness(self, sample: SensorSample, flight: Flight, mode: Mode) -> Readiness:
-        """Return what the pre-arm checks look at, for arming in a mode."""
+        """Return the input of the pre-arm checks for arming in a mode."""
         now_us, attitude = sample.time_us, self.watch.attitude
         return Readiness(
             mode,
@@ -188,7 +188,7 @@ class Supervisor:
         )
 
     def health(self, now_us: int) -> Health:
-        """Return what can be believed and used, for clients."""
+        """Return sensor and estimate health for clients."""
         seen, sensors = self.conditions, self.sensors.valid(now_us)
         return Health(
             gyro=not seen.angular_velocity_invalid,
@@ -207,12 +207,12 @@ class Supervisor:
         )
 
     def _ranges(self, now_us: int) -> bool | None:
-        """Return whether a distance sensor tells anything; None: it never has."""
+        """Return whether a distance sensor delivers data; None: it never has."""
         finder = self._estimator.range
         return None if finder is None else now_us - finder.reading_us < NO_DATA_US
 
     def _report(self, now_us: int, flight: Flight) -> list[Message]:
-        """Return the checks that have begun to fail, once the vehicle has been ready."""
+        """Return the newly failing checks once the vehicle has been ready."""
         if self._told is None:
             if flight.phase is Phase.BOOT:
                 self._asked = False
@@ -229,12 +229,12 @@ class Supervisor:
     # --- arming and modes
 
     def refusals(self, sample: SensorSample, flight: Flight) -> list[Message]:
-        """Return why the vehicle cannot be armed in its mode; nothing = it can."""
+        """Return the reasons against arming in the current mode; empty = armable."""
         checks = prearm.can_arm(self.readiness(sample, flight, flight.mode))
         return [Message(Severity.CRITICAL, check.text) for check in checks]
 
     def available(self, mode: Mode) -> bool:
-        """Return whether a mode has what it needs, a pilot apart, for the user to choose it."""
+        """Return whether a mode's requirements are met for a user request, pilot input aside."""
         return not lacking(mode, self.conditions) & ~(Need.NOT_ARMING | Need.MANUAL_CONTROL)
 
     # --- deciding
@@ -242,11 +242,11 @@ class Supervisor:
     def decide(
         self, time_us: int, flight: Flight, intervention: Intervention = NO_INTERVENTION
     ) -> Decision | None:
-        """Return what becomes of a flight; None = nothing changes."""
+        """Return the failsafes' decision for a flight; None = no change."""
         state, finished = self._state, self.watch.reports.mission_finished
         armed = flight.phase >= _GROUND
         seen = (self.conditions, armed, flight.intended, finished, self._settings)
-        # What changes with time alone: delays, and rows that end some time after arming.
+        # Time-dependent inputs: delays, and rows with a time limit after arming.
         waiting = state.delay_us > 0 or state.start_delay_us is not None
         timed = self.conditions.fd_critical_failure or self.conditions.battery_unhealthy
         idle = not (waiting or timed or state.taken_over)

@@ -1,7 +1,7 @@
-"""The table of failsafes: condition, parameter, action. One row a failsafe, pure.
+"""Table of failsafes: condition, parameter, action. One row per failsafe, pure.
 
-Source: PX4 1.16, commander/failsafe/failsafe.cpp (checkStateAndMode and what it calls). Left out is
-what this vehicle does not have: transitions of a VTOL, an ESC that fails to arm.
+Source: PX4 1.16, commander/failsafe/failsafe.cpp (checkStateAndMode and its callees). Not
+applicable to this vehicle and omitted: VTOL transitions, ESC arming failure.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ NOTHING = Options(Action.NONE)
 
 
 class Situation(NamedTuple):
-    """All that a row may look at."""
+    """Input of a table row."""
 
     time_us: int
     conditions: Conditions
     settings: Settings
     intended: Mode
-    """The mode that the user asked for."""
+    """Mode requested by the user."""
     mission_finished: bool = False
     armed_us: int | None = None
-    """When the vehicle was armed; None = it is not armed."""
+    """Time of arming; None = disarmed."""
     manual_control_lost_at_arming: bool = False
-    """Manual control was lost at arming and has not been there since: it is optional."""
+    """Manual control was lost at arming and has not returned: it is optional."""
     battery_at_arming: BatteryWarning = BatteryWarning.NONE
 
 
 class Trigger(Enum):
-    """What sets a failsafe off; of each only one action is held."""
+    """Cause of a failsafe; one action is held per trigger."""
 
     MANUAL_CONTROL = auto()
     GCS = auto()
@@ -62,25 +62,25 @@ class Trigger(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One failsafe."""
+    """Failsafe."""
 
     trigger: Trigger
     title: str
     when: str
-    """The condition, for the manual."""
+    """Condition, for the manual."""
     occurs: Callable[[Situation], bool]
     answers: Mapping[int, Options]
-    """By the parameter's value; a row without a parameter has the answer 0 alone."""
+    """Responses by parameter value; a row without a parameter has key 0 only."""
     parameter: str | None = None
     otherwise: Options = NOTHING
-    """For a value that the parameter does not have."""
+    """Response to an undefined parameter value."""
     related: tuple[str, ...] = ()
     """Other parameters of the condition."""
     value: Callable[[Situation], int] | None = None
-    """The value to go by, where it is not simply the parameter's."""
+    """Key into `answers` if it differs from the parameter's value."""
 
     def options(self, situation: Situation) -> Options:
-        """Return the answer in a situation in which the failsafe occurs."""
+        """Return the response if the failsafe is triggered in a situation."""
         if self.value is not None:
             chosen = self.value(situation)
         elif self.parameter is not None:
@@ -91,7 +91,7 @@ class Row:
 
 
 _STICKS_OFF = 4
-"""COM_RC_IN_MODE: no sticks are used."""
+"""COM_RC_IN_MODE: stick input disabled."""
 _EXCEPT_MISSION, _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 1, 2, 4
 """Bits of COM_RCL_EXCEPT."""
 
@@ -109,11 +109,11 @@ def _caused(answers: Mapping[int, Options], cause: Cause) -> dict[int, Options]:
 
 _LANDING = (Mode.LAND, Mode.PRECISION_LAND)
 _LINK_LOSS = {0: _NONE, 1: _HOLD, 2: _RETURN, 3: _LAND, 5: _TERMINATE, 6: _DISARM}
-"""NAV_RCL_ACT and NAV_DLL_ACT."""
+"""Responses of NAV_RCL_ACT and NAV_DLL_ACT."""
 
 _ESCAPABLE_HOLD = _LASTING_HOLD._replace(takeover=Takeover.MODE_SWITCH)
 _LIMITS = {0: _NONE, 1: _WARN, 2: _ESCAPABLE_HOLD, 3: _RETURN, 4: _TERMINATE, 5: _LAND}
-"""GF_ACTION and COM_WIND_MAX_ACT."""
+"""Responses of GF_ACTION and COM_WIND_MAX_ACT."""
 
 _POSITION_LOW = {
     value: Options(action, takeover=Takeover.MODE_SWITCH)
@@ -132,7 +132,7 @@ _ACTUATOR = {
 
 
 def ignores_manual_control(s: Situation) -> bool:
-    """Return whether a lost manual control is no failsafe in this mode (COM_RCL_EXCEPT)."""
+    """Return whether the loss of manual control is exempt in this mode (COM_RCL_EXCEPT)."""
     mode, bits = s.intended, s.settings.com_rcl_except
     return (
         s.manual_control_lost_at_arming
@@ -148,7 +148,7 @@ def _manual_control(s: Situation) -> bool:
 
 
 def _links_lost_after_mission(s: Situation) -> bool:
-    """Return whether neither link is a failsafe of its own, both are lost and nothing is left."""
+    """Return whether a finished mission has no link and no link failsafe applies."""
     unwatched = s.settings.com_rc_in_mode == _STICKS_OFF or bool(
         s.settings.com_rcl_except & _EXCEPT_MISSION
     )
@@ -178,7 +178,7 @@ def _terminates(s: Situation) -> bool:
 
 
 def _battery_action(s: Situation) -> int:
-    """Return COM_LOW_BAT_ACT; 0 while the charge is no worse than it was at arming."""
+    """Return COM_LOW_BAT_ACT; 0 unless the battery warning is worse than at arming."""
     worse = s.conditions.battery_warning > s.battery_at_arming
     return s.settings.com_low_bat_act if worse else 0
 
@@ -378,11 +378,11 @@ TABLE: tuple[Row, ...] = (
         related=("FD_ACT_EN", "FD_ACT_MOT_THR", "FD_ACT_MOT_C2T", "FD_ACT_MOT_TOUT"),
     ),
 )
-"""Every failsafe but the last, which `answers` adds: the fallback of a mode that cannot fly on."""
+"""All failsafes except the last, added by `answers`: the fallback of a mode that cannot run."""
 
 
 def answers(situation: Situation) -> list[tuple[Trigger, Options]]:
-    """Return what occurs now and the answer to each, in the table's order; no answer is none."""
+    """Return the triggered failsafes with their responses in table order, without NONE."""
     found = [(row.trigger, row.options(situation)) for row in TABLE if row.occurs(situation)]
     found = [(trigger, options) for trigger, options in found if options.action is not Action.NONE]
     fallback = mode_fallback(situation.conditions, situation.settings, situation.intended)

@@ -1,4 +1,4 @@
-"""Where the conditions come from: estimator, links, battery, clocks, and what others report."""
+"""Detection of failure conditions from estimator, links, battery, timers and reports."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ _GROUND, _AIR = Phase.GROUND, Phase.AIR
 _WARNINGS = tuple(BatteryWarning)
 
 _RECENT, _ACCURACY, _SPEED_ACCURACY, _ROLL, _PITCH, _BATTERY = range(6)
-"""Places in the limits of `is_calm`."""
+"""Indices into the limits of `is_calm`."""
 
 
 @kernel
 def is_calm(controller: Record, limits: Vector) -> bool:
-    """Return whether all that is measured is far from what failsafes look for; note that look.
+    """Return whether all measurements are far from failsafe limits, and record that check.
 
     Args:
-        controller: Record (1,); `looked_at` and `watch` are updated in a calm look.
+        controller: Record (1,); `looked_at` and `watch` are updated by a calm check.
         limits: (6,) age of the newest fusion [µs], accuracies [m], [m/s], angles [rad], charge.
     """
     c = controller[0]
@@ -89,22 +89,22 @@ def is_calm(controller: Record, limits: Vector) -> bool:
 
 @dataclass
 class Reports:
-    """What other parts of the autopilot report; each writes its own and nobody else's."""
+    """Reports from other parts of the autopilot; each writes only its fields."""
 
     fence: FenceBreach = NO_BREACH
     mission_missing: bool = True
-    """No mission is stored that could be flown."""
+    """True if no feasible mission is stored."""
     mission_failure: bool = False
-    """The mission that is flown has become infeasible."""
+    """True if the active mission has become infeasible."""
     mission_finished: bool = False
     navigator_failure: bool = False
-    """What the mode flies to cannot be reached."""
+    """True if the mode's destination cannot be reached."""
     return_time_s: float = 0.0
-    """How long a return would take, with its margins; 0 = not known."""
+    """Duration of a return including margins [s]; 0 = unknown."""
 
 
 class WatchSettings(NamedTuple):
-    """Each field is the parameter of that name in capitals; the numbers are PX4's defaults."""
+    """Monitor parameters: the field name in capitals; defaults are PX4's."""
 
     bat1_capacity: float = -1.0
     bat_avrg_current: float = 15.0
@@ -130,25 +130,25 @@ class WatchSettings(NamedTuple):
 
     @classmethod
     def read(cls, value: Callable[[str], float]) -> WatchSettings:
-        """Read them by a lookup of PX4 parameter names."""
+        """Read the parameters with a look-up by PX4 name."""
         return cls(*(value(name.upper()) for name in cls._fields))
 
 
 class Watch:
-    """Notes what is heard and measured, and says what is wrong."""
+    """Monitor of signals and measurements; reports failure conditions."""
 
     def __init__(self, value: Callable[[str], float], estimator: Estimator) -> None:
-        """Take a lookup of PX4 parameter names, and the estimator whose outputs are judged."""
+        """Store the look-up for PX4 parameters and the estimator to monitor."""
         self._value = value
         self._estimator = estimator
         self.sensors = SensorMonitor(estimator.record["watch"][0])
-        """The sensors, watched."""
+        """Sensor monitor."""
         self.attitude = AttitudeFailure()
-        """The failure detector."""
+        """Attitude failure detector."""
         self.motors = MotorFailure()
-        """The failure detector's motors."""
+        """Motor failure detector."""
         self.reports = Reports()
-        """What others report."""
+        """Reports from other parts of the autopilot."""
         self._setpoint_us: int | None = None
         self._setpoint: Setpoint | None = None
         self._manual_us: int | None = None
@@ -164,11 +164,11 @@ class Watch:
         self._compass_given_up = False
         self._armed = False
         self._calm: tuple[object, ...] | None = None
-        """What was reported and heard at a look that found nothing unusual; None = it did."""
+        """Reported and received state at a check without findings; None = there were findings."""
         self.read_parameters()
 
     def read_parameters(self) -> None:
-        """Read the parameters anew."""
+        """Read the parameters again."""
         self.settings = p = WatchSettings.read(self._value)
         self._calm = None
         tilts = (math.radians(abs(d)) or math.inf for d in (p.fd_fail_r, p.fd_fail_p))
@@ -183,21 +183,21 @@ class Watch:
         )
 
     def hear_setpoint(self, setpoint: Setpoint | None, time_us: int) -> None:
-        """Note a valid offboard setpoint; None = one of attitude or body rates."""
+        """Record a valid offboard setpoint; None = attitude or body rates."""
         self._setpoint, self._setpoint_us = setpoint, time_us
 
     def hear_pilot(self, time_us: int) -> None:
-        """Note a pilot's valid input: MANUAL_CONTROL or RC."""
+        """Record valid pilot input: MANUAL_CONTROL or RC."""
         self._manual_us = time_us
 
     def hear_gcs(self, time_us: int) -> None:
-        """Note a ground station's heartbeat."""
+        """Record a ground station's heartbeat."""
         if self._gcs_us is None:
-            self._gcs_lost = False  # The first one is no news.
+            self._gcs_lost = False  # The first one is not reported.
         self._gcs_us = time_us
 
     def offboard_lost(self, time_us: int) -> bool:
-        """Return whether there is no setpoint that could be flown, young enough (COM_OF_LOSS_T)."""
+        """Return whether no usable setpoint arrived within COM_OF_LOSS_T."""
         setpoint = self._setpoint
         if _silent(self._setpoint_us, time_us, self.settings.com_of_loss_t):
             return True
@@ -207,14 +207,14 @@ class Watch:
         return not (self._local if by_position else self._velocity).valid
 
     def hear_escs(self, time_us: int, told: Motors, outputs: Motors) -> None:
-        """Note what the speed controllers report that their motors do, and what they are told."""
+        """Check the motor outputs reported by the speed controllers against the commands."""
         p = self.settings
         if p.fd_act_en:
             limits = Undercurrent(p.fd_act_mot_thr, p.fd_act_mot_c2t, p.fd_act_mot_tout)
             self.motors.take(time_us, told, outputs, limits)
 
     def look(self, sample: SensorSample, phase: Phase) -> tuple[Conditions, list[Message]]:
-        """Return what is wrong now, and what has changed that an operator is told at once."""
+        """Return the current conditions and the messages for the operator."""
         seen, now_us = self._estimator.record["looked_at"][0], sample.time_us
         if self._calm is not None:
             self.sensors.looked_at(seen[:3], seen[3:])
@@ -228,11 +228,11 @@ class Watch:
 
     @property
     def is_calm(self) -> bool:
-        """Whether the newest look found nothing unusual."""
+        """True if the newest check found nothing unusual."""
         return self._calm is not None
 
     def is_unchanged(self, now_us: int) -> bool:
-        """Return whether a look would find what the newest one found."""
+        """Return whether a check would repeat the newest result."""
         calm = self._calm
         if calm is None or self._reported(now_us) != calm:
             return False
@@ -252,7 +252,7 @@ class Watch:
         )
 
     def _is_usual(self, found: Conditions, now_us: int) -> bool:
-        """Return whether nothing is under way that time alone, or a look, would change."""
+        """Return whether neither time nor another check would change the result."""
         p = self.settings
         return (
             max(p.com_flt_time_max, p.com_pos_low_eph, p.bat1_capacity) <= 0.0
@@ -360,7 +360,7 @@ class Watch:
         return texts
 
     def _lasts_too_short(self, sample: SensorSample, *, armed: bool) -> bool:
-        """Return whether the battery lasts no longer than a return takes."""
+        """Return whether the remaining battery time is shorter than a return."""
         p, needed_s = self.settings, self.reports.return_time_s
         if p.bat1_capacity <= 0.0:
             return False
@@ -370,7 +370,7 @@ class Watch:
         return left_s < needed_s
 
     def _charge(self, battery: BatterySample, *, armed: bool) -> BatteryWarning:
-        """Return how low the charge is; while armed it gets no better."""
+        """Return the battery warning level, which cannot decrease while armed."""
         p, left = self.settings, battery.remaining
         below = (left < p.bat_low_thr) + (left < p.bat_crit_thr) + (left < p.bat_emergen_thr)
         warning = _WARNINGS[below]

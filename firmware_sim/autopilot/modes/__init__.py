@@ -1,4 +1,4 @@
-"""Flight modes, one file each: what a mode flies. To add one: write its file, enter it below."""
+"""Flight modes, one file each. To add a mode, write its file and register it below."""
 
 from __future__ import annotations
 
@@ -41,4 +41,4 @@ MODES: Mapping[Mode, Callable[[FlightContext], FlightMode]] = MappingProxyType(
         Mode.PRECISION_LAND: PrecisionLand,
     }
 )
-"""What flies each mode."""
+"""Implementation of each mode."""

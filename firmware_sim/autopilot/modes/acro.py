@@ -1,4 +1,4 @@
-"""Acro: the sticks turn the body, and push.
+"""Acro: the sticks command body rates and thrust.
 
 Source: PX4 1.16, MulticopterRateControl.
 """
@@ -14,19 +14,19 @@ from firmware_sim.autopilot.modes.stick_motion import superexpo
 
 
 class Acro(FlightMode):
-    """Turns as fast as the sticks say, with the thrust of the throttle stick, linear."""
+    """Body rates proportional to the sticks, and thrust linear in the throttle stick."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
 
     @property
     def lifts(self) -> bool:
-        """Whether the throttle stick asks for thrust."""
+        """True if the throttle stick commands thrust."""
         sticks = self._context.sticks
         return sticks is not None and sticks.throttle > IDLE_THROTTLE
 
     def demand(self, _state: Vector, _time_us: int, /) -> RateDemand:
-        """Follow the sticks."""
+        """Return the demand of the sticks."""
         value, sticks = self._context.value, self._context.sticks or RELEASED
         gentle, steep = value("MC_ACRO_EXPO"), value("MC_ACRO_SUPEXPO")
         roll = superexpo(sticks.roll, gentle, steep) * value("MC_ACRO_R_MAX") * DEG

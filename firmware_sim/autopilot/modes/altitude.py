@@ -1,4 +1,4 @@
-"""Altitude: the sticks tilt, and climb; released, the height is held and the vehicle drifts."""
+"""Altitude: the sticks command tilt and climb. Released: height held, position drifts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from firmware_sim.autopilot.modes.stick_motion import AxisDemand
 
 
 class Altitude(Piloted):
-    """Tilts as the sticks say."""
+    """Tilt proportional to the sticks."""
 
     def _steer(
         self, sticks: Sticks, heading: float, _state: Vector, _dt: float, /

@@ -1,10 +1,10 @@
-"""Collision prevention: in Position mode the sticks lead no closer to an obstacle than CP_DIST.
+"""Collision prevention: distance CP_DIST to obstacles in Position mode.
 
-Where obstacles are is told by OBSTACLE_DISTANCE, in bins around the vehicle. Where nothing is told
-nothing is flown to, unless CP_GO_NO_DATA allows it, and without any data not at all.
+OBSTACLE_DISTANCE reports obstacles in bins around the vehicle. Bins without data are avoided unless
+CP_GO_NO_DATA permits them; without any data the vehicle stops.
 
-Source: PX4 1.16, lib/collision_prevention: CollisionPrevention and ObstacleMath. Its map is one of
-the body, too, and is not turned between two messages. This vehicle has no DISTANCE_SENSOR.
+Source: PX4 1.16, lib/collision_prevention: CollisionPrevention and ObstacleMath. As in PX4, the map
+is in the body frame and is not rotated between messages. This vehicle has no DISTANCE_SENSOR.
 """
 
 from __future__ import annotations
@@ -21,42 +21,42 @@ from firmware_sim.autopilot.trajectory import braking_speed
 
 BINS = 72
 BIN_DEG = 360.0 / BINS
-"""Bin 0 is straight ahead, the numbers rise clockwise."""
+"""Width of a bin [deg]. Bin 0 is straight ahead; indices increase clockwise."""
 
 UNKNOWN_CM = 65_535
-"""Distance of a bin of which nothing is known."""
+"""Distance of a bin without data."""
 
 STALE_US = US_PER_S // 2
-"""Data that are older are forgotten (RANGE_STREAM_TIMEOUT_US) [µs]."""
+"""Maximum age of data [µs] (RANGE_STREAM_TIMEOUT_US)."""
 
 GIVE_UP_US = 5 * US_PER_S
-"""So long without data, the mode ends in Hold (TIMEOUT_HOLD_US) [µs]."""
+"""Timeout without data after which the mode ends in Hold [µs] (TIMEOUT_HOLD_US)."""
 
 _DEFLECTED_M_S2 = 1e-3
-"""From this acceleration on the sticks are deflected."""
+"""Minimum acceleration of a deflected stick."""
 
 _M_PER_CM = 0.01
 
 
 class ObstacleMap:
-    """How far the nearest obstacle is in each direction of the body, as was told last."""
+    """Distance to the nearest obstacle in each body direction, from the newest reports."""
 
     def __init__(self) -> None:
-        """Begin without data."""
+        """Start without data."""
         self.distances_cm = np.full(BINS, float(UNKNOWN_CM))
         self.seen_us = np.zeros(BINS)
-        """When each was told."""
+        """Time of each bin's newest report [µs]."""
         self.ranges_cm = np.zeros(BINS)
-        """Range of what told it."""
+        """Maximum range of the sensor of each bin [cm]."""
         self.told = np.zeros(BINS, dtype=bool)
-        """Whether it has ever been told: lies in some sensor's field of view."""
+        """True if the bin was ever reported, so lies in a sensor's field of view."""
         self.nearest_cm = UNKNOWN_CM
-        """What is nearer cannot be measured."""
+        """Minimum measurable distance [cm]."""
         self.time_us = 0
-        """When the newest data came."""
+        """Time of the newest data [µs]."""
 
     def take(self, obstacles: Obstacles, yaw: float) -> None:
-        """Take what was told, at a heading [rad]."""
+        """Add reported obstacles at a heading [rad]."""
         self.time_us = max(self.time_us, obstacles.time_us)
         self.nearest_cm = min(self.nearest_cm, obstacles.nearest_cm)
         offset = obstacles.offset_deg - (math.degrees(yaw) if obstacles.in_world else 0.0)
@@ -72,19 +72,19 @@ class ObstacleMap:
                 self.told[i] = True
 
     def forget(self, now_us: int) -> None:
-        """Forget what is stale."""
+        """Discard stale data."""
         self.distances_cm[now_us - self.seen_us > STALE_US] = UNKNOWN_CM
 
     def has_data(self, now_us: int) -> bool:
-        """Return whether anything is known."""
+        """Return whether there are current data."""
         fresh = now_us - self.time_us < STALE_US
         return fresh and bool((self.distances_cm < UNKNOWN_CM).any())
 
     def _replaces(self, i: int, reading_cm: float, range_cm: float) -> bool:
         """Return whether a reading is used (`_enterData`).
 
-        Of several sensors that see something it is the one with the shorter range, and of several
-        that see nothing the one with the longer.
+        Among sensors with an obstacle in range, the shortest range takes precedence; among the
+        others, the longest.
         """
         before_in_range = self.distances_cm[i] < self.ranges_cm[i]
         if reading_cm < range_cm:
@@ -95,25 +95,25 @@ class ObstacleMap:
 
 
 class CollisionPrevention:
-    """Changes the acceleration that the sticks ask for."""
+    """Limiter for the acceleration commanded by the sticks."""
 
     def __init__(self, value: Callable[[str], float]) -> None:
-        """Begin without data; `value` looks up a PX4 parameter by its name."""
+        """Start without data; `value` is the look-up for PX4 parameters."""
         self._value = value
         self.map = ObstacleMap()
         self._taken: Obstacles | None = None
         self._active_us: int | None = None
-        """Since when it is switched on."""
+        """Time of activation [µs]."""
         self.gives_up = False
-        """Whether there has been no data for so long that the mode must not go on."""
+        """True if data have been missing for `GIVE_UP_US` and the mode must end."""
 
     @property
     def is_on(self) -> bool:
-        """Whether CP_DIST asks for it."""
+        """True if enabled by CP_DIST."""
         return self._value("CP_DIST") > 0.0
 
     def rest(self) -> None:
-        """Note that it is not used now."""
+        """Record that collision prevention is inactive."""
         self._active_us, self.gives_up = None, False
 
     def constrain(
@@ -124,14 +124,14 @@ class CollisionPrevention:
         yaw: float,
         now_us: int,
     ) -> tuple[float, float]:
-        """Return the acceleration (north, east) [m/s²] that may be flown.
+        """Return the permitted acceleration (north, east) [m/s²].
 
         Args:
-            wanted: What the sticks ask for, north and east [m/s²].
-            velocity: The velocity setpoint, north and east [m/s].
-            obstacles: What was told last; None = nothing yet.
+            wanted: Acceleration commanded by the sticks, north and east [m/s²].
+            velocity: Velocity setpoint, north and east [m/s].
+            obstacles: Newest report; None = none yet.
             yaw: Heading [rad].
-            now_us: Now.
+            now_us: Current time [µs].
         """
         self._active_us = now_us if self._active_us is None else self._active_us
         fresh = obstacles is not None and now_us - obstacles.time_us < STALE_US
@@ -140,7 +140,7 @@ class CollisionPrevention:
             self.map.take(obstacles, yaw)
         self.map.forget(now_us)
         if not self.map.has_data(now_us):
-            # Nothing is known: nothing is flown to.
+            # Without data no direction is permitted.
             since_us = max(self.map.time_us, self._active_us)
             self.gives_up = now_us - since_us > GIVE_UP_US
             return 0.0, 0.0
@@ -158,11 +158,11 @@ class CollisionPrevention:
 
     @property
     def _keep_m(self) -> float:
-        """The least distance that is kept [m]."""
+        """Minimum distance to keep [m]."""
         return max(_M_PER_CM * self.map.nearest_cm, self._value("CP_DIST"))
 
     def _guided(self, direction: Vector, yaw: float, bins: Vector) -> tuple[int, Vector]:
-        """Return bin and direction, turned by up to CP_GUIDE_ANG to where there is more room."""
+        """Return bin and direction, turned by up to CP_GUIDE_ANG towards more space."""
         ahead = math.degrees(math.atan2(direction[1], direction[0]) - yaw) % 360.0
         asked = best = int(ahead // BIN_DEG)
         distances, keep_cm = self.map.distances_cm, 100.0 * self._value("CP_DIST")
@@ -177,13 +177,13 @@ class CollisionPrevention:
         return (asked, direction) if best == asked else (best, bins[best])
 
     def _is_feasible(self, index: int) -> bool:
-        """Return whether there are data where it is asked to go, or may be none."""
+        """Return whether the requested direction has data, or may lack them."""
         if self.map.distances_cm[index] != UNKNOWN_CM:
             return True
         return bool(self._value("CP_GO_NO_DATA")) and not self.map.told[index]
 
     def _scaled(self, direction: Vector, yaw: float, bins: Vector) -> Vector:
-        """Return a direction, shorter as it leads to the closest obstacle."""
+        """Return a direction, shortened by its component towards the closest obstacle."""
         closest = int(np.argmin(self.map.distances_cm))
         towards = bins[closest]
         share = float(direction @ towards)
@@ -200,14 +200,14 @@ class CollisionPrevention:
         return scaled
 
     def _scale(self, distance_m: float) -> float:
-        """Return the share of an acceleration towards something so far away; below 0: away."""
+        """Return the share of an acceleration towards an obstacle at a distance; negative: away."""
         keep_m = self._keep_m
         over_m = distance_m - keep_m
         reach_m = max(keep_m, self._value("MPC_VEL_MANUAL") / self._value("MPC_XY_P"))
         return min(1.0, (over_m / reach_m) ** 2 if over_m > 0.0 else over_m)
 
     def _braking(self, velocity: Vector, bins: Vector, now_us: int) -> Vector:
-        """Return the acceleration (2,) that keeps it able to stop in time."""
+        """Return the acceleration (2,) that preserves the stopping distance."""
         value, obstacles = self._value, self.map
         hardest, away = math.inf, np.zeros(2)
         for i in range(BINS):
@@ -230,7 +230,7 @@ class CollisionPrevention:
 
 
 def _edges(count: int, width_deg: float, offset_deg: float) -> Vector:
-    """Return the lower and upper edge (count, 2) [deg] of bins; the lower one lies in -360..360."""
+    """Return the lower and upper edge (count, 2) [deg] of bins; lower edges are in -360..360."""
     numbers = np.arange(count)
     per_turn = 360.0 / width_deg
     lower = (np.mod(numbers, per_turn) * width_deg + offset_deg - 0.5 * width_deg) % 360.0
@@ -239,7 +239,7 @@ def _edges(count: int, width_deg: float, offset_deg: float) -> Vector:
 
 
 def _overlap(mine: Vector, told: Vector) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Return which of my bins (n, 2) lie in which of those that were told (m, 2): (n, m)."""
+    """Return the overlap (n, m) of the map's bins (n, 2) with the reported bins (m, 2)."""
     lower, upper = mine[:, None, 0], mine[:, None, 1]
     low, high = told[None, :, 0], told[None, :, 1]
     begins = (low > lower) & (low < upper)

@@ -1,4 +1,4 @@
-"""Descend: come down level, without knowing where; no pilot's input is used.
+"""Descend: level descent without a position estimate or pilot input.
 
 Source: PX4 1.16, FlightTaskDescend.
 """
@@ -13,16 +13,16 @@ from firmware_sim.autopilot.requests import Request
 
 
 class Descend(FlightMode):
-    """Descends at MPC_LAND_SPEED, level, keeping its heading."""
+    """Level descent at MPC_LAND_SPEED with constant heading."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
         self._yaw = 0.0
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
-        """Begin with the present heading."""
+        """Start with the current heading."""
         self._yaw = quat_yaw(state[Q:RATES])
 
     def demand(self, _state: Vector, _time_us: int, /) -> Demand:
-        """Descend."""
+        """Return the descent demand."""
         return Demand(FREE, (NAN, NAN, self._context.value("MPC_LAND_SPEED")), self._yaw, NAN)

@@ -1,7 +1,7 @@
-"""Follow: behind a target that reports where it is (FOLLOW_TARGET).
+"""Follow: stay relative to a target that reports its position (FOLLOW_TARGET).
 
 Source: PX4 1.16, FlightTaskAutoFollowTarget: distance, angle and height by FLW_TGT_DST, FLW_TGT_FA
-and FLW_TGT_HT. The height is above home; there is no terrain.
+and FLW_TGT_HT. The height is above home; terrain is not used.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from firmware_sim.autopilot.requests import Request
 from firmware_sim.autopilot.trajectory import Leg
 
 LOST_US = 3 * US_PER_S
-"""A target that was silent for so long is waited for where the vehicle is [µs]."""
+"""Target timeout [µs], after which the vehicle waits at its position."""
 
 WALKS_M_S = 1.0
-"""From this speed on a target has a course; slower, the last one counts [m/s]."""
+"""Minimum speed at which a target has a course; below it, the last course applies [m/s]."""
 
 
 class Follow(FlightMode):
-    """Keeps its place relative to the target's course, and looks at the target."""
+    """Follow mode: keeps a position relative to the target's course, nose towards the target."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
         self._waiting = Hold(context)
         self._course = 0.0
-        """Of the target [rad]."""
+        """Course of the target [rad]."""
         self._following = False
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
-        """Begin; until a target walks, the vehicle's heading is its course."""
+        """Start; until the target moves, its course is the vehicle's heading."""
         self._course, self._following = quat_yaw(state[Q:RATES]), False
         self._waiting.enter(state, None)
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
-        """Go where the target's place and course ask."""
+        """Return the demand to the place given by the target's position and course."""
         target = self._context.target
         if target is None or time_us - target.time_us > LOST_US:
             if self._following:

@@ -1,4 +1,4 @@
-"""Hold: brake, then stay there; or go to a place first."""
+"""Hold: brake and hold position, or fly to a place first."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from firmware_sim.autopilot.travel import stopping_place
 from firmware_sim.engine.record import SETTLING
 
 STANDING_M_S = 0.3
-"""From this speed on the vehicle counts as at rest: hold keeps the place where it is [m/s]."""
+"""Speed below which the vehicle counts as stopped, and Hold keeps the position [m/s]."""
 
 
 class Hold(FlightMode):
-    """Brakes, then holds the place where the vehicle came to rest."""
+    """Hold mode: brakes, then holds the position of the stop."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
@@ -36,21 +36,21 @@ class Hold(FlightMode):
         self._braking = False
         self._travelling = False
         self._settling = False
-        """Whether hold still climbs to the altitude of a take-off that has ended."""
+        """True if Hold still climbs to the altitude of an ended take-off."""
 
     @property
     def is_steady(self) -> bool:
-        """Whether it holds its place, or compiled ticks fly it there."""
+        """True if Hold keeps its position, or compiled ticks fly to it."""
         settling = self._settling and not self._context.climb.flies
         return not (self._travelling or settling or self._braking)
 
     @property
     def destination(self) -> Vec | None:
-        """The place, once it is known."""
+        """Hold position, once known."""
         return None if self._braking else self._place.position
 
     def enter(self, state: Vector, request: Request | None, /) -> None:
-        """Begin: climb the rest of a take-off, go to a place, or brake here."""
+        """Start: finish a take-off climb, fly to a place, or brake."""
         self._settling = isinstance(request, ClimbOn)
         self._travelling = isinstance(request, Reposition)
         self._braking = not (self._settling or self._travelling)
@@ -62,7 +62,7 @@ class Hold(FlightMode):
             self._place = here(state)
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
-        """Brake first, then hold the place where the vehicle came to rest."""
+        """Brake first, then hold the position of the stop."""
         if self._travelling:
             place = self._place
             leg = Leg(place.position)
@@ -80,10 +80,10 @@ class Hold(FlightMode):
         return Demand(self._place.position, FREE, self._place.yaw, NAN)
 
     def _go(self, request: Reposition, state: Vector) -> None:
-        """Begin the way to a place; what it leaves open stays as it is.
+        """Start the flight to a place; NaN coordinates keep their current value.
 
-        Source: PX4 1.16, Navigator: with a new height alone the vehicle stays above its place;
-        without anything it stops.
+        Source: PX4 1.16, Navigator: a new height alone keeps the horizontal position; an empty
+        request stops the vehicle.
         """
         place, before = request.place, self._place
         held = before.position if not self._braking else stopping_place(state, self._context.value)

@@ -1,4 +1,4 @@
-"""The interface of a flight mode, and the state that all modes share."""
+"""Interface of a flight mode, and the state shared by all modes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from firmware_sim.autopilot.travel import Travel
 
 NAN = math.nan
 FREE: Vec = (NAN, NAN, NAN)
-"""Of a demand's position or velocity: no axis is commanded."""
+"""Position or velocity of a demand without commanded axes."""
 
 
 OffboardSetpoint: TypeAlias = "Setpoint | AttitudeDemand | RateDemand"
@@ -29,58 +29,58 @@ OffboardSetpoint: TypeAlias = "Setpoint | AttitudeDemand | RateDemand"
 
 @dataclass
 class FlightContext:
-    """What the modes of one vehicle share."""
+    """State shared by the modes of one vehicle."""
 
     value: Callable[[str], float]
-    """Looks up a PX4 parameter by its name."""
+    """Look-up for PX4 parameters by name."""
     climb: Climb
-    """The vertical trajectory of a take-off, which hold goes on with."""
+    """Vertical trajectory of a take-off, which Hold continues."""
     home: Vec = (0.0, 0.0, 0.0)
-    """Local NED [m]."""
+    """Home position, local NED [m]."""
     takeoff_altitude_m: float = 0.0
-    """Height above home that a take-off climbs to [m]."""
+    """Target height of a take-off above home [m]."""
     takeoff_place: tuple[float, float] | None = None
-    """Where it leads, north and east [m]; None = straight up."""
+    """Target of a take-off, north and east [m]; None = vertical."""
     say: Callable[[Message], None] = lambda _message: None
-    """Tells the operators something."""
+    """Sends a text to the operator."""
     home_yaw: float = 0.0
     """Heading at home [rad]."""
     home_amsl_m: float = 0.0
     """Altitude of home above mean sea level [m]."""
     travel: Travel = field(init=False)
-    """How the automatic modes move."""
+    """Trajectories of the automatic modes."""
     setpoint: OffboardSetpoint | None = None
-    """The newest offboard setpoint."""
+    """Newest offboard setpoint."""
     setpoints: dict[type, OffboardSetpoint] = field(default_factory=dict)
-    """The newest of each kind."""
+    """Newest offboard setpoint by type."""
     return_place: Callable[[], Place | None] | None = None
-    """Chooses where Return goes; returns None where it flies items of the mission. None = home."""
+    """Returns Return's destination, or None if it flies mission items. None = home."""
     triplet: Triplet = STANDING
-    """What Mission mode flies, and Return where it flies items of the mission."""
+    """Waypoints of Mission mode, and of Return if it flies mission items."""
     mission_over: bool = False
-    """Whether the mission has come to its end."""
+    """True if the mission has ended."""
     armed: bool = False
-    """Whether the motors may turn: a mode that is chosen before is only entered."""
+    """True if armed: a mode selected earlier is only entered."""
     standing: bool = True
-    """Whether the vehicle stands on the ground."""
+    """True if the vehicle is on the ground."""
     sticks: Sticks | None = None
-    """The pilot's sticks; None = there are none, or they are lost."""
+    """Pilot's sticks; None = never received, or lost."""
     target: FollowedTarget | None = None
-    """What Follow follows."""
+    """Target of Follow."""
     landing_target: LandingTarget | None = None
-    """What a precision landing lands on, as it was reported last."""
+    """Target of a precision landing, as last reported."""
     obstacles: Obstacles | None = None
-    """Where obstacles are, as was told last."""
+    """Obstacles, as last reported."""
     ground: Clearance | None = None
-    """How far the ground is below; None = nothing tells it."""
+    """Height above ground; None = not measured."""
     orbit: OrbitStatus | None = None
-    """The circle that was flown last."""
+    """Last circle of Orbit."""
 
     def __post_init__(self) -> None:
         self.travel = Travel(self.value)
 
     def offer(self, setpoint: OffboardSetpoint) -> None:
-        """Take an offboard setpoint."""
+        """Store an offboard setpoint."""
         self.setpoint = self.setpoints[type(setpoint)] = setpoint
 
     def height(self, state: Vector) -> float:
@@ -89,68 +89,68 @@ class FlightContext:
 
     @property
     def ground_m(self) -> float:
-        """How far the ground is below [m]; NaN = not known."""
+        """Height above ground [m]; NaN = unknown."""
         ground = self.ground
         return NAN if ground is None or not ground.valid else ground.dist_bottom_m
 
     def over_ground(self, state: Vector) -> float:
-        """Return the height above ground [m], above home where the ground is not known."""
+        """Return the height above ground [m], or above home if the ground is unknown."""
         ground_m = self.ground_m
         return self.height(state) if math.isnan(ground_m) else ground_m
 
 
 class FlightMode(Protocol):
-    """One flight mode, made once for a vehicle and entered again and again.
+    """Interface of a flight mode, created once per vehicle and entered repeatedly.
 
-    Modes inherit from it what they have nothing to say about. Every `state` is the estimator's
-    newest nominal state (`error_state`).
+    Modes inherit the defaults. `state` is always the estimator's newest nominal state
+    (`error_state`).
     """
 
     def __init__(self, context: FlightContext, /) -> None: ...
 
     @property
     def lifts(self) -> bool:
-        """Whether an armed vehicle that stands on the ground takes off in this mode."""
+        """True if an armed vehicle on the ground takes off in this mode."""
         return False
 
     @property
     def is_steady(self) -> bool:
-        """Whether the demand stays the same until another setpoint or request arrives."""
+        """True if the demand is constant until the next setpoint or request."""
         return False
 
     @property
     def destination(self) -> Vec | None:
-        """Where an automatic mode is going, local NED [m]; None in all other modes."""
+        """Destination of an automatic mode, local NED [m]; None in all other modes."""
         return None
 
     def enter(self, _state: Vector, _request: Request | None, /) -> None:
-        """Begin at the present state.
+        """Start at the current state.
 
-        The request is the user's, or what the mode before leaves to this one (its `remainder`). A
-        mode ignores those that are not for it.
+        The request comes from the user, or from the previous mode (its `remainder`). Modes ignore
+        requests of other modes.
         """
         return
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
-        """Return what to fly at a time [µs] that rises from call to call."""
+        """Return the demand at a time [µs], which increases from call to call."""
         ...
 
     def remainder(self, _state: Vector, /) -> Request | None:
-        """Return what is left to the mode after this one; None = it begins where it is entered."""
+        """Return a request for the next mode; None = the next mode starts without."""
         return None
 
     def is_done(self, _state: Vector, /) -> bool:
-        """Return whether the mode has reached its end, and another one should follow."""
+        """Return whether the mode has reached its goal, so that another one should follow."""
         return False
 
 
 FALLBACK_DESCENT_M_S = 0.75
-"""Descent of modes that need a pilot's input and have none (measured on PX4 1.16). The vehicle
-stays level: drag alone slows it, from 1.0 to 0.3 m/s in 7 s (FlightTaskDescend)."""
+"""Descent rate of stick modes without pilot input (measured on PX4 1.16). The vehicle stays level:
+drag alone slows it, from 1.0 to 0.3 m/s in 7 s (FlightTaskDescend)."""
 
 
 def descend(yaw: float) -> Demand:
-    """Return the demand of a mode without the pilot's input that it needs."""
+    """Return the demand of a stick mode without pilot input."""
     return Demand(FREE, (NAN, NAN, FALLBACK_DESCENT_M_S), yaw, NAN)
 
 
@@ -166,11 +166,11 @@ def triple(state: Vector, start: int) -> Vec:
 
 
 def here(state: Vector) -> Place:
-    """Return where the vehicle is and where it points."""
+    """Return the current position and heading."""
     return Place(triple(state, P), quat_yaw(state[Q:RATES]))
 
 
 def over(place: Place, down_m_s: float) -> Demand:
-    """Return the demand that keeps to a place and a heading at a vertical speed NED [m/s]."""
+    """Return the demand that holds a place and heading at a vertical speed NED [m/s]."""
     north, east, _ = place.position
     return Demand((north, east, NAN), (NAN, NAN, down_m_s), place.yaw, NAN)

@@ -1,4 +1,4 @@
-"""Land: stop, then descend there."""
+"""Land: stop, then descend vertically."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from firmware_sim.autopilot.modes.interface import (
 from firmware_sim.autopilot.requests import Place, Request
 
 STANDING_M_S = 0.3
-"""From this horizontal speed on the descent keeps to a place [m/s]."""
+"""Horizontal speed below which the descent holds a position [m/s]."""
 
 
 SLOW_BELOW_M = 0.5
-"""So far below MPC_LAND_ALT2 the errors of the estimate no longer lead above it [m]."""
+"""Margin below MPC_LAND_ALT2 that exceeds the estimate's error [m]."""
 
 
 class Land(FlightMode):
-    """Descends where the vehicle came to rest, slower and slower as PX4 does."""
+    """Land mode: descends at the position of the stop, with PX4's decreasing speed."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
@@ -39,22 +39,22 @@ class Land(FlightMode):
 
     @property
     def is_steady(self) -> bool:
-        """Whether it descends to its place at the speed of the touchdown."""
+        """True if the vehicle descends to its place at touchdown speed."""
         return self._is_slow and not self._stopping
 
     @property
     def destination(self) -> Vec | None:
-        """The ground below the place where the mode began, as high as home."""
+        """Ground below the start of the mode, at home altitude."""
         north, east = self._began
         return north, east, self._context.home[2]
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
-        """Begin at the present place."""
+        """Start at the current position."""
         self._place, self._stopping = here(state), True
         self._began = self._place.position[:2]
 
     def demand(self, state: Vector, _time_us: int, /) -> Demand:
-        """Stop first, then hold that place; descend all the while."""
+        """Stop first, then hold that position; descend at all times."""
         context = self._context
         height_m, ground_m = context.height(state), context.ground_m
         speed = landing_speed(context.value, height_m, ground_m)
@@ -70,12 +70,12 @@ class Land(FlightMode):
 
 
 def landing_speed(value: Callable[[str], float], height_m: float, ground_m: float = NAN) -> float:
-    """Return how fast to descend [m/s]: PX4 slows down linearly between two heights.
+    """Return the descent speed [m/s]: PX4 slows down linearly between two heights.
 
     Args:
-        value: Looks up a parameter.
-        height_m: Height above where it lands.
-        ground_m: How far the ground is below, which counts where it is known; NaN = it is not.
+        value: Look-up for parameters.
+        height_m: Height above the landing place.
+        ground_m: Height above ground, which takes precedence; NaN = unknown.
     """
     if not math.isnan(ground_m):
         if ground_m <= value("MPC_LAND_ALT3"):

@@ -1,4 +1,4 @@
-"""Mission: flies the way that the mission's executor gives it."""
+"""Mission: flies the waypoints of the mission executor."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from firmware_sim.autopilot.trajectory import Leg, PathLimits
 _TAKEOFF, _LAND, _IDLE = TripletKind.TAKEOFF, TripletKind.LAND, TripletKind.IDLE
 
 _REQUIRED = 2
-"""PRECISION_LAND_MODE: the target is searched for."""
+"""PRECISION_LAND_MODE: search for the target."""
 
 _MOVES_M_S = 0.5
-"""Along its way a vehicle turns from this speed on [m/s] (MPC_YAW_MODE = 3)."""
+"""Minimum speed to turn the nose along the path [m/s] (MPC_YAW_MODE = 3)."""
 
 
 class Mission(FlightMode):
-    """Follows `FlightContext.triplet`, with PX4's speeds at and between waypoints."""
+    """Mission mode: follows `FlightContext.triplet` with PX4's speeds at and between waypoints."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
@@ -36,24 +36,24 @@ class Mission(FlightMode):
 
     @property
     def lifts(self) -> bool:
-        """Whether the mission leads off the ground."""
+        """True if the mission leaves the ground."""
         return self._context.triplet.kind not in (_IDLE, _LAND)
 
     @property
     def destination(self) -> Vec | None:
-        """The item that is flown to."""
+        """Position of the active item."""
         return self._context.triplet.target
 
     def enter(self, _state: Vector, _request: Request | None, /) -> None:
-        """Begin; the executor says with what."""
+        """Start; the executor supplies the waypoints."""
         self._triplet, self._lands_precisely = None, False
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
-        """Fly on."""
+        """Return the demand for the active waypoints."""
         context = self._context
         triplet, position, travel = context.triplet, triple(state, P), context.travel
         if context.standing:
-            # The trajectory begins where the vehicle is once it has left the ground.
+            # The trajectory starts at the vehicle's position at lift-off.
             return leave_ground(context, state, time_us)
         if triplet is not self._triplet:
             if self._triplet is None or triplet.cruise_m_s != self._triplet.cruise_m_s:
@@ -71,7 +71,7 @@ class Mission(FlightMode):
         return travel.fly(state, time_us, leg, yaw=yaw, limits=limits)
 
     def _land_precisely(self, triplet: Triplet, state: Vector, time_us: int) -> AnyDemand:
-        """Land on a target near the place of the item."""
+        """Land on a target near the item's position."""
         if not self._lands_precisely:
             self._lands_precisely = True
             north, east, _ = triplet.target
@@ -80,7 +80,7 @@ class Mission(FlightMode):
         return self._precision.demand(state, time_us)
 
     def is_done(self, _state: Vector, /) -> bool:
-        """Return whether the mission is over."""
+        """Return whether the mission has ended."""
         return self._context.mission_over
 
     def _limits(self, state: Vector) -> PathLimits:
@@ -89,7 +89,7 @@ class Mission(FlightMode):
         return gentle(limits, self._context, state) if triplet.kind is _TAKEOFF else limits
 
     def _heading(self, state: Vector) -> float:
-        """Return the heading by MPC_YAW_MODE; NaN = towards the waypoint, or as it is near it."""
+        """Return the heading by MPC_YAW_MODE; NaN = towards the waypoint, unchanged near it."""
         mode, home = round(self._context.value("MPC_YAW_MODE")), self._context.home
         if mode == 3:
             north, east, _ = triple(state, V)
@@ -104,7 +104,7 @@ class Mission(FlightMode):
 
 
 def _leg(triplet: Triplet, position: Vec) -> Leg:
-    """Return the way to fly; a vehicle beside or beyond its line finds back to it.
+    """Return the leg to fly; off its line, the vehicle returns to the line first.
 
     Source: PX4 1.16, FlightTaskAuto::_getCurrentState, _updateInternalWaypoints.
     """

@@ -1,4 +1,4 @@
-"""Offboard: what the companion computer commands."""
+"""Offboard: setpoints from a companion computer."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from firmware_sim.autopilot.modes.interface import (
 from firmware_sim.autopilot.requests import Request
 
 CLIMBS_M_S = 0.1
-"""A setpoint that asks to climb faster than this lifts a standing vehicle [m/s]."""
+"""Minimum climb rate of a setpoint that lifts a standing vehicle [m/s]."""
 
 ABOVE_HOME_M = 0.3
-"""So does one that lies this much above home [m]."""
+"""Minimum height above home of a setpoint that lifts a standing vehicle [m]."""
 
 HOVER = Demand(FREE, (0.0, 0.0, 0.0), NAN, NAN)
-"""What PX4 flies when a setpoint leaves an axis open (PositionControl::inputValid)."""
+"""PX4's fallback for a setpoint with an uncommanded axis (PositionControl::inputValid)."""
 
 
 class Offboard(FlightMode):
-    """Flies the newest setpoint; holds as long as there was none."""
+    """Offboard mode: flies the newest setpoint; holds position before the first."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
@@ -45,13 +45,13 @@ class Offboard(FlightMode):
         self._setpoint: OffboardSetpoint | None = None
         self._flown: AnyDemand | None = None
         self._kind: type = Setpoint
-        """Which kind of setpoint is followed."""
+        """Type of the active setpoint."""
         self._kind_us = 0
-        """When the kind is looked at next [µs]."""
+        """Time of the next check of the type [µs]."""
 
     @property
     def lifts(self) -> bool:
-        """Whether the setpoint lies above the ground or goes up, or commands a thrust."""
+        """True if the setpoint is above the ground, climbs, or commands thrust."""
         demand = self._demand_of(self._context.setpoint)
         if demand is None:
             return False
@@ -64,19 +64,19 @@ class Offboard(FlightMode):
 
     @property
     def is_steady(self) -> bool:
-        """Whether the setpoint says all that is flown, and another kind is not waited for."""
+        """True if the setpoint determines the whole demand and no type change is pending."""
         newest = self._context.setpoint
         if newest is None or type(newest) is not self._kind:
             return False
         return not isinstance(newest, RateDemand) or not math.isnan(newest.rates[2])
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
-        """Begin."""
+        """Start the mode."""
         self._waiting.enter(state, None)
         self._kind_us = 0
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
-        """Return what the companion commands."""
+        """Return the demand of the setpoint."""
         newest = self._context.setpoint
         if newest is not None and time_us >= self._kind_us:
             self._kind_us, self._kind = time_us + KIND_US, type(newest)
@@ -84,13 +84,13 @@ class Offboard(FlightMode):
         if demand is None:
             return self._waiting.demand(state, time_us)
         if isinstance(demand, RateDemand) and math.isnan(demand.rates[2]):
-            # No yaw rate is commanded: it stays what it is.
+            # Without a commanded yaw rate, the current rate is kept.
             roll, pitch, _ = demand.rates
             return RateDemand((roll, pitch, state.item(RATES + 2)), demand.thrust)
         return demand
 
     def _demand_of(self, setpoint: OffboardSetpoint | None) -> AnyDemand | None:
-        """Return a setpoint as a demand, made once as long as it stays the same."""
+        """Return a setpoint as a demand, cached while the setpoint is unchanged."""
         if setpoint is None:
             return None
         if setpoint is not self._setpoint:
@@ -100,10 +100,10 @@ class Offboard(FlightMode):
 
 
 def demand_of(setpoint: Setpoint) -> Demand | TrajectoryDemand:
-    """Return what a setpoint of position and motion asks the cascade for; NaN = not commanded.
+    """Return the controller demand of a position and motion setpoint; NaN = not commanded.
 
-    Each axis needs a position, a velocity or an acceleration, and north and east come in pairs;
-    otherwise the vehicle hovers. Source: PX4 1.16, PositionControl::inputValid.
+    Each axis needs a position, velocity or acceleration, and north and east must come in pairs. If
+    not, the vehicle hovers. Source: PX4 1.16, PositionControl::inputValid.
     """
     isnan, position = math.isnan, tuple(setpoint.position.tolist())
     velocity, acceleration = (
@@ -113,7 +113,7 @@ def demand_of(setpoint: Setpoint) -> Demand | TrajectoryDemand:
     if not _is_valid(position, velocity, acceleration):
         return HOVER._replace(yaw=setpoint.yaw, yaw_rate=setpoint.yaw_rate)
     if all(map(isnan, acceleration)):
-        # A velocity that is not commanded adds nothing to a position.
+        # An uncommanded velocity adds nothing to a position.
         vn, ve, vd = velocity
         rest = 0.0 if isnan(vn) else vn, 0.0 if isnan(ve) else ve, 0.0 if isnan(vd) else vd
         return Demand(position, rest, setpoint.yaw, setpoint.yaw_rate)

@@ -1,4 +1,4 @@
-"""Orbit: around a place, at a radius and a speed.
+"""Orbit: circle around a place with a radius and speed.
 
 Source: PX4 1.16, FlightTaskOrbit.
 """
@@ -28,14 +28,14 @@ from firmware_sim.autopilot.trajectory import Leg
 LEAST_RADIUS_M = 1.0
 FASTEST_M_S = 10.0
 MOST_M_S2 = 2.0
-"""Of the acceleration towards the centre: it limits the speed."""
+"""Maximum centripetal acceleration, which limits the speed."""
 
 ON_CIRCLE_M = 2.0
-"""A vehicle that is this close to its circle begins to go round [m]."""
+"""Maximum distance to the circle at which circling starts [m]."""
 
 
 class Facing(IntEnum):
-    """ORBIT_YAW_BEHAVIOUR."""
+    """Values of ORBIT_YAW_BEHAVIOUR."""
 
     CENTRE = 0
     INITIAL_HEADING = 1
@@ -46,25 +46,25 @@ class Facing(IntEnum):
 
 
 class Orbit(FlightMode):
-    """Flies to the circle, and round."""
+    """Orbit mode: flies to the circle, then along it."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
         self._centre: Vec = (0.0, 0.0, 0.0)
         self._radius = LEAST_RADIUS_M
         self._speed = 1.0
-        """Positive clockwise [m/s]."""
+        """Speed along the circle, positive clockwise [m/s]."""
         self._facing = Facing.CENTRE
         self._initial_yaw = 0.0
         self._yaw = 0.0
         self._going_round = False
         self._present = 0.0
-        """Speed so far: it rises with MPC_ACC_HOR."""
+        """Current speed, which rises with MPC_ACC_HOR [m/s]."""
         self._time_us: int | None = None
 
     def enter(self, state: Vector, request: Request | None, /) -> None:
-        """Begin, or change the orbit that is flown."""
-        if self._context.orbit is None:  # otherwise, the orbit that is flown is changed
+        """Start, or change the active orbit."""
+        if self._context.orbit is None:  # otherwise the active orbit is changed
             self._centre, self._radius, self._speed = triple(state, P), LEAST_RADIUS_M, 1.0
         self._time_us = None
         self._initial_yaw = self._yaw = quat_yaw(state[Q:RATES])
@@ -74,7 +74,7 @@ class Orbit(FlightMode):
             self._apply(request)
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
-        """Fly to the circle first, straight; then round."""
+        """Fly straight to the circle first, then along it."""
         dt, self._time_us = since(self._time_us, time_us), time_us
         position = triple(state, P)
         north, east = position[0] - self._centre[0], position[1] - self._centre[1]
@@ -111,7 +111,7 @@ class Orbit(FlightMode):
         return TrajectoryDemand((NAN, NAN, self._centre[2]), velocity, acceleration, yaw, rate)
 
     def _heading(self, outward: tuple[float, float], now: float, dt: float) -> tuple[float, float]:
-        """Return heading [rad] and yaw rate [rad/s]; the heading turns with MPC_YAWRAUTO_MAX."""
+        """Return heading [rad] and yaw rate [rad/s]; MPC_YAWRAUTO_MAX limits the rate."""
         rate = self._speed / self._radius
         side = math.copysign(1.0, self._speed)
         if self._facing is Facing.UNCONTROLLED:
@@ -130,7 +130,7 @@ class Orbit(FlightMode):
         return self._yaw, rate
 
     def _apply(self, request: OrbitRequest) -> None:
-        """Take what a request gives; NaN leaves things as they are."""
+        """Apply a request; NaN keeps the current value."""
         radius, clockwise = self._radius, self._speed > 0.0
         if not math.isnan(request.radius_m):
             radius, clockwise = abs(request.radius_m), request.radius_m > 0.0

@@ -1,4 +1,4 @@
-"""What Altitude and Position share: the throttle stick climbs, the yaw stick turns."""
+"""Common base of Altitude and Position: throttle stick climbs, yaw stick turns."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from firmware_sim.autopilot.modes.terrain_hold import Piloting, TerrainHold
 from firmware_sim.autopilot.requests import Request
 
 LIFTING_THROTTLE = 0.3
-"""From this deflection on a standing vehicle takes off: PX4's 65 % of the stick's way."""
+"""Minimum deflection for a take-off: PX4's 65 % of the stick's travel."""
 
 
 class Piloted(FlightMode):
-    """Moves as the sticks say. Without a pilot's input it descends, level."""
+    """Stick mode; without pilot input it descends level."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
@@ -43,19 +43,19 @@ class Piloted(FlightMode):
 
     @property
     def lifts(self) -> bool:
-        """Whether the throttle stick is well above its centre."""
+        """True if the throttle stick is well above its centre."""
         sticks = self._context.sticks
         return sticks is not None and sticks.throttle > LIFTING_THROTTLE
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
-        """Begin with the present motion."""
+        """Start with the current motion."""
         self._vertical.restart(state.item(P + 2), state.item(V + 2))
         self._turning.restart()
         self._terrain.restart()
         self._yaw, self._time_us = quat_yaw(state[Q:RATES]), None
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
-        """Follow the sticks."""
+        """Return the demand of the sticks."""
         sticks = self._context.sticks
         dt, self._time_us = since(self._time_us, time_us), time_us
         if sticks is None:
@@ -79,7 +79,7 @@ class Piloted(FlightMode):
         )
 
     def _over_ground(self, sticks: Sticks, state: Vector, z: AxisDemand) -> AxisDemand:
-        """Return the vertical demand where the ground is held, and not the altitude."""
+        """Return the vertical demand, which holds the height above ground if enabled."""
         value, hold, (vn, ve, vd) = self._context.value, self._terrain, triple(state, V)
         zone = value("MPC_HOLD_DZ")
         share = value("MPC_XY_MAN_EXPO")
@@ -104,4 +104,4 @@ class Piloted(FlightMode):
     def _steer(
         self, sticks: Sticks, heading: float, state: Vector, dt: float, /
     ) -> tuple[AxisDemand, AxisDemand]:
-        """Return the motion north and east that pitch and roll command."""
+        """Return the motion north and east commanded by pitch and roll."""

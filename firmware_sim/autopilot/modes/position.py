@@ -1,4 +1,4 @@
-"""Position: the sticks accelerate, and climb; released, the place is held."""
+"""Position: the sticks command acceleration and climb. Released, the position is held."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from firmware_sim.autopilot.requests import Request
 
 
 class Position(Piloted):
-    """Moves as the sticks say."""
+    """Motion commanded by the sticks."""
 
     def __init__(self, context: FlightContext, /) -> None:
         super().__init__(context)
@@ -23,7 +23,7 @@ class Position(Piloted):
         self._prevention = CollisionPrevention(context.value)
 
     def enter(self, state: Vector, request: Request | None, /) -> None:
-        """Begin with the present motion."""
+        """Start with the current motion."""
         super().enter(state, request)
         north, east, _ = triple(state, V)
         self._horizontal.restart((north, east))
@@ -48,5 +48,5 @@ class Position(Piloted):
         return self._horizontal.move(deflected, heading, (north, east), dt, constrain)
 
     def is_done(self, _state: Vector, /) -> bool:
-        """Return whether obstacles have been unknown for so long that nobody should steer."""
+        """Return whether obstacle data have been missing too long to permit steering."""
         return self._prevention.gives_up

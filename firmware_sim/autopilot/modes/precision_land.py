@@ -1,4 +1,4 @@
-"""Precision land: over a landing target that somebody reports (LANDING_TARGET), down onto it.
+"""Precision land: fly above a reported landing target (LANDING_TARGET) and land on it.
 
 Source: PX4 1.16, navigator/precland.cpp: its states, their conditions and PLD_*.
 """
@@ -19,72 +19,72 @@ from firmware_sim.autopilot.requests import LandingTarget, Request
 from firmware_sim.autopilot.trajectory import Leg
 
 PERIOD_US = 50_000
-"""Time between two looks for the target [µs]: PX4's navigator runs at 20 Hz."""
+"""Period of target checks [µs]: PX4's navigator runs at 20 Hz."""
 
 _SETTLE_US = 2 * US_PER_S
-"""The vehicle waits so long at the start for the target, and above it before it descends [µs]."""
+"""Waiting time for the target at the start, and above the target before the descent [µs]."""
 
 _SEEN_US = US_PER_S
-"""A target that the search has found is looked at for so long before it is approached [µs]."""
+"""Waiting time between finding a target in the search and its approach [µs]."""
 
 _LOST_NEAR_GROUND_US = US_PER_S // 2
-"""Near the ground a target that was silent for so long is lost [µs]."""
+"""Target timeout near the ground [µs]."""
 
 _STOP_CLIMBING_M = 1.0
-"""The search climbs on by so much once it has found the target [m]."""
+"""Additional climb of the search after the target was found [m]."""
 
 
 class _State(Enum):
     START = auto()
-    """At a place, on the look-out."""
+    """Wait at a place for the target."""
     APPROACH = auto()
-    """To the target, at the present height."""
+    """Fly to the target at the current height."""
     DESCEND = auto()
-    """Above the target, downwards."""
+    """Descend above the target."""
     FINAL = auto()
-    """Down to the ground without looking any more."""
+    """Descend to the ground without target updates."""
     SEARCH = auto()
-    """Up to PLD_SRCH_ALT, on the look-out."""
+    """Climb to PLD_SRCH_ALT, waiting for the target."""
     FALLBACK = auto()
-    """Down where it is: an ordinary landing."""
+    """Ordinary landing at the current position."""
 
 
 _DOWNWARDS = (_State.DESCEND, _State.FINAL, _State.FALLBACK)
 
 
 class PrecisionLand(FlightMode):
-    """Finds the landing target, and lands on it; without one, where the vehicle is."""
+    """Precision landing mode: finds the target and lands on it; without one, lands in place."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
         self._state = _State.START
         self._goal: Vec = (0.0, 0.0, 0.0)
-        """Where it flies, local NED [m]; on the way down the height has no meaning."""
+        """Destination, local NED [m]; the height is ignored during the descent."""
         self._required = True
         self._searches = 0
         self._next_us = 0
         self._entered_us = 0
-        """When the present state began."""
+        """Start time of the current state [µs]."""
         self._reached_us: int | None = None
         self._found_us: int | None = None
         self._known_us = 0
-        """Time of the newest report that was looked at."""
+        """Time of the newest processed report [µs]."""
         self._is_new = False
 
     @property
     def destination(self) -> Vec | None:
-        """Where it flies; on the way down, the ground."""
+        """Destination; during the descent, the ground."""
         north, east, down = self._goal
         return north, east, self._context.home[2] if self._state in _DOWNWARDS else down
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
-        """Begin at the present place; a target that is not seen is searched for."""
+        """Start at the current position; search for the target if not visible."""
         self.begin(triple(state, P), required=True)
 
     def begin(self, place: Vec, *, required: bool) -> None:
-        """Begin over a place, local NED [m].
+        """Start above a place, local NED [m].
 
-        `required`: a target that is not seen is searched for; else the vehicle just lands.
+        `required`: search for the target if not visible; otherwise land without it.
         """
         self._goal, self._required = place, required
         self._searches, self._next_us = 1, 0
@@ -93,7 +93,7 @@ class PrecisionLand(FlightMode):
         self._state = _State.START
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
-        """Look for the target now and then; fly on."""
+        """Check for the target periodically; return the demand."""
         if time_us >= self._next_us:
             self._next_us = time_us + PERIOD_US
             self._look(triple(state, P), time_us)
@@ -135,7 +135,7 @@ class PrecisionLand(FlightMode):
             self._fall_back(position)
         elif now_us - self._reached_us > _SETTLE_US:
             north, east, _ = self._goal
-            # Above the origin of local NED, where PX4 has its reference altitude.
+            # Above the origin of local NED, PX4's reference altitude.
             self._goal = north, east, -self._context.value("PLD_SRCH_ALT")
             self._become(_State.SEARCH, now_us)
 
@@ -185,7 +185,7 @@ class PrecisionLand(FlightMode):
         self._reached_us = self._found_us = None
 
     def _begin_approach(self, position: Vec, now_us: int) -> bool:
-        """Approach the target where it is seen now; return whether it is."""
+        """Approach a currently visible target; return whether there is one."""
         if not (self._is_new and self._is_seen(now_us)):
             return False
         north, east, _ = self._goal
@@ -194,7 +194,7 @@ class PrecisionLand(FlightMode):
         return True
 
     def _lose(self, position: Vec, now_us: int) -> None:
-        """Look for the target where the vehicle is, unless that was done too often."""
+        """Search for the target at the current position, up to PLD_MAX_SRCH times."""
         self._goal = position
         if self._searches <= self._context.value("PLD_MAX_SRCH"):
             self._searches += 1
@@ -219,12 +219,12 @@ class PrecisionLand(FlightMode):
         return now_us - target.time_us <= self._context.value("PLD_BTOUT") * US_PER_S
 
     def _is_over(self, target: LandingTarget, position: Vec) -> bool:
-        """Return whether the vehicle is above the target, within PLD_HACC_RAD on either axis."""
+        """Return whether the vehicle is above the target, within PLD_HACC_RAD on each axis."""
         radius = self._context.value("PLD_HACC_RAD")
         offsets = (a - b for a, b in zip(target.position[:2], position[:2], strict=True))
         return all(abs(offset) < radius for offset in offsets)
 
     def _is_near_ground(self, target: LandingTarget, position: Vec, now_us: int) -> bool:
-        """Return whether the vehicle is within PLD_FAPPR_ALT above a target that is seen."""
+        """Return whether the vehicle is within PLD_FAPPR_ALT above a visible target."""
         above = target.position[2] - position[2]
         return self._is_seen(now_us) and above < self._context.value("PLD_FAPPR_ALT")

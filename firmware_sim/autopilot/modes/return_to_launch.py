@@ -1,6 +1,6 @@
-"""Return: climb, fly home or to a rally point, wait if asked to, land; or fly along the mission.
+"""Return: climb, fly home or to a rally point, optionally wait, land; or fly the mission.
 
-Source: PX4 1.16, RtlDirect. The way along the mission is the navigator's.
+Source: PX4 1.16, RtlDirect. The navigator provides the path along the mission.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from firmware_sim.autopilot.requests import Place, Request
 from firmware_sim.autopilot.trajectory import Leg
 
 _REQUIRED = 2
-"""RTL_PLD_MD: 1 lands on a landing target that is seen at once, 2 searches for it."""
+"""RTL_PLD_MD: 1 lands on a target that is visible at once, 2 searches for the target."""
 
 
 class _Stage(Enum):
     CLIMB = auto()
     GO_HOME = auto()
     DESCEND = auto()
-    """To RTL_DESCEND_ALT, to wait there."""
+    """Descend to RTL_DESCEND_ALT to wait."""
     WAIT = auto()
     LAND = auto()
 
 
 class ReturnToLaunch(FlightMode):
-    """Climbs, flies home and lands there."""
+    """Return mode: climbs, flies home and lands."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
@@ -45,7 +45,7 @@ class ReturnToLaunch(FlightMode):
         self._stage = _Stage.CLIMB
         self._waiting_since_us: int | None = None
         self._down = 0.0
-        """Of the way home, NED [m]."""
+        """Height of the flight home, NED [m]."""
         self._home = Place((0.0, 0.0, 0.0), 0.0)
         self._mission = Mission(context)
         self._precision = PrecisionLand(context)
@@ -54,7 +54,7 @@ class ReturnToLaunch(FlightMode):
 
     @property
     def destination(self) -> Vec | None:
-        """The end of the present stage."""
+        """End of the current stage."""
         if self._by_mission:
             return self._mission.destination
         north, east, ground = self._home.position
@@ -65,7 +65,7 @@ class ReturnToLaunch(FlightMode):
         return north, east, ground if self._stage is _Stage.LAND else self._waiting_down
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
-        """Begin with the climb, if it takes one."""
+        """Start with the climb, if needed."""
         context = self._context
         home = Place(context.home, context.home_yaw)
         chosen = home if context.return_place is None else context.return_place()
@@ -84,11 +84,11 @@ class ReturnToLaunch(FlightMode):
         above_sea = math.ceil(ground + at)
         text = f"RTL: start return at {above_sea} m ({math.ceil(at)} m above destination)"
         event = events.RTL_RETURN_AT.event(above_sea, math.ceil(at))
-        if context.armed:  # Disarmed nothing is flown, and nothing is told of it.
+        if context.armed:  # Disarmed, nothing is flown or reported.
             context.say(Message(Severity.INFO, text, event))
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
-        """Fly the present stage, and on to the next when it is over."""
+        """Return the demand of the current stage, and advance stages."""
         if self._by_mission:
             return self._mission.demand(state, time_us)
         self._go_on(state, time_us)
@@ -113,11 +113,11 @@ class ReturnToLaunch(FlightMode):
 
     @property
     def _waiting_down(self) -> float:
-        """Height to wait at before landing NED [m]."""
+        """Waiting height before landing, NED [m]."""
         return max(self._down, self._home.position[2] - self._context.value("RTL_DESCEND_ALT"))
 
     def _go_on(self, state: Vector, time_us: int) -> None:
-        """Choose the next stage when the present one has reached its end."""
+        """Select the next stage when the current one has ended."""
         value, down = self._context.value, triple(state, P)[2]
         radius = value("NAV_MC_ALT_RAD")
         delay = value("RTL_LAND_DELAY")
@@ -139,7 +139,7 @@ class ReturnToLaunch(FlightMode):
                 self._land(down)
 
     def _land(self, down: float) -> None:
-        """Land from a height NED [m], onto a landing target where RTL_PLD_MD asks for it."""
+        """Land from a height NED [m], on a landing target if RTL_PLD_MD requires it."""
         self._stage = _Stage.LAND
         asked = round(self._context.value("RTL_PLD_MD"))
         self._precise = asked > 0
@@ -149,7 +149,7 @@ class ReturnToLaunch(FlightMode):
         self._context.say(Message.of(Severity.INFO, events.RTL_LAND))
 
     def _height(self, state: Vector) -> float:
-        """Return the height above where it will land [m]."""
+        """Return the height above the landing place [m]."""
         return self._home.position[2] - state.item(P + 2)
 
     def _away(self, state: Vector) -> float:

@@ -1,4 +1,4 @@
-"""Stabilized, and Manual, which is the same for a multicopter: the sticks tilt and push.
+"""Stabilized, identical to Manual for a multicopter: the sticks command tilt and thrust.
 
 Source: PX4 1.16, MulticopterAttitudeControl::generate_attitude_setpoint and throttle_curve.
 """
@@ -18,14 +18,14 @@ from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, si
 from firmware_sim.autopilot.requests import Request
 
 IDLE_THROTTLE = -0.9
-"""Below this deflection a standing vehicle stands, and its heading setpoint follows it."""
+"""Deflection below which a standing vehicle stays, and its heading setpoint follows the heading."""
 
 RELEASED = Sticks(0.0, 0.0, 0.0, 0.0)
-"""What is flown until the failsafe for lost sticks acts."""
+"""Centred sticks, used after stick loss until the failsafe acts."""
 
 
 class Stabilized(FlightMode):
-    """Tilts as the sticks say, with the thrust of the throttle stick."""
+    """Tilt proportional to the sticks, thrust from the throttle stick."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
@@ -34,16 +34,16 @@ class Stabilized(FlightMode):
 
     @property
     def lifts(self) -> bool:
-        """Whether the throttle stick asks for thrust."""
+        """True if the throttle stick commands thrust."""
         sticks = self._context.sticks
         return sticks is not None and sticks.throttle > IDLE_THROTTLE
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
-        """Begin with the present heading."""
+        """Start with the current heading."""
         self._yaw, self._time_us = quat_yaw(state[Q:RATES]), None
 
     def demand(self, state: Vector, time_us: int, /) -> AttitudeDemand:
-        """Follow the sticks."""
+        """Return the demand of the sticks."""
         value, sticks = self._context.value, self._context.sticks or RELEASED
         dt, self._time_us = since(self._time_us, time_us), time_us
         rate = sticks.yaw * value("MPC_MAN_Y_MAX") * DEG
@@ -63,7 +63,7 @@ class Stabilized(FlightMode):
 
 
 def thrust_of(throttle: float, value: Callable[[str], float]) -> float:
-    """Return the collective 0..1 of a throttle stick -1..1; its centre hovers (MPC_THR_CURVE)."""
+    """Return the collective 0..1 of a throttle stick -1..1; centre = hover (MPC_THR_CURVE)."""
     low, high = value("MPC_MANTHR_MIN"), value("MPC_THR_MAX")
     if value("MPC_THR_CURVE") == 1.0:
         return low + 0.5 * (throttle + 1.0) * (high - low)

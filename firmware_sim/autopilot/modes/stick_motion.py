@@ -1,4 +1,4 @@
-"""How deflected sticks move the setpoints of the manual modes.
+"""Setpoint trajectories of the manual modes from stick deflections.
 
 Source: PX4 1.16, Sticks, StickYaw, StickAccelerationXY, ManualVelocitySmoothingZ and
 FlightTaskManualAltitude.
@@ -17,36 +17,36 @@ from firmware_sim.autopilot.trajectory import Axis
 NAN = math.nan
 
 _TURNS_RAD_S = 1e-3
-"""From this yaw rate on no heading is held [rad/s]."""
+"""Yaw rate above which no heading is held [rad/s]."""
 
 _AT_REST_M_S, _AT_REST_M_S2 = 0.1, 0.2
-"""Below both, a height is held."""
+"""Speed and acceleration below which a height is held."""
 
 _BOOST_TAU_S = 0.8
-"""Time constant of the stronger drag that brakes when the stick is let go [s]."""
+"""Time constant of the increased drag after release of the stick [s]."""
 
 
 def deadzone(x: float, zone: float) -> float:
-    """Return a deflection with a dead centre; still 1 at the end."""
+    """Return a deflection with a deadzone; full deflection remains 1."""
     return 0.0 if abs(x) <= zone else math.copysign((abs(x) - zone) / (1.0 - zone), x)
 
 
 def expo(x: float, share: float) -> float:
-    """Return a deflection that is gentle around the centre, by a share of x³."""
+    """Return a deflection with reduced gain around the centre, by a share of x³."""
     return (1.0 - share) * x + share * x**3
 
 
 def superexpo(x: float, share: float, steeper: float) -> float:
-    """As `expo`, and steeper towards the end."""
+    """Return the `expo` of a deflection, steeper towards full deflection."""
     return expo(x, share) * (1.0 - steeper) / (1.0 - abs(x) * steeper)
 
 
 Pair = tuple[float, float]
-"""North and east."""
+"""North and east components."""
 
 
 class AxisDemand(NamedTuple):
-    """What is commanded on one axis; NaN = no position."""
+    """Demand of one axis; NaN = no position."""
 
     position: float
     velocity: float
@@ -54,7 +54,7 @@ class AxisDemand(NamedTuple):
 
 
 class YawStick:
-    """The yaw stick turns; released, the heading is held."""
+    """Yaw stick commands a yaw rate; released, the heading is held."""
 
     def __init__(self, value: Callable[[str], float]) -> None:
         self._value = value
@@ -62,7 +62,7 @@ class YawStick:
         self._held = NAN
 
     def restart(self) -> None:
-        """Begin."""
+        """Reset rate and held heading."""
         self._rate, self._held = 0.0, NAN
 
     def turn(self, stick: float, yaw: float, dt: float) -> tuple[float, float]:
@@ -79,7 +79,7 @@ class YawStick:
 
 
 class VerticalStick:
-    """The throttle stick climbs and descends; released, the height is held."""
+    """Throttle stick commands climb and descent; released, the height is held."""
 
     def __init__(self, value: Callable[[str], float]) -> None:
         self._value = value
@@ -87,12 +87,12 @@ class VerticalStick:
         self._held = NAN
 
     def restart(self, down: float, velocity: float) -> None:
-        """Begin at a position [m] and a velocity [m/s], NED."""
+        """Start with a position [m] and velocity [m/s], NED."""
         self._axis.restart(down, velocity)
         self._held = NAN
 
     def move(self, stick: float, down: float, height: float, dt: float) -> AxisDemand:
-        """Return the demand, NED; `down` and `height` above home [m] are measured."""
+        """Return the demand, NED, from measured `down` and `height` above home [m]."""
         value, axis = self._value, self._axis
         shaped = expo(deadzone(stick, value("MPC_HOLD_DZ")), value("MPC_Z_MAN_EXPO"))
         wanted = self._speed(shaped, height)
@@ -109,14 +109,14 @@ class VerticalStick:
         return AxisDemand(self._held, axis.velocity, axis.acceleration)
 
     def put(self, down: float) -> float:
-        """Go on from another height NED [m]; return what is held of it, NaN = nothing."""
+        """Continue from another height NED [m]; return the held height, NaN = none."""
         self._axis.position = down
         if not math.isnan(self._held):
             self._held = down
         return self._held
 
     def _speed(self, shaped: float, height: float) -> float:
-        """Return the speed NED [m/s], slower near the ground."""
+        """Return the speed NED [m/s], reduced near the ground."""
         value = self._value
         low, high = value("MPC_LAND_ALT2"), max(value("MPC_LAND_ALT1"), value("MPC_LAND_ALT2"))
         share = 1.0 if height >= high else 0.0
@@ -130,7 +130,7 @@ class VerticalStick:
 
 
 class HorizontalStick:
-    """Roll and pitch sticks accelerate; drag makes a speed of it, and a stop when released."""
+    """Roll and pitch sticks accelerate; drag limits the speed, and stops when released."""
 
     def __init__(self, value: Callable[[str], float]) -> None:
         self._value = value
@@ -140,7 +140,7 @@ class HorizontalStick:
         self._boost = 1.0
 
     def restart(self, velocity: tuple[float, float]) -> None:
-        """Begin with a velocity NED [m/s]."""
+        """Start with a velocity NED [m/s]."""
         self._velocity, self._acceleration = velocity, (0.0, 0.0)
         self._held, self._boost = (NAN, NAN), 1.0
 
@@ -152,9 +152,9 @@ class HorizontalStick:
         dt: float,
         constrain: Callable[[Pair, Pair], Pair] | None = None,
     ) -> tuple[AxisDemand, AxisDemand]:
-        """Return the demands north and east; sticks forward and right, the heading [rad].
+        """Return the demands north and east from sticks (forward, right) and heading [rad].
 
-        `constrain` returns what may be flown of an acceleration at a velocity setpoint.
+        `constrain` returns the permitted acceleration at a velocity setpoint.
         """
         value = self._value
         speed, force = value("MPC_VEL_MANUAL"), 2.0 * value("MPC_ACC_HOR")
@@ -185,7 +185,7 @@ class HorizontalStick:
         return first, second
 
     def _direction(self, sticks: tuple[float, float], yaw: float) -> tuple[float, float]:
-        """Return the deflection north and east, at most 1 long."""
+        """Return the deflection north and east, with a norm of at most 1."""
         value = self._value
         zone, share = value("MPC_HOLD_DZ"), value("MPC_XY_MAN_EXPO")
         forward, right = (expo(deadzone(s, zone), share) for s in sticks)
@@ -200,7 +200,7 @@ class HorizontalStick:
         return c * forward - s * right, s * forward + c * right
 
     def _dragged(self) -> tuple[float, float]:
-        """Return the velocity that drag works against: when braking below 1 m/s, its root."""
+        """Return the velocity for the drag: increased when braking below 1 m/s, by its root."""
         vn, ve = self._velocity
         speed = math.hypot(vn, ve)
         if speed == 0.0:
@@ -210,7 +210,7 @@ class HorizontalStick:
         return vn * share, ve * share
 
     def _limited(self, wanted: list[float], dt: float) -> tuple[float, float]:
-        """Return an acceleration whose jerk and tilt are limited."""
+        """Return an acceleration with limited jerk and tilt."""
         value, (bn, be) = self._value, self._acceleration
         dn, de = wanted[0] - bn, wanted[1] - be
         step, most = math.hypot(dn, de), value("MPC_JERK_MAX") * dt

@@ -1,4 +1,4 @@
-"""Take-off: climb above the place where it began, or to another one."""
+"""Take-off: climb above the start, or fly to another place."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ from firmware_sim.autopilot.trajectory import Leg, PathLimits
 from firmware_sim.engine.record import RISING
 
 LEAST_CLIMB_M = 0.1
-"""A take-off that asks for less than this above where the vehicle stands leaves it there [m]."""
+"""Minimum height of a take-off above the standing vehicle; below it, the vehicle stays [m]."""
 
 
 class Takeoff(FlightMode):
-    """Climbs to `FlightContext.takeoff_altitude_m`, gently near the ground."""
+    """Take-off mode: climbs to `FlightContext.takeoff_altitude_m`, slowly near the ground."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
         self._place = Place((0.0, 0.0, 0.0), 0.0)
         self._gently = True
-        """Whether it began on the ground."""
+        """True if the take-off started on the ground."""
 
     @property
     def lifts(self) -> bool:
-        """Whether the altitude lies above the ground."""
+        """True if the altitude is above the ground."""
         return self._context.takeoff_altitude_m > LEAST_CLIMB_M
 
     @property
     def is_steady(self) -> bool:
-        """Whether compiled ticks fly it."""
+        """True if compiled ticks fly the climb."""
         return self._context.climb.flies
 
     @property
     def destination(self) -> Vec | None:
-        """The altitude above the place where it began, or above the one asked for."""
+        """Take-off altitude above the start, or above the requested place."""
         return self._end
 
     @property
@@ -53,17 +53,17 @@ class Takeoff(FlightMode):
         return north, east, self._context.home[2] - self._context.takeoff_altitude_m
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
-        """Begin the climb at the present place."""
+        """Start the climb at the current position."""
         self._context.climb.restart(max(0.0, -state.item(V + 2)))
         self._place = here(state)
         self._gently = self._context.standing
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
-        """Climb on."""
+        """Return the demand of the climb."""
         if self._context.takeoff_place is not None:
             return self._fly(state, time_us)
-        # The trajectory stays where the vehicle is: it must not wait below the ground while the
-        # thrust ramps up, nor be chased after it.
+        # The trajectory follows the vehicle on the ground: otherwise it would wait below ground
+        # during the thrust ramp, or be chased afterwards.
         climb = self._context.climb
         if not self._context.standing:
             aim(self._context)
@@ -71,7 +71,7 @@ class Takeoff(FlightMode):
         return over(self._place, -climb.speed_m_s)
 
     def _fly(self, state: Vector, time_us: int) -> AnyDemand:
-        """Fly to the place asked for, climbing on the way as PX4 does."""
+        """Fly to the requested place with a simultaneous climb, as in PX4."""
         context, travel = self._context, self._context.travel
         if context.standing:
             return leave_ground(context, state, time_us)
@@ -81,7 +81,7 @@ class Takeoff(FlightMode):
         return travel.fly(state, time_us, Leg(self._end), limits=limits)
 
     def remainder(self, state: Vector, /) -> Request | None:
-        """Return where it leads, once it is near that altitude: hold goes on."""
+        """Return the take-off target for Hold, once near its altitude."""
         if not self.is_done(state):
             return None
         if self._context.takeoff_place is not None:
@@ -89,15 +89,15 @@ class Takeoff(FlightMode):
         return ClimbOn(Place(self._end, self._place.yaw))
 
     def is_done(self, state: Vector, /) -> bool:
-        """Return whether the take-off has come near its altitude, by PX4's acceptance radius.
+        """Return whether the take-off is near its altitude, within PX4's acceptance radius.
 
-        Source: PX4 1.16, MissionBlock; half of an altitude that is smaller than the radius.
+        Source: PX4 1.16, MissionBlock; half the altitude if that is smaller than the radius.
         """
         return self._context.height(state) > _end_m(self._context)
 
 
 def leave_ground(context: FlightContext, state: Vector, time_us: int) -> Demand:
-    """Return the demand of a vehicle on the ground whose trajectory begins once it has left it."""
+    """Return the demand on the ground; the trajectory starts at lift-off."""
     context.travel.launch(state, time_us, context.climb.speed_m_s)
     place = here(state)
     north, east, _ = place.position
@@ -105,7 +105,7 @@ def leave_ground(context: FlightContext, state: Vector, time_us: int) -> Demand:
 
 
 def gentle(limits: PathLimits, context: FlightContext, state: Vector) -> PathLimits:
-    """Return the limits of a take-off: near the ground it climbs as slowly as MPC_TKO_SPEED."""
+    """Return the limits of a take-off: near the ground, at most MPC_TKO_SPEED."""
     value = context.value
     if context.over_ground(state) >= value("MPC_LAND_ALT1"):
         return limits
@@ -115,13 +115,13 @@ def gentle(limits: PathLimits, context: FlightContext, state: Vector) -> PathLim
 
 
 def _end_m(context: FlightContext) -> float:
-    """Return the height above home at which a take-off has come near its altitude [m]."""
+    """Return the height above home at which a take-off counts as near its altitude [m]."""
     altitude, radius = context.takeoff_altitude_m, context.value("NAV_MC_ALT_RAD")
     return altitude - (altitude / 2.0 if altitude < radius else radius)
 
 
 def aim(context: FlightContext) -> None:
-    """Direct the climb to the take-off altitude, by the limits of PX4's FlightTaskAuto."""
+    """Set the climb to the take-off altitude with the limits of PX4's FlightTaskAuto."""
     value = context.value
     jerk, brisk_m_s2 = value("MPC_JERK_AUTO"), value("MPC_ACC_UP_MAX")
     slow = value("MPC_TKO_SPEED")

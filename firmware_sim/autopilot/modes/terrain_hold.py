@@ -1,9 +1,8 @@
-"""Holding the height above ground while a vehicle stands: MPC_ALT_MODE 2.
+"""Terrain hold: constant height above ground while hovering (MPC_ALT_MODE 2).
 
-Source: PX4 1.16, FlightTaskManualAltitude::_updateAltitudeLock and _terrainFollowing, as
-FlightTaskManualAltitudeSmoothVel flies them. Its smoothed sticks put their own altitude in the
-place of every other one but while the ground is held: MPC_ALT_MODE 1 flies there as 0 does, and so
-it does here.
+Source: PX4 1.16, FlightTaskManualAltitude::_updateAltitudeLock and _terrainFollowing, in
+FlightTaskManualAltitudeSmoothVel. Its smoothed sticks override every other altitude except in
+terrain hold, so MPC_ALT_MODE 1 behaves like 0, also here.
 """
 
 from __future__ import annotations
@@ -14,47 +13,47 @@ from typing import NamedTuple
 
 NAN = math.nan
 HOLD = 2
-"""MPC_ALT_MODE."""
+"""Value of MPC_ALT_MODE."""
 
 _DEFLECTED = 1e-3
 
 
 class Piloting(NamedTuple):
-    """What decides whether the ground is held."""
+    """Input of the terrain hold."""
 
     level: float
-    """How far pitch and roll sticks are deflected, shaped."""
+    """Shaped deflection of the pitch and roll sticks."""
     climbing: bool
-    """Whether the throttle stick is deflected."""
+    """True if the throttle stick is deflected."""
     speed_m_s: float
-    """Horizontal."""
+    """Horizontal speed."""
     climb_m_s: float
-    """Vertical, NED."""
+    """Vertical speed, NED."""
     down_m: float
-    """Where the vehicle is, NED."""
+    """Height of the vehicle, NED."""
     ground_m: float
-    """How far the ground is below; NaN = not known."""
+    """Height above ground; NaN = unknown."""
     resets: int
-    """How often the ground has been put elsewhere."""
+    """Number of terrain height resets."""
 
 
 class TerrainHold:
-    """Keeps the height above ground that the vehicle has when it comes to stand."""
+    """Hold of the height above ground at the end of a motion."""
 
     def __init__(self, value: Callable[[str], float]) -> None:
         self._value = value
         self.restart()
 
     def restart(self) -> None:
-        """Begin."""
+        """Reset the hold."""
         self.holds = False
-        """Whether the ground is held, and not the altitude."""
+        """True if the height above ground is held instead of the altitude."""
         self.locked_m = NAN
-        """Height above ground that is kept; NaN = none."""
+        """Held height above ground; NaN = none."""
         self._resets: int | None = None
 
     def place(self, now: Piloting, held: float) -> float:
-        """Return where to be, NED [m], NaN = nowhere; `held` is where the sticks would be."""
+        """Return the target height, NED [m], NaN = none; `held` is the sticks' held height."""
         if int(self._value("MPC_ALT_MODE")) != HOLD:
             self.restart()
             return held
@@ -68,7 +67,7 @@ class TerrainHold:
         elif not deflected and now.speed_m_s < 0.5 * limit and known:
             self.holds = True
             if math.isfinite(held):
-                # The same error of height as before.
+                # Keep the height error.
                 self.locked_m = now.ground_m - (held - now.down_m)
         if not self.holds:
             if not now.climbing and math.isnan(held):

@@ -1,1 +1,1 @@
-"""Where the vehicle shall go: missions, the geofence and rally points, as PX4's navigator."""
+"""Navigation as in PX4's navigator: missions, geofence and rally points."""

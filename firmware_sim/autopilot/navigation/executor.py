@@ -1,8 +1,8 @@
-"""Flies a stored mission, item by item: PX4's navigator in Mission mode.
+"""Mission executor: PX4's navigator in Mission mode.
 
-Source of the order of events, conditions and texts: PX4 1.16, MissionBase, Mission and
-MissionBlock, as they treat a multicopter; of the region of interest: Navigator (vehicle_roi) and
-MissionBase::heading_sp_update. It runs at `PERIOD_US`, as PX4's navigator does.
+Source of the sequence, conditions and texts: PX4 1.16, MissionBase, Mission and MissionBlock, for a
+multicopter. Source of the region of interest: Navigator (vehicle_roi) and
+MissionBase::heading_sp_update. It runs at `PERIOD_US`, like PX4's navigator.
 """
 
 from __future__ import annotations
@@ -54,15 +54,15 @@ class RegionOfInterest:
         self._offset = 0.0
 
     def reset(self) -> None:
-        """Look at nothing in particular."""
+        """Clear the region of interest."""
         self._look = _Look.NOWHERE
 
     def look_at(self, place: Geodetic) -> None:
-        """Look at a place (MAV_CMD_DO_SET_ROI_LOCATION)."""
+        """Set the region of interest to a place (MAV_CMD_DO_SET_ROI_LOCATION)."""
         self._look, self._place = _Look.PLACE, place
 
     def command(self, item: PlanItem) -> None:
-        """Carry out a mission item, where it is about the region of interest."""
+        """Execute a mission item about the region of interest; others are ignored."""
         if item.command == NavCommand.DO_SET_ROI_NONE:
             self.reset()
         elif item.command == NavCommand.DO_SET_ROI_LOCATION:
@@ -81,10 +81,9 @@ class RegionOfInterest:
     def heading(
         self, position: Vec, target: Vec, local: Callable[[Geodetic], Vec], nearest_m: float
     ) -> float | None:
-        """Return the heading [rad] towards it; None = any, or it is nearer than `nearest_m`.
+        """Return the heading [rad] to it; None = undefined, or closer than `nearest_m`.
 
-        `position` and `target`, where the vehicle is flying to, are local NED [m], and `local`
-        turns a place into that.
+        `position` and the destination `target` are local NED [m]; `local` converts a place to it.
         """
         if self._look is _Look.NOWHERE:
             return None
@@ -100,36 +99,36 @@ _N = NavCommand
 NAN = math.nan
 
 PERIOD_US = 50_000
-"""PX4's navigator runs at 20 Hz."""
+"""Period of PX4's navigator, 20 Hz [µs]."""
 
 _LOITERS = (_N.LOITER_UNLIM, _N.LOITER_TIME, _N.LOITER_TO_ALT)
 
 
 class Crew(Protocol):
-    """Who carries out what a mission asks for besides flying."""
+    """Callbacks for mission commands other than flight."""
 
     def say(self, message: Message, /) -> None:
-        """Tell the operator."""
+        """Send a text to the operator."""
 
     def set_home(self, place: Geodetic | None, /) -> object:
-        """Move home; None = to the present place."""
+        """Move home; None = the current position."""
 
     def return_to_launch(self) -> None:
-        """End the mission and return."""
+        """Abort the mission and return."""
 
 
 class _Work(Enum):
-    """What is done for the present item before it is flown itself."""
+    """Preparatory step before the current item."""
 
     ITEM = auto()
     CLIMB = auto()
-    """To its altitude, at the present place."""
+    """Climb to the item's altitude at the current position."""
     MOVE_TO_LAND = auto()
-    """Over the place to land at."""
+    """Fly above the landing place."""
 
 
 class MissionExecutor:
-    """Goes through the mission; `triplet` is what to fly."""
+    """Executor of the mission; `triplet` is the current path."""
 
     def __init__(
         self,
@@ -140,19 +139,19 @@ class MissionExecutor:
         *,
         climbs_first: bool = True,
     ) -> None:
-        """Take the plans, a lookup of parameters, the crew, and the check of feasibility.
+        """Store the plans, the look-up for parameters, the crew, and the feasibility check.
 
-        `climbs_first`: whether it climbs to the first item's altitude before it sets out.
+        `climbs_first`: climb to the first item's altitude before departure.
         """
         self._plans, self._value, self._crew, self._check = plans, value, crew, check
         self.triplet = STANDING
-        """What to fly."""
+        """Current path."""
         self.valid = False
-        """Whether there is a mission that can be flown."""
+        """True if there is a feasible mission."""
         self.finished = False
-        """Whether the mission has come to its end, in this run."""
+        """True if the mission has ended in this run."""
         self.cruise_m_s = NAN
-        """Speed that DO_CHANGE_SPEED asked for; NaN = MPC_XY_CRUISE."""
+        """Speed set by DO_CHANGE_SPEED; NaN = MPC_XY_CRUISE."""
         self.roi = RegionOfInterest()
         self._running = False
         self._active = False
@@ -161,9 +160,9 @@ class MissionExecutor:
         self._arrival = Arrival(value)
         self._climbs_first = climbs_first
         self._climb_down = NAN
-        """Height NED to climb to before the mission begins; NaN = none."""
+        """Height NED of the climb before departure; NaN = none."""
         self._began_before = False
-        """Whether this mission has been flown before."""
+        """True if this mission has been flown before."""
         self._disarmed_meanwhile = False
         self._activated_at = 0
         self._speed_to_restore = NAN
@@ -171,23 +170,23 @@ class MissionExecutor:
         self._home_altitude_m = NAN
         self._checked_for: object = None
 
-    # --- what the autopilot calls
+    # --- interface to the autopilot
 
     def idle(self, situation: Situation, *, armed: bool) -> None:
-        """Keep an eye on the plans while another mode flies."""
+        """Track changes of the plans while another mode flies."""
         if not armed:
             self._disarmed_meanwhile = True
         self._look()
         self.review(situation)
 
     def activate(self, situation: Situation) -> None:
-        """Mission mode begins."""
+        """Start Mission mode."""
         plans = self._plans
         self._look()
         self._validate(situation)
         over = len(plans.mission) > 0 and plans.current + 1 == len(plans.mission)
         if self._disarmed_meanwhile and self._began_before and over:
-            # It has been flown to its end, and the vehicle was disarmed: from the start again.
+            # The mission was completed and the vehicle disarmed: restart from the first item.
             plans.current = 0
             plans.jumps_done.clear()
         self._began_before, self._disarmed_meanwhile = True, False
@@ -200,13 +199,13 @@ class MissionExecutor:
         self._activated_at = plans.current
 
     def deactivate(self) -> None:
-        """Another mode begins; the present item is begun anew when the mission goes on."""
+        """Leave Mission mode; the current item restarts when the mission resumes."""
         self._active = self._running = False
         self._work = _Work.ITEM
         self._plans.reached = -1
 
     def update(self, situation: Situation) -> None:
-        """Advance; to be called every PERIOD_US in Mission mode."""
+        """Advance the mission; call every PERIOD_US in Mission mode."""
         if self._look():
             self.review(situation)
             self.triplet = STANDING
@@ -226,7 +225,7 @@ class MissionExecutor:
     # --- the mission as a whole
 
     def _look(self) -> bool:
-        """Return whether a client has changed the mission or the item to go on with."""
+        """Return whether a client has changed the mission or its current item."""
         plans = self._plans
         mission = plans.stored(Kind.MISSION)
         seen = (mission.revision, plans.set_current_count)
@@ -238,7 +237,7 @@ class MissionExecutor:
         return True
 
     def review(self, situation: Situation) -> None:
-        """Check the mission when it, the fence or home has changed."""
+        """Check the mission after a change of mission, fence or home."""
         revisions = tuple(self._plans.stored(kind).revision for kind in (Kind.MISSION, Kind.FENCE))
         if (revisions, situation.home) != self._checked_for:
             self._validate(situation)
@@ -252,7 +251,7 @@ class MissionExecutor:
         self.valid = verdict.valid
 
     def _begin(self, landed: bool) -> None:
-        """Run, or say why not."""
+        """Start, or report the reason against it."""
         self.roi.reset()
         self.finished = False
         if not self.valid:
@@ -267,7 +266,7 @@ class MissionExecutor:
         self._plans.reached = -1
 
     def _climb_first(self, situation: Situation) -> None:
-        """Find out whether the vehicle must climb before it sets out."""
+        """Determine whether the vehicle must climb before departure."""
         self._climb_down = NAN
         following = next_places(self._plans, self._plans.current, 1)
         if self._running and following and self._climbs_first:
@@ -276,7 +275,7 @@ class MissionExecutor:
                 self._climb_down = down
 
     def _speed_before(self, index: int) -> float:
-        """Return the speed that the items before an index have set; NaN = none."""
+        """Return the speed set by the items before an index; NaN = none."""
         speeds = [
             item.params[1]
             for item in self._plans.mission[:index]
@@ -285,7 +284,7 @@ class MissionExecutor:
         return speeds[-1] if speeds and speeds[-1] > 0.0 else NAN
 
     def _advance(self, situation: Situation) -> None:
-        """Go on to the next item, or end the mission."""
+        """Advance to the next item, or end the mission."""
         if self._work is _Work.ITEM:
             following = go_to(self._plans, self._plans.current + 1)
             if following is None:
@@ -300,7 +299,7 @@ class MissionExecutor:
         self._take_item(situation)
 
     def _end(self, situation: Situation) -> None:
-        """Stay where the mission ended."""
+        """Hold position at the end of the mission."""
         self._running = False
         self.finished = True
         triplet = self.triplet
@@ -315,7 +314,7 @@ class MissionExecutor:
     # --- one item
 
     def _take_item(self, situation: Situation) -> None:
-        """Work out what to fly for the present item."""
+        """Set the path for the current item."""
         if not self._running:
             self._end(situation)
             return
@@ -348,7 +347,7 @@ class MissionExecutor:
         self._home_altitude_m = situation.home.altitude_m
 
     def _prepare(self, item: PlanItem, situation: Situation) -> tuple[_Work, Vec | None]:
-        """Change what is flown into what must come first; return where the item then leads."""
+        """Replace the item by a preparatory step if needed; return the item's place after it."""
         flown = self._flown
         north, east, down = situation.position
         if item.command in (_N.TAKEOFF, _N.LAND):
@@ -385,7 +384,7 @@ class MissionExecutor:
             kind = TripletKind.TAKEOFF
         else:
             kind = TripletKind.POSITION
-        # A vehicle that stays at the waypoint brakes before it.
+        # With a stay at the waypoint, the vehicle brakes before it.
         goes_on = flown.autocontinue and flown.stay_s <= 0.0 and bool(places)
         self.triplet = Triplet(
             kind,
@@ -402,11 +401,11 @@ class MissionExecutor:
         if not (item.has_position or item.command == _N.CONDITION_GATE):
             return situation.position
         north, east, down = situation.local(item.place(situation.home.altitude_m))
-        # An altitude that is not given is the present one.
+        # An omitted altitude is the current one.
         return north, east, down if math.isfinite(down) else situation.position[2]
 
     def _follow_home(self, situation: Situation) -> None:
-        """Shift the altitudes that count from home when home has moved."""
+        """Shift relative altitudes when home has moved."""
         rise = situation.home.altitude_m - self._home_altitude_m
         self._home_altitude_m = situation.home.altitude_m
         plans = self._plans
@@ -421,10 +420,10 @@ class MissionExecutor:
                 next=None if triplet.next is None else _raised(triplet.next, rise),
             )
 
-    # --- what is not flown
+    # --- commands
 
     def _issue(self, item: PlanItem, situation: Situation) -> None:
-        """Carry out an item without a place."""
+        """Execute an item without a place."""
         command, params = item.command, item.params
         self._arrival.issued(situation.time_us)
         if command == _N.DO_CHANGE_SPEED:
@@ -440,7 +439,7 @@ class MissionExecutor:
             self.roi.command(item)
 
     def _look_at_roi(self, situation: Situation) -> None:
-        """Turn towards what is to be looked at, unless a camera's mount does (MIS_MNT_YAW_CTL)."""
+        """Point the nose to the region of interest, unless the mount does (MIS_MNT_YAW_CTL)."""
         turns = self.triplet.kind in (TripletKind.POSITION, TripletKind.LOITER)
         if not turns or self._value("MIS_MNT_YAW_CTL") > 0.0:
             return

@@ -1,6 +1,6 @@
-"""Whether a mission can be flown: PX4's checks, before the mission is.
+"""Feasibility checks of a mission, as in PX4.
 
-Source of checks and texts: PX4 1.16, FeasibilityChecker (as it treats a multicopter) and
+Source of checks and texts: PX4 1.16, FeasibilityChecker (for a multicopter) and
 MissionFeasibilityChecker.
 """
 
@@ -22,7 +22,7 @@ FLYABLE = (
     - {_N.ROI, _N.CONDITION_DELAY, _N.CONDITION_DISTANCE, _N.FENCE_RETURN_POINT}
     - NOT_IN_MISSIONS
 )
-"""Commands that a mission may consist of; the others are stored, and the mission is rejected."""
+"""Supported commands; a mission with others is stored but rejected."""
 
 _VTOL = (_N.VTOL_TAKEOFF, _N.VTOL_LAND, _N.DO_VTOL_TRANSITION)
 _TAKEOFFS = (_N.TAKEOFF, _N.VTOL_TAKEOFF)
@@ -31,7 +31,7 @@ _NEVER_FIRST = frozenset(
     | {_N.VTOL_LAND, _N.CONDITION_GATE, _N.RETURN_TO_LAUNCH, _N.DO_WINCH, _N.DO_GRIPPER}
     | {_N.DO_SET_ACTUATOR}
 )
-"""After one of these a take-off is no longer the first waypoint, by PX4's reckoning."""
+"""Commands after which PX4 no longer counts a take-off as the first waypoint."""
 
 
 class Verdict(NamedTuple):
@@ -52,11 +52,11 @@ def check(
     """Check a mission.
 
     Args:
-        items: The mission.
-        home: None = not known yet.
-        value: Looks up a PX4 parameter by its name.
-        landed: Whether the vehicle stands on the ground.
-        inside_fence: Whether the geofence allows a place.
+        items: Mission items.
+        home: Home position; None = unknown.
+        value: Look-up for PX4 parameters by name.
+        landed: True if the vehicle is on the ground.
+        inside_fence: Returns whether the geofence allows a place.
     """
     if not items:
         return Verdict(valid=False)
@@ -111,7 +111,7 @@ def _vehicle_type(items: tuple[PlanItem, ...]) -> list[Message]:
 
 
 def _required(items: tuple[PlanItem, ...], required: int, *, landed: bool) -> list[Message]:
-    """Return what MIS_TKO_LAND_REQ asks for and the mission lacks."""
+    """Return the errors for items required by MIS_TKO_LAND_REQ."""
     commands = {item.command for item in items}
     takeoff, land = not commands.isdisjoint(_TAKEOFFS), _N.LAND in commands
     missing = {
@@ -143,7 +143,7 @@ def _fence(
 
 
 def _first_far_away(items: tuple[PlanItem, ...], home: Geodetic, most_m: float) -> list[Message]:
-    """Return the warning that the first waypoint is far off; it has no effect on validity."""
+    """Return the warning for a distant first waypoint; it does not affect validity."""
     first = next((item for item in items if item.has_position), None)
     if first is None or most_m <= 0.0:
         return []

@@ -1,9 +1,9 @@
-"""The geofence: its geometry, the place where the vehicle would come to a stand, and the watch.
+"""Geofence: geometry, predicted stopping point and breach monitor.
 
 Source: PX4 1.16, Geofence, GeofenceBreachAvoidance (multirotor) and
-Navigator::geofence_breach_check. What a breach leads to (GF_ACTION) is the failsafes' business.
-Polygons are tested in degrees (W. R. Franklin's PNPOLY), circles by
-their distance. All inclusions must hold the place, and no exclusion.
+Navigator::geofence_breach_check. The failsafes implement the response (GF_ACTION). Polygons are
+tested in degrees (W. R. Franklin's PNPOLY), circles by distance. A place must be inside all
+inclusions and outside all exclusions.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ _CIRCLES = {NavCommand.FENCE_CIRCLE_INCLUSION: True, NavCommand.FENCE_CIRCLE_EXC
 
 
 class Polygon(NamedTuple):
-    """A polygon of the fence."""
+    """Polygon of the fence."""
 
     vertices: tuple[tuple[float, float], ...]
-    """(latitude, longitude) [deg], in order; the last one is joined to the first."""
+    """(latitude, longitude) [deg], in order; the last vertex connects to the first."""
     inclusion: bool
-    """Whether the vehicle must be inside; else outside."""
+    """True if the vehicle must be inside, False if outside."""
 
     def contains(self, latitude_deg: float, longitude_deg: float) -> bool:
-        """Return whether a place is inside."""
+        """Return whether a place is inside the polygon."""
         inside = False
         before = self.vertices[-1]
         for vertex in self.vertices:
@@ -52,16 +52,16 @@ class Polygon(NamedTuple):
 
 
 class Circle(NamedTuple):
-    """A circle of the fence."""
+    """Circle of the fence."""
 
     center: tuple[float, float]
     """(latitude, longitude) [deg]."""
     radius_m: float
     inclusion: bool
-    """Whether the vehicle must be inside; else outside."""
+    """True if the vehicle must be inside, False if outside."""
 
     def contains(self, latitude_deg: float, longitude_deg: float) -> bool:
-        """Return whether a place is inside."""
+        """Return whether a place is inside the circle."""
         return distance_m(self.center, (latitude_deg, longitude_deg)) < self.radius_m
 
 
@@ -69,7 +69,7 @@ Area: TypeAlias = "Polygon | Circle"
 
 
 def areas(items: Sequence[PlanItem]) -> Iterator[Area]:
-    """Return the polygons and circles of a stored fence; what is neither is passed over."""
+    """Yield the polygons and circles of a stored fence; other items are skipped."""
     index = 0
     while index < len(items):
         item = items[index]
@@ -98,16 +98,16 @@ def all_allow(fence: Iterable[Area], place: Geodetic) -> bool:
 
 
 PERIOD_S = 0.2
-"""Between two looks at the fence: so long the vehicle may have flown on [s]."""
+"""Period of fence checks, during which the vehicle flies on [s]."""
 
 
 def point_ahead(place: Geodetic, velocity: Vec, value: Callable[[str], float]) -> Geodetic:
-    """Return the place that must be within the fence: where braking from a velocity would end.
+    """Return the predicted stopping point, which must be inside the fence.
 
     Args:
-        place: Where the vehicle is.
-        velocity: NED [m/s].
-        value: Looks up a PX4 parameter by its name.
+        place: Position of the vehicle.
+        velocity: Velocity NED [m/s].
+        value: Look-up for PX4 parameters by name.
     """
     north, east, down = velocity
     speed, jerk = math.hypot(north, east), value("MPC_JERK_AUTO")
@@ -115,22 +115,22 @@ def point_ahead(place: Geodetic, velocity: Vec, value: Callable[[str], float]) -
     ahead_m = braking_distance(speed, value("MPC_ACC_HOR"), most, jerk)
     share = ahead_m / speed if speed > 0.0 else 0.0
     upward, downward = value("MPC_ACC_UP_MAX"), value("MPC_ACC_DOWN_MAX")
-    limit = downward if down < 0.0 else upward  # a climb is ended by accelerating down
+    limit = downward if down < 0.0 else upward  # a climb ends with downward acceleration
     below_m = math.copysign(braking_distance(abs(down), limit, max(upward, downward), jerk), down)
     offset = np.array([north * share, east * share, below_m if down else 0.0])
     return local_to_geodetic(offset, place)
 
 
 def braking_distance(speed: float, limit: float, most: float, jerk: float) -> float:
-    """Return how far a vehicle flies until it stands, and between two looks at the fence [m].
+    """Return the stopping distance plus the distance of one check period [m].
 
-    PX4 takes the vehicle to accelerate as much as it may when it begins to brake.
+    As in PX4, braking starts from maximum acceleration.
 
     Args:
-        speed: At which it flies [m/s].
-        limit: Of the deceleration [m/s²].
-        most: Of the acceleration when braking begins [m/s²].
-        jerk: Limit of the jerk, > 0 [m/s³].
+        speed: Initial speed [m/s].
+        limit: Maximum deceleration [m/s²].
+        most: Acceleration at the start of braking [m/s²].
+        jerk: Maximum jerk, > 0 [m/s³].
     """
     axis = Axis()
     axis.restart(0.0, speed)
@@ -141,27 +141,27 @@ def braking_distance(speed: float, limit: float, most: float, jerk: float) -> fl
 
 
 PERIOD_US = 200_000
-"""PX4 checks the fence every 0.2 s."""
+"""Period of PX4's fence check, 0.2 s [µs]."""
 
 _HOLD = 2
-"""GF_ACTION."""
+"""GF_ACTION value of Hold."""
 
 
 class FenceMonitor:
-    """Keeps the fence and says whether it is breached."""
+    """Fence storage and breach monitor."""
 
     def __init__(
         self, plans: Plans, value: Callable[[str], float], say: Callable[[Message], object]
     ) -> None:
-        """Take the plans, a lookup of PX4 parameter names, and where texts go."""
+        """Store the plans, the look-up for PX4 parameters, and the text callback."""
         self._plans, self._value, self._say = plans, value, say
         self.status = FenceStatus()
-        """What is breached now, and how often it was."""
+        """Active breaches and their count."""
         self._revision = 0
         self._areas: tuple[Area, ...] = ()
         self._due_us = 0
         self._holding = False
-        """Whether the vehicle holds because of a breach: what is breached then stays so."""
+        """True if the vehicle holds due to a breach, which then stays active."""
 
     def inside(self, place: Geodetic, home: Geodetic) -> bool:
         """Return whether the fence and the limits about home allow a place."""
@@ -169,7 +169,7 @@ class FenceMonitor:
         return not (far or high) and all_allow(self._areas, place)
 
     def step(self, now: Situation, mode: Mode, place: Callable[[], Geodetic]) -> None:
-        """Check, when it is time; `place` is where the vehicle is, by GF_SOURCE."""
+        """Check the fence if due; `place` returns the position selected by GF_SOURCE."""
         if self._plans.stored(Kind.FENCE).revision != self._revision:
             self._take(now, place)
         if now.time_us < self._due_us:
@@ -202,19 +202,19 @@ class FenceMonitor:
 
     @property
     def is_set(self) -> bool:
-        """Whether there are areas, or limits about home."""
+        """True if there are areas, or limits about home."""
         value = self._value
         limited = value("GF_MAX_HOR_DIST") > 0.0 or value("GF_MAX_VER_DIST") > 0.0
         return limited or bool(self._areas)
 
     def _limits(self, place: Geodetic, home: Geodetic) -> tuple[bool, bool]:
-        """Return whether a place is too far from home, and whether it is too high above it."""
+        """Return whether a place exceeds the distance from home, and the height above it."""
         farthest, highest = self._value("GF_MAX_HOR_DIST"), self._value("GF_MAX_VER_DIST")
         far = farthest > 0.0 and distance_m(place[:2], home[:2]) >= farthest
         return far, highest > 0.0 and place.altitude_m - home.altitude_m >= highest
 
     def _take(self, now: Situation, place: Callable[[], Geodetic]) -> None:
-        """Take a new fence; an area that home or the flying vehicle violates is left out."""
+        """Load a new fence, without areas that home or the flying vehicle violates."""
         fence = self._plans.stored(Kind.FENCE)
         self._revision = fence.revision
         kept = []

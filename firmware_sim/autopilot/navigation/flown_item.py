@@ -1,4 +1,4 @@
-"""A mission item as it is flown, and whether the vehicle has done it.
+"""Active mission item, and the test for its completion.
 
 Source: PX4 1.16, MissionBlock::is_mission_item_reached_or_completed, for a multicopter.
 """
@@ -46,20 +46,20 @@ AT_ONCE = frozenset(
         _N.DO_SET_HOME,
     }
 )
-"""Commands that are done when they have been issued."""
+"""Commands that are complete once issued."""
 
 WITH_TIMEOUT = (_N.DO_WINCH, _N.DO_GRIPPER, _N.DO_GIMBAL_MANAGER_PITCHYAW)
-"""Commands that are given MIS_COMMAND_TOUT to be carried out."""
+"""Commands that are complete after MIS_COMMAND_TOUT."""
 
 _PRECISE = (1.0, 2.0)
 """PRECISION_LAND_MODE in parameter 2 of a landing: opportunistic, required."""
 
 _STAYS = (_N.WAYPOINT, _N.LOITER_TIME, _N.DELAY)
-"""Commands whose parameter 1 is a time to stay [s]."""
+"""Commands with a stay [s] in parameter 1."""
 
 
 class Situation(NamedTuple):
-    """What the executor knows of the flight."""
+    """Flight state for the executor."""
 
     time_us: int
     position: Vec
@@ -69,7 +69,7 @@ class Situation(NamedTuple):
     landed: bool
     home: Geodetic
     origin: Geodetic
-    """Where local NED is zero."""
+    """Geodetic origin of local NED."""
     velocity: Vec = (0.0, 0.0, 0.0)
     """NED [m/s]."""
 
@@ -81,23 +81,23 @@ class Situation(NamedTuple):
 
 @dataclass(slots=True)
 class FlownItem:
-    """The present item as it is flown."""
+    """Active item with its current values."""
 
     command: int
     place: Vec
-    """Local NED [m]; without meaning where there is none."""
+    """Place, local NED [m]; undefined for items without a place."""
     yaw: float = math.nan
-    """Heading [rad] to turn to; NaN = any."""
+    """Target heading [rad]; NaN = any."""
     stay_s: float = 0.0
     acceptance_m: float = 0.0
-    """0 = NAV_ACC_RAD."""
+    """Acceptance radius [m]; 0 = NAV_ACC_RAD."""
     autocontinue: bool = True
     precision: int = 0
-    """As of `Triplet`."""
+    """Precision landing mode, as in `Triplet`."""
 
 
 def as_flown(item: PlanItem, place: Vec) -> FlownItem:
-    """Return an item as it is flown to a place in local NED [m]."""
+    """Return an active item for a place in local NED [m]."""
     first, radius, _, heading = item.params
     yaw = math.radians(heading) if item.has_position else math.nan
     return FlownItem(
@@ -112,30 +112,30 @@ def as_flown(item: PlanItem, place: Vec) -> FlownItem:
 
 
 class Arrival:
-    """Watches one item after the other: whether the vehicle is there, has turned and has stayed."""
+    """Completion test of successive items: position reached, heading reached, stay over."""
 
     def __init__(self, value: Callable[[str], float]) -> None:
-        """Take a lookup of PX4 parameter names."""
+        """Store the look-up for PX4 parameters."""
         self._value = value
         self._since_us: int | None = None
-        """Since when the vehicle has been there; None = it is not."""
+        """Time of arrival [µs]; None = not there."""
         self._turned = False
         self._issued_us = 0
 
     def restart(self) -> None:
-        """Begin with an item."""
+        """Start with an item."""
         self._since_us, self._turned = None, False
 
     def issued(self, time_us: int) -> None:
-        """Note when an item's command was issued [µs]."""
+        """Record the time of an item's command [µs]."""
         self._issued_us = time_us
 
     def acceptance_m(self, flown: FlownItem) -> float:
-        """Return how near the vehicle must come to an item [m]."""
+        """Return the acceptance radius of an item [m]."""
         return flown.acceptance_m if flown.acceptance_m > 0.0 else self._value("NAV_ACC_RAD")
 
     def is_done(self, flown: FlownItem, target: Vec, now: Situation) -> bool:
-        """Return whether an item is done, `target` being where the vehicle is flying to."""
+        """Return whether an item is complete; `target` is the vehicle's destination."""
         if flown.command in AT_ONCE:
             return True
         if flown.command == _N.LAND:
@@ -153,7 +153,7 @@ class Arrival:
             self._turned = (
                 math.isnan(wrong)
                 or wrong < math.radians(self._value("MIS_YAW_ERR"))
-                # With a timeout, a heading that is not forced does not matter.
+                # With a timeout set, a heading that is not forced is ignored.
                 or self._value("MIS_YAW_TMT") > 0.0
             )
         return self._turned and now.time_us >= self._since_us + flown.stay_s * US_PER_S

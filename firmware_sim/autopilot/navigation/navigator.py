@@ -1,4 +1,4 @@
-"""PX4's navigator: missions, geofence and the way home, at 20 Hz while it leads the vehicle."""
+"""PX4's navigator: missions, geofence and return path, at 20 Hz in its modes."""
 
 from __future__ import annotations
 
@@ -34,63 +34,63 @@ from firmware_sim.autopilot.navigation.way_home import (
 from firmware_sim.autopilot.requests import Place, Reposition, Request
 
 IDLE_US = 100_000
-"""Period in modes that it does not lead: what it reports then is read at 10 Hz."""
+"""Period in other modes [µs]; its reports are read at 10 Hz."""
 
 _LED = (Mode.MISSION, Mode.RETURN)
 
 _WARN = 1
-"""GF_ACTION: up to here the fence is told of, and not kept."""
+"""Highest GF_ACTION that reports breaches without enforcing the fence."""
 
 
 class Navigator:
-    """Flies the mission while its mode is on, and watches the fence."""
+    """Navigator: runs the mission in its mode, and monitors the fence."""
 
     def __init__(self, plans: Plans, value: Callable[[str], float], crew: Crew) -> None:
-        """Take the plans, a lookup of PX4 parameter names, and who carries out the rest."""
+        """Store the plans, the look-up for PX4 parameters, and the mission callbacks."""
         self._plans, self._value = plans, value
         self.mission = MissionExecutor(plans, value, crew, self._check)
-        """Holds the region of interest and the speed, too."""
+        """Mission executor, which also holds region of interest and speed."""
         self._way_home = Plans()
-        """What Return flies of the mission."""
+        """Mission items flown by Return."""
         self._returning = MissionExecutor(
             self._way_home, value, crew, self._check_way_home, climbs_first=False
         )
         self._home_by_mission = False
-        """Whether Return flies along the mission now."""
+        """True if Return flies mission items now."""
         self.fence = FenceMonitor(plans, value, crew.say)
-        """What of the geofence is breached."""
+        """Fence monitor."""
         self.due_us = 0
-        """When to step next [µs]; 0 = at once."""
+        """Time of the next step [µs]; 0 = immediately."""
         self.idle = False
-        """Whether steps change nothing as long as mode, plans, home and parameters stay."""
+        """True if steps have no effect until mode, plans, home or parameters change."""
         self._crew = crew
         self._returned = False
-        """Whether the way of the present return has been chosen."""
+        """True if the path of the current return has been selected."""
         self._flying = False
         self._position: Vec | None = None
 
     @property
     def triplet(self) -> Triplet:
-        """What is flown of a mission, in Mission or Return mode."""
+        """Active waypoints in Mission or Return mode."""
         if self._home_by_mission:
             return self._returning.triplet
         return self.mission.triplet if self._flying else STANDING
 
     @property
     def mission_over(self) -> bool:
-        """Whether the mission has come to its end."""
+        """True if the mission has ended."""
         return self._flying and self.mission.finished
 
     def mission_is_valid(self, situation: Situation | None) -> bool:
-        """Return whether Mission mode has what it needs."""
+        """Return whether the mission is feasible, as required by Mission mode."""
         if situation is not None:
             self.mission.review(situation)
         return self.mission.valid
 
     def permitted(self, request: Request | None, now: Situation | None) -> Request | None:
-        """Return a request; None where the geofence forbids the place, which is said.
+        """Return a request, or None with a text if the geofence forbids the place.
 
-        As PX4: with a GF_ACTION that does no more than warn, any place is allowed.
+        As in PX4, any place is allowed unless GF_ACTION is stronger than a warning.
         """
         kept = round(self._value("GF_ACTION")) > _WARN
         if now is None or not kept or not isinstance(request, Reposition):
@@ -105,9 +105,9 @@ class Navigator:
         return None
 
     def return_place(self, situation: Situation, home: Place) -> Place | None:
-        """Return where Return goes: home, or what RTL_TYPE prefers; its height is the ground's.
+        """Return the destination of Return by RTL_TYPE; its height is the ground's.
 
-        None where it flies items of the mission, which lead it there.
+        None if Return flies mission items instead.
         """
         if self._return_type is ReturnType.MISSION:
             return None
@@ -128,7 +128,7 @@ class Navigator:
         return destination(self._plans, situation.home, here, kind, valid=valid)
 
     def _plan_way_home(self, situation: Situation, *, flying: bool) -> None:
-        """Find the items that Return flies; `flying`: whether a mission was flown until now."""
+        """Store the items for Return; `flying`: a mission was active until now."""
         plans, home = self._plans, situation.home
         here = local_to_geodetic(np.array(situation.position), situation.origin)
         if self._return_type is ReturnType.MISSION:
@@ -138,7 +138,7 @@ class Navigator:
         self._way_home.store(Kind.MISSION, way, 0, 0)
 
     def _way_to_landing(self, situation: Situation, here: Geodetic) -> tuple[PlanItem, ...]:
-        """Return the climb, and the mission's landing from its beginning."""
+        """Return the climb and the complete landing of the mission."""
         begin = landing_start(self._plans.mission)
         if begin is None:
             return ()
@@ -158,7 +158,7 @@ class Navigator:
         return Verdict(bool(self._way_home.mission), ())
 
     def tell(self, context: FlightContext, reports: Reports) -> None:
-        """Tell the modes what to fly, and the failsafes what is wrong."""
+        """Update the paths of the modes and the reports to the failsafes."""
         context.triplet, context.mission_over = self.triplet, self.mission_over
         reports.fence = FenceBreach(*self.fence.status.breached)
         reports.mission_missing = not self.mission.valid
@@ -167,10 +167,10 @@ class Navigator:
             reports.return_time_s = self._return_time_s(context, self._position)
 
     def _return_time_s(self, context: FlightContext, position: Vec) -> float:
-        """Return how long a return from a place, local NED [m], takes [s]."""
+        """Return the duration of a return from a place, local NED [m], in seconds."""
         place = None if context.return_place is None else context.return_place()
         if place is None:
-            return 0.0  # along a mission nobody knows
+            return 0.0  # unknown along a mission
         goal = place.position
         away, height = math.dist(position[:2], goal[:2]), goal[2] - position[2]
         return return_time_s(self._value, height, away)
@@ -178,7 +178,7 @@ class Navigator:
     def step(
         self, situation: Situation, mode: Mode, place: Callable[[], Geodetic], *, armed: bool
     ) -> None:
-        """Advance by a period; `place` is where the vehicle is, for the geofence."""
+        """Advance by a period; `place` returns the vehicle's position for the geofence."""
         self.due_us = situation.time_us + (PERIOD_US if mode in _LED else IDLE_US)
         self._position = situation.position
         self.fence.step(situation, mode, place)
@@ -197,7 +197,7 @@ class Navigator:
         self._flying = flying
 
     def _step_home(self, situation: Situation, *, returning: bool) -> None:
-        """Advance along the mission where Return flies it."""
+        """Advance Return along the mission, if it flies mission items."""
         if not returning:
             if self._home_by_mission:
                 self._returning.deactivate()
@@ -205,7 +205,7 @@ class Navigator:
         elif self._home_by_mission:
             self._returning.update(situation)
         elif not self._returned:
-            # The way is chosen once, when the mode begins.
+            # The path is selected once, at the start of the mode.
             self._returned = True
             anywhere = Place((0.0, 0.0, 0.0), 0.0)
             if self.return_place(situation, anywhere) is None:

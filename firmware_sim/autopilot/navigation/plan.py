@@ -1,7 +1,7 @@
-"""What a ground station stores aboard: the mission, the geofence, rally points; jumps, distances.
+"""Plans stored on board: mission, geofence, rally points; with jumps and distances.
 
-Source of commands, frames and limits: MAVLink common.xml and PX4 1.16 (navigation.h, dataman.h);
-of jumps: MissionBase::getNonJumpItem, getNextPositionItems.
+Source of commands, frames and limits: MAVLink common.xml and PX4 1.16 (navigation.h, dataman.h); of
+jumps: MissionBase::getNonJumpItem, getNextPositionItems.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from airl_mav.core.frames import Geodetic
 
 
 class NavCommand(IntEnum):
-    """The MAV_CMD of plan items that the autopilot gives a meaning; the numbers are MAVLink's."""
+    """MAV_CMD of supported plan items; values are MAVLink's."""
 
     WAYPOINT = 16
     LOITER_UNLIM = 17
@@ -79,7 +79,7 @@ NOT_IN_MISSIONS = frozenset(
         NavCommand.RALLY_POINT,
     }
 )
-"""Points of a fence and rally points."""
+"""Fence points and rally points."""
 
 
 class Frame(IntEnum):
@@ -102,7 +102,7 @@ class Kind(IntEnum):
 
 
 MOST_ITEMS = {Kind.MISSION: 65_534, Kind.FENCE: 64, Kind.RALLY: 32}
-"""How many items a list may have, as in PX4's SITL."""
+"""Maximum number of items per list, as in PX4's SITL."""
 
 POSITION_COMMANDS = frozenset(
     {
@@ -116,14 +116,14 @@ POSITION_COMMANDS = frozenset(
         NavCommand.VTOL_LAND,
     }
 )
-"""Commands that have a place to fly to (MissionBlock::item_contains_position)."""
+"""Commands with a place to fly to (MissionBlock::item_contains_position)."""
 
 _RELATIVE = (Frame.GLOBAL_RELATIVE_ALT, Frame.GLOBAL_RELATIVE_ALT_INT)
 
 
 @dataclass(frozen=True, slots=True)
 class PlanItem:
-    """One item of a mission, fence or list of rally points."""
+    """Item of a mission, fence or list of rally points."""
 
     command: int
     """MAV_CMD."""
@@ -132,75 +132,75 @@ class PlanItem:
     params: tuple[float, float, float, float]
     """Parameters 1..4; angles in degrees as on the wire, NaN = not given."""
     x: float
-    """Latitude [deg]; in the frame MISSION parameter 5."""
+    """Latitude [deg]; parameter 5 in frame MISSION."""
     y: float
-    """Longitude [deg]; in the frame MISSION parameter 6."""
+    """Longitude [deg]; parameter 6 in frame MISSION."""
     z: float
-    """Altitude [m], by the frame above mean sea level or above home; else parameter 7."""
+    """Altitude [m] above mean sea level or home, by the frame; parameter 7 in frame MISSION."""
     autocontinue: bool = True
-    """Whether the mission goes on by itself once the item is reached."""
+    """True if the mission continues automatically after the item."""
 
     @property
     def has_position(self) -> bool:
-        """Whether there is a place to fly to."""
+        """True if the item has a place to fly to."""
         return self.command in POSITION_COMMANDS
 
     @property
     def altitude_is_relative(self) -> bool:
-        """Whether the altitude counts from home."""
+        """True if the altitude is relative to home."""
         return self.frame in _RELATIVE
 
     def place(self, home_altitude_m: float) -> Geodetic:
-        """Return where it is, for a home at an altitude above mean sea level [m]."""
+        """Return the item's place for a home altitude above mean sea level [m]."""
         above = home_altitude_m if self.altitude_is_relative else 0.0
         return Geodetic(self.x, self.y, self.z + above)
 
 
 class Stored(NamedTuple):
-    """One list of items."""
+    """Stored list of items."""
 
     items: tuple[PlanItem, ...] = ()
     identity: int = 0
     """PX4's opaque id of the list, a checksum; 0 = empty."""
     revision: int = 0
-    """Rises with every change."""
+    """Number of changes."""
 
 
 class Plans:
-    """All that is stored aboard, and how far the mission has come: PX4's dataman.
+    """Storage of all plans and of the mission progress: PX4's dataman.
 
-    It lives as long as the autopilot, through landings and disarming.
+    It persists with the autopilot, through landings and disarming.
     """
 
     def __init__(self) -> None:
         self._stored = {kind: Stored() for kind in Kind}
         self.current = 0
-        """Index of the mission item that is flown, or will be when the mission goes on."""
+        """Index of the active mission item, or of the next item if the mission is paused."""
         self.set_current_count = 0
-        """Rises whenever a client chooses the current item."""
+        """Number of client selections of the current item."""
         self.changes = 0
-        """Rises with every list that is stored, and every choice of the current item."""
+        """Number of stored lists and client selections."""
         self.reached = -1
-        """Index of the newest item that was reached; -1 = none in this run."""
+        """Index of the newest reached item; -1 = none in this run."""
         self.jumps_done: dict[int, int] = {}
-        """How often each DO_JUMP has been carried out, by index."""
+        """Number of executions of each DO_JUMP, by index."""
         self.jumped = -1
-        """Index of the newest DO_JUMP whose count has changed; -1 = none."""
+        """Index of the newest DO_JUMP with a changed count; -1 = none."""
         self.receiving = False
-        """Whether a list is being uploaded, on any link."""
+        """True while a list is being uploaded, on any link."""
 
     @property
     def progress(self) -> tuple[int, int, int, int]:
-        """How far the mission has come: current and reached item, newest DO_JUMP and its count."""
+        """Mission progress: current and reached item, newest DO_JUMP and its count."""
         return self.current, self.reached, self.jumped, self.jumps_done.get(self.jumped, 0)
 
     def stored(self, kind: Kind) -> Stored:
-        """Return a list."""
+        """Return a stored list."""
         return self._stored[kind]
 
     @property
     def mission(self) -> tuple[PlanItem, ...]:
-        """The mission's items."""
+        """Items of the mission."""
         return self._stored[Kind.MISSION].items
 
     def store(
@@ -208,8 +208,7 @@ class Plans:
     ) -> None:
         """Replace a list.
 
-        `current` is the mission item to begin with; -1 = the present index, if there is such an
-        item.
+        `current` is the first mission item; -1 = the current index, at most the last item.
         """
         self.changes += 1
         self._stored[kind] = Stored(items, identity, self._stored[kind].revision + 1)
@@ -220,11 +219,11 @@ class Plans:
             self.reached = -1
 
     def clear(self, kind: Kind) -> None:
-        """Forget a list."""
+        """Delete a list."""
         self.store(kind, (), 0, 0)
 
     def set_current(self, index: int) -> None:
-        """Choose the mission item to go on with, as a client asks. Raises IndexError."""
+        """Set the current mission item on a client's request. Raises IndexError."""
         if not 0 <= index < len(self.mission):
             raise IndexError(f"mission item {index}: there are {len(self.mission)}")
         self.current = index
@@ -235,7 +234,7 @@ class Plans:
 def distance_m(a: tuple[float, float], b: tuple[float, float]) -> float:
     """Return the great-circle distance [m] between two places (latitude, longitude) [deg].
 
-    Haversine on a sphere, as PX4's get_distance_to_next_waypoint.
+    Haversine on a sphere, like PX4's get_distance_to_next_waypoint.
     """
     lat_a, lat_b = math.radians(a[0]), math.radians(b[0])
     half_lat = math.sin(0.5 * (lat_b - lat_a))
@@ -245,19 +244,19 @@ def distance_m(a: tuple[float, float], b: tuple[float, float]) -> float:
 
 
 MOST_JUMPS = 10
-"""After so many jumps in a row the search ends at a jump (PX4's MAX_JUMP_ITERATION)."""
+"""Maximum number of consecutive jumps before the search stops (PX4's MAX_JUMP_ITERATION)."""
 
 
 def resolve(plans: Plans, index: int, *, count: bool) -> int | None:
-    """Return the index of the item that is flown instead of a DO_JUMP; others are themselves.
+    """Return the index of the item to fly after resolving DO_JUMP.
 
     Args:
-        plans: The mission, and how often its jumps have been carried out.
-        index: Where to begin.
-        count: Whether jumps count as carried out.
+        plans: Mission with its jump counts.
+        index: First index.
+        count: True if jumps count as executed.
 
     Returns:
-        None where the mission ends, or where a jump leads out of it.
+        None at the end of the mission, or if a jump leads out of it.
     """
     items = plans.mission
     for _ in range(MOST_JUMPS):
@@ -281,14 +280,14 @@ def resolve(plans: Plans, index: int, *, count: bool) -> int | None:
 
 
 def go_to(plans: Plans, index: int) -> int | None:
-    """Return the item to fly for an index, and count the jumps to it; None = there is none."""
+    """Return the item to fly for an index, and count the jumps; None = end."""
     return resolve(plans, index, count=True)
 
 
 def next_places(plans: Plans, index: int, most: int) -> list[PlanItem]:
-    """Return the next items with a place from an index on, at most so many."""
+    """Return up to `most` next items with a place, starting at an index."""
     found: list[PlanItem] = []
-    # Each item is looked at once, so that a jump back and forth ends.
+    # Bounded, so that mutual jumps end.
     for _ in range(2 * len(plans.mission)):
         if len(found) == most:
             break
@@ -302,5 +301,5 @@ def next_places(plans: Plans, index: int, most: int) -> list[PlanItem]:
 
 
 def _whole(value: float) -> int:
-    """Return a number of the wire as PX4 does, towards zero; what is none is -1."""
+    """Return a number of the wire as in PX4, truncated; -1 if out of range or NaN."""
     return int(value) if abs(value) < 65_536.0 else -1

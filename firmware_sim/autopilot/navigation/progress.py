@@ -1,4 +1,4 @@
-"""Progress of the plans."""
+"""Mission progress of the plans."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from firmware_sim.autopilot.navigation.plan import Kind, Plans
 
 
 def progress(plans: Plans) -> MissionProgress:
-    """Return how far the mission has come, and which lists are stored."""
+    """Return the mission progress and the ids of the stored lists."""
     mission, fence, rally = (plans.stored(kind) for kind in Kind)
     if not (mission.items or fence.items or rally.items):
         return NO_MISSION

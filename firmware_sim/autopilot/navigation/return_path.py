@@ -1,4 +1,4 @@
-"""How high Return flies home, and how long that takes.
+"""Height and duration of Return.
 
 Source: PX4 1.16, RTL::calculate_return_alt_from_cone_half_angle, RtlDirect and RtlTimeEstimator.
 """
@@ -11,16 +11,16 @@ from collections.abc import Callable
 from airl_mav.core.constants import DEG
 
 _SLOWEST_M_S = 0.1
-"""Bound of every speed: a parameter may be zero."""
+"""Minimum of every speed, as a parameter may be zero."""
 
 
 def return_height(value: Callable[[str], float], height_m: float, away_m: float) -> float:
-    """Return the height above the destination for the way there [m].
+    """Return the height of the return flight above the destination [m].
 
     Args:
-        value: Looks up a PX4 parameter by its name.
-        height_m: Of the vehicle above the destination.
-        away_m: Its horizontal distance from there.
+        value: Look-up for PX4 parameters by name.
+        height_m: Height of the vehicle above the destination.
+        away_m: Horizontal distance of the vehicle from the destination.
     """
     highest, angle, radius = value("RTL_RETURN_ALT"), value("RTL_CONE_ANG"), value("NAV_ACC_RAD")
     if angle <= 0.0:
@@ -36,9 +36,9 @@ def return_height(value: Callable[[str], float], height_m: float, away_m: float)
 
 
 def return_time_s(value: Callable[[str], float], height_m: float, away_m: float) -> float:
-    """Return how long Return takes from there, with RTL_TIME_FACTOR and RTL_TIME_MARGIN [s].
+    """Return the duration of Return, with RTL_TIME_FACTOR and RTL_TIME_MARGIN [s].
 
-    PX4 counts the whole way down at MPC_Z_V_AUTO_DN. Arguments as of `return_height`.
+    As in PX4, the whole descent is at MPC_Z_V_AUTO_DN. For the arguments see `return_height`.
     """
     at = return_height(value, height_m, away_m)
     climb = (at - height_m) / max(value("MPC_Z_V_AUTO_UP"), _SLOWEST_M_S)

@@ -1,4 +1,4 @@
-"""PX4's position setpoint triplet: the way from a waypoint to the next, and past it."""
+"""PX4's position setpoint triplet: path from a waypoint to the next, and past it."""
 
 from __future__ import annotations
 
@@ -10,41 +10,41 @@ from airl_mav.vehicle.rotation import Vec
 
 
 class TripletKind(Enum):
-    """Manner in which a triplet is flown."""
+    """Type of a triplet."""
 
     IDLE = auto()
-    """Not at all: the vehicle stands."""
+    """No flight: the vehicle is on the ground."""
     TAKEOFF = auto()
-    """From the ground, gently at first."""
+    """Take-off, slow at first."""
     POSITION = auto()
-    """To the target, and on to the next one."""
+    """Flight to the target, continuing to the next waypoint."""
     LOITER = auto()
-    """To the target, to stay there."""
+    """Flight to the target, with a stay."""
     LAND = auto()
-    """Down to the ground."""
+    """Landing."""
 
 
 class Triplet(NamedTuple):
-    """What a mission gives to be flown. Places are local NED [m]."""
+    """Path of a mission. Places are local NED [m]."""
 
     kind: TripletKind
     target: Vec
     previous: Vec | None = None
-    """Where the way begins; None = wherever the vehicle is."""
+    """Start of the path; None = the vehicle's position."""
     next: Vec | None = None
-    """Where it goes on; None = the vehicle stops at the target."""
+    """Next waypoint; None = the vehicle stops at the target."""
     yaw: float = math.nan
     """Heading [rad]; NaN = by MPC_YAW_MODE."""
     acceptance_m: float = 0.0
     precision: int = 0
-    """Of a landing: 1 onto a landing target that is seen at once, 2 also onto one that is not."""
+    """Precision landing: 0 = off, 1 = on a target visible at once, 2 = search for the target."""
     cruise_m_s: float = math.nan
-    """NaN = MPC_XY_CRUISE."""
+    """Cruise speed [m/s]; NaN = MPC_XY_CRUISE."""
 
     def same_target(self, other: Triplet) -> bool:
-        """Return whether both lead to the same place in the same way."""
+        """Return whether both have the same target and attributes."""
         return self._replace(previous=None, next=None) == other._replace(previous=None, next=None)
 
 
 STANDING = Triplet(TripletKind.IDLE, (0.0, 0.0, 0.0))
-"""Nothing is to be flown."""
+"""Triplet without flight."""

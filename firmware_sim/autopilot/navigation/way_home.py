@@ -1,8 +1,8 @@
-"""Destination of Return, and its way along the mission: items and their order.
+"""Destination of Return, and its path along the mission as items.
 
 Source: PX4 1.16, RTL::findRtlDestination, RtlMissionFast, RtlMissionFastReverse and
-RtlDirectMissionLand, for a multicopter. They fly the places of a mission alone: no waits, no
-commands. RTL_TYPE = 2 has no destination, but a way along the mission.
+RtlDirectMissionLand, for a multicopter. They fly only the places of a mission, without waits and
+commands. RTL_TYPE = 2 has no destination but a path along the mission.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ _N = NavCommand
 NAN = math.nan
 
 MOST_ITEMS = 1_000
-"""Of a way home: a mission may jump back 65,535 times."""
+"""Maximum length of a return path: a mission may jump back 65,535 times."""
 
 
 def landing_start(items: tuple[PlanItem, ...]) -> int | None:
-    """Return where the mission's landing begins: at DO_LAND_START, else at its NAV_LAND.
+    """Return the index of the mission's landing: DO_LAND_START, else NAV_LAND.
 
-    None where it has no landing.
+    None if the mission has no landing.
     """
     landings = [index for index, item in enumerate(items) if item.command == _N.LAND]
     if not landings:
@@ -45,13 +45,13 @@ def landing_start(items: tuple[PlanItem, ...]) -> int | None:
 def along_mission(
     plans: Plans, home: Geodetic, here: Geodetic, *, flying: bool
 ) -> tuple[PlanItem, ...]:
-    """Return the way of RTL_TYPE 2: on to the mission's landing, else back to where it began.
+    """Return the path of RTL_TYPE 2: on to the mission's landing, else back to its start.
 
     Args:
-        plans: The mission, and the item that is flown.
-        home: Where a way back ends.
-        here: Where the vehicle is.
-        flying: Whether the mission is being flown; else it begins at the nearest item.
+        plans: Mission with its active item.
+        home: End of a path back.
+        here: Position of the vehicle.
+        flying: True if the mission is active; False: start at the nearest item.
     """
     items = plans.mission
     index = plans.current if flying else _nearest(items, home, here)
@@ -63,7 +63,7 @@ def along_mission(
 
 
 def onwards(plans: Plans, index: int) -> tuple[PlanItem, ...]:
-    """Return the places from an item on, up to the landing; jumps that are left are taken."""
+    """Return the places from an item to the landing, including remaining jumps."""
     left = Plans()
     left.store(Kind.MISSION, plans.mission, 0)
     left.jumps_done = dict(plans.jumps_done)
@@ -82,7 +82,7 @@ def onwards(plans: Plans, index: int) -> tuple[PlanItem, ...]:
 
 
 def climb(here: Geodetic, altitude_m: float) -> PlanItem:
-    """Return the item that climbs to an altitude above mean sea level [m], at a place."""
+    """Return an item for a climb at a place to an altitude above mean sea level [m]."""
     params = (0.0, 0.0, 0.0, NAN)
     return PlanItem(
         _N.WAYPOINT, Frame.GLOBAL, params, here.latitude_deg, here.longitude_deg, altitude_m
@@ -105,7 +105,7 @@ def _back(items: tuple[PlanItem, ...], index: int, home: Geodetic) -> tuple[Plan
 
 
 def _passed(item: PlanItem) -> PlanItem:
-    """Return an item as a place that is passed without a stay; LOITER_TO_ALT stays what it is."""
+    """Return an item as a waypoint without a stay; LOITER_TO_ALT is unchanged."""
     _, radius, passing, heading = item.params
     if item.command == _N.LOITER_TO_ALT:
         return replace(item, autocontinue=True)
@@ -116,7 +116,7 @@ def _passed(item: PlanItem) -> PlanItem:
 
 
 def _nearest(items: tuple[PlanItem, ...], home: Geodetic, here: Geodetic) -> int | None:
-    """Return the item whose place is nearest, height counted; None = no item has one."""
+    """Return the item with the nearest place in 3D; None = no places."""
 
     def away(index: int) -> float:
         place = items[index].place(home.altitude_m)
@@ -128,44 +128,44 @@ def _nearest(items: tuple[PlanItem, ...], home: Geodetic, here: Geodetic) -> int
 
 
 NEARER_M = 2.0
-"""A place must be nearer than another one by this much to be preferred [m]."""
+"""Minimum advantage in distance to prefer a place over another [m]."""
 
 OF_HOME_M = 10.0
-"""Rally points as near to home as this are home's [m]."""
+"""Distance to home within which rally points are ignored [m]."""
 
 
 class ReturnType(IntEnum):
-    """RTL_TYPE."""
+    """Values of RTL_TYPE."""
 
     HOME_OR_RALLY = 0
     NOT_HOME = 1
-    """The mission's landing or a rally point; home only where there is neither."""
+    """Landing of the mission or a rally point; home if there is neither."""
     MISSION = 2
-    """Along the mission to its landing; where it has none, back along it and home."""
+    """Along the mission to its landing; without a landing, back along the mission to home."""
     NEAREST = 3
-    """Home, the mission's landing or a rally point."""
+    """Home, landing of the mission, or a rally point."""
 
 
 class Destination(NamedTuple):
     """Destination of Return."""
 
     place: Geodetic
-    """Its altitude is the ground's."""
+    """Place at ground altitude."""
     by_landing: bool = False
-    """Whether it is the mission's landing, which is flown from its beginning."""
+    """True if the destination is the mission's landing, flown from its first item."""
 
 
 def destination(
     plans: Plans, home: Geodetic, here: Geodetic, kind: int, *, valid: bool = True
 ) -> Destination:
-    """Return where to return to.
+    """Return the destination of Return.
 
     Args:
-        plans: The rally points and the mission.
-        home: Its altitude is the ground's, as is that of what is returned.
-        here: Where the vehicle is.
-        kind: RTL_TYPE; a number that it does not have counts as 0.
-        valid: Whether the mission can be flown; else its landing does not count.
+        plans: Rally points and mission.
+        home: Home at ground altitude; the result is also at ground altitude.
+        here: Position of the vehicle.
+        kind: RTL_TYPE; undefined values count as 0.
+        valid: True if the mission is feasible; if not, its landing is ignored.
     """
 
     def away(place: Geodetic) -> float:

@@ -1,4 +1,4 @@
-"""Where the vehicle is, as missions, the geofence and Return ask for it."""
+"""Position of the vehicle for missions, the geofence and Return."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from firmware_sim.autopilot.newest_sensors import NewestSensors
 
 
 class Whereabouts:
-    """Puts together what the estimator, the sensors and home know."""
+    """Vehicle position from estimator, sensors and home."""
 
     def __init__(
         self,
@@ -23,12 +23,12 @@ class Whereabouts:
         home: Home,
         value: Callable[[str], float],
     ) -> None:
-        """Take what knows it, and a lookup of PX4 parameter names."""
+        """Store the sources and the look-up for PX4 parameters."""
         self._estimator, self._sensors, self._home = estimator, sensors, home
         self._value = value
 
     def situation(self, *, landed: bool) -> Situation | None:
-        """Return what missions go by; None before the first fix."""
+        """Return the flight state for missions; None before the first fix."""
         sample, home, origin = self._sensors.sample, self._home.place, self._estimator.origin
         if sample is None or home is None or origin is None:
             return None
@@ -37,7 +37,7 @@ class Whereabouts:
         return Situation(sample.time_us, place.position, place.yaw, landed, home, origin, velocity)
 
     def fenced_place(self) -> Geodetic:
-        """Return where the vehicle is, by GF_SOURCE: the estimate, or the GPS.
+        """Return the position selected by GF_SOURCE: the estimate, or GPS.
 
         Raises RuntimeError before the first fix.
         """

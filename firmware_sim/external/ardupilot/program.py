@@ -17,25 +17,25 @@ SIMULATOR_PORT, PORTS_PER_INSTANCE = 9002, 10
 """Port to which instance 0 sends its servo packets, and the step to the next instance (`-I`)."""
 
 LAYOUTS = (".", "bin", "build/sitl/bin")
-"""Where below a folder arducopter is looked for: the program's own, a build, a source tree."""
+"""Subfolders searched for arducopter: the program's folder, a build, a source tree."""
 
 PROGRAM = "arducopter"
 OBSERVER_PORT = 14030
-"""UDP port of the observer of an ArduPilot that the user starts; plus one per instance."""
+"""UDP port of the observer of an ArduPilot started by the user; plus one per instance."""
 
 PARAMETERS = "vehicle.parm"
 
 
 @dataclass(frozen=True)
 class Links:
-    """UDP ports on the loopback address that ArduPilot's serial ports talk to."""
+    """UDP ports on the loopback address to which ArduPilot's serial ports connect."""
 
     api: int
-    """Of the companion's MAVSDK (serial 0)."""
+    """Port of the companion's MAVSDK (serial 0)."""
     gcs: int
-    """Of the ground station (serial 1)."""
+    """Port of the ground station (serial 1)."""
     observer: int
-    """Ours (serial 2)."""
+    """Port of the observer (serial 2)."""
 
 
 def find_arducopter(path: Path) -> Path:
@@ -58,7 +58,7 @@ def simulator_port(instance: int) -> int:
 
 
 def command(program: str, instance: int, links: Links, defaults: str) -> list[str]:
-    """Return program and arguments; `instance` moves the port, `defaults` is a relative file."""
+    """Return program and arguments; `instance` shifts the port, `defaults` is a relative file."""
     home = f"{HOME.latitude_deg},{HOME.longitude_deg},{HOME.altitude_m},0"
     return [
         program,
@@ -73,11 +73,11 @@ def command(program: str, instance: int, links: Links, defaults: str) -> list[st
 def start(
     program: Path, instance: int, links: Links, settings: Mapping[str, float], folder: Path
 ) -> StartCommand:
-    """Write its parameter file into its working folder; return the command that starts it there."""
+    """Write the parameter file to the working folder; return the start command."""
     (folder / PARAMETERS).write_text(ardupilot_file(settings), encoding="ascii")
     return StartCommand(command(str(program), instance, links, PARAMETERS), {})
 
 
 def how_to_start(instance: int, links: Links) -> str:
-    """Return the command with which a user starts ArduCopter from its source tree."""
+    """Return the user's command to start ArduCopter from its source tree."""
     return shlex.join(command(f"build/sitl/bin/{PROGRAM}", instance, links, PARAMETERS))

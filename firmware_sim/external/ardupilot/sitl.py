@@ -1,8 +1,8 @@
-"""ArduPilot SITL behind our plant: its JSON simulator interface over UDP, in lockstep.
+"""ArduPilot SITL with the built-in plant: JSON simulator interface over UDP, in lockstep.
 
 ArduPilot sends a servo packet, waits for one state line, advances to the line's time and sends the
-next packet. It repeats a packet after a second without an answer. The interface lacks the armed
-state: `armed` means that a motor turns, which ArduCopter's do on the ground too (MOT_SPIN_ARM).
+next packet. It repeats a packet after a second without a reply. The interface lacks the armed
+state: `armed` means that a motor turns, which includes armed on the ground (MOT_SPIN_ARM).
 Source: ArduPilot libraries/SITL/SIM_JSON.h and .cpp, checked against a running ArduCopter 4.7.
 """
 
@@ -24,25 +24,25 @@ from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 from firmware_sim.mavlink.endpoint import Address
 
 MAGIC_16, MAGIC_32 = 18_458, 29_569
-"""First word of a packet of 16 servo channels, and of 32 (SERVO_32_ENABLE = 1)."""
+"""First word of a packet with 16 servo channels and with 32 (SERVO_32_ENABLE = 1)."""
 
 _PACKETS = {40: (MAGIC_16, struct.Struct("<HHI16H")), 72: (MAGIC_32, struct.Struct("<HHI32H"))}
-"""Length of a packet [bytes]: its magic and its layout."""
+"""Magic and layout of a packet, by its length [bytes]."""
 
 
 class ServoPacketError(ValueError):
-    """A datagram is not a servo packet. The message says why."""
+    """A datagram is not a servo packet. The message contains the reason."""
 
 
 class ServoPacket(NamedTuple):
-    """Packet of ArduPilot for each frame."""
+    """Packet sent by ArduPilot for each frame."""
 
     frame_rate_hz: int
-    """Frames a second of simulated time that it asks for (SIM_RATE_HZ)."""
+    """Requested frames per second of simulated time [Hz] (SIM_RATE_HZ)."""
     frame_count: int
-    """State lines that it has received since it started."""
+    """State lines received since ArduPilot started."""
     pwm_us: tuple[int, ...]
-    """Servo outputs 1..16 or 1..32 [µs]; 0 = none."""
+    """Servo outputs 1..16 or 1..32 [µs]; 0 = no output."""
 
 
 def parse_servos(datagram: bytes) -> ServoPacket:
@@ -59,16 +59,16 @@ def parse_servos(datagram: bytes) -> ServoPacket:
 
 
 AWAY_FROM_ZERO = 1.0 + 1e-8
-"""ArduPilot cuts the difference of two times to whole microseconds: 832.9999 of 833 would lose a
-thousandth of its time."""
+"""Factor on time stamps: ArduPilot truncates the difference of two times to whole microseconds, so
+832.9999 instead of 833 would lose a thousandth of its time."""
 
 
 def state_line(time_us: int, sample: SensorSample, truth: Truth) -> bytes:
-    """Return the answer to a servo packet: one line, a line feed before and after.
+    """Return the reply to a servo packet: one line, with a line feed before and after.
 
-    ArduPilot finds keys by substring and then reads with sscanf. Nothing may stand between a key's
-    colon and its bracket, and no key may hold the name of a later one. Numbers are the shortest
-    that read back as the same double. From `truth` ArduPilot simulates GPS, barometer and compass.
+    ArduPilot finds keys by substring and then reads with sscanf. A key's colon and bracket must be
+    adjacent, and no key may contain the name of a later key. Numbers have the shortest form that
+    reads back as the same double. ArduPilot simulates GPS, barometer and compass from `truth`.
     """
     return (
         f'\n{{"timestamp":{time_us * AWAY_FROM_ZERO / US_PER_S!r},'
@@ -76,25 +76,25 @@ def state_line(time_us: int, sample: SensorSample, truth: Truth) -> bytes:
         f'"position":{truth.position.tolist()},'
         f'"quaternion":{truth.quaternion.tolist()},'
         f'"velocity":{truth.velocity.tolist()},'
-        # Otherwise it would pace itself by the wall clock; here the plant sets the pace.
+        # Without it ArduPilot would pace by the wall clock; here the plant sets the pace.
         f'"no_time_sync":1}}\n'
     ).encode("ascii")
 
 
 SILENCE_S = 5.0
-"""Longest wait for a packet [wall s]."""
+"""Timeout of a packet [wall s]."""
 
 NEWCOMER_S = 0.5
-"""When another ArduPilot starts and ours is silent for this long, ours is gone [wall s]."""
+"""Silence after which ArduPilot is lost once another ArduPilot has started [wall s]."""
 
 MAX_GARBAGE = 100
-"""Consecutive datagrams that are not servo packets, after which a connected ArduPilot is lost."""
+"""Number of consecutive invalid datagrams after which a connected ArduPilot is lost."""
 
 RATES_HZ = range(50, 10_001)
 """Accepted frame rates [Hz]: lines less than 0.1 s apart, and a clock of whole microseconds."""
 
 _SLICE_S = 0.1
-"""Longest single wait [wall s]: `alive` is asked in between."""
+"""Maximum single wait between checks of `alive` [wall s]."""
 
 _MAX_DATAGRAM = 4096
 
@@ -102,36 +102,36 @@ PWM_MIN_US, PWM_MAX_US = 1000, 2000
 """Pulses of a stopped motor (MOT_PWM_MIN) and of full thrust (MOT_PWM_MAX) [µs]."""
 
 MOTORS = 4
-"""Servo outputs 1 to 4 are the motors. The airframe says which is which."""
+"""Number of motors, on servo outputs 1 to 4. The airframe assigns their corners."""
 
 
 class ArdupilotBridge:
-    """One ArduPilot, one episode. Implements `Bridge`."""
+    """Bridge to one ArduPilot for one episode. Implements `Bridge`."""
 
     def __init__(self, port: int, *, silence_s: float = SILENCE_S) -> None:
         """Open a loopback UDP port, or raise UsageError; packets may take `silence_s` [wall s]."""
         self.rate_hz = 0
-        """What ArduPilot asks for: it arms only with 1.8 times its loop rate (SCHED_LOOP_RATE,
-        400 Hz) or more."""
+        """Rate requested by ArduPilot [Hz], which arms only at 1.8 times its loop rate or more
+        (SCHED_LOOP_RATE, 400 Hz)."""
         self.armed = False
         self.time_us = 0
         self.port = port
         self.garbage = 0
-        """Datagrams so far that were not servo packets."""
+        """Number of datagrams that were not servo packets."""
         self._run = 0
-        """How many of them were consecutive."""
+        """Number of consecutive invalid datagrams."""
         self._silence_us = int(silence_s * US_PER_S)
         self._alive: Callable[[], None] = no_process
         self._truth: Callable[[], Truth] | None = None
         self._address: Address | None = None
         self._packet: ServoPacket | None = None
-        """The newest one: what the next line answers."""
+        """Newest packet, answered by the next line."""
         self._newcomer = False
-        """Whether another sender has sent a first packet."""
+        """True if another sender has sent a first packet."""
         self._veteran = False
-        """Whether another sender has sent a later packet: its time cannot start at 0 again."""
+        """True if another sender has sent a later packet: its time cannot restart at 0."""
         self._base_us: int | None = None
-        """Simulated time that is 0 to ArduPilot."""
+        """Simulated time at ArduPilot's time 0 [µs]."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.settimeout(_SLICE_S)
         try:
@@ -161,11 +161,11 @@ class ArdupilotBridge:
             )
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
-        """Accept a source of the true state, from which ArduPilot simulates its other sensors."""
+        """Set the source of the true state, from which ArduPilot simulates its other sensors."""
         self._truth = truth
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Answer the pending packet, and return the motor commands of the next one; see `Bridge`.
+        """Answer the pending packet and return the next packet's motor commands; see `Bridge`.
 
         Outputs 1 to 4 of ArduCopter's quad X (FRAME_TYPE 1) are PX4's motors: front right, rear
         left, front left, rear right.
@@ -174,7 +174,7 @@ class ArdupilotBridge:
         if answered is None or truth is None or address is None:
             raise RuntimeError("step() before wait_connected() and use_truth()")
         if self._base_us is None:
-            # Its time starts at 0 and must move with the first line, too.
+            # ArduPilot's time starts at 0 and must also advance with the first line.
             self._base_us = sample.time_us - US_PER_S // self.rate_hz
         self.time_us = sample.time_us - self._base_us
         answered = self._newest(answered)
@@ -190,7 +190,7 @@ class ArdupilotBridge:
         self._socket.close()
 
     def _newest(self, packet: ServoPacket) -> ServoPacket:
-        """Return the newest packet since the last step: extra answers would put ArduPilot ahead."""
+        """Return the newest packet since the last step: extra replies would put ArduPilot ahead."""
         self._socket.settimeout(0.0)
         try:
             while True:
@@ -220,12 +220,12 @@ class ArdupilotBridge:
                     f"ArduPilot has sent no servo packet for {self._silence_us / US_PER_S:g} s"
                 )
             if repeated and self._address is not None:
-                # It asked again and has nothing newer: the line was lost.
+                # A repeated packet without a newer one means that the line was lost.
                 repeated = False
                 self._socket.sendto(line, self._address)
 
     def _receive(self) -> ServoPacket | None:
-        """Return the next servo packet or None in time; FirmwareLostError after garbage only."""
+        """Return the next servo packet; None = timeout. FirmwareLostError after only garbage."""
         for _ in range(MAX_GARBAGE):
             try:
                 datagram, address = self._socket.recvfrom(_MAX_DATAGRAM)
@@ -267,7 +267,7 @@ _RESTARTED = "ArduPilot restarted during an episode"
 
 
 def _follows(before: ServoPacket, after: ServoPacket) -> ServoPacket:
-    """Return `after`. Raises FirmwareLostError when its frame count went back."""
+    """Return `after`. Raises FirmwareLostError if its frame count went back."""
     if after.frame_count < before.frame_count:
         raise FirmwareLostError(_RESTARTED)
     return after

@@ -1,4 +1,4 @@
-"""The connection to a PX4 board: found, rebooted, found again, and used to send messages."""
+"""Connection to a PX4 board: detection, reboot and exchange of messages."""
 
 from __future__ import annotations
 
@@ -23,53 +23,53 @@ from firmware_sim.mavlink.codec import Encoder, Layout, Values, WireMessage, dia
 HIL_SETUP = "set SYS_HITL = 1 with the airframe HIL Quadcopter X (SYS_AUTOSTART 1001) and reboot it"
 
 JUMP_US = US_PER_S
-"""Its clock going back by this is a restart [µs]."""
+"""Backward jump of the board's clock that indicates a restart [µs]."""
 
 SURE_BEATS = 3
-"""After so many heartbeats without the HIL flag, the board is not just starting up."""
+"""Number of heartbeats after which a missing HIL flag is not due to start-up."""
 
 _ALL_MOTORS = (1 << hil.MOTORS) - 1
 
 
 class Board:
-    """What was received from a board since its line was opened. No message raises."""
+    """State received from a board since its line was opened. No message raises."""
 
     def __init__(self, clock: Clock) -> None:
-        """Start without any message; `clock` is the wall clock."""
+        """Create the state without messages; `clock` is the wall clock."""
         self._clock = clock
         self.system: int | None = None
-        """MAVLink system id; None before its first heartbeat."""
+        """MAVLink system id; None before the first heartbeat."""
         self.autopilot = 0
-        """MAV_AUTOPILOT of its heartbeats."""
+        """MAV_AUTOPILOT of the heartbeats."""
         self.beats = 0
         self.hil = False
-        """Whether its newest heartbeat has the HIL flag."""
+        """True if the newest heartbeat has the HIL flag."""
         self.armed = False
-        """Whether its newest heartbeat says that it is armed."""
+        """True if the newest heartbeat reports armed."""
         self.controls: WireMessage | None = None
-        """The newest HIL_ACTUATOR_CONTROLS."""
+        """Newest HIL_ACTUATOR_CONTROLS."""
         self.controls_us = 0
-        """When that was received [wall µs]."""
+        """Time when the newest HIL_ACTUATOR_CONTROLS was received [wall µs]."""
         self.restarted = False
-        """Whether its clock went back."""
+        """True if the board's clock went back."""
         self.reboot_answer: int | None = None
-        """MAV_RESULT of its answer to a reboot command, whoever sent it."""
+        """MAV_RESULT of the reply to a reboot command of any sender."""
         self._boot_us = 0
 
     @property
     def ready(self) -> bool:
-        """Whether it is a PX4 in HIL mode, which waits for sensors."""
+        """True if the board is a PX4 in HIL mode, which waits for sensors."""
         return self.hil and self.autopilot == dialect.MAV_AUTOPILOT_PX4
 
     @property
     def rebooting(self) -> bool:
-        """Whether it has accepted a reboot command."""
+        """True if the board has accepted a reboot command."""
         return bool(self.reboot_answer == dialect.MAV_RESULT_ACCEPTED)
 
     def take(self, message: WireMessage) -> None:
-        """Take a message received from the line."""
+        """Handle a message received from the line."""
         if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
-            return  # of another component, forwarded by the board
+            return  # another component's message, forwarded by the board
         name = message.get_type()
         if name == "HEARTBEAT" and self.system in (None, message.get_srcSystem()):
             self.system = message.get_srcSystem()
@@ -94,15 +94,15 @@ class Board:
         self._boot_us = max(self._boot_us, boot_us)
 
     def setup_problem(self) -> str | None:
-        """Return what is wrong with its configuration, None while nothing is known to be."""
+        """Return the problem of the board's configuration; None = no known problem."""
         if self.beats and self.autopilot != dialect.MAV_AUTOPILOT_PX4:
             return f"it is not a PX4 (HEARTBEAT.autopilot {self.autopilot}, PX4's is 12)"
         if self.beats >= SURE_BEATS and not self.hil:
             return f"it is not in HIL mode (HEARTBEAT.base_mode without bit 32): {HIL_SETUP}"
         if self.controls is None:
             return None
-        # PX4 1.16's boards send 0, later ones a bit for each output that is a motor; a lockstep
-        # build, which is for SITL only, sends 1.
+        # Boards with PX4 1.16 send 0, later versions a bit for each motor output; a lockstep build,
+        # for SITL only, sends 1.
         flags = int(self.controls.flags)
         if flags == dialect.HIL_ACTUATOR_CONTROLS_FLAGS_LOCKSTEP:
             return (
@@ -119,7 +119,7 @@ class Board:
 
 
 def silence(board: Board, line: Router) -> str:
-    """Return why a connection was not completed: how far it got."""
+    """Return the reason for an incomplete connection, from the last stage reached."""
     if line.received_bytes == 0:
         return (
             "no byte was received: is it powered, is this its port, does it send MAVLink there "
@@ -138,25 +138,24 @@ def silence(board: Board, line: Router) -> str:
 
 
 REBOOT_S = 10.0
-"""Longest time from a reboot command until the board goes down [wall s]."""
+"""Timeout from a reboot command until the board goes down [wall s]."""
 
 SILENCE_S = 1.5
-"""A board that is silent for this long is down: its heartbeat is due every second [wall s]."""
+"""Silence after which a board is down [wall s]; its heartbeat is due every second."""
 
 SENSOR_BYTES, GPS_BYTES = 76, 51
-"""Longest frames of HIL_SENSOR and HIL_GPS."""
+"""Maximum frame lengths of HIL_SENSOR and HIL_GPS [bytes]."""
 
 GPS_HZ = 10
 
 HIL_BYTES_S = TICK_HZ * SENSOR_BYTES + GPS_HZ * GPS_BYTES
-"""What the simulator sends [bytes/s]."""
+"""Data rate of the simulator [bytes/s]."""
 
 HIL_SHARE = 2 / 3
-"""Largest share of a line's capacity that this may take. Companion and ground station need the
-rest."""
+"""Maximum share of a line's capacity for the simulator; the clients use the rest."""
 
 USB_CLIENTS_BYTES_S = 100_000
-"""What those may send over USB [bytes/s]: a tenth of its capacity at full speed."""
+"""Maximum data rate of the clients over USB [bytes/s]: a tenth of USB's full-speed capacity."""
 
 _POLL_S = 0.02
 _AGAIN_S = 0.2
@@ -165,18 +164,18 @@ _MAVLINK_VERSION = 3
 
 
 class BoardLink:
-    """A board that may vanish during a reboot. Nothing is sent before something was received."""
+    """Link to a board that may vanish during a reboot. Sends only after data were received."""
 
     def __init__(self, router: Router, device: str, baud: int) -> None:
         """Configure a serial line for a router with lasting clients; UsageError if too slow."""
         self.known = False
-        """Whether the board was looked for already: its device may be absent for a while."""
+        """True after the first search for the board; the device may then be absent for a while."""
         self.went_down = False
-        """Whether others have told it to reboot, and it was down when it was released."""
+        """True if another client rebooted the board and it was down when released."""
         self.device = device
         self.clock = WallClock()
         self.board = Board(self.clock)
-        """What was received from it. A new object each time that the device is opened."""
+        """State received from the board; a new object each time the device is opened."""
         self._router = router
         self._baud = baud
         self._budget_bytes_s = check_line(device, baud)
@@ -186,20 +185,20 @@ class BoardLink:
 
     @property
     def lost(self) -> str | None:
-        """Why there is no connection; None while there is one."""
+        """Reason for a missing connection; None while connected."""
         return self._router.lost or (None if self._line else f"{self.device}: not connected")
 
     # --- connecting
 
     def connect(self, timeout_s: float, alive: Callable[[], None], *, returning: bool) -> None:
-        """Return once a board in HIL mode has sent a heartbeat, at most after `timeout_s` [wall s].
+        """Wait for a heartbeat of a board in HIL mode, at most `timeout_s` [wall s].
 
-        `alive` is called at intervals and raises to give up. If `returning`, the device was there
+        `alive` is called at intervals and raises to abort. If `returning`, the device was present
         before and may be absent at first.
 
         Raises:
             UsageError: The device cannot be opened.
-            FirmwareMissingError: No such board was found.
+            FirmwareMissingError: No board in HIL mode was found.
             FirmwareLostError: The device did not come back.
         """
         self.close()
@@ -214,7 +213,7 @@ class BoardLink:
             if problem is not None:
                 raise FirmwareMissingError(f"--serial {self.device}: the board: {problem}")
             if self._router.lost is not None:
-                # Its boot loader is a USB device of its own, gone when the firmware starts.
+                # The boot loader is a separate USB device, which vanishes when the firmware starts.
                 self.close()
                 returning = True
             elif self.clock.time_us() > deadline_us and not self.board.ready:
@@ -224,7 +223,7 @@ class BoardLink:
                 )
 
     def _open(self, deadline_us: int) -> None:
-        """Open the device, or wait a moment if it is absent before the deadline [wall µs]."""
+        """Open the device, or wait briefly if it is absent before the deadline [wall µs]."""
         try:
             self._line = SerialPort(self.device, self._baud)
         except UsageError as error:
@@ -253,14 +252,14 @@ class BoardLink:
             if not board.rebooting and now_us >= due_us and now_us - heard_us < _AGAIN_S * US_PER_S:
                 due_us = now_us + US_PER_S
                 if board.armed:
-                    self.disarm()  # it would refuse otherwise
+                    self.disarm()  # an armed board rejects the reboot
                 self._command(dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1.0)
             if now_us > deadline_us:
                 raise FirmwareLostError(
                     f"{self.device}: the board does not reboot (it answered "
                     f"{_result(board.reboot_answer)}): power-cycle it"
                 )
-            self._listen(beat=not board.rebooting)  # nothing to a boot loader
+            self._listen(beat=not board.rebooting)  # send nothing to a boot loader
         self.close()
 
     def _listen(self, *, beat: bool = True) -> None:
@@ -271,15 +270,15 @@ class BoardLink:
     # --- sending
 
     def send(self, layout: Layout, values: Values) -> bool:
-        """Send a message of the simulator; False when the line did not accept it."""
+        """Send a simulator message; return False if the line did not accept it."""
         return self._router.send_ahead(self._encoder.frame(layout, layout.payload(values)))
 
     def pump(self) -> None:
-        """Take the messages received, and pass on those for clients."""
+        """Handle received messages, and forward the clients' messages."""
         self._router.pump()
 
     def beat(self) -> None:
-        """Send a heartbeat when it is due, so that the board keeps the line in use."""
+        """Send a heartbeat when due, so that the board keeps using the line."""
         now_us = self.clock.time_us()
         if now_us >= self._beat_due_us and self.board.beats:
             self._beat_due_us = now_us + _BEAT_US
@@ -292,7 +291,7 @@ class BoardLink:
             )
 
     def disarm(self) -> None:
-        """Disarm a board in HIL mode, whatever its state."""
+        """Disarm a board in HIL mode, in any state."""
         if self.board.ready:
             self._command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, FORCE)
 
@@ -306,7 +305,7 @@ class BoardLink:
         self._router.send_ahead(self._encoder.pack(message))
 
     def close(self) -> None:
-        """Close the device; harmless when called again."""
+        """Close the device. Idempotent."""
         self._router.on_message = None
         self._router.detach()
         line, self._line = self._line, None
@@ -323,7 +322,7 @@ def _result(answer: int | None) -> str:
 
 
 def check_line(device: str, baud: int) -> int:
-    """Return the clients' share of a line [bytes/s]; UsageError if it cannot carry the sensors."""
+    """Return the clients' share of a line [bytes/s]; UsageError if too slow for the sensors."""
     check_baud(baud)
     carries = carries_bytes_s(device, baud)
     if carries is None:

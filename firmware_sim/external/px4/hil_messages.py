@@ -1,8 +1,8 @@
-"""The plant's samples as MAVLink's HIL messages, and HIL_ACTUATOR_CONTROLS as motor commands.
+"""Conversion of sensor samples to MAVLink HIL messages, and of HIL_ACTUATOR_CONTROLS to commands.
 
-What PX4 reads on its simulator interface (SITL), and on the normal link of a board in HITL.
-Units are those of common.xml and of PX4's reader where it says otherwise. `BatterySample` has no
-message here: PX4 simulates a battery of its own.
+PX4 reads these messages on the simulator interface (SITL), and on the normal link of a board in
+HITL. Units follow common.xml, or PX4's reader where it differs. `BatterySample` has no message
+here: PX4 simulates the battery.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FLOW = layout("HIL_OPTICAL_FLOW")
 
 
 class Answer(NamedTuple):
-    """HIL_ACTUATOR_CONTROLS, in the order in which it is sent. The names are MAVLink's."""
+    """Fields of HIL_ACTUATOR_CONTROLS in wire order, with MAVLink's names."""
 
     time_usec: int
     flags: int
@@ -35,7 +35,7 @@ class Answer(NamedTuple):
 
 
 Controls: TypeAlias = "Answer | WireMessage"
-"""HIL_ACTUATOR_CONTROLS, however it was read."""
+"""HIL_ACTUATOR_CONTROLS from either decoder."""
 
 _ANSWERS = Reader("HIL_ACTUATOR_CONTROLS")
 
@@ -46,19 +46,19 @@ def _updated(*fields: str) -> int:
 
 IMU_FIELDS = _updated("XACC", "YACC", "ZACC", "XGYRO", "YGYRO", "ZGYRO")
 MAG_FIELDS = _updated("XMAG", "YMAG", "ZMAG")
-# The temperature goes with them: PX4 reads it as the barometer's, and only together with it.
+# PX4 reads the temperature as the barometer's, and only together with the pressure.
 BARO_FIELDS = _updated("ABS_PRESSURE", "PRESSURE_ALT", "TEMPERATURE")
 
 MOTORS = 4
 STILL = (0.0, 0.0, 0.0, 0.0)
 
 TOLERANCE = 1e-3
-"""Motor commands may exceed 0..1 by this much, due to rounding."""
+"""Tolerance of motor commands beyond 0..1, for rounding."""
 
 COURSE_UNKNOWN = 65_535
 
 _ID = 0
-"""Of the only instance of each sensor; PX4 takes the first IMU's time for its clock."""
+"""Id of the single instance of each sensor; PX4 sets its clock from the first IMU."""
 
 _YAW_UNAVAILABLE = 0
 _NO_AIRSPEED = 0.0
@@ -67,7 +67,7 @@ _POSE_FRAMES = {"ned": dialect.MAV_FRAME_LOCAL_NED, "frd": dialect.MAV_FRAME_LOC
 _VELOCITY_FRAMES = {**_POSE_FRAMES, "body": dialect.MAV_FRAME_BODY_FRD}
 
 _COURSE_MIN_M_S = 0.1
-"""Slower than this a GPS knows no course."""
+"""Minimum ground speed for a valid GPS course [m/s]."""
 
 _DEGREES = 1e7
 _MM = 1e3
@@ -75,7 +75,7 @@ _CM = 1e2
 
 ACCEL_LIMIT_M_S2 = 32_767 / 2048 * GRAVITY_M_S2
 GYRO_LIMIT_RAD_S = 32_767 / 32_768 * 2000.0 * DEG
-"""Range of the inertial sensors that PX4's drivers simulate: 16 g, 2000 deg/s in 16 bits. What lies
+"""Range of the inertial sensors simulated by PX4's drivers: 16 g, 2000 deg/s in 16 bits. Values
 beyond would wrap around: a hard landing (0.7 m/s stopped within a tick) would look like a fall."""
 
 _UINT8 = (0, 255)
@@ -85,7 +85,7 @@ _INT32 = (-(2**31), 2**31 - 1)
 
 
 class ControlsError(ValueError):
-    """HIL_ACTUATOR_CONTROLS that are invalid for a quadrotor."""
+    """Values of HIL_ACTUATOR_CONTROLS are invalid for a quadrotor."""
 
 
 def sensor(sample: interfaces.SensorSample, time_us: int) -> Values:
@@ -132,7 +132,7 @@ def gps(fix: interfaces.GpsFix, time_us: int) -> Values:
 
 
 def odometry(seen: interfaces.Odometry, time_us: int) -> Values:
-    """Return ODOMETRY at the firmware's time [µs]. What is not measured is NaN."""
+    """Return ODOMETRY at the firmware's time [µs]; NaN = not measured."""
     return (
         time_us,
         _POSE_FRAMES[seen.pose_frame],
@@ -150,7 +150,7 @@ def odometry(seen: interfaces.Odometry, time_us: int) -> Values:
 
 
 def distance(told: interfaces.DistanceReading, time_us: int) -> Values:
-    """Return DISTANCE_SENSOR at the firmware's time [µs]: whole centimetres, as the message has."""
+    """Return DISTANCE_SENSOR at the firmware's time [µs], in whole centimetres."""
     quality = 0 if told.quality < 0 else 1 + round(told.quality * 0.99)
     return (
         time_us // 1_000 & 0xFFFF_FFFF,
@@ -168,7 +168,7 @@ def distance(told: interfaces.DistanceReading, time_us: int) -> Values:
 
 
 def flow(told: interfaces.FlowReading, time_us: int) -> Values:
-    """Return HIL_OPTICAL_FLOW at the firmware's time [µs]. It tells no distance."""
+    """Return HIL_OPTICAL_FLOW at the firmware's time [µs], without a distance."""
     temperature, since_us, distance_m = 0, 0, -1.0
     return (
         time_us,
@@ -184,12 +184,12 @@ def flow(told: interfaces.FlowReading, time_us: int) -> Values:
 
 
 def armed(message: Controls) -> bool:
-    """Return whether HIL_ACTUATOR_CONTROLS says armed."""
+    """Return True if HIL_ACTUATOR_CONTROLS reports armed."""
     return bool(message.mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
 
 
 def answer(chunk: bytes) -> Answer | None:
-    """Return the HIL_ACTUATOR_CONTROLS that a chunk of bytes is; None where it is anything else."""
+    """Return a chunk of bytes as HIL_ACTUATOR_CONTROLS; None for any other content."""
     values = _ANSWERS.read(chunk)
     if values is None:
         return None
@@ -198,7 +198,7 @@ def answer(chunk: bytes) -> Answer | None:
 
 
 def lockstep(message: Controls) -> bool:
-    """Return whether HIL_ACTUATOR_CONTROLS comes from a build that waits for the simulator."""
+    """Return True if HIL_ACTUATOR_CONTROLS comes from a lockstep build of PX4."""
     return bool(message.flags & dialect.HIL_ACTUATOR_CONTROLS_FLAGS_LOCKSTEP)
 
 
@@ -213,7 +213,7 @@ def controls(message: Controls, time_us: int) -> interfaces.ActuatorControls:
     if 0.0 <= a <= 1.0 and 0.0 <= b <= 1.0 and 0.0 <= c <= 1.0 and 0.0 <= d <= 1.0:
         return interfaces.ActuatorControls(time_us, (a, b, c, d), armed=True)
     for i, value in enumerate((a, b, c, d)):
-        # Written so that NaN fails.
+        # The comparison is written so that NaN fails.
         if not -TOLERANCE <= value <= 1.0 + TOLERANCE:
             raise ControlsError(
                 f"HIL_ACTUATOR_CONTROLS controls[{i}] = {value:g}, a motor takes 0..1: is its "

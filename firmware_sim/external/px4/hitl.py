@@ -1,7 +1,7 @@
 """Hardware in the loop: a PX4 board that flies on simulated sensors over a serial or USB line.
 
-There is no lockstep. The board runs on its own clock. Every tick's sensors are sent to it, and its
-newest motor commands are applied, late by a transfer and a cycle of the board.
+There is no lockstep: the board runs on its own clock. Every tick sends sensors to the board and
+applies its newest motor commands, delayed by a transfer and a cycle of the board.
 
 Source: PX4, src/modules/mavlink: mavlink_receiver.cpp (HIL_SENSOR, HIL_GPS),
 streams/HIL_ACTUATOR_CONTROLS.hpp; Commander.cpp (reboot).
@@ -21,22 +21,23 @@ from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingErr
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 
 SILENCE_US = US_PER_S
-"""Longest time without motor commands, once there were some [wall µs]."""
+"""Maximum time without motor commands after the first command [wall µs]."""
 
 FIRST_CONTROLS_US = 10 * US_PER_S
-"""Longest time with sensors but without motor commands [wall µs]."""
+"""Maximum time from the first sample to the first motor command [wall µs]."""
 
 EPOCH_US = US_PER_S
-"""Time in the first sample [µs]. The board takes its own clock's instead."""
+"""Time in the first sample [µs]; the board uses its own clock instead."""
 
 _CREEP_US = 20
 _BEHIND_US = 20_000
 
 
 class Pace:
-    """Limits ticks to 250 per second of wall time. The board's clock is not simulated.
+    """Limiter to 250 ticks per second of wall time, as the board's clock is not simulated.
 
-    Where ticks are paced already, it adapts to the pace of the punctual ones and does not wait.
+    If another clock already paces the ticks, the limiter adapts to its punctual ticks and does not
+    wait.
     """
 
     def __init__(self, clock: WallClock) -> None:
@@ -45,13 +46,13 @@ class Pace:
         """Wall time of simulated time 0 [µs]."""
 
     def wait(self, time_us: int) -> None:
-        """Wait for the tick of simulated `time_us`."""
+        """Wait for the tick of simulated `time_us` [µs]."""
         now_us = self._clock.time_us()
         if self._origin_us is None:
             self._origin_us = now_us - time_us
         ahead_us = self._origin_us + time_us - now_us
         if ahead_us > 0:
-            # Another pace may be ahead of ours permanently: follow it slowly.
+            # Another pace may be permanently ahead: follow it slowly.
             self._origin_us -= min(ahead_us, _CREEP_US)
             self._clock.sleep_until(self._origin_us + time_us)
         elif ahead_us < -_BEHIND_US:
@@ -59,31 +60,31 @@ class Pace:
 
 
 class HitlBridge:
-    """Flies one board for one episode. Implements `Bridge`.
+    """Bridge to one board for one episode. Implements `Bridge`.
 
     A lost device, missing or invalid motor commands, a restart or leaving HIL mode end the flight
-    (`FirmwareLostError`). Sensors are sent once HIL mode is reported, HIL_STATE_QUATERNION never. A
-    board takes it for its own estimate.
+    (`FirmwareLostError`). Sensors are sent once HIL mode is reported. HIL_STATE_QUATERNION is never
+    sent: a board would use it as its estimate.
     """
 
     rate_hz = TICK_HZ
 
     def __init__(self, link: BoardLink) -> None:
-        """Take the link to the board, which goes from episode to episode. It is not opened yet."""
+        """Set the link to the board, shared by all episodes and not yet opened."""
         self.armed = False
         self.time_us = 0
         self._link = link
         self._pace = Pace(link.clock)
         self._epoch_us: int | None = None
-        """Simulated time that is 0 to the board [µs]."""
+        """Simulated time at the board's time 0 [µs]."""
         self._began_us = 0
-        """When the first sample was sent [wall µs]."""
+        """Time of the first sample [wall µs]."""
         self._stuck_us: int | None = None
-        """Since when the line has not accepted samples [wall µs]; None: it does."""
+        """Time since which the line has accepted no samples [wall µs]; None = not blocked."""
         self._stepped_us = 0
-        """When the newest step was [wall µs]."""
+        """Time of the newest step [wall µs]."""
         self._resumed_us = 0
-        """When this process resumed after a standstill of its own [wall µs]."""
+        """Time when this process resumed after a pause [wall µs]."""
 
     def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
         """Find the board in HIL mode, reboot it, and find it again; see `Bridge`."""
@@ -92,12 +93,12 @@ class HitlBridge:
         rebooted, link.went_down = link.went_down, False
         link.connect(timeout_s, alive, returning=returning)
         if not rebooted:
-            # Its estimator may hold a flight.
+            # The estimator may still contain an earlier flight.
             link.go_down(alive)
             link.connect(timeout_s, alive, returning=True)
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Send a tick's sensors and return the newest motor commands, at first stopped."""
+        """Send a tick's sensors and return the newest motor commands, initially stopped."""
         self._pace.wait(sample.time_us)
         link = self._link
         link.pump()
@@ -105,7 +106,7 @@ class HitlBridge:
         if self._epoch_us is None:
             self._epoch_us = sample.time_us - EPOCH_US
             self._began_us = now_us
-            link.board.controls = None  # of before
+            link.board.controls = None  # from before the episode
         if now_us - self._stepped_us > SILENCE_US // 2:
             self._resumed_us = now_us  # a board without sensors sends no commands
         self._stepped_us = now_us
@@ -124,13 +125,13 @@ class HitlBridge:
         return controls
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
-        """Ignore the true state: a board would take it for its estimate."""
+        """Ignore the true state: a board would use it as its estimate."""
 
     def close(self) -> None:
-        """Disarm the board and close the device; harmless when called again."""
+        """Disarm the board and close the device. Idempotent."""
         link = self._link
         if link.board.rebooting:
-            # Whoever finds it next must not take it for a board that has come up.
+            # The next connection must not mistake this board for a rebooted board.
             with suppress(FirmwareLostError):
                 link.go_down(no_process)
                 link.went_down = True

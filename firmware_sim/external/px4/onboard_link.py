@@ -1,8 +1,8 @@
-"""PX4's onboard link in the hands of who conducts the companion: frames in, frames out, an echo.
+"""PX4's onboard link for a companion in lockstep: frames in, frames out, an echo.
 
-PX4 takes in the messages of a link one after the other, in a thread that runs by the wall clock
-while all others sleep on simulated time. That thread answers a PING itself, so the answer proves
-that everything sent before has been taken in, and stamped with the time at which it was sent.
+PX4 reads the messages of a link in order, in a thread that runs by the wall clock while all other
+threads sleep on simulated time. This thread answers a PING, so the reply proves that all earlier
+messages have been received and stamped with the time at which they were sent.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from firmware_sim.mavlink.codec import Encoder, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 
 ECHO_S = 60.0
-"""Longest wait for an echo [wall s, while this process runs]."""
+"""Timeout of an echo [wall s, while this process runs]."""
 
 PING_AGAIN_S = 0.1
-"""A PING is repeated after so long without an answer [wall s]."""
+"""Interval of repeated PINGs without a reply [wall s]."""
 
 COMPONENT_ID = dialect.MAV_COMP_ID_USER2
-"""MAVLink component id of the echo's sender, which PX4's answer is addressed to."""
+"""MAVLink component id of the sender of PINGs, to which PX4 addresses the reply."""
 
 _MARKER, _ID, _PAYLOAD = 0xFD, slice(7, 10), 10
 _PING: bytes = dialect.MAVLINK_MSG_ID_PING.to_bytes(3, "little")
@@ -36,10 +36,10 @@ _US = bytes([SYSTEM_ID, COMPONENT_ID])
 
 
 class OnboardLink:
-    """One end of the link, the one that MAVSDK's port is in a rehearsal of two processes."""
+    """Companion's end of the link: MAVSDK's port in a rehearsal with two processes."""
 
     def __init__(self, instance: int, alive: Callable[[], None]) -> None:
-        """Bind the port of an instance; `alive` is polled in waits and raises when PX4 is gone."""
+        """Bind the port of an instance; `alive` is polled in waits and raises if PX4 is lost."""
         self._endpoint = UdpEndpoint(
             (LOOPBACK, API_PORT + instance),
             (LOOPBACK, API_LOCAL_PORT + instance),
@@ -52,11 +52,11 @@ class OnboardLink:
         self._heard: deque[bytes] = deque()
 
     def send(self, frame: bytes) -> None:
-        """Send a frame: MAVLink 2, so PX4 speaks that version from then on."""
+        """Send a MAVLink 2 frame; PX4 replies in this version from then on."""
         self._endpoint.send(frame)
 
     def take(self) -> list[bytes]:
-        """Return the datagrams that have come, oldest first: whole MAVLink frames."""
+        """Return the received datagrams, oldest first: complete MAVLink frames."""
         self._receive(None)
         heard = list(self._heard)
         self._heard.clear()
@@ -67,10 +67,10 @@ class OnboardLink:
         self._endpoint.close()
 
     def await_echo(self) -> None:
-        """Return when PX4 has processed everything sent, or raise FirmwareLostError.
+        """Wait until PX4 has processed all sent frames, or raise FirmwareLostError.
 
-        Not while a command is pending: setting a message's rate, for one, blocks PX4's receiver for
-        some milliseconds of simulated time.
+        Do not call while a command is pending: setting a message's rate, for example, blocks PX4's
+        receiver for some milliseconds of simulated time.
         """
         number = self._echoes = (self._echoes + 1) & 0xFFFF_FFFF
         ping = self._encoder.pack(dialect.MAVLink_ping_message(0, number, 0, 0))
@@ -93,11 +93,11 @@ class OnboardLink:
         )
 
     def _receive(self, wanted: bytes | None) -> bool:
-        """Take what has come; return whether the echo of that sequence number was among it."""
+        """Read all datagrams; return True if they contain the echo of the sequence number."""
         found = False
         for data in self._endpoint.receive():
             if len(data) <= _PAYLOAD or data[0] != _MARKER:
-                continue  # Version 1 is what PX4 speaks before it has heard anybody.
+                continue  # PX4 sends MAVLink 1 until it has received a frame.
             if data[_ID] == _PING and data[_TARGET] == _US:
                 found = found or data[_SEQUENCE] == wanted
                 continue

@@ -14,30 +14,30 @@ from firmware_sim.flight_controller import FirmwareMissingError
 SIMULATOR_PORT = 4560
 API_PORT, API_LOCAL_PORT = 14540, 14580
 PAYLOAD_PORT, PAYLOAD_LOCAL_PORT = 14030, 14280
-"""Ports of PX4's instance 0. Each further one has the next (px4-rc.simulator, px4-rc.mavlink).
+"""Ports of PX4's instance 0; other instances add their number (px4-rc.simulator, px4-rc.mavlink).
 Instances above 9 share one API port."""
 
 LOCAL_PORTS = (API_LOCAL_PORT, 18_570, PAYLOAD_LOCAL_PORT, 13_030)
-"""UDP ports that instance 0 binds itself: onboard API, ground station, payload, gimbal."""
+"""UDP ports bound by instance 0: onboard API, ground station, payload, gimbal."""
 
 MODEL = "none_iris"
-"""PX4_SIM_MODEL without which PX4's scripts would start a simulator of their own."""
+"""PX4_SIM_MODEL that keeps PX4's scripts from starting another simulator."""
 
 SCRIPT = "etc/init.d-posix/rcS"
 
 UNAWAITED_THREADS = (b"commander", b"navigator", b"mavlink_if1", b"mavlink_if2")
-"""Threads that PX4 does not wait for before it answers a sample, and that a flight depends on.
-Modules with a thread of their own, and the links of companion and observer (px4-rc.mavlink starts
-0 for the ground station, 1 onboard, 2 for a payload, 3 for a gimbal). Its controllers and estimator
-run in work queues, which it waits for."""
+"""Threads that affect a flight but that PX4 does not await before it answers a sample: modules with
+a separate thread, and the links of companion and observer (px4-rc.mavlink starts 0 for the ground
+station, 1 onboard, 2 for a payload, 3 for a gimbal). PX4 awaits the work queues, which run its
+controllers and estimator."""
 
 LAYOUTS = (".", "build/px4_sitl_default", "usr", "opt/px4")
-"""Where below a folder bin/px4 and etc/ are looked for: a build, a source tree, a package."""
+"""Subfolders searched for bin/px4 and etc/: a build, a source tree, a package."""
 
 
 @dataclass(frozen=True)
 class Px4Program:
-    """An executable PX4."""
+    """Executable of PX4 and its etc/ folder."""
 
     binary: Path
     etc: Path
@@ -66,7 +66,7 @@ def find_px4(folder: Path) -> Px4Program:
 
 
 def environment(airframe: int) -> dict[str, str]:
-    """Return the environment variables that PX4's start-up script reads."""
+    """Return the environment variables for PX4's start-up script."""
     return {"PX4_SIM_MODEL": MODEL, "PX4_SYS_AUTOSTART": str(airframe)}
 
 
@@ -78,9 +78,9 @@ def how_to_start(instance: int, airframe: int) -> str:
 
 
 def check_free(instance: int) -> None:
-    """Raise UsageError when a port is taken that PX4, or its bridge, is about to bind."""
+    """Raise UsageError if a port required by PX4 or its bridge is taken."""
     simulator = (socket.SOCK_STREAM, LOOPBACK, SIMULATOR_PORT + instance)
-    # PX4 binds its own ports on all interfaces.
+    # PX4 binds its ports on all interfaces.
     links = ((socket.SOCK_DGRAM, "", port + instance) for port in LOCAL_PORTS)
     for kind, host, port in (simulator, *links):
         with socket.socket(socket.AF_INET, kind) as trial:

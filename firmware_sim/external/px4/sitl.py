@@ -1,6 +1,6 @@
-"""PX4's simulator interface (SITL): lockstep over TCP, PX4 being the client.
+"""PX4's simulator interface (SITL): lockstep over TCP, with PX4 as the client.
 
-Source: PX4, src/modules/simulation/simulator_mavlink; the order of messages as measured.
+Source: PX4, src/modules/simulation/simulator_mavlink; the message order was measured.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from firmware_sim.mavlink.codec import Decoder, Encoder, Layout, Values, WireMes
 from firmware_sim.mavlink.streams.pose import hil_state_quaternion
 
 WATCH_S = 0.1
-"""Longest wait without checking that the other program is alive [wall s]."""
+"""Maximum wait between checks that the other program is alive [wall s]."""
 
 CHUNK = 65_536
 
@@ -35,12 +35,12 @@ _READ, _WRITE = select.POLLIN, select.POLLOUT
 
 
 class TcpPort:
-    """Listens on the loopback address, accepts one connection, refuses every further one."""
+    """TCP server on the loopback address that accepts only one connection."""
 
     def __init__(self, port: int) -> None:
-        """Listen on a TCP port, 0 = any free one. Raises UsageError if it cannot be used."""
+        """Listen on a TCP port, 0 = any free port. Raises UsageError if the port is unusable."""
         self.refused = 0
-        """Further connections that were refused."""
+        """Number of additional connections refused."""
         self._clock = WallClock()
         self._connection: socket.socket | None = None
         self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -57,7 +57,7 @@ class TcpPort:
         self._poll.register(self._listener, _READ)
 
     def accept(self, timeout_s: float, alive: Callable[[], None]) -> bool:
-        """Wait for the connection [wall s]; return whether it was made; `alive` may raise."""
+        """Wait for the connection [wall s]; return True if connected; `alive` may raise."""
         deadline_us = self._deadline_us(timeout_s)
         while self._connection is None:
             alive()
@@ -73,16 +73,16 @@ class TcpPort:
 
     @property
     def peer(self) -> tuple[str, int]:
-        """Address of the other end."""
+        """Address of the client: host and port."""
         host, port = self._connected().getpeername()
         return host, port
 
     def send(self, data: bytes, timeout_s: float, alive: Callable[[], None]) -> bool:
-        """Send all of it; False when the connection has ended or does not accept it in time."""
+        """Send all data; return False if the connection ended or did not accept it in time."""
         connection, left = self._connected(), data
         sent = _send(connection, left)
         if sent == len(left):
-            return True  # As nearly always: there is nothing to look at the clock for.
+            return True  # the usual case, without reading the clock
         deadline_us = self._deadline_us(timeout_s)
         while sent is not None:
             left = left[sent:]
@@ -97,7 +97,7 @@ class TcpPort:
         return False
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """Return received data, b"" after a timeout [wall s] or early, None at the end."""
+        """Return received data, b"" after a timeout [wall s] or earlier, None at the end."""
         connection = self._connected()
         for number, _ in self._poll.poll(timeout_s * MS_PER_S):
             if number == connection.fileno():
@@ -114,7 +114,7 @@ class TcpPort:
         return b""
 
     def close(self) -> None:
-        """Close everything; harmless when called again."""
+        """Close all sockets. Idempotent."""
         if self._connection is not None:
             self._connection.close()
         self._listener.close()
@@ -125,7 +125,7 @@ class TcpPort:
         return self._connection
 
     def _newcomer(self) -> socket.socket | None:
-        """Return who asked to be connected; None when it is gone again."""
+        """Return the new connection; None if it was already closed."""
         try:
             return self._listener.accept()[0]
         except OSError:
@@ -139,7 +139,7 @@ class TcpPort:
 
 
 def _send(connection: socket.socket, data: bytes) -> int | None:
-    """Return how many bytes were taken, None when the connection has ended."""
+    """Return the number of bytes sent; None if the connection has ended."""
     try:
         return connection.send(data)
     except BlockingIOError:
@@ -158,36 +158,36 @@ def _listen_problem(port: int, error: OSError | OverflowError) -> str:
 
 
 ANSWER_S = 5.0
-"""Longest wait for an answer [wall s]."""
+"""Timeout of a reply [wall s]."""
 
 STOPPED_S = 1.0
-"""A PX4 that has not answered for so long is looked at: is it stopped? [wall s] Sooner than its
-clients miss its heartbeats."""
+"""Wait for a reply after which a stopped PX4 is detected [wall s]; shorter than the heartbeat
+timeout of its clients."""
 
 REST_S = 0.1
-"""Longest wait for one answer of a PX4 that is disarmed [wall s]. Then the next sample is sent. In
-Offboard on the ground, without a setpoint, it answers only now and then, by its own clock, which
-does not advance while it is waited for."""
+"""Maximum wait for one reply of a disarmed PX4 before the next sample is sent [wall s]. In Offboard
+on the ground without a setpoint, PX4 replies only occasionally, by its own clock, which does not
+advance during the wait."""
 
 AT_ONCE_S = 0.01
-"""An answer that comes sooner is nothing to look at the clock for [wall s]."""
+"""Maximum wait for a reply before the clock is read [wall s]."""
 
 START_S = 60.0
-"""Longest time from the first sample to the first answer [wall s]: PX4's start script runs."""
+"""Timeout from the first sample to the first reply [wall s], while PX4's start script runs."""
 
 EPOCH_US = US_PER_S
-"""PX4's time of the first sample [µs]: it reads 0 as never."""
+"""PX4's time of the first sample [µs]; PX4 reads 0 as never."""
 
 STATE_US = 200_000
-"""How often the true state is sent [µs], unless PX4 asks."""
+"""Default interval of the true state [µs], unless PX4 requests another."""
 
 NEVER_US = sys.maxsize
 
 MAX_GARBAGE = 16
-"""Most runs of garbage that are tolerated; TCP should deliver none."""
+"""Maximum number of tolerated garbage runs; TCP should deliver none."""
 
 MAX_GARBAGE_BYTES = 4096
-"""Longest run of it."""
+"""Maximum length of a garbage run [bytes]."""
 
 _BESIDE_THE_SAMPLE: tuple[tuple[str, Layout, Callable[[Any, int], Values]], ...] = (
     ("gps", hil.GPS, hil.gps),
@@ -195,19 +195,19 @@ _BESIDE_THE_SAMPLE: tuple[tuple[str, Layout, Callable[[Any, int], Values]], ...]
     ("distance", hil.DISTANCE, hil.distance),
     ("flow", hil.FLOW, hil.flow),
 )
-"""Messages of a sample's slower sensors, in the order in which they are sent."""
+"""Messages of a sample's slower sensors, in the order of sending."""
 
 _ANSWER = dialect.MAVLINK_MSG_ID_HIL_ACTUATOR_CONTROLS
 _COMMAND = dialect.MAVLINK_MSG_ID_COMMAND_LONG
 
 
 class Px4Bridge:
-    """Flies PX4 SITL: it gets HIL_SENSOR and answers each with one HIL_ACTUATOR_CONTROLS.
+    """Bridge to PX4 SITL, which answers each HIL_SENSOR with one HIL_ACTUATOR_CONTROLS.
 
-    Implements `Bridge`. PX4's clock is HIL_SENSOR's time. Before its first answer samples are sent
-    at their nominal rate and motors are stopped. Disarmed it may skip answers for a while. Silence,
-    a closed connection, clock jumps, garbage or invalid motor commands end the flight
-    (`FirmwareLostError`). Second answers are dropped, second connections refused.
+    Implements `Bridge`. PX4's clock is HIL_SENSOR's time. Before the first reply, samples are sent
+    at their nominal rate and motors are stopped. A disarmed PX4 may skip replies for a while.
+    Silence, a closed connection, clock jumps, garbage or invalid motor commands end the flight
+    (`FirmwareLostError`). Duplicate replies are dropped, additional connections refused.
     """
 
     rate_hz = TICK_HZ
@@ -220,10 +220,10 @@ class Px4Bridge:
         start_s: float = START_S,
         least_state_us: int = 1,
     ) -> None:
-        """Listen for PX4 on TCP port 4560 + instance, 0 = any free one, or raise UsageError.
+        """Listen for PX4 on TCP port 4560 + instance, 0 = any free port, or raise UsageError.
 
-        `answer_s` and `start_s` are the timeouts of an answer and of the first one [wall s],
-        `least_state_us` the minimum interval of the true state.
+        `answer_s` is the timeout of a reply, `start_s` of the first reply [wall s];
+        `least_state_us` is the minimum interval of the true state [µs].
         """
         self._least_state_us = least_state_us
         self.armed = False
@@ -246,15 +246,15 @@ class Px4Bridge:
         self._sent_us = 0
         """PX4's time of the newest sample [µs]."""
         self._pace_us = 0
-        """Wall time before which no sample is sent, until the first answer [µs]."""
+        """Wall time of the next sample, until the first reply [µs]."""
         self._answer: hil.Controls | None = None
-        """The newest one."""
+        """Newest reply."""
         self._waiting: Patience | None = None
-        """Since when an answer is due; None: no answer is due."""
+        """Timer since a reply is due; None = no reply is due."""
         self._program: RunningProgram | None = None
-        """PX4's process, where it can be found."""
+        """PX4's process; None = not found."""
         self._garbage_bytes = 0
-        """Bytes since the last message."""
+        """Number of bytes since the last message."""
 
     def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
         """Wait until PX4 has connected; see `Bridge`."""
@@ -269,16 +269,16 @@ class Px4Bridge:
             self._program = RunningProgram(pid, UNAWAITED_THREADS)
 
     def settle(self) -> None:
-        """Return once PX4 has done all that is due by its clock, as far as that can be seen.
+        """Wait until PX4 has done all work due by its clock, as far as observable.
 
-        Controllers and estimator are done when it answers a sample. Other threads may lag on a busy
-        host.
+        Controllers and estimator have finished when PX4 answers a sample. Other threads may lag on
+        a busy host.
         """
         if self._program is not None and self._answer is not None:
             self._program.settle()
 
     def alive(self) -> None:
-        """Raise FirmwareLostError when PX4 has ended, or was stopped."""
+        """Raise FirmwareLostError if PX4 has ended or was stopped."""
         self._alive()
         if self._program is not None and self._program.stopped:
             raise self._lost(
@@ -286,11 +286,11 @@ class Px4Bridge:
             )
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
-        """Accept a source of the true state."""
+        """Set the source of the true state."""
         self._truth = truth
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Advance PX4 to the sample's time; see `Bridge`. Motors are stopped until it answers."""
+        """Advance PX4 to the sample's time; see `Bridge`. Motors are stopped until it replies."""
         if self._first_us is None:
             self._first_us = sample.time_us
             self._began_us = self._clock.time_us()
@@ -316,7 +316,7 @@ class Px4Bridge:
     # --- sending
 
     def _pace(self) -> None:
-        """Wait for the next sample's wall time or PX4's first answer, to keep queues short."""
+        """Wait for the next sample's wall time or PX4's first reply, to keep queues short."""
         clock = self._clock
         while (wait_us := self._pace_us - clock.time_us()) > 0 and self._answer is None:
             self._receive(min(wait_us / US_PER_S, WATCH_S))
@@ -330,14 +330,14 @@ class Px4Bridge:
 
     def _send(self, sample: SensorSample, now_us: int) -> None:
         encoder = self._encoder
-        # What comes with a sample goes before it: the sample moves PX4's clock, and is answered.
+        # HIL_SENSOR goes last: it advances PX4's clock and triggers the reply.
         data = b""
         for name, kind, fields in _BESIDE_THE_SAMPLE:
             measured = getattr(sample, name)
             if measured is not None:
                 data += encoder.frame(kind, kind.payload(fields(measured, now_us)))
         if now_us >= self._state_due_us and self._truth is not None:
-            # Keeps its phase, skips what it missed.
+            # Keep the phase and skip missed messages.
             late_us = now_us - self._state_due_us
             self._state_due_us = now_us + self._state_us - late_us % self._state_us
             state = hil_state_quaternion(self._truth(), now_us)
@@ -352,7 +352,7 @@ class Px4Bridge:
     # --- receiving
 
     def _answered(self) -> hil.Controls:
-        """Wait for the answer to the newest sample, and return the newest there is."""
+        """Wait for the reply to the newest sample, and return the newest reply."""
         if self._waiting is None and self._due is None:
             self._receive(AT_ONCE_S)
         if (answer := self._due) is not None:
@@ -379,11 +379,11 @@ class Px4Bridge:
 
     @property
     def _due(self) -> hil.Controls | None:
-        """The answer to the newest sample; None: it has not come."""
+        """Reply to the newest sample; None = not received yet."""
         return self._answer if self.time_us == self._sent_us else None
 
     def _receive(self, timeout_s: float) -> bool:
-        """Take what arrives in time; return whether anything did."""
+        """Handle data that arrive in time; return True if any did."""
         data = self._tcp.receive(timeout_s)
         if data is None:
             self._alive()
@@ -429,7 +429,7 @@ class Px4Bridge:
         self.armed = hil.armed(message)
 
     def _command(self, message: WireMessage) -> None:
-        """Carry out SET_MESSAGE_INTERVAL for the true state: PX4 asks for it, awaits no answer."""
+        """Apply SET_MESSAGE_INTERVAL for the true state; PX4 expects no acknowledgement."""
         if (
             message.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL
             or message.param1 != dialect.MAVLINK_MSG_ID_HIL_STATE_QUATERNION

@@ -1,1 +1,1 @@
-"""The lines to external firmware: TCP, serial, and the router between a board and UDP."""
+"""Transports to external firmware: serial port, and the router between a board and UDP."""

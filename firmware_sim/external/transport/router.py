@@ -29,17 +29,17 @@ SIMULATOR_IDS = frozenset(
         "HIL_STATE_QUATERNION",
     )
 )
-"""Messages that are forwarded in neither direction: only we simulate for the board."""
+"""Messages forwarded in neither direction: only this simulator may send them to the board."""
 
 BURST_BYTES = 8192
-"""Bytes that may be sent to the board at once before the budget applies."""
+"""Maximum burst to the board before the budget applies [bytes]."""
 
 HEARD_FRAMES = 4096
-"""Frames kept for a listener in this process: ten seconds of a PX4's telemetry."""
+"""Frames buffered for a listener in this process: ten seconds of PX4 telemetry."""
 
 
 class Frame(NamedTuple):
-    """One frame as received."""
+    """Received frame."""
 
     raw: bytes
     number: int
@@ -47,12 +47,12 @@ class Frame(NamedTuple):
 
     @property
     def known(self) -> bool:
-        """Whether the dialect has the message, so that its checksum was checked."""
+        """True if the dialect has the message, so that its checksum was checked."""
         return self.number in dialect.mavlink_map
 
 
 class FrameDecoder(Decoder):
-    """A decoder that keeps each frame's bytes, also of messages that the dialect lacks."""
+    """Decoder that keeps the bytes of each frame, also of messages unknown to the dialect."""
 
     def __init__(self, *, datagrams: bool) -> None:
         super().__init__(datagrams=datagrams)
@@ -72,7 +72,7 @@ class FrameDecoder(Decoder):
 
 
 class Budget:
-    """A token bucket: a rate in bytes per second, and a burst."""
+    """Token bucket: a rate in bytes per second, and a burst."""
 
     def __init__(self, bytes_s: int, clock: Clock) -> None:
         """Start with a full burst; `bytes_s` is the long-term rate [bytes/s]."""
@@ -82,7 +82,7 @@ class Budget:
         self._then_us = clock.time_us()
 
     def take(self, count: int) -> bool:
-        """Return whether `count` bytes may be sent now; if so they are spent."""
+        """Return True and spend `count` bytes if they may be sent now."""
         now_us = self._clock.time_us()
         self._left += self._bytes_s * (now_us - self._then_us) / US_PER_S
         self._left, self._then_us = min(self._left, BURST_BYTES), now_us
@@ -93,23 +93,23 @@ class Budget:
 
 
 class Line(Protocol):
-    """The board's end; `serial_port.SerialPort` is one. All may raise SerialLostError."""
+    """Line to the board, such as `serial_port.SerialPort`. All may raise SerialLostError."""
 
     def read(self) -> bytes:
-        """Return what has arrived."""
+        """Return received data."""
 
     def write(self, data: bytes) -> bool:
-        """Send soon; False when dropped."""
+        """Queue data to be sent; return False if dropped."""
 
     def drain(self) -> None:
-        """Send what is queued."""
+        """Send queued data."""
 
     def fileno(self) -> int:
         """Return the descriptor to wait on."""
 
 
 class _Client:
-    """One client over UDP."""
+    """Client over UDP."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         self.endpoint = endpoint
@@ -118,26 +118,26 @@ class _Client:
 
 
 class Router:
-    """Forwards frames whenever `pump` is called. Nothing blocks or raises; see `lost`.
+    """Router that forwards frames whenever `pump` is called. Nothing blocks or raises; see `lost`.
 
     Clients stay when the line changes (a USB device vanishes during a reboot). Listeners in this
-    process use it as an `Endpoint`, pumped between ticks.
+    process use the router as an `Endpoint`, pumped between ticks.
     """
 
     datagrams = True
 
     def __init__(self, clients: Mapping[str, Endpoint], clock: Clock) -> None:
-        """Take the clients' ends by the names of their links. The router closes them."""
+        """Set the clients' endpoints by link name. The router closes them."""
         self.lost: str | None = None
-        """Why the line is gone; None while there is one, or none was there yet."""
+        """Reason for the loss of the line; None = line present, or never attached."""
         self.on_message: Callable[[WireMessage], None] | None = None
-        """Called with every message of the board that the dialect knows, if set."""
+        """Callback for every message of the board known to the dialect; None = no callback."""
         self.send_errors = 0
         self.received_bytes = 0
         """Bytes received on the line since it was attached."""
         self.speaks_mavlink = False
-        """Whether a frame with a valid checksum was received since the line was attached. Nothing
-        is sent before: a boot loader at the other end would take bytes for commands."""
+        """True once a frame with a valid checksum was received on the attached line. No data are
+        sent before: a boot loader at the other end would interpret bytes as commands."""
         self._clients = {name: _Client(endpoint) for name, endpoint in clients.items()}
         self._clock = clock
         self._line: Line | None = None
@@ -165,15 +165,15 @@ class Router:
         self.lost, self.received_bytes, self.speaks_mavlink = None, 0, False
 
     def detach(self) -> None:
-        """Release the line; to be called before it is closed."""
+        """Release the line. Call before the line is closed."""
         if self._line is not None:
             self._selector.unregister(self._line_fd)
             self._line = None
 
     def send_ahead(self, frame: bytes) -> bool:
-        """Send a simulator frame ahead of the clients' and outside their budget.
+        """Send a simulator frame ahead of the clients' frames and outside their budget.
 
-        Returns False when the line is full, lost (see `lost`), or has not shown to speak MAVLink.
+        Returns False if the line is full, lost (see `lost`), or not yet known to speak MAVLink.
         """
         if self._line is None or not self.speaks_mavlink:
             return False
@@ -186,7 +186,7 @@ class Router:
     # --- forwarding
 
     def pump(self, wait_s: float = 0.0) -> None:
-        """Forward everything that has arrived, or arrives within `wait_s` [wall s]."""
+        """Forward all received data; waits up to `wait_s` for data [wall s]."""
         if wait_s > 0.0:
             self._selector.select(wait_s)
         for frame in self._from_line():
@@ -208,7 +208,7 @@ class Router:
                         client.refused += 1
 
     def pass_to_board(self, frame: bytes) -> bool:
-        """Send a client's frame to the board; False when budget or line do not allow it."""
+        """Send a client's frame to the board; return False if budget or line do not allow it."""
         return self.speaks_mavlink and self._budget.take(len(frame)) and self.send_ahead(frame)
 
     def _from_line(self) -> list[Frame]:
@@ -225,14 +225,14 @@ class Router:
         return self._decoder.frames(data) if data else []
 
     def _lose(self, error: SerialLostError) -> None:
-        # A line that hung up stays readable: selecting on it would never wait again.
+        # A line that hung up stays readable, so a select on it would never wait.
         self.detach()
         self.lost = str(error)
 
     # --- the listener in this process (Endpoint)
 
     def receive(self) -> list[bytes]:
-        """Forward what has arrived; return the board's frames since the last call, oldest first."""
+        """Forward received data; return the board's frames since the last call, oldest first."""
         if self._closed:
             return []
         self.pump()
@@ -241,7 +241,7 @@ class Router:
         return heard
 
     def send(self, data: bytes) -> None:
-        """Send one frame to the board, as a client does."""
+        """Send one frame to the board within the clients' budget."""
         if not self.pass_to_board(data):
             self.send_errors += 1
 
@@ -252,11 +252,11 @@ class Router:
 
     def fileno(self) -> int | None:
         """Return a descriptor that is readable while the line or a client is; None once closed."""
-        # epoll's or kqueue's, which can be waited for itself
+        # the descriptor of epoll or kqueue
         return None if self._closed else self._selector.fileno()
 
     def counters(self) -> dict[str, LinkCounters]:
-        """Return the traffic with each client."""
+        """Return the traffic counters of each client."""
         return {
             name: LinkCounters(
                 client.rx,
@@ -269,7 +269,7 @@ class Router:
         }
 
     def close(self) -> None:
-        """Close the clients' ends; harmless when called again."""
+        """Close the clients' endpoints. Idempotent."""
         self._closed = True
         self.detach()
         for client in self._clients.values():

@@ -1,4 +1,4 @@
-"""A serial port, or a USB device that acts as one. Nothing blocks."""
+"""Non-blocking serial port, or a USB device that acts as a serial port."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ DEFAULT_BAUD = 921_600
 BAUDS = range(1_200, 12_000_001)
 
 BUFFER_BYTES = 4096
-"""Most bytes queued for the line: a fifth of a second of sensors; older ones are worthless."""
+"""Maximum bytes queued for the line: a fifth of a second of sensors; older data are useless."""
 
 BITS_PER_BYTE = 10
-"""On a UART, with start and stop bit."""
+"""Bits per byte on a UART, with start and stop bit."""
 
 _CHUNK = 4096
 _CHUNKS_PER_READ = 16
-"""A flood must not hold up the simulation."""
+"""Maximum chunks per read, so that a flood does not block the simulation."""
 
 _LAST_CHANCES, _LAST_CHANCE_S = 10, 0.01
-"""Number and length of the waits for the last bytes when closing [wall s]."""
+"""Number and duration of the waits for the last bytes when closing [wall s]."""
 
 _NO_UART = ("ttyACM", "pts/", "cu.usbmodem", "tty.usbmodem")
-"""Names of devices without a UART behind them: USB's own serial class, and pseudo-terminals."""
+"""Names of devices without a UART: USB's serial class, and pseudo-terminals."""
 
 _GONE = select.POLLHUP | select.POLLERR | select.POLLNVAL
 
@@ -40,11 +40,11 @@ _LATER = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR)
 
 
 class SerialLostError(Exception):
-    """The device was unplugged, or its driver gave up."""
+    """The device was unplugged, or its driver failed."""
 
 
 class SerialPort:
-    """An open serial device."""
+    """Open serial device."""
 
     def __init__(self, device: str, baud: int = DEFAULT_BAUD) -> None:
         """Open a device exclusively, 8N1, without flow control and old data, or raise UsageError.
@@ -54,7 +54,7 @@ class SerialPort:
         check_baud(baud)
         self.device = device
         self.dropped = 0
-        """Writes dropped because the line was full."""
+        """Number of writes dropped because the line was full."""
         try:
             self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, ValueError) as error:
@@ -65,11 +65,11 @@ class SerialPort:
         self._poll.register(self._fd, select.POLLIN)
 
     def read(self) -> bytes:
-        """Return what has arrived, b"" when nothing has. Raises SerialLostError if it is gone."""
+        """Return received data, b"" = no data. Raises SerialLostError if the device is gone."""
         received = bytearray()
         for _ in range(_CHUNKS_PER_READ):
             try:
-                # Asked first: a terminal without data and one that hung up both read as b"".
+                # Poll first: a terminal reads as b"" both without data and after a hang-up.
                 events = self._poll.poll(0)
                 if not events:
                     break
@@ -78,7 +78,7 @@ class SerialPort:
                 if error.errno in _LATER:
                     break
                 if received:
-                    break  # return what came before; the next read raises
+                    break  # return the earlier data; the next read raises
                 raise SerialLostError(self._lost(error)) from error
             if not chunk:
                 if received:
@@ -100,7 +100,7 @@ class SerialPort:
         return True
 
     def drain(self) -> None:
-        """Send as much of the queue as the line accepts. Raises SerialLostError if it is gone."""
+        """Send as much of the queue as the line accepts. Raises SerialLostError if it is lost."""
         while self._waiting:
             # Not pyserial's write: without a timeout it spins until the line is free.
             try:
@@ -118,15 +118,15 @@ class SerialPort:
         return self._fd
 
     def close(self) -> None:
-        """Close it. What the line does not accept soon is lost. Harmless when called again."""
-        with suppress(SerialLostError, OSError, TypeError):  # pyserial's, when it is closed
+        """Close the device; data that the line does not accept soon are lost. Idempotent."""
+        with suppress(SerialLostError, OSError, TypeError):  # raised by a closed pyserial port
             for _ in range(_LAST_CHANCES):
                 self.drain()
                 if not self._waiting and not self._port.out_waiting:
                     break
                 select.select([], [], [], _LAST_CHANCE_S)
             else:
-                # Or closing waits until a line that stands still takes it.
+                # Otherwise closing a blocked line would wait until it accepts the data.
                 self._port.reset_output_buffer()
         with suppress(OSError):
             self._port.close()
@@ -143,8 +143,8 @@ def check_baud(baud: int) -> None:
 
 
 def carries_bytes_s(device: str, baud: int) -> int | None:
-    """Return the line's capacity each way [bytes/s]; None where the baud rate has no meaning."""
-    # /dev/serial/by-id is full of links.
+    """Return the line's capacity each way [bytes/s]; None if the baud rate has no effect."""
+    # /dev/serial/by-id contains symbolic links.
     path = str(Path(device).resolve())
     if any(name in path for name in _NO_UART):
         return None

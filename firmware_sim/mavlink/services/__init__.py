@@ -1,4 +1,4 @@
-"""MAVLink microservices: a table from message name to its addressees and its handler."""
+"""MAVLink microservices: a table of message names with their addressee check and handler."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from firmware_sim.mavlink.services import (
 from firmware_sim.mavlink.services.context import Context, for_vehicle, for_vehicle_or_all
 
 Handler = Callable[[WireMessage, Context], bool]
-"""Handles one message for this vehicle; returns False if it has no effect."""
+"""Handles one message for this vehicle; returns False if it had no effect."""
 
 
 def _for_anyone(_message: WireMessage, _context: Context) -> bool:
@@ -32,7 +32,7 @@ def _for_anyone(_message: WireMessage, _context: Context) -> bool:
 
 
 Addressee = Callable[[WireMessage, Context], bool]
-"""Returns whether a message is for this vehicle."""
+"""Returns True if a message is addressed to this vehicle."""
 
 HANDLERS: Mapping[str, tuple[Addressee, Handler]] = MappingProxyType(
     {
@@ -82,7 +82,7 @@ HANDLERS: Mapping[str, tuple[Addressee, Handler]] = MappingProxyType(
 
 
 def handle(message: WireMessage, kind: str, context: Context) -> bool:
-    """Return whether a message of a kind was for this vehicle and did something; now it has."""
+    """Handle a message of a type; return True if it was for this vehicle and had an effect."""
     is_addressed, handler = HANDLERS.get(kind, (None, None))
     return bool(
         is_addressed and handler and is_addressed(message, context) and handler(message, context)
@@ -97,12 +97,12 @@ PENDING: tuple[Callable[[Context], None], ...] = (
     shell.send_pending,
     logs.send_pending,
 )
-"""Send the next part of what a client is getting piece by piece; once a tick and client."""
+"""Functions that send the next part of a client's transfers, once per tick and client."""
 
 
 def send_pending(context: Context) -> None:
-    """Send a client what is next of all that it is getting piece by piece."""
-    if not context.is_getting:  # Most of the time: of the missions there may still be news.
+    """Send the next part of all transfers of a client."""
+    if not context.is_getting:  # Usual case: only mission progress may be due.
         missions.send_pending(context)
         return
     for send in PENDING:

@@ -1,9 +1,9 @@
-"""Sensor calibration, as a PX4 SITL goes through it: texts that ground stations follow.
+"""Sensor calibration as in PX4 SITL, reported as texts that ground stations parse.
 
-The simulated sensors are calibrated from the start, so nothing is estimated. What is real is what a
-client sees. A calibration is refused while the vehicle is armed or another one runs. It fails when
-the vehicle moves, and it takes its time. One that needs the vehicle turned by hand waits until it
-is cancelled. Source: PX4 1.16, Commander::handle_command and what a running SITL said.
+The simulated sensors are always calibrated, so nothing is estimated, but the client sees the usual
+texts and durations. A calibration is rejected while the vehicle is armed or another one runs.
+Motion of the vehicle makes it fail. A calibration that requires manual rotation waits until it is
+cancelled. Source: PX4 1.16, Commander::handle_command and the texts of a running SITL.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from firmware_sim.mavlink.services.context import Action, Command, Context
 from firmware_sim.mavlink.services.transfers import Step
 
 MOVING_RAD_S = 0.2
-"""A body rate that counts as motion [rad/s]."""
+"""Minimum body rate that counts as motion [rad/s]."""
 
 _GYRO_STEP_S, _LEVEL_STEP_S, _REST_S, _AGAIN_S = 0.15, 0.5, 1.0, 5.0
 
@@ -42,14 +42,14 @@ def _done(sensor: str) -> Step:
 
 
 def failed(sensor: str) -> Step:
-    """Return the end of a calibration that failed."""
+    """Return the final step of a failed calibration."""
     return _critical(f"[cal] calibration failed: {sensor}")
 
 
 def _at_rest(
     context: Context, sensor: str, percents: range, step_s: float, needs_rest: bool = True
 ) -> Iterator[Step]:
-    """A calibration that a vehicle at rest goes through by itself."""
+    """Return the steps of a calibration that needs no rotation of the vehicle."""
     yield _started(sensor)
     for percent in percents:
         if needs_rest and _moving(context.port.sample):
@@ -77,7 +77,7 @@ def _barometer(context: Context) -> Iterator[Step]:
 
 
 def _one_side(context: Context, sensor: str) -> Iterator[Step]:
-    """The side on which the vehicle stands: the first of six."""
+    """Return the steps of the first of six sides, the one the vehicle rests on."""
     yield _started(sensor)
     yield _info("[cal] pending: back front left right up down")
     yield _info("[cal] hold vehicle still on a pending side")
@@ -97,7 +97,7 @@ def _accelerometer(context: Context) -> Iterator[Step]:
         yield _info(f"[cal] down side result: [{x:.3f} {y:.3f} {z:.3f}]", _REST_S)
     yield _info("[cal] progress <17>")
     yield _info("[cal] down side done, rotate to a different side")
-    while True:  # nobody turns it
+    while True:  # the vehicle is never rotated
         yield _info("[cal] pending: back front left right up", _AGAIN_S)
         yield _info("[cal] hold vehicle still on a pending side")
 
@@ -112,7 +112,7 @@ def _magnetometer(context: Context) -> Iterator[Step]:
 def _airspeed(_context: Context) -> Iterator[Step]:
     yield _started("airspeed")
     yield _critical("[cal] Ensure sensor is not measuring wind")
-    yield _critical("[cal] calibration failed: airspeed", _AGAIN_S)  # there is no such sensor
+    yield _critical("[cal] calibration failed: airspeed", _AGAIN_S)  # no airspeed sensor
 
 
 def _silent(_context: Context) -> Iterator[Step]:
@@ -141,13 +141,13 @@ ROUTINES: dict[tuple[int, int], tuple[str, Routine]] = {
     (6, 1): ("airspeed", _airspeed),
     (6, 2): ("airspeed", _airspeed),
 }
-"""Sensor and routine by parameter number and value, in the order in which PX4 looks."""
+"""Sensor and routine by parameter number and value, in PX4's order of evaluation."""
 
 _ESC = 7
 
 
 def _calibrate(command: Command, context: Context) -> Result:
-    """PREFLIGHT_CALIBRATION: one parameter says what; all zero cancels."""
+    """Handle PREFLIGHT_CALIBRATION: one parameter selects the sensor; all zero cancels."""
     running = context.calibration
     asked = {number: command.integer(number) or 0 for number in range(1, 8)}
     if context.port.state().status.arming is Arming.ARMED:
@@ -168,7 +168,7 @@ def _calibrate(command: Command, context: Context) -> Result:
         context.announce(Message(Severity.CRITICAL, text))
         return Result.DENIED
     if command.integer(4) != 0:
-        return Result.UNSUPPORTED  # what is no number is no cancellation either
+        return Result.UNSUPPORTED  # NaN does not cancel
     if running.radio:
         running.radio = False
         context.announce(Message.of(Severity.INFO, events.RC_CALIBRATED))
@@ -176,7 +176,7 @@ def _calibrate(command: Command, context: Context) -> Result:
 
 
 def _quick_magnetometer(command: Command, context: Context) -> Result:
-    """FIXED_MAG_CAL_YAW, parameter 1: heading [deg]."""
+    """Handle FIXED_MAG_CAL_YAW, parameter 1: heading [deg]."""
     if context.calibration.active or context.port.state().status.arming is Arming.ARMED:
         return Result.TEMPORARILY_REJECTED
     heading = command.integer(1) or 0
@@ -189,7 +189,7 @@ def _quick_magnetometer(command: Command, context: Context) -> Result:
 
 
 def send_pending(context: Context) -> None:
-    """Say what is due of a running calibration; call once per tick."""
+    """Announce the due texts of a running calibration; call once per tick."""
     running = context.calibration
     if running.active:
         for message in running.due(context.now_us):

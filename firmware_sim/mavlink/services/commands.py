@@ -1,13 +1,13 @@
 """COMMAND_LONG, COMMAND_INT and SET_MODE.
 
-Answers and refusals follow PX4's Commander.cpp and mavlink_receiver.cpp, checked against a
-running PX4 1.16. A command addressed to the vehicle is acknowledged to its sender, on the link it
-came from. The same command may come twice (clients repeat), so actions are idempotent. A service
-with commands has a table `ACTIONS` of its own, which is taken into the one here.
+Replies and rejections follow PX4's Commander.cpp and mavlink_receiver.cpp, checked against a
+running PX4 1.16. A command to the vehicle is acknowledged to its sender, on the same link. Clients
+repeat commands, so actions are idempotent. Services with commands have a table `ACTIONS`, which is
+merged into the table here.
 
-MAV_CMD_INJECT_FAILURE makes a part fail: the simulated part itself, as in a scenario. Which units
-and types are known, and which get no answer at all, is PX4's (SimulatorMavlink, FailureInjector,
-BatterySimulator; 1.16).
+MAV_CMD_INJECT_FAILURE injects a fault into the simulated part, as a scenario does. Known units and
+types, and those without a reply, match PX4 (SimulatorMavlink, FailureInjector, BatterySimulator;
+1.16).
 """
 
 from __future__ import annotations
@@ -52,22 +52,22 @@ SENSORS: dict[int, tuple[Part | None, tuple[int, ...]]] = {
     dialect.FAILURE_UNIT_SENSOR_BARO: ("baro", (OK, OFF, STUCK)),
     dialect.FAILURE_UNIT_SENSOR_GPS: ("gps", (OK, OFF)),
     dialect.FAILURE_UNIT_SENSOR_VIO: ("vision", (OK, OFF)),
-    # The vehicle has none; PX4 takes the command all the same.
+    # The vehicle has no such sensor, but PX4 accepts the command.
     dialect.FAILURE_UNIT_SENSOR_AIRSPEED: (None, (OK, OFF, WRONG)),
 }
 """Part and accepted types of each sensor; other types are UNSUPPORTED."""
 
 WITHOUT_INSTANCE: tuple[Part, ...] = ("baro", "gps", "vision")
-"""Sensors of which PX4 has one, whatever instance is named."""
+"""Sensors that PX4 has once, for any requested instance."""
 
 KINDS = {OFF: "off", STUCK: "stuck"}
 
 GREATEST_MOTOR = 8
-"""ESCs that PX4 counts."""
+"""Maximum number of ESCs in PX4."""
 
 
 def _inject(command: Command, context: Context) -> Result | None:
-    """Parameters: unit, type, instance (0: all)."""
+    """Handle INJECT_FAILURE, parameters: unit, type, instance (0 = all)."""
     enabled = context.port.parameters.by_name(ENABLED)
     if enabled is None or not enabled.value:
         return Result.DENIED
@@ -88,13 +88,13 @@ def _inject(command: Command, context: Context) -> Result | None:
         return Result.ACCEPTED
     if unit == dialect.FAILURE_UNIT_SYSTEM_MOTOR:
         return _motor(context, kind, instance)
-    return None  # nobody in PX4 answers
+    return None  # PX4 sends no reply
 
 
 def _motor(context: Context, kind: int, instance: int) -> Result:
     if kind not in (OK, OFF, WRONG) or (kind == OK and not 0 <= instance <= GREATEST_MOTOR):
         return Result.UNSUPPORTED
-    if kind != WRONG:  # its readings alone would be wrong
+    if kind != WRONG:  # WRONG would affect the readings alone
         motors = MOTORS if instance == 0 else MOTORS[instance - 1 : instance]
         _act(context, motors if instance >= 0 else (), kind)
     return Result.ACCEPTED
@@ -110,7 +110,7 @@ def _act(context: Context, parts: tuple[Part, ...], kind: int) -> None:
             failures.inject(Fault(part=part, kind=KINDS[kind]))
 
 
-# Commands that do nothing here are answered as a running PX4 1.16 SITL answers them.
+# Commands without effect here are answered as by a running PX4 1.16 SITL.
 
 ACCEPTED = (
     dialect.MAV_CMD_DO_SET_ACTUATOR,
@@ -131,16 +131,16 @@ NOT_ACKNOWLEDGED = [
         *("PAYLOAD_PREPARE_DEPLOY", "PAYLOAD_CONTROL_DEPLOY"),
     )
 ]
-"""Commands to a part of the vehicle that is not there."""
+"""Commands to parts that the vehicle lacks."""
 
 
 def _answer(result: Result | None) -> Action:
-    """Return the action that does nothing and answers so."""
+    """Return an action without effect that returns this result."""
     return lambda _command, _context: result
 
 
 def _actuator_test(_command: Command, context: Context) -> Result | None:
-    """PX4 refuses it while armed; disarmed there is nothing here that could be turned."""
+    """Handle ACTUATOR_TEST: PX4 rejects it while armed; disarmed, it has no effect here."""
     armed = context.port.state().status.arming is Arming.ARMED
     return Result.DENIED if armed else None
 
@@ -151,12 +151,12 @@ def _high_latency(_command: Command, context: Context) -> Result:
 
 
 FORCE_MAGIC = 21_196
-"""MAV_CMD_COMPONENT_ARM_DISARM param2 that skips the checks."""
+"""Value of MAV_CMD_COMPONENT_ARM_DISARM param2 that skips the checks."""
 
 TERMINATE_FROM = 0.5
-"""Parameter 1 must exceed this. A termination cannot be undone (PX4: DENIED)."""
+"""Parameter 1 must exceed this value. Termination is irreversible (otherwise DENIED, as in PX4)."""
 
-# Names made anew for each message would stay in the interpreter's cache of attributes.
+# Cached: names built per message would accumulate in the interpreter's attribute cache.
 _PARAMS = attrgetter(*(f"param{number}" for number in range(1, 8)))
 
 _RELATIVE_FRAMES = (
@@ -181,9 +181,9 @@ def _arm_disarm(command: Command, context: Context) -> Result | None:
 
 
 def _takeoff(command: Command, context: Context) -> Result:
-    """Parameters 5 and 6: where to, 7: altitude above mean sea level [m].
+    """Handle NAV_TAKEOFF, parameters 5, 6: target; 7: altitude above mean sea level [m].
 
-    In a relative frame the altitude is above home. NaN = straight up, to MIS_TAKEOFF_ALT.
+    In a relative frame the altitude is above home. NaN = vertical takeoff to MIS_TAKEOFF_ALT.
     """
     altitude, (north, east, _) = command.params[6], local_place(command, context)
     place = None if math.isnan(north) else (north, east)
@@ -198,7 +198,7 @@ def _takeoff(command: Command, context: Context) -> Result:
 
 
 def _change_mode(base: int, main: int, sub: int, context: Context) -> Result:
-    """Change the mode: MAV_MODE_FLAG bits, PX4's main and sub mode."""
+    """Change the mode, given MAV_MODE_FLAG bits, PX4's main mode and sub mode."""
     request = requested_mode(base, main, sub)
     if isinstance(request, Message):
         context.announce(request)
@@ -207,7 +207,7 @@ def _change_mode(base: int, main: int, sub: int, context: Context) -> Result:
 
 
 def _set_standard_mode(command: Command, context: Context) -> Result:
-    """Parameter 1: MAV_STANDARD_MODE; FAILED for one that a multicopter does not have."""
+    """Handle DO_SET_STANDARD_MODE, parameter 1: MAV_STANDARD_MODE; FAILED if unsupported."""
     asked = command.integer(1) or 0
     if asked != dialect.MAV_STANDARD_MODE_NON_STANDARD:
         for known in KNOWN:
@@ -224,24 +224,24 @@ def _set_mode(command: Command, context: Context) -> Result:
 
 
 def _terminate(command: Command, context: Context) -> Result:
-    """DO_FLIGHTTERMINATION: stop the motors for good; DENIED unless the vehicle is armed (PX4)."""
+    """Handle DO_FLIGHTTERMINATION: stop the motors permanently; DENIED unless armed (PX4)."""
     wanted = command.params[0] > TERMINATE_FROM
     return context.port.terminate() if wanted else Result.DENIED
 
 
 def _run_checks(_command: Command, context: Context) -> Result:
-    """Tell anew what keeps the vehicle from arming."""
+    """Handle RUN_PREARM_CHECKS: report the failed checks again."""
     context.port.tell_checks()
     return Result.ACCEPTED
 
 
 def _reboot(command: Command, _context: Context) -> Result:
-    """PX4 SITL has no board to reset: doing nothing is all it accepts, armed or not."""
+    """Handle a reboot request: PX4 SITL accepts only "do nothing", armed or not."""
     return Result.ACCEPTED if command.integer(1) == 0 else Result.DENIED
 
 
 def _mode(mode: Mode) -> Action:
-    """Return what grants a mode by a command of its own."""
+    """Return the action of a command that requests one mode."""
     return lambda _, context: context.port.set_mode(mode, commanded=True)
 
 
@@ -269,28 +269,28 @@ ACTIONS: dict[int, Action] = {
     **dict.fromkeys(NOT_ACKNOWLEDGED, _answer(None)),
     dialect.MAV_CMD_ACTUATOR_TEST: _actuator_test,
     dialect.MAV_CMD_CONTROL_HIGH_LATENCY: _high_latency,
-    # The estimator takes a place from outside only while it has none of its own.
+    # The estimator accepts an external position only while it has none.
     dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE: _answer(Result.TEMPORARILY_REJECTED),
 }
-"""Everything else is UNSUPPORTED."""
+"""Actions by command. Other commands are UNSUPPORTED."""
 
 
 def handle_command_long(message: WireMessage, context: Context) -> bool:
-    """Carry out and acknowledge a COMMAND_LONG."""
+    """Execute and acknowledge a COMMAND_LONG."""
     return _handle(Command(message.command, _PARAMS(message), sender(message)), context)
 
 
 def handle_command_int(message: WireMessage, context: Context) -> bool:
-    """Carry out and acknowledge a COMMAND_INT."""
+    """Execute and acknowledge a COMMAND_INT."""
     four = (message.param1, message.param2, message.param3, message.param4)
-    given = (message.x, message.y) != (INT32_MAX, INT32_MAX)  # otherwise: to be ignored
+    given = (message.x, message.y) != (INT32_MAX, INT32_MAX)  # INT32_MAX = unset
     place = (message.x / 1e7, message.y / 1e7) if given else (math.nan, math.nan)
     params = (*four, *place, message.z)
     return _handle(Command(message.command, params, sender(message), message.frame), context)
 
 
 def handle_set_mode(message: WireMessage, context: Context) -> bool:
-    """Carry out a SET_MODE, the old message without acknowledgement."""
+    """Execute a SET_MODE, the legacy message without acknowledgement."""
     if message.target_system != context.system_id:
         return False
     main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
@@ -309,7 +309,7 @@ def _handle(command: Command, context: Context) -> bool:
 
 
 def is_addressed(message: WireMessage, context: Context) -> bool:
-    """Return whether a command is for this vehicle: who it is may be asked of all systems."""
+    """Return True if a command is for this vehicle. Identity requests may be broadcasts."""
     if message.command in (_REQUEST_CAPABILITIES, _REQUEST_PROTOCOL):
         return message.target_system in (context.system_id, ANY)
     return for_vehicle(message, context)

@@ -1,9 +1,9 @@
-"""Component metadata: what a ground station learns of parameters and events, as files.
+"""Component metadata: files that describe parameters and events to ground stations.
 
-COMPONENT_METADATA (and the older COMPONENT_INFORMATION) say where the general file lies; that names
-the files with the parameters and with the words of events. All are read over MAVLink FTP. Source of
-the formats: https://mavlink.io/en/services/component_information.html, `general.schema.json`,
-`parameter.schema.json`.
+COMPONENT_METADATA (and the older COMPONENT_INFORMATION) contain the URI of the general file. This
+file lists the files with parameters and event texts. Ground stations read them over MAVLink FTP.
+Source of the formats: https://mavlink.io/en/services/component_information.html,
+`general.schema.json`, `parameter.schema.json`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _EVENTS = "all_events.json.xz"
 
 @functools.cache
 def files() -> dict[str, bytes]:
-    """Return the files by their names; made when they are first wanted."""
+    """Return the files by name. Created on first use."""
     parameters = _compressed({"version": 1, "parameters": [_parameter_described(s) for s in SPECS]})
     events = _compressed(_event_document())
     entries = [
@@ -50,7 +50,7 @@ def files() -> dict[str, bytes]:
 
 
 def provide(storage: Storage) -> None:
-    """Put the files onto a vehicle's storage, unless they are there."""
+    """Write the files to a vehicle's storage if they are missing."""
     folder = storage.folder / _FOLDER
     if folder.is_dir():
         return
@@ -70,7 +70,7 @@ def request_metadata(_command: Command, context: Context) -> Result:
 
 
 def request_information(_command: Command, context: Context) -> Result:
-    """Send COMPONENT_INFORMATION, what the same was before."""
+    """Send COMPONENT_INFORMATION, the predecessor of COMPONENT_METADATA."""
     no_crc, no_uri = 0, b""
     context.link.send(
         dialect.MAVLink_component_information_message(
@@ -86,7 +86,7 @@ def _uri() -> bytes:
 
 def _compressed(document: dict[str, Any]) -> bytes:
     data = json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode()
-    # The small decoders of ground stations know this check only.
+    # Small decoders in ground stations support only this check.
     return lzma.compress(data, format=lzma.FORMAT_XZ, check=lzma.CHECK_CRC32)
 
 
@@ -110,11 +110,11 @@ def _parameter_described(spec: ParameterSpec) -> dict[str, Any]:
     return described
 
 
-# --- the words of events (https://github.com/mavlink/libevents, `validation/schema.json`)
+# --- event texts (https://github.com/mavlink/libevents, `validation/schema.json`)
 
 
 def definitions() -> Iterator[Definition]:
-    """Yield every event that this vehicle can send."""
+    """Yield all events that this vehicle can send."""
     for module in (flight_events, command_events, check_events):
         for value in vars(module).values():
             if isinstance(value, Definition):
@@ -124,7 +124,7 @@ def definitions() -> Iterator[Definition]:
 
 
 def _event_document() -> dict[str, Any]:
-    """Return the content of the file with the words of events."""
+    """Return the content of the file with the event texts."""
     groups: dict[str, dict[str, Any]] = {}
     for definition in definitions():
         group = groups.setdefault(definition.group, {"events": {}})
@@ -164,7 +164,7 @@ def _enumeration(listed: Enumeration) -> dict[str, Any]:
 
 
 def _modes_of_groups() -> dict[str, list[int]]:
-    """Return the custom modes that each bit of a check stands for."""
+    """Return the custom modes by bit number of the mode groups in checks."""
     groups = {group.value for group in ModeGroup}
     lowest = {mode: bits & -bits for mode, bits in STATE_BITS.items()}
     return {

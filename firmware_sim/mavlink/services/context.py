@@ -32,42 +32,41 @@ ANY = 0
 class Context:
     """State of one client for its handlers. The server updates `now_us` for every message.
 
-    Events, signing, storage, calibration and radio are the vehicle's, the same for all clients.
+    All clients of a vehicle share events, signing, storage, calibration and radio.
     """
 
     link: Link
-    """Answers and streams of this client."""
+    """Replies and streams of this client."""
     port: AutopilotPort
     now_us: int
     """Simulated time [µs]."""
     announce: Callable[[Message], None]
-    """Sends a text, with its event if it has one, to all clients of all links.
-    Events are part of the telemetry. Where an answer to a client must not change that, in lockstep,
-    it is a text alone."""
+    """Sends a text, with its event if available, to all clients of all links. Events are part of
+    the telemetry. In lockstep, replies must not change the telemetry, so only the text is sent."""
     broadcast: Callable[[str, bytes], None]
-    """Sends a message, by its name and payload, to all clients of all links."""
+    """Sends a message, given by name and payload, to all clients of all links."""
     events: EventBuffer
     signing: Signing
-    """The key of all links, if there is one."""
+    """Signing key of all links, if set."""
     system_id: int = SYSTEM_ID
     next_parameter: int | None = None
-    """Index that a running parameter list sends next; -1 = the hash; None = no list is running."""
+    """Next index of a running parameter list; -1 = the hash; None = no list is running."""
     transfer: MissionTransfer = field(default_factory=MissionTransfer)
     storage: Storage = field(default_factory=Storage)
     ftp: FtpClient = field(default_factory=FtpClient)
     shell: Shell = field(default_factory=Shell)
     calibration: RunningCalibration = field(default_factory=RunningCalibration)
     radio: Radio = field(default_factory=Radio)
-    """Newest channels of a radio."""
+    """Newest RC channels."""
     log_listing: LogListing | None = None
     log_download: LogDownload | None = None
     log_stream: LogStream | None = None
     refusals: set[str] = field(default_factory=set)
-    """Why setpoints have been refused since the last one that was accepted."""
+    """Rejections of setpoints reported since the last accepted setpoint."""
 
     @property
     def is_getting(self) -> bool:
-        """Whether a service other than the missions' sends the client something piece by piece."""
+        """True if any transfer except a mission's is in progress."""
         ftp = self.ftp
         return (
             self.next_parameter is not None
@@ -82,28 +81,28 @@ class Context:
 
     @property
     def is_busy(self) -> bool:
-        """Whether any service sends the client something piece by piece, or repeats it."""
+        """True if any transfer or repetition is in progress."""
         return self.is_getting or self.transfer.is_running
 
     def announce_once(self, refusal: Message) -> None:
-        """Announce why a message is refused, unless that was announced already."""
+        """Announce a rejection unless it was announced before."""
         if refusal.text not in self.refusals:
             self.refusals.add(refusal.text)
             self.announce(refusal)
 
     def close(self) -> None:
-        """Release what is held for the client: it has gone, or another autopilot comes."""
+        """Release the client's resources when the client leaves or the autopilot changes."""
         self.ftp.close()
 
 
 def for_vehicle(message: WireMessage, context: Context) -> bool:
-    """Return whether a message is addressed to this vehicle, its autopilot or all components."""
+    """Return True if a message is addressed to this vehicle's autopilot or all its components."""
     system: int = message.target_system
     return system == context.system_id and message.target_component in (COMPONENT_ID, ANY)
 
 
 def for_vehicle_or_all(message: WireMessage, context: Context) -> bool:
-    """As `for_vehicle`, and broadcasts to all systems too."""
+    """Return True for messages to this vehicle, as `for_vehicle`, and for broadcasts."""
     system: int = message.target_system
     component: int = message.target_component
     return system in (context.system_id, ANY) and component in (COMPONENT_ID, ANY)
@@ -120,16 +119,16 @@ class Command:
 
     number: int
     params: tuple[float, float, float, float, float, float, float]
-    """Parameters 1..7 of COMMAND_LONG; NaN = not given."""
+    """Parameters 1 to 7 of COMMAND_LONG; NaN = not set."""
     sender: tuple[int, int] = (0, 0)
     frame: int | None = None
-    """MAV_FRAME of a COMMAND_INT."""
+    """MAV_FRAME of a COMMAND_INT; None for a COMMAND_LONG."""
 
     def integer(self, number: int) -> int | None:
-        """Return parameter 1..7 rounded, None when it is not a finite number."""
+        """Return parameter 1 to 7, rounded; None if not finite."""
         value = self.params[number - 1]
         return round(value) if math.isfinite(value) else None
 
 
 Action = Callable[[Command, Context], "Result | None"]
-"""Carries out a command and returns the answer; None: it is not acknowledged, as by PX4."""
+"""Executes a command and returns its result; None = no acknowledgement, as in PX4."""

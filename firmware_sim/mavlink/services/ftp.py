@@ -1,7 +1,7 @@
-"""MAVLink FTP: requests in, answers and bursts out.
+"""MAVLink FTP: requests, replies and bursts.
 
-Source: https://mavlink.io/en/services/ftp.html and PX4 1.16, MavlinkFTP. What is done with files
-stands in `ftp_files`; nobody gets out of the vehicle's storage.
+Source: https://mavlink.io/en/services/ftp.html and PX4 1.16, MavlinkFTP. File operations are in
+`ftp_files`; access is limited to the vehicle's storage.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from firmware_sim.mavlink.services.transfers import (
 )
 
 _HEADER = struct.Struct("<HBBBBBxI")
-"""Sequence, session, opcode, size, requested opcode, burst complete, padding, offset."""
+"""Header: sequence, session, opcode, size, requested opcode, burst complete, padding, offset."""
 
 _PAYLOAD_BYTES = 251
 _CRC32, _BURST = 14, 15
 _ACK, _NAK = 128, 129
 _OPENS = (4, 6, 11)
-"""To read, new, and to write."""
+"""Opcodes that open a file: for reading, new, for writing."""
 
 BURST_MESSAGES = 8
-"""Messages of a burst that are sent per tick: half a megabyte a second."""
+"""Maximum messages of a burst per tick: half a megabyte per second."""
 
 _IDLE_US = 10 * US_PER_S
-"""A session without activity is closed then, when another client wants one [µs]."""
+"""Idle time after which the next request closes an open session [µs]."""
 
 _SMALL_BYTES = 4
-"""Answers with at most this much data are kept, to be sent again when they were lost (as PX4)."""
+"""Maximum data of a reply that is kept for retransmission [bytes] (as PX4)."""
 
 
 def handle_request(message: WireMessage, context: Context) -> bool:
-    """Carry out a request and answer it."""
+    """Execute a request and reply."""
     payload = bytes(message.payload)
     sequence, session, opcode, size, _, _, offset = _HEADER.unpack_from(payload)
     if opcode in (_ACK, _NAK):
@@ -55,7 +55,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
         _send(client.last_answer, asker, context)
         return True
     if client.summing is not None and client.summing.asked.sequence == sequence:
-        return True  # asked again, out of impatience
+        return True  # repeated while the checksum is running
     client.stop_summing()
     if client.session.file is not None and context.now_us - client.used_us > _IDLE_US:
         client.session.close()
@@ -89,7 +89,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
 def _answer(request: Answered, kind: int, answer: bytes, context: Context) -> None:
     client = context.ftp
     sequence = (request.sequence + 1) & 0xFFFF
-    # As PX4: the number that the client has given, but for the session that was opened.
+    # As in PX4: the client's session number, except after opening a session.
     opened = kind == _ACK and request.opcode in _OPENS
     session = SESSION if opened else request.session
     body = _packed(sequence, session, kind, request.opcode, request.offset, answer)
@@ -99,7 +99,7 @@ def _answer(request: Answered, kind: int, answer: bytes, context: Context) -> No
 
 
 def _sum(summing: Summing, context: Context) -> None:
-    """Go on with a checksum, and answer when it is known."""
+    """Continue a checksum, and reply when it is complete."""
     kind = _ACK
     try:
         answer = summing.sum.go_on()
@@ -111,7 +111,7 @@ def _sum(summing: Summing, context: Context) -> None:
 
 
 def send_pending(context: Context) -> None:
-    """Send the next messages of a burst, or go on with a checksum; call once per tick."""
+    """Send the next messages of a burst, or continue a checksum; call once per tick."""
     client = context.ftp
     if client.summing is not None:
         _sum(client.summing, context)

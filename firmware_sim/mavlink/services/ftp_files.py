@@ -1,7 +1,7 @@
 """File operations of MAVLink FTP: one function per request, on the vehicle's storage.
 
-Requests, answers and error codes: https://mavlink.io/en/services/ftp.html, and what a running PX4
-1.16 (MavlinkFTP) answers. Like PX4's, a session has the number 0, and each client has one.
+Requests, replies and error codes follow https://mavlink.io/en/services/ftp.html and a running PX4
+1.16 (MavlinkFTP). As in PX4, a session has the number 0, and each client has one.
 """
 
 from __future__ import annotations
@@ -23,23 +23,22 @@ from firmware_sim.mavlink.services.transfers import (
 from firmware_sim.storage import Storage
 
 DATA_BYTES = 239
-"""Most data in one message."""
+"""Maximum data in one message [bytes]."""
 
 READ_ONLY = "etc"
-"""Folder of the vehicle's own files: clients may read it."""
+"""Folder of the vehicle's files, read-only for clients."""
 
 _SIZE = struct.Struct("<I")
 
 
 Operation = Callable[[Request, Session, Storage], bytes]
-"""Carries out a request and returns the data of its answer.
+"""Executes a request and returns the data of the reply.
 
-Raises RefusedError or OSError for a NAK.
-"""
+Raises RefusedError or OSError for a NAK."""
 
 
 def _list(request: Request, _session: Session, storage: Storage) -> bytes:
-    """List a folder from entry number `offset` on: D and name, or F, name, tab and size."""
+    """List a folder from entry number `offset`: D and name, or F, name, tab and size."""
     folder = storage.path(request.name)
     if not folder.is_dir():
         raise RefusedError(Code.FILE_NOT_FOUND)
@@ -62,7 +61,7 @@ def _line(entry: os.DirEntry[str]) -> bytes:
         return b"D" + name + b"\0"
     if entry.is_file(follow_symlinks=False):
         return b"F" + name + b"\t%d" % entry.stat().st_size + b"\0"
-    return b"S\0"  # a link, say: skipped, as by PX4
+    return b"S\0"  # for example a link: skipped, as in PX4
 
 
 def _open_to_read(request: Request, session: Session, storage: Storage) -> bytes:
@@ -94,7 +93,7 @@ def _open_to_write(request: Request, session: Session, storage: Storage, flags: 
 
 
 def read_at(file: BinaryIO, offset: int, size: int) -> bytes:
-    """Return what a file has there. Raises RefusedError at its end."""
+    """Return data of a file from an offset. Raises RefusedError at the end of the file."""
     file.seek(offset)
     data = file.read(min(size, DATA_BYTES))
     if not data:
@@ -129,7 +128,7 @@ def _reset(_request: Request, session: Session, _storage: Storage) -> bytes:
 
 
 def _on_path(change: Callable[[Path], object], *, more: bool = False) -> Operation:
-    """Return what changes the file or folder that a request names; `more`: it makes one."""
+    """Return an operation on the requested path; `more`: the operation creates an entry."""
 
     def operation(request: Request, _session: Session, storage: Storage) -> bytes:
         path = _writable(request.name, storage)
@@ -170,7 +169,7 @@ def _check_free(session: Session) -> None:
 
 
 def _writable(name: str, storage: Storage) -> Path:
-    """Return the path of a file that clients may change. Raises RefusedError for another."""
+    """Return the path of a file that clients may change. Raises RefusedError otherwise."""
     path = storage.path(name)
     parts = path.relative_to(storage.folder).parts
     if not parts or parts[0] == READ_ONLY:
@@ -194,4 +193,4 @@ OPERATIONS: dict[int, Operation] = {
     12: _truncate,
     13: _rename,
 }
-"""By opcode. What takes several ticks (checksums, burst reads) stands in `ftp`."""
+"""Operations by opcode. `ftp` handles checksums and burst reads, which take several ticks."""

@@ -1,7 +1,7 @@
-"""Flight logs: list, download, and the stream of the log that is being written.
+"""Flight logs: listing, download, and streaming of the open log.
 
-Protocol: LOG_REQUEST_LIST and its kin of MAVLink's common set, and MAV_CMD_LOGGING_START with
-LOGGING_DATA(_ACKED), as PX4 1.16 answers them (mavlink_log_handler.cpp, mavlink_ulog.cpp).
+Protocol: LOG_REQUEST_LIST and related messages of MAVLink's common set, and MAV_CMD_LOGGING_START
+with LOGGING_DATA(_ACKED), as in PX4 1.16 (mavlink_log_handler.cpp, mavlink_ulog.cpp).
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from firmware_sim.mavlink.services.transfers import (
 
 ENTRIES_PER_TICK = 1
 PACKETS_PER_TICK = 8
-"""LOG_DATA of one client: 180 kB a second."""
+"""LOG_DATA messages per client and tick: 180 kB per second."""
 PIECES_PER_TICK = 2
-"""LOGGING_DATA of one client: 125 kB a second. The log grows by 25 kB."""
+"""LOGGING_DATA messages per client and tick: 125 kB per second. The log grows by 25 kB."""
 
 _PACKET_BYTES = 90
-"""LOG_DATA.data."""
+"""Size of LOG_DATA.data [bytes]."""
 _LOG_DATA = struct.Struct(f"<IHB{_PACKET_BYTES}s")
-"""As it is on the wire: offset, number, count, data."""
+"""Wire format: offset, number, count, data."""
 _ACK_TIMEOUT_US = 50_000
 _ACK_TRIES = 50
-"""ulog_stream_ack: ACK_TIMEOUT, ACK_MAX_TRIES."""
+"""ACK_TIMEOUT [µs] and ACK_MAX_TRIES of ulog_stream_ack."""
 
 
 def send_pending(context: Context) -> None:
-    """Send the next of what a client is getting; call once per tick."""
+    """Send the next part of a client's log transfers; call once per tick."""
     if context.log_listing is not None:
         _send_entries(context, context.log_listing)
     if context.log_download is not None:
@@ -48,7 +48,7 @@ def send_pending(context: Context) -> None:
 
 
 def handle_list(message: WireMessage, context: Context) -> bool:
-    """Begin to send the entries from `start` to `end`."""
+    """Start sending the entries from `start` to `end`."""
     entries = context.port.logs.entries()
     total = len(entries)
     if total == 0:
@@ -61,7 +61,7 @@ def handle_list(message: WireMessage, context: Context) -> bool:
 
 
 def handle_data(message: WireMessage, context: Context) -> bool:
-    """Begin to send a part of a log."""
+    """Start sending a part of a log."""
     end = message.ofs + message.count
     context.log_download = LogDownload(message.id, message.ofs, end)
     return True
@@ -74,7 +74,7 @@ def handle_end(_message: WireMessage, context: Context) -> bool:
 
 
 def handle_erase(_message: WireMessage, context: Context) -> bool:
-    """Refuse: a flight's log is its record, which no client may delete."""
+    """Reject the request: a flight's log is its record, and clients may not delete it."""
     context.announce(Message(Severity.WARNING, "Logs are not erased: they belong to the run"))
     return True
 
@@ -96,7 +96,7 @@ def _send_entries(context: Context, listing: LogListing) -> None:
 def _send_data(context: Context, download: LogDownload) -> None:
     wanted = min(PACKETS_PER_TICK * _PACKET_BYTES, download.end - download.offset)
     data = context.port.logs.read(download.number, download.offset, wanted)
-    # A packet that is not full tells the client that the log ends.
+    # A packet that is not full signals the end of the log to the client.
     for at in range(0, max(len(data), 1), _PACKET_BYTES):
         part = data[at : at + _PACKET_BYTES]
         context.link.send_payload(
@@ -107,7 +107,7 @@ def _send_data(context: Context, download: LogDownload) -> None:
         context.log_download = None
 
 
-# --- the stream of the log that is being written
+# --- streaming of the open log
 
 
 def _start(command: Command, context: Context) -> Result:
@@ -119,7 +119,7 @@ def _start(command: Command, context: Context) -> Result:
 
 
 def _stop(_command: Command, context: Context) -> None:
-    """End the stream. PX4 does not acknowledge it."""
+    """Stop the stream. PX4 does not acknowledge this command."""
     context.log_stream = None
 
 
@@ -130,7 +130,7 @@ ACTIONS: dict[int, Action] = {
 
 
 def handle_ack(message: WireMessage, context: Context) -> bool:
-    """Go on behind a piece of the head."""
+    """Continue after an acknowledged piece of the log header."""
     stream = context.log_stream
     if stream is None or stream.waiting is None or stream.waiting.sequence != message.sequence:
         return False
@@ -156,7 +156,7 @@ def _stream(context: Context, stream: LogStream) -> None:
                 _send_acked(context, stream, piece)
             log = logs.open_log()
             if not stream.in_head and log is not None:
-                # What was flown before the client asked is for the download.
+                # The client can download data from before its request.
                 stream.skip_to(log.size_bytes)
             return
         piece = stream.next_piece(logs.read)

@@ -1,9 +1,9 @@
 """Measurements from clients: poses, distances, optical flow, obstacles and landing targets.
 
 Source: PX4 1.16, the handlers of these messages in MavlinkReceiver, and
-EKF2::UpdateExtVisionSample, which drops what is not a rotation. The senders' times are not used:
-EKF2_EV_DELAY alone gives the age of a pose. Motion capture, as ODOMETRY of that type or
-ATT_POS_MOCAP, has no effect: PX4 publishes it apart, and EKF2 does not take it.
+EKF2::UpdateExtVisionSample, which drops quaternions without unit norm. The senders' time stamps are
+ignored: the age of a pose is EKF2_EV_DELAY. Motion capture (ODOMETRY of this type, or
+ATT_POS_MOCAP) has no effect: PX4 publishes it separately, and EKF2 does not use it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _POSES: dict[int, tuple[PoseFrame, bool]] = {
     dialect.MAV_FRAME_LOCAL_FRD: ("frd", False),
     dialect.MAV_FRAME_LOCAL_FLU: ("frd", True),
 }
-"""The frame of a pose, and whether its axes are others than ours."""
+"""Frame of a pose, and True if its axes must be converted to NED or FRD."""
 
 _VELOCITIES: dict[int, tuple[VelocityFrame, bool]] = {
     **_POSES,
@@ -47,11 +47,11 @@ _VELOCITIES: dict[int, tuple[VelocityFrame, bool]] = {
 _NOT_TOLD = np.full(6, np.nan)
 
 _UNIT_TOLERANCE = 1e-5
-"""A quaternion's length may differ from 1 by so much."""
+"""Maximum deviation of a quaternion's norm from 1."""
 
 
 def handle_odometry(message: WireMessage, context: Context) -> bool:
-    """ODOMETRY: hand over its valid parts; report once an estimator type that PX4 rejects."""
+    """Handle ODOMETRY: store its valid parts; report an unsupported estimator type once."""
     kind = message.estimator_type
     if kind == dialect.MAV_ESTIMATOR_TYPE_MOCAP:
         return False
@@ -84,7 +84,7 @@ def handle_odometry(message: WireMessage, context: Context) -> bool:
 
 
 def handle_vision_position(message: WireMessage, context: Context) -> bool:
-    """VISION_POSITION_ESTIMATE: a pose in local NED."""
+    """Handle VISION_POSITION_ESTIMATE: a pose in local NED."""
     told = _diagonal(message.covariance)
     angles = _finite(message.roll, message.pitch, message.yaw)
     return _see(
@@ -119,10 +119,10 @@ def _in_our_axes(
     *,
     naive: bool,
 ) -> tuple[Vector | None, Vector]:
-    """Return a vector and variances (6,); None and NaN where they are not known.
+    """Return a vector and variances (6,) in NED or FRD; None and NaN if unknown.
 
-    `frame` says whether its axes are others than ours; None = an unknown frame. A `naive` sender
-    has no covariance.
+    `frame` is the name, and True if the axes must be converted; None = an unknown frame. A `naive`
+    sender has no covariance.
     """
     if frame is None:
         return None, _NOT_TOLD
@@ -136,19 +136,19 @@ def _in_our_axes(
 
 
 def _ours(frame: str, vector: Vector) -> Vector:
-    """Return a vector of east, north, up, or of forward, left, up, in our axes."""
+    """Return a vector in ENU as NED, or a vector in FLU as FRD."""
     a, b, up = vector.tolist()
     return np.array([b, a, -up]) if frame == "ned" else np.array([a, -b, -up])
 
 
 def _diagonal(triangle: tuple[float, ...]) -> Vector:
-    """Return the diagonal (6,) of a covariance; NaN where it is not known."""
+    """Return the diagonal (6,) of a covariance; NaN = unknown."""
     return np.array([triangle[i] for i in DIAGONAL])
 
 
 def _rotation(quaternion: Vector) -> Vector | None:
     length = float(np.linalg.norm(quaternion))
-    # Written so that NaN fails.
+    # The negated comparison also rejects NaN.
     if not abs(length - 1.0) <= _UNIT_TOLERANCE:
         return None
     rotation: Vector = quaternion / length
@@ -159,7 +159,7 @@ def _rotation(quaternion: Vector) -> Vector | None:
 
 
 def handle_distance(message: WireMessage, context: Context) -> bool:
-    """DISTANCE_SENSOR: the estimator uses it if the sensor looks down."""
+    """Handle DISTANCE_SENSOR: the estimator uses downward-facing sensors only."""
     context.port.measure_distance(
         DistanceReading(
             message.current_distance * 1e-2,
@@ -175,15 +175,15 @@ def handle_distance(message: WireMessage, context: Context) -> bool:
 
 
 def quality_of(signal_quality: int) -> int:
-    """Return a quality [%] of the field's 1 (invalid) to 100, 0 = not told; -1 = not told.
+    """Return the quality [%] of a field from 1 (invalid) to 100; -1 if the field is 0 (unknown).
 
-    More than the field's greatest is taken for that; PX4's byte would overflow.
+    Values above 100 are clamped; PX4's byte would overflow.
     """
     return -1 if signal_quality == 0 else 100 * (min(signal_quality, 100) - 1) // 99
 
 
 def handle_optical_flow(message: WireMessage, context: Context) -> bool:
-    """OPTICAL_FLOW_RAD; distance and temperature are not used."""
+    """Handle OPTICAL_FLOW_RAD. Ignores distance and temperature."""
     turned = (message.integrated_xgyro, message.integrated_ygyro, message.integrated_zgyro)
     context.port.look_down(
         FlowReading(
@@ -201,7 +201,7 @@ _IN_BODY = dialect.MAV_FRAME_BODY_FRD
 
 
 def handle_obstacle_distance(message: WireMessage, context: Context) -> bool:
-    """OBSTACLE_DISTANCE; like PX4, report an unknown frame only if CP_DIST is set."""
+    """Handle OBSTACLE_DISTANCE. Like PX4, report an unknown frame only if CP_DIST is set."""
     frame = message.frame
     if frame not in _IN_WORLD and frame != _IN_BODY:
         if context.port.parameters.value("CP_DIST") > 0.0:
@@ -227,9 +227,9 @@ def handle_obstacle_distance(message: WireMessage, context: Context) -> bool:
 
 
 def handle_landing_target(message: WireMessage, context: Context) -> bool:
-    """LANDING_TARGET: like PX4, accept positions in local NED alone.
+    """Handle LANDING_TARGET. Like PX4, accept only positions in local NED.
 
-    Bearings of a target need a module that PX4's SITL does not start, and have no effect.
+    Target bearings have no effect: they require a module that PX4 SITL does not start.
     """
     if not message.position_valid:
         return False

@@ -1,8 +1,8 @@
-"""Messages on request, and how often they are streamed.
+"""Message requests and stream rates.
 
-REQUEST_MESSAGE, SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL and their older kin, answered as a
-running PX4 1.16 answers them. A message that has nothing to say is DENIED, the rate of one that is
-no stream FAILED.
+REQUEST_MESSAGE, SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL and older equivalents, with the replies
+of a running PX4 1.16. A request for a message without content is DENIED; setting the rate of a
+message that is not a stream is FAILED.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from firmware_sim.mavlink.streams import information
 from firmware_sim.mavlink.streams.units import INT32_MAX, boot_ms
 
 _INTERVAL_UNAVAILABLE = 0
-"""PX4 says the same of a stream that is off as of one that there is not."""
+"""Reported interval of a stream that is off. PX4 reports the same for an unknown stream."""
 _MIB = 1024.0 * 1024.0
 
 FIXED_RATE = frozenset(("HEARTBEAT", "MISSION_CURRENT"))
-"""Messages that PX4 sends at rates of its own: no client can change them."""
+"""Messages with fixed rates in PX4, which clients cannot change."""
 
 OF_MISSING_DEVICES = frozenset((370, 371))
-"""BATTERY_INFO and FUEL_STATUS, which no definitions here have: PX4 accepts a rate, and as it lacks
-the devices, sends nothing. A NaN for an id is accepted likewise."""
+"""Ids of BATTERY_INFO and FUEL_STATUS, which the definitions here lack. PX4 accepts a rate but
+sends nothing, because it lacks the devices. PX4 also accepts a NaN id."""
 
 
 GROUPS: dict[int, tuple[str, ...]] = {
@@ -52,7 +52,7 @@ GROUPS: dict[int, tuple[str, ...]] = {
 
 
 def _set_message_interval(command: Command, context: Context) -> Result:
-    """Parameter 1: message id; 2: interval [µs], 0 or not given = default, negative = off."""
+    """Handle parameter 1: message id; 2: interval [µs], 0 or unset = default, negative = off."""
     number = command.integer(1)
     if number is None or number in OF_MISSING_DEVICES:
         return Result.ACCEPTED
@@ -76,7 +76,7 @@ def _get_message_interval(command: Command, context: Context) -> Result:
 
 
 def _request_message(command: Command, context: Context) -> Result:
-    """Parameter 1: message id; 2: what the message takes."""
+    """Handle parameter 1: message id; 2: parameter of the message."""
     number = command.integer(1) or 0
     special = _SPECIAL.get(number)
     if special is not None:
@@ -91,7 +91,7 @@ def _request_interval(command: Command, context: Context) -> Result:
 
 
 def _request_modes(command: Command, context: Context) -> Result:
-    """Parameter 2: the mode's number from 1 on; 0 = all."""
+    """Handle parameter 2: number of the mode, starting at 1; 0 = all."""
     asked = command.integer(2) or 0
     modes = information.available_modes()
     if not 0 <= asked <= len(modes):
@@ -102,7 +102,7 @@ def _request_modes(command: Command, context: Context) -> Result:
 
 
 def _request_storage(command: Command, context: Context) -> Result:
-    """Parameter 2: storage number; 0 = all. There is one, with number 1."""
+    """Handle parameter 2: storage number; 0 = all. The only storage has number 1."""
     number, count, empty = 1, 1, b""
     if command.integer(2) not in (None, 0, number):
         return Result.DENIED
@@ -130,11 +130,11 @@ _SPECIAL: Mapping[int, Callable[[Command, Context], Result]] = {
     dialect.MAVLINK_MSG_ID_COMPONENT_INFORMATION: component_metadata.request_information,
     dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION: _request_storage,
 }
-"""Messages that are no streams, or whose request has parameters."""
+"""Messages that are not streams, or whose request has parameters."""
 
 
 def send_stream(name: str, context: Context) -> Result:
-    """Send a streamed message now; DENIED: nothing to say, UNSUPPORTED: no such message."""
+    """Send a streamed message now; DENIED = no content, UNSUPPORTED = unknown message."""
     if name not in context.link.builders:
         return Result.UNSUPPORTED
     sent = context.link.send_stream(name, context.port.state())
@@ -142,7 +142,7 @@ def send_stream(name: str, context: Context) -> Result:
 
 
 def _stream_name(number: int | None, context: Context) -> str | None:
-    """Return the stream with a message id, None when there is none."""
+    """Return the name of the stream with a message id; None if unknown."""
     name = None if number is None else message_name(number)
     return name if name in context.link.builders else None
 
@@ -157,9 +157,9 @@ def _send_interval(number: int, context: Context) -> Result:
 
 
 def handle_data_stream(message: WireMessage, context: Context) -> bool:
-    """REQUEST_DATA_STREAM: raise the rates of a group of streams, or restore its default rates.
+    """Handle REQUEST_DATA_STREAM: raise the rates of a stream group, or restore the defaults.
 
-    A real PX4 ignores this deprecated message. It may only raise rates: MAVProxy asks for all
+    A real PX4 ignores this deprecated message. Here it can only raise rates: MAVProxy requests all
     streams at 4 Hz when it connects, and another client on the same link must keep its 100 Hz
     attitude.
     """
@@ -181,9 +181,9 @@ def handle_data_stream(message: WireMessage, context: Context) -> bool:
 
 
 def handle_event(request: WireMessage, context: Context) -> bool:
-    """REQUEST_EVENT: send events again; RESPONSE_EVENT_ERROR for each that is gone."""
+    """Handle REQUEST_EVENT: resend events, or RESPONSE_EVENT_ERROR for each expired event."""
     first, last = request.first_sequence, request.last_sequence
-    # The first one that is gone tells where to go on: naming thousands would help nobody.
+    # Limited: the first error reply already contains the oldest available number.
     wanted = min((last - first) % NUMBERS + 1, KEPT)
     for number in range(first, first + wanted):
         sequence = number % NUMBERS

@@ -1,7 +1,7 @@
-"""Plan items on the wire: MISSION_ITEM and MISSION_ITEM_INT to and from `plan.PlanItem`.
+"""Conversion between MISSION_ITEM, MISSION_ITEM_INT and `plan.PlanItem`.
 
-Stored fields, rejections and downloads follow PX4 1.16.
-Source: MavlinkMissionManager::parse_mavlink_mission_item, format_mavlink_mission_item.
+Stored fields, rejections and downloads follow PX4 1.16. Source:
+MavlinkMissionManager::parse_mavlink_mission_item, format_mavlink_mission_item.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _GLOBAL_FRAMES = (Frame.GLOBAL, Frame.GLOBAL_RELATIVE_ALT)
 _INT_FRAMES = (Frame.GLOBAL_INT, Frame.GLOBAL_RELATIVE_ALT_INT)
 
 _ROI_NONE, _ROI_WPNEXT, _ROI_WPINDEX, _ROI_LOCATION = 0, 1, 2, 3
-"""MAV_ROI."""
+"""Values of MAV_ROI."""
 
 _Kept = Callable[[float], float]
 
@@ -53,7 +53,7 @@ def _whole(value: float) -> float:
 
 
 def _region(value: float) -> float | None:
-    """Return which MAV_ROI is meant; NaN means none of them to PX4's SITL."""
+    """Return the MAV_ROI value; None for NaN, which PX4 SITL does not match to any value."""
     return _whole(value) if math.isfinite(value) else None
 
 
@@ -83,24 +83,24 @@ _PLACES: Mapping[int, tuple[_Kept, _Kept, _Kept, _Kept]] = MappingProxyType(
         _N.RALLY_POINT: (_nothing, _nothing, _nothing, _nothing),
     }
 )
-"""Commands with a place, and what a download returns of their parameters 1..4."""
+"""Conversion of parameters 1 to 4 for a download, by command with a position."""
 
 _WITHOUT_PLACE = frozenset(_N) - _PLACES.keys() - {_N.SET_CAMERA_ZOOM} | {_N.ROI, _N.DO_SET_ROI}
-"""Commands of the frame MISSION."""
+"""Commands without a position, for the frame MISSION."""
 
 _POLYGONS = (_N.FENCE_POLYGON_VERTEX_INCLUSION, _N.FENCE_POLYGON_VERTEX_EXCLUSION)
 
 _CHECKED = struct.Struct("<BHB4f4s4sf")
-"""What PX4's checksum covers: frame, command, autocontinue, parameters 1..4, x, y, z."""
+"""Fields of PX4's checksum: frame, command, autocontinue, parameters 1 to 4, x, y, z."""
 
 
 def is_int(message: WireMessage) -> bool:
-    """Return whether an item came as MISSION_ITEM_INT."""
+    """Return True for a MISSION_ITEM_INT."""
     return bool(message.get_type() == "MISSION_ITEM_INT")
 
 
 def parse(message: WireMessage) -> PlanItem | int:
-    """Return the item of a MISSION_ITEM(_INT), or the MAV_MISSION_RESULT that refuses it."""
+    """Return the item of a MISSION_ITEM(_INT), or the MAV_MISSION_RESULT of its rejection."""
     frame, command, integer = message.frame, message.command, is_int(message)
     params = (message.param1, message.param2, message.param3, message.param4)
     x, y = float(message.x), float(message.y)
@@ -111,7 +111,7 @@ def parse(message: WireMessage) -> PlanItem | int:
         if roi and _region(message.param1) not in (_ROI_NONE, _ROI_LOCATION):
             return int(dialect.MAV_MISSION_INVALID_PARAM1)
         if not (math.isfinite(x) and math.isfinite(y)):
-            # PX4 stores such a place, and does not know what to fly.
+            # PX4 stores such a position but cannot fly to it.
             wrong_y = dialect.MAV_MISSION_INVALID_PARAM6_Y
             return int(wrong_y if math.isfinite(x) else dialect.MAV_MISSION_INVALID_PARAM5_X)
         if integer:
@@ -129,7 +129,7 @@ def parse(message: WireMessage) -> PlanItem | int:
 
 
 def belongs(item: PlanItem, kind: Kind) -> bool:
-    """Return whether an item may be part of such a list. A polygon has at least 3 vertices."""
+    """Return True if an item is valid in a list of this type. Polygons need 3 vertices."""
     if kind is Kind.MISSION:
         return item.command not in NOT_IN_MISSIONS
     if kind is Kind.FENCE and item.command in _POLYGONS:
@@ -146,7 +146,7 @@ def format_item(
     current: bool,
     integer: bool,
 ) -> WireMessage:
-    """Return the MISSION_ITEM_INT (or MISSION_ITEM) that a download returns."""
+    """Return the MISSION_ITEM_INT (or MISSION_ITEM) for a download."""
     x: float = item.x
     y: float = item.y
     if item.frame == Frame.MISSION:
@@ -155,7 +155,7 @@ def format_item(
             params = (_whole(params[0]), _whole(params[1]), params[2], params[3])
         x, y = (_fit(x), _fit(y)) if integer else (x, y)
     else:
-        # PX4 does not keep the frame of a fence's points: it says global.
+        # PX4 does not store the frame of fence points: it reports a global frame.
         frame = _frame(
             relative=item.altitude_is_relative and kind is not Kind.FENCE, integer=integer
         )
@@ -186,7 +186,7 @@ def _fit(value: float) -> int:
 
 
 def checksum(message: WireMessage, previous: int) -> int:
-    """Return PX4's checksum of a list with one more item: its opaque id (CRC-32, no inversion)."""
+    """Return PX4's list checksum (opaque id) after one more item: CRC-32 without inversion."""
     pack = struct.Struct("<i" if is_int(message) else "<f").pack
     four = (message.param1, message.param2, message.param3, message.param4)
     head = (message.frame, message.command, message.autocontinue)

@@ -1,9 +1,8 @@
-"""The mission protocol: missions, the geofence and rally points, up, down, cleared, chosen.
+"""Mission protocol: upload, download, clear and select, for missions, geofence and rally points.
 
-Answers, refusals and texts follow PX4 1.16 (MavlinkMissionManager). Each link has one transfer at
-a time; an upload blocks uploads on all links. What PX4 passes over in silence (an item out of
-turn, MISSION_WRITE_PARTIAL_LIST) has no answer here either.
-https://mavlink.io/en/services/mission.html
+Replies, rejections and texts follow PX4 1.16 (MavlinkMissionManager). Each link has one transfer at
+a time; an upload blocks uploads on all links. Messages that PX4 ignores (an item out of sequence,
+MISSION_WRITE_PARTIAL_LIST) have no reply here either. https://mavlink.io/en/services/mission.html
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ _ERROR: int = dialect.MAV_MISSION_ERROR
 
 
 def is_addressed(message: WireMessage, context: Context) -> bool:
-    """Return whether a message is for this vehicle's missions."""
+    """Return True if a message is addressed to this vehicle's mission manager."""
     return bool(
         message.target_system == context.system_id and message.target_component in _PLANNERS
     )
@@ -43,7 +42,7 @@ def is_addressed(message: WireMessage, context: Context) -> bool:
 
 
 def handle_list(message: WireMessage, context: Context) -> bool:
-    """MISSION_REQUEST_LIST: begin a download with the number of items."""
+    """Handle MISSION_REQUEST_LIST: start a download by sending the number of items."""
     transfer = context.transfer
     partner = sender(message)
     _settle(transfer)
@@ -67,7 +66,7 @@ def handle_list(message: WireMessage, context: Context) -> bool:
 
 
 def handle_request(message: WireMessage, context: Context) -> bool:
-    """MISSION_REQUEST and MISSION_REQUEST_INT: send an item of the running download."""
+    """Handle MISSION_REQUEST(_INT): send an item of the running download."""
     transfer = context.transfer
     transfer.integer = message.get_type() == "MISSION_REQUEST_INT"
     if sender(message) != transfer.partner:
@@ -91,7 +90,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
 
 
 def handle_ack(message: WireMessage, context: Context) -> bool:
-    """MISSION_ACK: the end of a download, or a client's word on our requests."""
+    """Handle MISSION_ACK: end a download, or react to the client's reply to a request."""
     transfer = context.transfer
     if sender(message) != transfer.partner:
         _complain(context, "REJ. WP CMD: partner id mismatch", events.ACK_OF_ANOTHER)
@@ -102,7 +101,7 @@ def handle_ack(message: WireMessage, context: Context) -> bool:
     if transfer.activity is not _RECEIVING:
         return False
     if message.type == dialect.MAV_MISSION_UNSUPPORTED:
-        # The client knows only the other kind of item.
+        # The client supports only the other item message.
         transfer.integer = not transfer.integer
         _request(context)
     elif message.type == dialect.MAV_MISSION_OPERATION_CANCELLED:
@@ -114,7 +113,7 @@ def handle_ack(message: WireMessage, context: Context) -> bool:
 
 
 def handle_count(message: WireMessage, context: Context) -> bool:
-    """MISSION_COUNT: begin an upload. A count of 0 clears the list."""
+    """Handle MISSION_COUNT: start an upload. A count of 0 clears the list."""
     transfer, partner = context.transfer, sender(message)
     _settle(transfer)
     if transfer.activity is _SENDING:
@@ -129,7 +128,7 @@ def handle_count(message: WireMessage, context: Context) -> bool:
             _complain(context, "WPM: REJ. CMD: Busy", events.COUNT_WHILE_RECEIVING)
             _acknowledge(context, partner, _ERROR)
         else:
-            _request(context)  # it seems that our request was lost
+            _request(context)  # the request was probably lost
         return True
     return _begin_upload(message, context)
 
@@ -140,7 +139,7 @@ def _begin_upload(message: WireMessage, context: Context) -> bool:
         _acknowledge(context, partner, _ERROR)
         return True
     if partner != transfer.partner:
-        # Another client may know floats alone (dronekit): it is asked for them first.
+        # Another client may support only floats (dronekit): request floats first.
         transfer.integer = False
     transfer.partner, transfer.kind, transfer.checksum = partner, message.mission_type, 0
     known = transfer.kind in MOST_ITEMS
@@ -160,7 +159,7 @@ def _begin_upload(message: WireMessage, context: Context) -> bool:
 
 
 def handle_item(message: WireMessage, context: Context) -> bool:
-    """MISSION_ITEM and MISSION_ITEM_INT: store an item and ask for the next."""
+    """Handle MISSION_ITEM(_INT): store an item and request the next."""
     transfer, partner = context.transfer, sender(message)
     transfer.integer = mission_items.is_int(message)
     if partner != transfer.partner:
@@ -175,7 +174,7 @@ def handle_item(message: WireMessage, context: Context) -> bool:
         return True
     if transfer.activity is _IDLE:
         if transfer.index == message.seq + 1:
-            # The last item once more: our acknowledgement was lost.
+            # The last item again: the acknowledgement was lost.
             _acknowledge(context, partner, _ACCEPTED, transfer.checksum)
         else:
             _complain(context, "IGN MISSION_ITEM: No transfer", events.ITEM_WITHOUT_TRANSFER)
@@ -209,7 +208,7 @@ def _take_item(message: WireMessage, context: Context) -> bool:
         return True
     plans = context.port.plans
     if transfer.checksum != plans.stored(kind).identity:
-        # The same list again changes nothing, not even the item to go on with.
+        # An identical list has no effect: the current item stays.
         plans.store(kind, tuple(transfer.items), transfer.checksum, transfer.current)
     _end_upload(context)
     _acknowledge(context, transfer.partner, _ACCEPTED, transfer.checksum)
@@ -220,7 +219,7 @@ def _take_item(message: WireMessage, context: Context) -> bool:
 
 
 def handle_clear(message: WireMessage, context: Context) -> bool:
-    """MISSION_CLEAR_ALL: forget one list, or all."""
+    """Handle MISSION_CLEAR_ALL: clear one list, or all lists."""
     transfer, kind = context.transfer, message.mission_type
     _settle(transfer)
     if transfer.activity is not _IDLE:
@@ -235,7 +234,7 @@ def handle_clear(message: WireMessage, context: Context) -> bool:
 
 
 def handle_set_current(message: WireMessage, context: Context) -> bool:
-    """MISSION_SET_CURRENT: choose the item to go on with. The mode does not change."""
+    """Handle MISSION_SET_CURRENT: select the item to resume with. The mode does not change."""
     plans = context.port.plans
     _settle(context.transfer)
     if context.transfer.activity is not _IDLE:
@@ -249,7 +248,7 @@ def handle_set_current(message: WireMessage, context: Context) -> bool:
 
 
 def send_pending(context: Context) -> None:
-    """Ask again, give up, and tell of the mission's progress. To be called every tick."""
+    """Repeat requests, check timeouts, and report mission progress. Call once per tick."""
     transfer, plans = context.transfer, context.port.plans
     if transfer.activity is not _IDLE:
         _check_timeouts(context)
@@ -287,9 +286,9 @@ def _tell_reached(context: Context) -> None:
 
 
 def _settle(transfer: MissionTransfer) -> None:
-    """End a download whose items were all sent: some clients (dronekit) never acknowledge it.
+    """End a complete download: some clients (dronekit) never acknowledge it.
 
-    PX4 does so where a new download begins, and else waits for its timeout.
+    PX4 does this when a new download starts, and otherwise waits for its timeout.
     """
     if transfer.activity is _SENDING and transfer.index == transfer.count:
         transfer.activity = _IDLE

@@ -1,8 +1,8 @@
-"""Commands to fly somewhere, missions, home, origin, and the region of interest.
+"""Commands for navigation, missions, home, origin, and the region of interest.
 
-Source: PX4 1.16, Commander.cpp and Navigator, checked against a running one. PX4 does not look
-at the frame. Every altitude is above mean sea level. MAVSDK relies on it, whose do_orbit sends such
-an altitude in a frame above home.
+Source: PX4 1.16, Commander.cpp and Navigator, checked against a running PX4. PX4 ignores the frame:
+every altitude is above mean sea level. MAVSDK relies on this: do_orbit sends such an altitude in a
+frame above home.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ NAN = math.nan
 _CHANGE_MODE: int = dialect.MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
 _GROUND_SPEED: int = dialect.SPEED_TYPE_GROUNDSPEED
 _ROI_LOCATION = 3
-"""MAV_ROI_LOCATION."""
+"""Value of MAV_ROI_LOCATION."""
 
 _LOWEST_M, _HIGHEST_M = -12_000.0, 100_000.0
-"""An origin lies between these altitudes above mean sea level, as in EKF2 [m]."""
+"""Range of valid origin altitudes above mean sea level, as in EKF2 [m]."""
 
 
 def _reposition(command: Command, context: Context) -> Result:
-    """Parameter 1: speed [m/s], 2: flags, 4: heading [rad], 5..7: place. NaN = as it is."""
+    """Handle parameters 1: speed [m/s], 2: flags, 4: heading [rad], 5..7: position; NaN = keep."""
     if command.integer(2) != _CHANGE_MODE:
         return Result.UNSUPPORTED
     speed, yaw = command.params[0], command.params[3]
@@ -42,7 +42,7 @@ def _reposition(command: Command, context: Context) -> Result:
 
 
 def _change_altitude(command: Command, context: Context) -> Result:
-    """Parameter 1: altitude [m] above mean sea level."""
+    """Handle parameter 1: altitude [m] above mean sea level."""
     nowhere = (NAN, NAN, NAN, NAN, NAN, NAN)
     above = replace(command, params=(*nowhere, command.params[0]))
     place = Place(local_place(above, context), NAN)
@@ -50,7 +50,7 @@ def _change_altitude(command: Command, context: Context) -> Result:
 
 
 def _change_speed(command: Command, context: Context) -> Result:
-    """Parameter 1: SPEED_TYPE, 2: speed [m/s]."""
+    """Handle parameters 1: SPEED_TYPE, 2: speed [m/s]."""
     speed = command.params[1]
     if command.integer(1) == _GROUND_SPEED and speed > 0.0 and math.isfinite(speed):
         context.port.change_speed(speed)
@@ -58,7 +58,7 @@ def _change_speed(command: Command, context: Context) -> Result:
 
 
 def _orbit(command: Command, context: Context) -> Result:
-    """Parameter 1: radius [m], 2: speed [m/s], 3: ORBIT_YAW_BEHAVIOUR, 5..7: centre."""
+    """Handle parameters 1: radius [m], 2: speed [m/s], 3: ORBIT_YAW_BEHAVIOUR, 5..7: centre."""
     radius, speed = (p if math.isfinite(p) else NAN for p in command.params[:2])
     request = OrbitRequest(local_place(command, context), radius, speed, command.integer(3))
     result = context.port.set_mode(Mode.ORBIT, request)
@@ -68,7 +68,7 @@ def _orbit(command: Command, context: Context) -> Result:
 
 
 def local_place(command: Command, context: Context) -> Vec:
-    """Return parameters 5..7 in local NED [m]; NaN where nothing is given or known."""
+    """Return parameters 5 to 7 in local NED [m]; NaN if unset or unknown."""
     latitude, longitude, altitude = command.params[4:]
     state = context.port.state()
     origin = state.origin
@@ -84,7 +84,7 @@ def local_place(command: Command, context: Context) -> Vec:
 
 
 def _start(command: Command, context: Context) -> Result:
-    """Parameter 1: the first item; -1 = as the mission stands."""
+    """Handle parameter 1: first item; -1 = continue the mission."""
     index = command.params[0]
     if not math.isfinite(index):
         return Result.DENIED
@@ -101,7 +101,7 @@ def _start_landing(_command: Command, context: Context) -> Result:
 
 
 def _set_home(command: Command, context: Context) -> Result:
-    """Parameter 1: 1 = the present place; else parameters 5 to 7 are the place."""
+    """Handle parameter 1: 1 = current position; otherwise parameters 5 to 7 are the position."""
     if command.params[0] > 0.5:
         return context.port.set_home(None)
     place = Geodetic(*command.params[4:7])
@@ -111,7 +111,7 @@ def _set_home(command: Command, context: Context) -> Result:
 
 
 def _look(command: Command, context: Context) -> Result:
-    """DO_SET_ROI_LOCATION, DO_SET_ROI (parameter 1: MAV_ROI) and DO_SET_ROI_NONE."""
+    """Handle DO_SET_ROI_LOCATION, DO_SET_ROI (parameter 1: MAV_ROI) and DO_SET_ROI_NONE."""
     place = Geodetic(*command.params[4:7])
     located = command.number == NavCommand.DO_SET_ROI_LOCATION or (
         command.number != NavCommand.DO_SET_ROI_NONE and command.params[0] == _ROI_LOCATION
@@ -122,9 +122,9 @@ def _look(command: Command, context: Context) -> Result:
 
 
 def handle_set_origin(message: WireMessage, context: Context) -> bool:
-    """SET_GPS_GLOBAL_ORIGIN: move local NED's zero, if this vehicle and a valid place are meant.
+    """Handle SET_GPS_GLOBAL_ORIGIN: move the origin of local NED.
 
-    Like PX4 1.16, answer any sender with GPS_GLOBAL_ORIGIN.
+    Requires this system id and a valid position. Like PX4 1.16, always reply GPS_GLOBAL_ORIGIN.
     """
     meant: bool = message.target_system == context.system_id
     place = Geodetic(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
@@ -151,6 +151,6 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_DO_SET_ROI_NONE: _look,
     dialect.MAV_CMD_DO_SET_ROI: _look,
     dialect.MAV_CMD_NAV_ROI: _look,
-    # It is followed only as a mission's item.
+    # Effective only as a mission item.
     dialect.MAV_CMD_DO_SET_ROI_WPNEXT_OFFSET: _look,
 }

@@ -1,4 +1,4 @@
-"""The parameter protocol with PX4's bytewise encoding: an INT32 travels as the bytes of a float."""
+"""Parameter protocol with PX4's bytewise encoding: an INT32 is sent as the bytes of a float."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from firmware_sim.mavlink.services.context import Action, Command, Context, send
 from firmware_sim.mavlink.services.transfers import crc32part
 
 HASH_NAME = "_HASH_CHECK"
-"""Pseudo parameter: a checksum by which a ground station recognises its cached values."""
+"""Name of a pseudo parameter: checksum with which ground stations validate cached values."""
 
 PARAMETERS_PER_TICK = 3
-"""Parameters of a full list that are sent per tick: it has hundreds."""
+"""Parameters of a full list sent per tick; a list has hundreds."""
 
 _NO_INDEX = 65_535
 _ERROR_TYPE_MISMATCH = 7
-"""MAV_PARAM_ERROR_TYPE_MISMATCH, newer than pymavlink's dialect."""
+"""MAV_PARAM_ERROR_TYPE_MISMATCH, which pymavlink's dialect lacks."""
 
 
 def send_pending(context: Context) -> None:
-    """Send the next few parameters of a running list; call once per tick."""
+    """Send the next parameters of a running list; call once per tick."""
     if context.next_parameter is None:
         return
     store = context.port.parameters
@@ -41,8 +41,8 @@ def send_pending(context: Context) -> None:
 
 
 def handle_list(_message: WireMessage, context: Context) -> bool:
-    """Begin to send all parameters."""
-    # As PX4: a client that asks again does not need the hash.
+    """Start sending all parameters."""
+    # As in PX4: a client that repeats the request does not need the hash.
     context.next_parameter = -1 if context.next_parameter is None else 0
     return True
 
@@ -65,7 +65,7 @@ def handle_read(message: WireMessage, context: Context) -> bool:
 def handle_set(message: WireMessage, context: Context) -> bool:
     """Set a parameter, and send its new value on all links."""
     if message.param_id == HASH_NAME:
-        context.next_parameter = None  # "my cached values are good: stop the list"
+        context.next_parameter = None  # the client's cached values are valid: stop the list
         return True
     store = context.port.parameters
     present = store.by_name(message.param_id)
@@ -103,7 +103,7 @@ def _encoded(value: int | float) -> bytes:
 
 
 def _received_value(message: WireMessage) -> int | float:
-    """Return the value of a PARAM_SET from its bytes (they lead the payload)."""
+    """Return the value of a PARAM_SET from its bytes (the start of the payload)."""
     shape = "<i" if message.param_type == dialect.MAV_PARAM_TYPE_INT32 else "<f"
     value: int | float
     (value,) = struct.unpack(shape, payload(message)[:4].ljust(4, b"\0"))
@@ -111,7 +111,7 @@ def _received_value(message: WireMessage) -> int | float:
 
 
 def _value_message(parameter: ParameterValue, count: int) -> tuple[str, bytes]:
-    """Return name and payload of the message."""
+    """Return name and payload of a PARAM_VALUE message."""
     value = parameter.value
     body = param_value(parameter.name, _encoded(value), _kind(value), count, parameter.index)
     return "PARAM_VALUE", body
@@ -127,7 +127,7 @@ def _hash_message(store: ParameterStore) -> tuple[str, bytes]:
 def _hash_of(store: ParameterStore, _revision: int) -> int:
     """Return PX4's param_hash_check(): CRC-32 without inversions over all names and values.
 
-    It takes most of a tick. All clients that begin get the same.
+    Cached for all new clients, because the computation takes most of a tick.
     """
     parameters = filter(None, map(store.by_index, range(len(store))))
     return crc32part(b"".join(p.name.encode("ascii") + _encoded(p.value) for p in parameters))
@@ -139,7 +139,7 @@ _LOAD, _SAVE, _RESET, _RESET_SENSORS, _FACTORY_RESET = range(5)
 
 
 def _store(command: Command, context: Context) -> Result | None:
-    """Parameter 1: what is done; PX4 does not acknowledge what it does not know."""
+    """Handle parameter 1: action. PX4 does not acknowledge unknown actions."""
     if context.port.state().status.arming is Arming.ARMED:
         return Result.TEMPORARILY_REJECTED
     parameters = context.port.parameters
@@ -150,7 +150,7 @@ def _store(command: Command, context: Context) -> Result | None:
         return Result.ACCEPTED if parameters.load() else Result.FAILED
     elif asked == _SAVE:
         return Result.ACCEPTED if parameters.save() else Result.FAILED
-    elif asked != _RESET_SENSORS:  # which have no calibration that could be reset
+    elif asked != _RESET_SENSORS:  # sensors have no calibration to reset
         return None
     return Result.ACCEPTED
 

@@ -1,4 +1,4 @@
-"""Other systems: HEARTBEAT, PING, TIMESYNC, SETUP_SIGNING, and streams for them to answer."""
+"""HEARTBEAT, PING, TIMESYNC and SETUP_SIGNING of other systems, and streamed requests."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from firmware_sim.mavlink.streams import Builder
 
 
 def handle_heartbeat(message: WireMessage, context: Context) -> bool:
-    """Notify the autopilot of a ground station's heartbeat (PX4's data link loss), of no other."""
+    """Report a ground station's heartbeat to the autopilot (PX4's data link loss), and no other."""
     if message.type == dialect.MAV_TYPE_GCS:
         context.port.gcs_heartbeat(context.now_us)
     return True
 
 
 def handle_ping(message: WireMessage, context: Context) -> bool:
-    """Return a request (target 0/0) to its sender; an answer to our own request ends here."""
+    """Return a request (target 0/0) to its sender. Replies to our requests need no action."""
     if (message.target_system, message.target_component) != (ANY, ANY):
         return False
     context.link.send(
@@ -29,9 +29,9 @@ def handle_ping(message: WireMessage, context: Context) -> bool:
 
 
 def handle_timesync(message: WireMessage, context: Context) -> bool:
-    """Answer a request (tc1 = 0) with our time [ns]. An answer to ours needs no action.
+    """Answer a request (tc1 = 0) with the vehicle's time [ns]. Replies need no action.
 
-    It lets peers measure the offset to the vehicle's clock (simulated time since boot).
+    Peers can measure the offset to the vehicle's clock (simulated time since boot).
     """
     if message.tc1 != 0:
         return False
@@ -40,16 +40,15 @@ def handle_timesync(message: WireMessage, context: Context) -> bool:
 
 
 def ping_requests() -> Builder:
-    """Return the builder of one link's PING stream, which counts its requests."""
+    """Return the builder of one link's PING stream, with numbered requests."""
     sequence = count()
     return lambda state: (state.time_us, next(sequence) & 0xFFFF_FFFF, ANY, ANY)
 
 
 def handle_setup(message: WireMessage, context: Context) -> bool:
-    """SETUP_SIGNING: take another key for frames from now on, or none if it is all zeros.
+    """Handle SETUP_SIGNING: replace the signing key; all zeros remove it.
 
-    As PX4 has it (PR 25284): unsigned it is taken only while there is no key, and never while
-    armed.
+    As in PX4 (PR 25284), an unsigned message is accepted only without a key, and never while armed.
     """
     if context.port.state().status.arming is Arming.ARMED:
         return False

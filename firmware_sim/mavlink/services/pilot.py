@@ -1,4 +1,4 @@
-"""The pilot's sticks (MANUAL_CONTROL, RC_CHANNELS_OVERRIDE), and the target of Follow.
+"""Pilot's sticks (MANUAL_CONTROL, RC_CHANNELS_OVERRIDE), and the target of Follow Me.
 
 Source: PX4 1.16, MavlinkReceiver::handle_message_manual_control, _rc_channels_override and
 _follow_target.
@@ -15,27 +15,27 @@ from firmware_sim.mavlink.codec import WireMessage
 from firmware_sim.mavlink.services.context import Context
 
 _CENTRE_US, _HALF_US = 1500.0, 500.0
-"""Pulse width of a channel's centre, and from there to its end [µs]."""
+"""Pulse width of a channel's centre, and from there to the maximum [µs]."""
 
 _NO_CHANNEL = (0, 65_535)
-"""Pulse widths that say nothing."""
+"""Pulse widths that mean no channel."""
 
 _HAS_VELOCITY = 1 << 1
-"""FOLLOW_TARGET.est_capabilities."""
+"""Velocity bit of FOLLOW_TARGET.est_capabilities."""
 
 
 def is_for_pilot(message: WireMessage, context: Context) -> bool:
-    """Return whether a MANUAL_CONTROL is addressed to this vehicle."""
+    """Return True if a MANUAL_CONTROL is addressed to this vehicle."""
     return bool(message.target in (0, context.system_id))
 
 
 def is_for_radio(message: WireMessage, context: Context) -> bool:
-    """Return whether an RC_CHANNELS_OVERRIDE is addressed to this vehicle."""
+    """Return True if an RC_CHANNELS_OVERRIDE is addressed to this vehicle."""
     return bool(message.target_system in (0, context.system_id))
 
 
 def handle_manual_control(message: WireMessage, context: Context) -> bool:
-    """MANUAL_CONTROL: the throttle is 0..1000, the others -1000..1000. What is not counts as 0."""
+    """Handle MANUAL_CONTROL: throttle 0..1000, others -1000..1000; 0 if out of range."""
     sticks = Sticks(
         roll=_share(message.y),
         pitch=_share(message.x),
@@ -47,9 +47,9 @@ def handle_manual_control(message: WireMessage, context: Context) -> bool:
 
 
 def handle_channels(message: WireMessage, context: Context) -> bool:
-    """RC_CHANNELS_OVERRIDE: roll, pitch, throttle, yaw as channels 1..4 of a usual radio.
+    """Handle RC_CHANNELS_OVERRIDE: roll, pitch, throttle, yaw in channels 1 to 4 (usual order).
 
-    Pulling the pitch stick lengthens its pulse. Nothing is flown while one of the four is missing.
+    Pulling the pitch stick increases its pulse width. All four channels are required.
     """
     context.radio.hear(message, context.now_us)
     raw = (message.chan1_raw, message.chan2_raw, message.chan3_raw, message.chan4_raw)
@@ -63,7 +63,7 @@ def handle_channels(message: WireMessage, context: Context) -> bool:
 
 
 def handle_follow_target(message: WireMessage, context: Context) -> bool:
-    """FOLLOW_TARGET: where it is, and its velocity if it knows it."""
+    """Handle FOLLOW_TARGET: position, and velocity if available."""
     origin = context.port.state().origin
     if origin is None or (message.lat, message.lon) == (0, 0):
         return False

@@ -1,8 +1,8 @@
-"""Offboard setpoints, read as PX4 reads them: of position and motion, local or global, of attitude.
+"""Offboard setpoints as in PX4: position and motion (local or global), attitude.
 
 Source: PX4 MavlinkReceiver::handle_message_set_position_target_local_ned, _global_int and
-_set_attitude_target, checked against a running PX4 1.16. PX4 says for every message that it is
-refused. Here the same refusal is told once, until a setpoint is accepted again.
+_set_attitude_target, checked against a running PX4 1.16. PX4 reports every rejected message. Here
+the same rejection is reported once, until a setpoint is accepted again.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from firmware_sim.mavlink.services.context import Context
 
 _CRITICAL = Severity.CRITICAL
 _POSITION_SHIFT, _VELOCITY_SHIFT, _ACCELERATION_SHIFT = 0, 3, 6
-"""First bit of each vector's three ignore bits (POSITION_TARGET_TYPEMASK)."""
+"""First of each vector's three ignore bits (POSITION_TARGET_TYPEMASK)."""
 
 _NOTHING = np.full(3, math.nan)
 
 _THRUST_BODY_SET = 32
-"""ATTITUDE_TARGET_TYPEMASK: `thrust_body` replaces `thrust`."""
+"""Bit of ATTITUDE_TARGET_TYPEMASK: `thrust_body` replaces `thrust`."""
 
 _LEAST_QUATERNION = 1e-6
-"""A quaternion whose norm is smaller is no attitude."""
+"""Minimum norm of a valid quaternion."""
 
 
 def handle_local(message: WireMessage, context: Context) -> bool:
-    """SET_POSITION_TARGET_LOCAL_NED."""
+    """Handle SET_POSITION_TARGET_LOCAL_NED."""
     mask, frame = message.type_mask, message.coordinate_frame
     velocity = _masked((message.vx, message.vy, message.vz), mask >> _VELOCITY_SHIFT)
     acceleration = _NOTHING
@@ -48,7 +48,7 @@ def handle_local(message: WireMessage, context: Context) -> bool:
     elif frame == dialect.MAV_FRAME_BODY_NED:
         position = _NOTHING
         q = context.port.attitude
-        # All or nothing, as in PX4; a velocity turns with the heading alone.
+        # All or none, as in PX4; velocities are rotated by the heading only.
         velocity = _NOTHING if mask >> _VELOCITY_SHIFT & 0b111 else _turned(velocity, q)
         if mask >> _ACCELERATION_SHIFT & 0b111:
             acceleration = _NOTHING
@@ -66,7 +66,7 @@ def handle_local(message: WireMessage, context: Context) -> bool:
 
 
 def handle_global(message: WireMessage, context: Context) -> bool:
-    """SET_POSITION_TARGET_GLOBAL_INT: the velocity and acceleration are local NED."""
+    """Handle SET_POSITION_TARGET_GLOBAL_INT: velocity and acceleration are local NED."""
     mask = message.type_mask
     velocity = _masked((message.vx, message.vy, message.vz), mask >> _VELOCITY_SHIFT)
     acceleration = _masked((message.afx, message.afy, message.afz), mask >> _ACCELERATION_SHIFT)
@@ -78,12 +78,12 @@ def handle_global(message: WireMessage, context: Context) -> bool:
             return _reject(context, Message.of(_CRITICAL, events.GLOBAL_FRAME, frame, text=text))
         position = _from_globe(message, _FRAMES_ABOVE[frame], context)
     if position is None or not _commands_something(position, velocity, acceleration):
-        return False  # PX4 says nothing
+        return False  # PX4 sends no reply
     return _offer(message, position, velocity, acceleration, context)
 
 
 def handle_attitude(message: WireMessage, context: Context) -> bool:
-    """SET_ATTITUDE_TARGET: an attitude, or else body rates, and a thrust."""
+    """Handle SET_ATTITUDE_TARGET: attitude or body rates, with thrust."""
     mask: int = message.type_mask
     thrust = _thrust(message)
     demand: AttitudeDemand | RateDemand
@@ -108,7 +108,7 @@ def handle_attitude(message: WireMessage, context: Context) -> bool:
         demand = RateDemand(rates, thrust)
         wire = (*rates, thrust)
     else:
-        return False  # PX4 says nothing
+        return False  # PX4 sends no reply
     context.port.offer_attitude(demand, context.now_us, wire)
     context.refusals.clear()
     return True
@@ -157,7 +157,7 @@ _FRAMES_ABOVE = {
 
 
 def _from_globe(message: WireMessage, above: int, context: Context) -> Vector | None:
-    """Return the local position NED (3,) [m]; None where it is unknown: nothing is terrain."""
+    """Return the local position NED (3,) [m]; None if unknown, or relative to terrain."""
     state = context.port.state()
     origin, home = state.origin, state.home
     if origin is None or home is None or above == _ABOVE_TERRAIN:
@@ -168,7 +168,7 @@ def _from_globe(message: WireMessage, above: int, context: Context) -> Vector | 
 
 
 def _thrust(message: WireMessage) -> float:
-    """Return the collective 0..1; none commanded is none."""
+    """Return the collective 0..1; 0 if thrust is ignored."""
     mask: int = message.type_mask
     thrust = message.thrust
     if mask & _THRUST_BODY_SET:
@@ -179,7 +179,7 @@ def _thrust(message: WireMessage) -> float:
 
 
 def _masked(values: tuple[float, float, float], ignore: int) -> Vector:
-    """Return the commanded vector (3,); NaN where ignored or not a finite number."""
+    """Return the commanded vector (3,); NaN if ignored or not finite."""
     isfinite, nan = math.isfinite, math.nan
     return np.array(
         [
@@ -190,7 +190,7 @@ def _masked(values: tuple[float, float, float], ignore: int) -> Vector:
 
 
 def _turned(velocity: Vector, quaternion: Vector) -> Vector:
-    """Turn a velocity (3,) by the heading."""
+    """Rotate a velocity (3,) by the heading."""
     forward, right, down = velocity.tolist()
     yaw = yaw_of(tuple(quaternion.tolist()))
     c, s = math.cos(yaw), math.sin(yaw)

@@ -1,6 +1,6 @@
-"""SERIAL_CONTROL: PX4's shell over MAVLink, with a handful of commands that only read.
+"""SERIAL_CONTROL: PX4's shell over MAVLink, with a few read-only commands.
 
-Source: PX4 1.16, MavlinkReceiver::handle_message_serial_control, and what its shell prints.
+Source: PX4 1.16, MavlinkReceiver::handle_message_serial_control, and the output of its shell.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from firmware_sim.mavlink.services.context import Context
 PROMPT = "pxh> "
 
 DATA_BYTES = 70
-"""Most text in one message."""
+"""Maximum text in one message [bytes]."""
 
 MESSAGES_PER_TICK = 10
 
 _SERIAL_CONTROL = struct.Struct(f"<IHBBB{DATA_BYTES}s")
-"""As it is on the wire: rate, timeout, device, flags, count, data."""
+"""Wire format: rate, timeout, device, flags, count, data."""
 _SHELL = dialect.SERIAL_CONTROL_DEV_SHELL, dialect.SERIAL_CONTROL_FLAG_REPLY
 
 _LONGEST_LINE = 256
-"""What is typed beyond this before the line ends is dropped [bytes]."""
+"""Maximum length of a line [bytes]. Further input before the end of the line is dropped."""
 
 _LONGEST_OUTPUT = 1 << 17
-"""Text that waits to be sent. A client that asks for more before it was sent gets no more."""
+"""Unsent output above which new commands are dropped [bytes]."""
 
 
 def handle_input(message: WireMessage, context: Context) -> bool:
-    """Take what was typed, run each line that ended."""
+    """Read input and run each complete line."""
     if (
         message.device != dialect.SERIAL_CONTROL_DEV_SHELL
         or message.flags & dialect.SERIAL_CONTROL_FLAG_REPLY
@@ -55,7 +55,7 @@ def handle_input(message: WireMessage, context: Context) -> bool:
 
 
 def send_pending(context: Context) -> None:
-    """Send the next part of what was printed; call once per tick."""
+    """Send the next part of the output; call once per tick."""
     output = context.shell.output
     for _ in range(MESSAGES_PER_TICK):
         if not output:
@@ -68,14 +68,14 @@ def send_pending(context: Context) -> None:
         )
 
 
-# --- commands: each prints what PX4's prints, where there is such a thing here
+# --- commands: each prints PX4's output, as far as available here
 
 Shown = Callable[[Sequence[str], AutopilotPort, int], str]
-"""Returns what a command prints: its further words, the autopilot, the time [µs]."""
+"""Returns the output of a command, given its arguments, the autopilot, and the time [µs]."""
 
 
 def run(words: Sequence[str], port: AutopilotPort, now_us: int) -> str:
-    """Return what a line prints, whole lines."""
+    """Return the output of a command line, in whole lines."""
     if not words:
         return ""
     command = COMMANDS.get(words[0])
@@ -97,7 +97,7 @@ def _uptime(_words: Sequence[str], _port: AutopilotPort, now_us: int) -> str:
 
 
 def _parameters(words: Sequence[str], port: AutopilotPort, _now_us: int) -> str:
-    """Param show [NAME, with * and ?]."""
+    """Run param show [NAME, with * and ?]."""
     if not words or words[0] != "show" or len(words) > 2:
         return "usage: param show [NAME]\n"
     pattern = words[1] if len(words) == 2 else "*"
@@ -170,7 +170,7 @@ _TOPICS: Mapping[str, Callable[[AutopilotState], Mapping[str, float]]] = {
 
 
 def _listener(words: Sequence[str], port: AutopilotPort, now_us: int) -> str:
-    """Listener TOPIC: its newest message, once."""
+    """Run listener TOPIC: print its newest message once."""
     topic = words[0] if words else ""
     fields = _TOPICS.get(topic)
     if fields is None:

@@ -19,7 +19,7 @@ _ALL_ONES = 0xFFFF_FFFF
 
 
 def crc32part(data: bytes, crc: int = 0) -> int:
-    """Return the CRC-32 of what came before (`crc`) and of `data`.
+    """Return the CRC-32 of preceding data (`crc`) and `data`.
 
     zlib inverts before and after; PX4's crc32part() does not.
     """
@@ -31,7 +31,7 @@ def crc32part(data: bytes, crc: int = 0) -> int:
 CHUNK_BYTES = 1 << 16
 
 SESSION = 0
-"""Number of a client's only session, as of PX4's."""
+"""Number of a client's only session, as in PX4."""
 
 
 class Code(IntEnum):
@@ -50,7 +50,7 @@ class Code(IntEnum):
 
 
 class RefusedError(Exception):
-    """A request that is answered with a NAK."""
+    """Error for a request that is answered with a NAK."""
 
     def __init__(self, code: Code) -> None:
         super().__init__(code.name)
@@ -59,7 +59,7 @@ class RefusedError(Exception):
 
 @dataclass(slots=True)
 class Request:
-    """One request, unpacked."""
+    """Unpacked FTP request."""
 
     session: int
     opcode: int
@@ -70,26 +70,26 @@ class Request:
 
     @property
     def name(self) -> str:
-        """The path that is meant."""
+        """Path of the requested file."""
         return os.fsdecode(self.data.split(b"\0", 1)[0])
 
 
 @dataclass(slots=True)
 class Session:
-    """The file that a client has open."""
+    """State of a client's open file."""
 
     file: BinaryIO | None = None
     size: int = 0
-    """Size of the file when it was opened [bytes]."""
+    """Size of the file [bytes], when opened and after writes."""
 
     def opened(self, request: Request) -> BinaryIO:
-        """Return the open file. Raises RefusedError when there is none."""
+        """Return the open file. Raises RefusedError if no file is open."""
         if request.session != SESSION or self.file is None:
             raise RefusedError(Code.INVALID_SESSION)
         return self.file
 
     def close(self) -> None:
-        """Close the file, if there is one."""
+        """Close the file, if open."""
         if self.file is not None:
             self.file.close()
             self.file = None
@@ -97,7 +97,7 @@ class Session:
 
 @dataclass(slots=True)
 class Burst:
-    """A burst read that is going on."""
+    """State of a burst read in progress."""
 
     sequence: int
     offset: int
@@ -105,7 +105,7 @@ class Burst:
 
 
 class Answered(NamedTuple):
-    """Fields of an answer about its request."""
+    """Fields of a reply that refer to its request."""
 
     sequence: int
     session: int
@@ -115,7 +115,7 @@ class Answered(NamedTuple):
 
 
 class Checksum:
-    """The CRC-32 of a file, piece by piece: a large file takes longer than a tick."""
+    """CRC-32 of a file, computed in parts: a large file takes longer than a tick."""
 
     def __init__(self, path: Path) -> None:
         """Open the file. Raises OSError."""
@@ -123,7 +123,7 @@ class Checksum:
         self._file = path.open("rb", buffering=0)
 
     def go_on(self) -> bytes | None:
-        """Read the next piece; return the data of the answer after the last. Raises OSError."""
+        """Read the next part; return the reply's data after the last. Raises OSError."""
         chunk = self._file.read(CHUNK_BYTES)
         self._crc = crc32part(chunk, self._crc)
         if len(chunk) == CHUNK_BYTES:
@@ -131,13 +131,13 @@ class Checksum:
         return self._crc.to_bytes(4, "little")
 
     def close(self) -> None:
-        """Close the file; harmless when called again."""
+        """Close the file. Repeated calls have no effect."""
         self._file.close()
 
 
 @dataclass(slots=True)
 class Summing:
-    """A request for a checksum that is not yet answered."""
+    """Checksum request in progress."""
 
     asked: Answered
     sum: Checksum
@@ -145,7 +145,7 @@ class Summing:
 
 @dataclass(slots=True)
 class FtpClient:
-    """One client's part in MAVLink FTP."""
+    """FTP state of one client."""
 
     session: Session = field(default_factory=Session)
     burst: Burst | None = None
@@ -155,12 +155,12 @@ class FtpClient:
     last_answer: bytes = b""
 
     def close(self) -> None:
-        """Close what is open."""
+        """Close the open file and stop the checksum."""
         self.session.close()
         self.stop_summing()
 
     def stop_summing(self) -> None:
-        """Forget a checksum that is being worked out, if there is one."""
+        """Cancel a checksum in progress, if any."""
         if self.summing is not None:
             self.summing.sum.close()
             self.summing = None
@@ -169,29 +169,29 @@ class FtpClient:
 # --- logs
 
 PIECE_BYTES = 249
-"""LOGGING_DATA.data."""
+"""Size of LOGGING_DATA.data [bytes]."""
 
 NO_MESSAGE = 255
-"""first_message_offset: no message begins in this piece."""
+"""Value of first_message_offset if no message starts in this piece."""
 
 _HEAD_BYTES = 16
-"""The magic, version and time with which a ULog file begins: no message."""
+"""Size of a ULog header [bytes]: magic, version and time, before the first message."""
 _MESSAGE_HEAD_BYTES = 3
 
 
 @dataclass(slots=True)
 class LogListing:
-    """Entries of logs: what is still to be sent of them."""
+    """Log entries that remain to be sent."""
 
     entries: Sequence[LogEntry]
-    """Of all logs, as they were when the client asked."""
+    """Entries of all logs at the time of the request."""
     number: int
     last: int
 
 
 @dataclass(slots=True)
 class LogDownload:
-    """A part of a log: what is still to be sent of it."""
+    """Part of a log that remains to be sent."""
 
     number: int
     offset: int
@@ -200,7 +200,7 @@ class LogDownload:
 
 @dataclass(slots=True)
 class Piece:
-    """A piece of a stream."""
+    """Piece of a log stream."""
 
     sequence: int
     first_message: int
@@ -208,16 +208,16 @@ class Piece:
 
 
 class LogStream:
-    """A log that is sent while it is written: first its head, each piece acknowledged, then on.
+    """Stream of an open log: the header in acknowledged pieces, then the data as written.
 
-    Afterwards it goes on with what is written from then on. What a link loses is not repeated.
+    After the header, lost data is not retransmitted.
     """
 
     def __init__(self, number: int, head_bytes: int, target: tuple[int, int]) -> None:
-        """Begin to send log `number` to the system and component `target`."""
+        """Start sending log `number` to the system and component `target`."""
         self.number, self.target = number, target
         self.waiting: Piece | None = None
-        """A piece of the head that is not yet acknowledged."""
+        """Piece of the header awaiting acknowledgement."""
         self.sent_us = 0
         self.tries = 0
         self._head_bytes = head_bytes
@@ -227,16 +227,16 @@ class LogStream:
 
     @property
     def in_head(self) -> bool:
-        """Whether pieces are to be acknowledged."""
+        """True if pieces require acknowledgement."""
         return self._offset < self._head_bytes
 
     def skip_to(self, offset: int) -> None:
-        """Go on from the end of a message; only behind the head."""
+        """Continue from the end of a message. Valid only after the header."""
         self._offset = max(self._offset, offset)
         self._boundaries = MessageBoundaries(skip=0)
 
     def next_piece(self, read: Callable[[int, int, int], bytes]) -> Piece | None:
-        """Return the next piece by `LogStore.read`, None until enough has been written."""
+        """Return the next piece, read by `LogStore.read`; None until enough data is written."""
         room = PIECE_BYTES
         if self.in_head:
             room = min(room, self._head_bytes - self._offset)
@@ -250,19 +250,19 @@ class LogStream:
 
 
 class MessageBoundaries:
-    """Finds where messages begin in a ULog file that comes in pieces."""
+    """Finder of message boundaries in a ULog file that arrives in pieces."""
 
     def __init__(self, skip: int = _HEAD_BYTES) -> None:
-        """Begin `skip` bytes before the first message."""
+        """Start `skip` bytes before the first message."""
         self._skip = skip
         self._head = b""
-        """The beginning of a message's head that was cut by the end of a piece."""
+        """Start of a message header truncated by the end of a piece."""
 
     def first_in(self, data: bytes) -> int:
-        """Return the place of the first message that begins in a piece; `NO_MESSAGE`: none."""
+        """Return the offset of the first message that starts in a piece; `NO_MESSAGE` if absent."""
         first, at = NO_MESSAGE, self._skip
         if self._head:
-            # The rest of the head is at the beginning of this piece.
+            # The rest of the header is at the start of this piece.
             lacking = _MESSAGE_HEAD_BYTES - len(self._head)
             head = self._head + data[:lacking]
             if len(head) < _MESSAGE_HEAD_BYTES:
@@ -285,10 +285,10 @@ class MessageBoundaries:
 # --- missions
 
 RETRY_US = 250_000
-"""After this time without an item it is asked for again [µs] (PX4)."""
+"""Time without an item after which the request is repeated [µs] (PX4)."""
 
 TIMEOUT_US = 5_000_000
-"""After this time without a message a transfer is given up [µs] (PX4)."""
+"""Time without a message after which a transfer is aborted [µs] (PX4)."""
 
 NOBODY = (-1, -1)
 
@@ -298,19 +298,19 @@ class Activity(Enum):
 
     IDLE = auto()
     SENDING = auto()
-    """A client downloads."""
+    """Download to a client."""
     RECEIVING = auto()
-    """A client uploads."""
+    """Upload from a client."""
 
 
 REPEATS = 10
-"""How often MISSION_ITEM_REACHED is sent again, each after REPEAT_US."""
+"""Number of repetitions of MISSION_ITEM_REACHED, at intervals of REPEAT_US."""
 REPEAT_US = 1_000_000
 
 
 @dataclass(slots=True)
 class MissionTransfer:
-    """The state of one link's transfers."""
+    """State of one link's mission transfers."""
 
     activity: Activity = Activity.IDLE
     kind: int = 0
@@ -318,29 +318,29 @@ class MissionTransfer:
     index: int = 0
     count: int = 0
     current: int = -1
-    """The item that the upload marks as current; -1 = none."""
+    """Item that the upload marks as current; -1 = none."""
     checksum: int = 0
     items: list[PlanItem] = field(default_factory=list)
     partner: tuple[int, int] = NOBODY
     """System and component id of the client."""
     integer: bool = False
-    """Items travel as MISSION_ITEM_INT; PX4 begins with MISSION_REQUEST and learns."""
+    """True if items are sent as MISSION_ITEM_INT; PX4 starts with MISSION_REQUEST and adapts."""
     sent_us: int = 0
-    """Time of the newest request to the client."""
+    """Time of the newest request to the client [µs]."""
     heard_us: int = 0
-    """Time of the client's newest message."""
+    """Time of the client's newest message [µs]."""
 
-    # What this link has told its clients of the mission.
+    # Mission progress that this link has reported to its clients.
     told_current: int = 0
     told_reached: int = -1
     repeats: int = 0
-    """Repetitions of the newest MISSION_ITEM_REACHED."""
+    """Number of repetitions of the newest MISSION_ITEM_REACHED."""
     repeated_us: int = 0
     told_jumped: tuple[int, int] = (-1, 0)
 
     @property
     def is_running(self) -> bool:
-        """Whether messages are due by time: requests to the client, or repetitions."""
+        """True if timed messages are due: requests to the client, or repetitions."""
         repeats = self.told_reached >= 0 and self.repeats < REPEATS
         return self.activity is not Activity.IDLE or repeats
 
@@ -349,41 +349,41 @@ class MissionTransfer:
 
 
 class Step(NamedTuple):
-    """A text of a calibration."""
+    """Text of a calibration."""
 
     after_s: float
-    """Time after the text before [s]."""
+    """Time after the previous text [s]."""
     message: Message
 
 
 class RunningCalibration:
-    """One vehicle's calibration, for all of its clients."""
+    """Calibration in progress of one vehicle, common to all its clients."""
 
     def __init__(self) -> None:
         self.sensor = ""
         self.radio = False
-        """A ground station calibrates a radio: it ends that with a cancellation."""
+        """True while a ground station calibrates a radio; a cancellation ends it."""
         self._steps: Iterator[Step] = iter(())
         self._next: Step | None = None
         self._due_us = 0
 
     @property
     def forbids_arming(self) -> bool:
-        """Whether PX4 refuses to arm meanwhile."""
+        """True if PX4 rejects arming because of the calibration."""
         return self.active or self.radio
 
     @property
     def active(self) -> bool:
-        """Whether there is more to come."""
+        """True if steps remain."""
         return self._next is not None
 
     def start(self, sensor: str, steps: Iterator[Step], now_us: int) -> None:
-        """Begin to calibrate a sensor, in the place of what may be running."""
+        """Start calibrating a sensor. Replaces a running calibration."""
         self.sensor, self._steps, self._due_us = sensor, steps, now_us
         self._plan()
 
     def due(self, now_us: int) -> list[Message]:
-        """Return what is due at `now_us` [µs], in order."""
+        """Return the messages due at `now_us` [µs], in order."""
         messages: list[Message] = []
         while self._next is not None and self._due_us <= now_us:
             messages.append(self._next.message)
@@ -401,7 +401,7 @@ class RunningCalibration:
 
 @dataclass(slots=True)
 class Shell:
-    """One client's shell."""
+    """Shell state of one client."""
 
     line: bytearray = field(default_factory=bytearray)
     output: bytearray = field(default_factory=bytearray)

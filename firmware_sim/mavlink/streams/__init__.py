@@ -1,4 +1,4 @@
-"""The streamed messages: a table from message name to the function that builds it.
+"""Streamed messages: a table of message names with their builder functions.
 
 Sources of fields, units and "unknown" values: MAVLink common.xml and PX4
 src/modules/mavlink/streams/*.hpp.
@@ -14,8 +14,8 @@ from firmware_sim.mavlink.codec import Values
 from firmware_sim.mavlink.streams import distance, information, pose, sensors, status
 
 Builder = Callable[[AutopilotState], "Values | None"]
-"""Returns one message's fields, in the order of its definition, from a snapshot; None = there is
-nothing to say yet. Plain values, because message objects would cost more than all the rest."""
+"""Returns one message's fields, in order of definition, from a snapshot; None = no content yet.
+Plain values: creating message objects takes longer than all the rest."""
 
 _SILENT = (
     *("GPS_STATUS", "NAV_CONTROLLER_OUTPUT", "COMMAND_LONG"),
@@ -28,15 +28,14 @@ _SILENT = (
     *("OBSTACLE_DISTANCE", "RAW_RPM", "DEBUG_FLOAT_ARRAY", "FIGURE_EIGHT_EXECUTION_STATUS"),
     *("OPEN_DRONE_ID_BASIC_ID", "OPEN_DRONE_ID_LOCATION", "OPEN_DRONE_ID_SYSTEM"),
 )
-"""Streams of PX4's in which this vehicle has nothing to say: it lacks the device.
+"""Streams of PX4 without content here, because the vehicle lacks the device.
 
-A real PX4 accepts a rate for them and sends nothing, and so does this. Source: what a running PX4
-1.16 accepts in SET_MESSAGE_INTERVAL.
-"""
+A real PX4 accepts a rate for these streams and sends nothing, as does this simulator. Source: the
+ids accepted by SET_MESSAGE_INTERVAL on a running PX4 1.16."""
 
 
 def _nothing(state: AutopilotState) -> None:
-    """There is nothing to say."""
+    """Return None: the stream has no content."""
 
 
 SILENT: Mapping[str, Builder] = MappingProxyType(dict.fromkeys(_SILENT, _nothing))
@@ -57,7 +56,7 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "SYS_STATUS": None,
         "ESTIMATOR_STATUS": status.estimator_status,
         "SCALED_PRESSURE": sensors.scaled_pressure,
-        # PX4's simulator hands one measurement to two barometers.
+        # PX4's simulator sends one measurement to two barometers.
         "SCALED_PRESSURE2": sensors.scaled_pressure,
         "MISSION_CURRENT": status.mission_current,
         "FENCE_STATUS": status.fence_status,
@@ -75,10 +74,10 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "FLIGHT_INFORMATION": information.flight_information,
         "PROTOCOL_VERSION": information.protocol_version,
         "HIGH_LATENCY2": status.high_latency2,
-        # Last, as it came last: where streams begin depends on their order.
+        # Last, because start times of streams depend on their order.
         "DISTANCE_SENSOR": distance.distance_sensor,
         "OPTICAL_FLOW_RAD": distance.optical_flow_rad,
     }
 )
-"""Streams that need the snapshot only; the server adds those that need more. None:
-compiled code packs it (`telemetry`)."""
+"""Streams that need only the snapshot; the server adds the others. None = packed by compiled code
+(`telemetry`)."""

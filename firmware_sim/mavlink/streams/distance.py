@@ -1,4 +1,4 @@
-"""Distance and optical flow sensors: height above the ground, and its motion.
+"""Distance and optical flow sensors: height above ground, and ground motion.
 
 Source: PX4 1.16, streams/DISTANCE_SENSOR.hpp, ALTITUDE.hpp and OPTICAL_FLOW_RAD.hpp.
 """
@@ -13,13 +13,13 @@ from firmware_sim.mavlink.codec import Values
 from firmware_sim.mavlink.streams import units
 
 NEW_US = 200_000
-"""PX4 sends a measurement once. Here it is sent while it is not older than this, the longest time
-that its estimator waits for the next [µs]."""
+"""Maximum age of a sent measurement [µs]: the longest time that PX4's estimator waits for the next.
+PX4 sends a measurement once."""
 
 _CM, _CM2 = 1e2, 1e4
 _FIRST = 0
 _LASER, _KINDS = 0, (0, 1, 2)
-"""MAV_DISTANCE_SENSOR: laser, ultrasound and infrared; any other is told as a laser."""
+"""MAV_DISTANCE_SENSOR values: laser, ultrasound, infrared. Other types are sent as laser."""
 _NO_FIELD_OF_VIEW = (0.0, 0.0)
 _NO_QUATERNION = (0.0, 0.0, 0.0, 0.0)
 _QUALITY_NOT_TOLD = 0
@@ -27,7 +27,7 @@ _TEMPERATURE, _NO_DISTANCE_US, _NO_DISTANCE_M = 0, 0, -1.0
 
 
 def distance_sensor(state: AutopilotState) -> Values | None:
-    """The newest distance [cm]. Nothing where none comes. PX4 does not send its quality."""
+    """Return the newest distance [cm]; None if outdated. PX4 does not send its quality."""
     told = state.distance
     if told is None or state.time_us - state.distance_us > NEW_US:
         return None
@@ -47,7 +47,7 @@ def distance_sensor(state: AutopilotState) -> Values | None:
 
 
 def clearance(state: AutopilotState, down: float) -> tuple[float, float]:
-    """Return the altitude of the ground, local, and how far it is below [m]; NaN = not known."""
+    """Return the local terrain altitude and the height above it [m]; NaN = unknown."""
     ground = state.clearance
     if ground is None or not ground.valid:
         return math.nan, math.nan
@@ -55,12 +55,12 @@ def clearance(state: AutopilotState, down: float) -> tuple[float, float]:
 
 
 def _whole(value: float) -> int:
-    """Return what C makes of a number for a uint16 field: cut off, not rounded."""
+    """Return a number for a uint16 field, truncated as in C."""
     return units.uint16(math.floor(value + 1e-9), unknown=0)
 
 
 def optical_flow_rad(state: AutopilotState) -> Values | None:
-    """The newest flow and turn [rad]. Nothing where none comes."""
+    """Return the newest flow and rotation [rad]; None if outdated."""
     told = state.flow
     if told is None or state.time_us - state.flow_us > NEW_US:
         return None

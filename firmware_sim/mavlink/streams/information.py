@@ -1,7 +1,7 @@
-"""The flight so far, the way home, the protocol's version, and PX4's modes: names and numbers.
+"""Flight times, return time, protocol version, and PX4's modes (names and numbers).
 
-Source: PX4 src/lib/modes, src/modules/mavlink/streams/{AVAILABLE_MODES,CURRENT_MODE}.hpp, and what
-a running PX4 1.16 sends.
+Source: PX4 src/lib/modes, src/modules/mavlink/streams/{AVAILABLE_MODES,CURRENT_MODE}.hpp, and the
+messages of a running PX4 1.16.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams.units import boot_ms
 
 _VERSION, _LEAST_VERSION, _GREATEST_VERSION = 200, 100, 200
-"""MAVLink 2.0 is spoken, 1.0 is understood, as PX4 says."""
+"""Sent, minimum and maximum version: MAVLink 2.0 is sent, 1.0 is accepted, as in PX4."""
 
 _NO_HASH = (0,) * 8
 
 
 def flight_information(state: AutopilotState) -> Values:
-    """Times of arming and take-off [µs since boot], 0 while disarmed."""
+    """Return the times of arming and takeoff [µs since boot]; 0 while disarmed."""
     flight_uuid = landing_time = 0
     armed, took_off = state.armed_us, state.takeoff_us
     return boot_ms(state.time_us), armed, took_off, flight_uuid, landing_time
 
 
 def protocol_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder
-    """The MAVLink versions that are spoken."""
+    """Return the supported MAVLink versions."""
     return _VERSION, _LEAST_VERSION, _GREATEST_VERSION, *_NO_HASH, *_NO_HASH
 
 
 _UNKNOWN_TIME = -1
-"""PX4 estimates nothing but the way home."""
+"""Value of unknown times: PX4 estimates only the return time."""
 
 
 def time_estimate_to_target(state: AutopilotState, value: Callable[[str], float]) -> Values | None:
-    """How long a safe way home takes [s]; 0 on the ground. Nothing before home is known.
+    """Return the duration of a safe return [s]; 0 on the ground, None without home.
 
-    `value` looks up a PX4 parameter, as it is flown, by its name.
+    `value` returns the current value of a PX4 parameter by name.
     """
     home, origin = state.home, state.origin
     if home is None or origin is None:
@@ -59,21 +59,21 @@ def time_estimate_to_target(state: AutopilotState, value: Callable[[str], float]
 
 
 class KnownMode(NamedTuple):
-    """A mode of PX4's."""
+    """Flight mode of PX4."""
 
     main: int
-    """Main and sub mode of custom_mode."""
+    """Main mode of custom_mode."""
     sub: int
     standard: int = dialect.MAV_STANDARD_MODE_NON_STANDARD
-    """MAV_STANDARD_MODE."""
+    """Value of MAV_STANDARD_MODE."""
     name: str = ""
-    """Empty where the standard mode says it."""
+    """Name of the mode; empty if the standard mode implies it."""
     properties: int = dialect.MAV_MODE_PROPERTY_ADVANCED
-    """MAV_MODE_PROPERTY bits."""
+    """Bits of MAV_MODE_PROPERTY."""
 
     @property
     def custom_mode(self) -> int:
-        """PX4's custom_mode."""
+        """Value of PX4's custom_mode."""
         return self.main << 16 | self.sub << 24
 
 
@@ -101,19 +101,19 @@ KNOWN = (
     KnownMode(4, 9, name="Precision Landing"),
     KnownMode(3, 1, dialect.MAV_STANDARD_MODE_ORBIT),
 )
-"""PX4's modes of a multicopter, in its order (vehicle_status.nav_state)."""
+"""PX4's multicopter modes, in PX4's order (vehicle_status.nav_state)."""
 
 _STANDARD = {known.custom_mode: known.standard for known in KNOWN}
 
 
 def existing() -> tuple[KnownMode, ...]:
-    """Return the modes that exist here."""
+    """Return the modes supported here."""
     ours = {custom_mode(mode) for mode in Mode}
     return tuple(known for known in KNOWN if known.custom_mode in ours)
 
 
 def available_modes() -> list[tuple[int, int, int, int, int, bytes]]:
-    """Return the fields of AVAILABLE_MODES for each mode that exists, in order."""
+    """Return the fields of AVAILABLE_MODES for each supported mode, in order."""
     modes = existing()
     return [
         (len(modes), number, known.standard, known.custom_mode, known.properties, name)
@@ -123,7 +123,7 @@ def available_modes() -> list[tuple[int, int, int, int, int, bytes]]:
 
 
 def current_mode(state: AutopilotState) -> Values:
-    """The mode that flies, and the one that the user asked for."""
+    """Return the active mode and the mode requested by the user."""
     status = state.status
     intended = custom_mode(status.intended_mode)
     return _STANDARD.get(intended, 0), custom_mode(status.mode), intended

@@ -1,4 +1,4 @@
-"""Circle, home and origin of the vehicle; its true state, for those who compare with it."""
+"""Orbit, home and origin of the vehicle, and its true state for comparison."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams import units
 
 _NO_APPROACH = (0.0, 0.0, 0.0)
-"""HOME_POSITION: there is no special way to land."""
+"""Approach vector of HOME_POSITION: no special approach."""
 
 
 def orbit_execution_status(state: AutopilotState) -> Values | None:
-    """The circle that is flown: its centre on the globe. Nothing in other modes."""
+    """Return the current orbit, with its global centre; None in other modes."""
     orbit, origin = state.orbit, state.origin
     if orbit is None or origin is None:
         return None
@@ -33,7 +33,7 @@ def orbit_execution_status(state: AutopilotState) -> Values | None:
 
 
 def home_position(state: AutopilotState) -> Values | None:
-    """Home on the globe and in local NED. Nothing before it is set."""
+    """Return home in global coordinates and in local NED; None if unset."""
     home, origin = state.home, state.origin
     if home is None:
         return None
@@ -46,7 +46,7 @@ def home_position(state: AutopilotState) -> Values | None:
 
 
 def gps_global_origin(state: AutopilotState) -> Values | None:
-    """The point of the globe where local NED is zero. Nothing before it is set."""
+    """Return the origin of local NED in global coordinates; None if unset."""
     return None if state.origin is None else (*_wire(state.origin), state.time_us)
 
 
@@ -64,21 +64,21 @@ def _heading(yaw: float) -> Values:
     return math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)
 
 
-# HIL_STATE_QUATERNION is sent on request only, as PX4 SITL sends the state of its simulator. Real
-# firmware gets it by the same function. No flight code reads it.
-# Source: PX4 1.16, streams/HIL_STATE_QUATERNION.hpp.
+# HIL_STATE_QUATERNION is sent on request only, as PX4 SITL sends its simulator's state. Real
+# firmware receives it from the same function. No flight code reads it. Source: PX4 1.16,
+# streams/HIL_STATE_QUATERNION.hpp.
 
 _NO_AIRSPEEDS = (0, 0)
 _NO_ACCELERATION = (0, 0, 0)
-"""`Truth` has none; PX4 only logs it."""
+"""Placeholder: `Truth` has no acceleration, and PX4 only logs it."""
 
 
 def hil_state_quaternion(truth: Truth, time_us: int) -> Values:
-    """Return attitude (w, x, y, z, body -> NED), rates [rad/s], place and velocity [cm/s].
+    """Return attitude (w, x, y, z, body -> NED), rates [rad/s], position and velocity [cm/s].
 
     Args:
-        truth: The true state.
-        time_us: Time stamp, of the receiver's clock [µs].
+        truth: True state.
+        time_us: Time stamp on the receiver's clock [µs].
     """
     place = local_to_geodetic(truth.position, HOME)
     return (

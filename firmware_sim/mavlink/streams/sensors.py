@@ -17,10 +17,10 @@ from firmware_sim.mavlink.px4_custom_mode import base_mode
 from firmware_sim.mavlink.streams import units
 
 _NO_AIRSPEED = 0.0
-"""Differential pressure: there is no such sensor."""
+"""Differential pressure: the vehicle has no airspeed sensor."""
 
 _NO_CELL_VOLTAGES = (units.UINT16_MAX,) * 9
-"""BATTERY_STATUS.voltages[1:]."""
+"""Unknown values of BATTERY_STATUS.voltages[1:]."""
 
 _CHARGE_WARNINGS = (
     ("BAT_LOW_THR", dialect.MAV_BATTERY_CHARGE_STATE_LOW),
@@ -31,7 +31,7 @@ _CHARGE_WARNINGS = (
 
 
 def scaled_imu(state: AutopilotState) -> Values:
-    """Newest IMU sample, biases removed [mG, mrad/s], and magnetic field [mGauss]."""
+    """Return the newest IMU sample without biases [mG, mrad/s], and magnetic field [mGauss]."""
     estimate = state.estimate
     return (
         units.boot_ms(state.time_us),
@@ -46,13 +46,13 @@ def scaled_imu(state: AutopilotState) -> Values:
 
 
 def scaled_pressure(state: AutopilotState) -> Values:
-    """Static pressure [hPa] and temperature [0.01 °C]."""
+    """Return static pressure [hPa] and temperature [0.01 °C]."""
     temperature = units.int16(state.temperature_c * 100.0)
     return units.boot_ms(state.time_us), state.pressure_hpa, _NO_AIRSPEED, temperature
 
 
 def mag_cal_report(value: Callable[[str], float]) -> Values | None:
-    """Calibration of the compass [gauss], of the parameters. Nothing while it has none."""
+    """Return the compass calibration [gauss] from the parameters; None if uncalibrated."""
     if not value("CAL_MAG0_ID"):
         return None
     number, being_calibrated, autosaved, fitness = 0, 0, 0, 0.0
@@ -72,7 +72,7 @@ def mag_cal_report(value: Callable[[str], float]) -> Values | None:
 
 
 def battery_status(state: AutopilotState, parameters: ParameterStore) -> Values:
-    """Battery 0: pack voltage in the first slot (cells are not measured), current, charge."""
+    """Return battery 0: pack voltage in the first slot (cells unmeasured), current, charge."""
     battery = state.battery
     number, no_temperature, no_energy, no_time_remaining = 0, units.INT16_MAX, -1, 0
     return (
@@ -92,7 +92,7 @@ def battery_status(state: AutopilotState, parameters: ParameterStore) -> Values:
 
 
 def _charge_state(remaining: float, parameters: ParameterStore) -> int:
-    """Return the MAV_BATTERY_CHARGE_STATE of a charge 0..1, by PX4's warning thresholds."""
+    """Return the MAV_BATTERY_CHARGE_STATE of a charge 0..1, from PX4's warning thresholds."""
     state: int = dialect.MAV_BATTERY_CHARGE_STATE_OK
     for name, warning in _CHARGE_WARNINGS:
         threshold = parameters.by_name(name)
@@ -104,7 +104,7 @@ def _charge_state(remaining: float, parameters: ParameterStore) -> int:
 
 
 def percent(share: float) -> int:
-    """Return a share 0..1 as percent for an int8 field, -1 when unknown."""
+    """Return a fraction 0..1 as percent for an int8 field; -1 if unknown."""
     return units.saturate(share * 100.0, 0, 100, -1)
 
 
@@ -114,19 +114,19 @@ _PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900, 1_000, 1_000
 """Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
 
 _OUTPUTS = 16
-"""Of PX4's simulation. Those that drive no motor stay at the disarmed pulse."""
+"""Number of outputs in PX4's simulation. Outputs without a motor stay at the disarmed pulse."""
 
 _OUTPUT_FIELDS = 32
-"""Slots of ACTUATOR_OUTPUT_STATUS."""
+"""Number of slots in ACTUATOR_OUTPUT_STATUS."""
 
 
 def actuator_output_status(state: AutopilotState) -> Values:
-    """The same pulse widths as an array of 16 outputs in use."""
+    """Return the pulse widths [µs] as an array with 16 active outputs."""
     return state.time_us, _OUTPUTS, *_outputs(state), *(0,) * (_OUTPUT_FIELDS - _OUTPUTS)
 
 
 def hil_actuator_controls(state: AutopilotState) -> Values:
-    """Motor commands 0..1, zero while disarmed; 16 controls."""
+    """Return motor commands 0..1, zero while disarmed; 16 controls."""
     commands, flags = _commands(state), 0
     unused = (0.0,) * (_OUTPUTS - len(commands))
     return state.time_us, *commands, *unused, base_mode(state.status), flags
@@ -160,16 +160,16 @@ _OLD, _NEW = 0.99, 0.01
 _CLIP_M_S2 = 16.0 * GRAVITY_M_S2
 """Range of PX4's simulated accelerometer [m/s²]."""
 
-# What the meter remembers: the four metrics, and the last sample (time, gyro, accel).
+# Layout of the meter's memory: the four metrics, and the last sample (time, gyro, accel).
 _CONING, _GYRO, _ACCEL, _CLIPPED, _LAST_US, _LAST_GYRO, _LAST_ACCEL, _SIZE = 0, 1, 2, 3, 4, 5, 8, 11
 
 
 class VibrationMeter:
-    """Filters every IMU sample; PX4's use of the fields differs from the MAVLink text.
+    """Vibration metrics of all IMU samples. PX4's use of the fields differs from the MAVLink text.
 
-    vibration_x: coning, filtered |delta angle x previous delta angle| [rad²]. vibration_y:
-    filtered |gyro - previous gyro| [rad/s]. vibration_z: filtered |accel - previous accel|
-    [m/s²]. clipping_0: samples at the end of the accelerometer's range.
+    vibration_x: coning, filtered |delta angle x previous delta angle| [rad²]. vibration_y: filtered
+    |gyro - previous gyro| [rad/s]. vibration_z: filtered |accel - previous accel| [m/s²].
+    clipping_0: samples at the limit of the accelerometer's range.
     """
 
     def __init__(self) -> None:
@@ -177,11 +177,11 @@ class VibrationMeter:
         self._memory[_LAST_US] = math.nan
 
     def update(self, flown: Record) -> None:
-        """Take in the samples of ticks (n,), each once (`engine.record.FLOWN_TICK`)."""
+        """Process the samples of ticks (n,), each once (`engine.record.FLOWN_TICK`)."""
         _update(self._memory, flown)
 
     def message(self, state: AutopilotState) -> Values:
-        """Return VIBRATION. There is one accelerometer."""
+        """Return VIBRATION, for one accelerometer."""
         coning, gyro, accel, clipped = self._memory[: _CLIPPED + 1].tolist()
         clipping_1 = clipping_2 = 0
         return state.time_us, coning, gyro, accel, int(clipped), clipping_1, clipping_2

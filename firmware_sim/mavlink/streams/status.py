@@ -1,6 +1,6 @@
-"""Status of the vehicle: identity, heartbeat, health, landed state, estimator, clock.
+"""Vehicle status: identity, heartbeat, health, landed state, estimator, clock.
 
-Source of what gimbals are told: PX4 1.16, streams/AUTOPILOT_STATE_FOR_GIMBAL_DEVICE.hpp.
+Source of the gimbal message: PX4 1.16, streams/AUTOPILOT_STATE_FOR_GIMBAL_DEVICE.hpp.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ CAPABILITIES: int = (
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
     | dialect.MAV_PROTOCOL_CAPABILITY_FTP
 )
-"""A real PX4's 0xE8FF."""
+"""Capabilities, equal to a real PX4's 0xE8FF."""
 
 _FIRMWARE_VERSION = 1 << 24 | 16 << 16 | 0 << 8 | 255
-"""The PX4 release whose behaviour is emulated: 1.16.0, FIRMWARE_VERSION_TYPE_OFFICIAL."""
+"""Emulated PX4 release: 1.16.0, FIRMWARE_VERSION_TYPE_OFFICIAL."""
 
 _BOARD_VERSION = 1
-"""As PX4 SITL reports."""
+"""Board version, as in PX4 SITL."""
 
 _CUSTOM_VERSION = b"airl-mav"
-"""Where a real PX4 puts the first 8 bytes of its git hash."""
+"""Custom version, in place of the first 8 bytes of a real PX4's git hash."""
 
 _UID = 0x4149_524C_4D41_5601
-"""Constant hardware id: every emulated vehicle is the same piece of hardware."""
+"""Constant hardware id, identical for all emulated vehicles."""
 
 _MAVLINK_VERSION = 3
 """HEARTBEAT.mavlink_version of all MAVLink 1 and 2 systems."""
 
 _NO_MISSION = 0xFFFF
-"""MISSION_CURRENT.total and HIGH_LATENCY2.wp_num where no mission is stored."""
+"""MISSION_CURRENT.total and HIGH_LATENCY2.wp_num without a stored mission."""
 
 _UNKNOWN_STATE = 0
-"""MISSION_CURRENT's mission_state and mission_mode: PX4 leaves them."""
+"""MISSION_CURRENT's mission_state and mission_mode: PX4 leaves them unset."""
 
 _LANDED = {
     Landed.ON_GROUND: dialect.MAV_LANDED_STATE_ON_GROUND,
@@ -76,21 +76,21 @@ _PRESENT = (
     | dialect.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
     | dialect.MAV_SYS_STATUS_SENSOR_BATTERY
 )
-"""As a running PX4 1.16 SITL has them: it does not count the accelerometer."""
+"""Sensors present in a running PX4 1.16 SITL, which omits the accelerometer."""
 
 _LOGGED = dialect.MAV_SYS_STATUS_LOGGING
-"""Present once it is armed: the log begins then."""
+"""Bit that is set after arming, when logging starts."""
 
 _AUXILIARY = 6
 _ALL_AUXILIARY = 0b1111_1100
-"""MANUAL_CONTROL.enabled_extensions: PX4 has six auxiliary axes, at rest here."""
+"""MANUAL_CONTROL.enabled_extensions: PX4 has six auxiliary axes, constant here."""
 
 _RADIO = dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 _RANGES = dialect.MAV_SYS_STATUS_SENSOR_LASER_POSITION
 
 
 def heartbeat(state: AutopilotState) -> Values:
-    """A PX4 quadrotor and its mode."""
+    """Return the vehicle type (PX4 quadrotor), mode and status."""
     status = state.status
     return (
         dialect.MAV_TYPE_QUADROTOR,
@@ -103,7 +103,7 @@ def heartbeat(state: AutopilotState) -> Values:
 
 
 def manual_control(state: AutopilotState, system_id: int) -> Values | None:
-    """A pilot's sticks [1e-3], the throttle from -1000 on, as PX4 sends it; nothing without."""
+    """Return the pilot's sticks [1e-3], throttle from -1000 as in PX4; None without input."""
     sticks = state.sticks
     if sticks is None:
         return None
@@ -120,7 +120,7 @@ def manual_control(state: AutopilotState, system_id: int) -> Values | None:
 
 
 def extended_sys_state(state: AutopilotState) -> Values:
-    """Landed state. The vehicle is no VTOL."""
+    """Return the landed state. The vehicle is not a VTOL."""
     return dialect.MAV_VTOL_STATE_UNDEFINED, _LANDED[state.status.landed]
 
 
@@ -149,7 +149,7 @@ def sensor_bits(state: AutopilotState) -> tuple[int, int, int]:
 
 
 def _health(state: AutopilotState) -> Sequence[tuple[bool, int]]:
-    """Return what may fail, and its bits: whether it is good."""
+    """Return the health and SYS_STATUS bit of each part that can fail."""
     health = state.health
     fixed = state.gps is not None and state.gps.fix_type >= dialect.GPS_FIX_TYPE_3D_FIX
     known = _knows(state)
@@ -175,7 +175,7 @@ def _health(state: AutopilotState) -> Sequence[tuple[bool, int]]:
 
 
 def estimator_status(state: AutopilotState) -> Values:
-    """Which outputs are good, innovation test ratios (1 = rejection gate), accuracies [m]."""
+    """Return output flags, innovation test ratios (1 = rejection gate), accuracies [m]."""
     estimate = state.estimate
     flags = _estimator_flags(state) if _knows(state) else 0
     horizontal, height, mag, vertical = estimate.innovation_ratio.tolist()
@@ -187,12 +187,12 @@ def estimator_status(state: AutopilotState) -> Values:
 
 
 def _knows(state: AutopilotState) -> bool:
-    """Return whether the estimator has converged; once armed, its health alone counts."""
+    """Return True if the estimator has converged. Always True when armed."""
     return state.estimate.healthy or state.status.arming is Arming.ARMED
 
 
 def _may_be_armed(state: AutopilotState) -> bool:
-    """Return whether the pre-arm checks pass; armed, they do."""
+    """Return True if the pre-arm checks pass. Always True when armed."""
     arming = state.status.arming
     return arming is Arming.ARMED or (state.health.armable and arming is Arming.STANDBY)
 
@@ -219,7 +219,7 @@ def _estimator_flags(state: AutopilotState) -> int:
             state.clearance is not None and state.clearance.valid,
             dialect.ESTIMATOR_POS_VERT_AGL,
         ),
-        # A disarmed vehicle is known to stand.
+        # A disarmed vehicle is assumed stationary.
         (state.status.arming is not Arming.ARMED, dialect.ESTIMATOR_CONST_POS_MODE),
     ):
         if good:
@@ -228,7 +228,7 @@ def _estimator_flags(state: AutopilotState) -> int:
 
 
 def mission_current(state: AutopilotState) -> Values:
-    """The current item, how many there are, and the ids of what is stored; PX4 says no more."""
+    """Return the current item, the number of items, and the ids of stored lists, as in PX4."""
     mission = state.mission
     total = mission.total or _NO_MISSION
     ids = (mission.mission_id, mission.fence_id, mission.rally_points_id)
@@ -236,7 +236,7 @@ def mission_current(state: AutopilotState) -> Values:
 
 
 def fence_status(state: AutopilotState) -> Values:
-    """Breaches of the geofence. PX4 has no such stream: it is sent on request."""
+    """Return geofence breaches. PX4 has no such stream; sent on request only."""
     fence = state.fence
     kind = dialect.FENCE_BREACH_NONE
     if fence.distance or fence.custom:
@@ -248,7 +248,7 @@ def fence_status(state: AutopilotState) -> Values:
 
 
 def autopilot_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder
-    """The identity and the true capabilities of the built-in autopilot."""
+    """Return the identity and the actual capabilities of the built-in autopilot."""
     os_version = vendor = product = 0
     middleware_custom_version = os_custom_version = (0,) * 8
     return (
@@ -260,7 +260,7 @@ def autopilot_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a buil
 
 
 def system_time(boot_unix_us: int) -> Callable[[AutopilotState], Values]:
-    """Return the builder of SYSTEM_TIME for a calendar time of boot [µs since 1970, UTC]."""
+    """Return the builder of SYSTEM_TIME, given the calendar time of boot [µs since 1970, UTC]."""
 
     def build(state: AutopilotState) -> Values:
         return boot_unix_us + state.time_us, units.boot_ms(state.time_us)
@@ -269,14 +269,14 @@ def system_time(boot_unix_us: int) -> Callable[[AutopilotState], Values]:
 
 
 _ALL = 0
-"""Target of a broadcast."""
+"""Target id of a broadcast."""
 _NO_DELAY_US = 0
 
 
 def autopilot_state_for_gimbal_device(state: AutopilotState) -> Values:
-    """Attitude, velocity and yaw rate, so that a gimbal can hold its view.
+    """Return attitude, velocity and yaw rate for gimbal stabilization.
 
-    As PX4, it knows two landed states, and no delays.
+    As in PX4, this message has two landed states and no delays.
     """
     estimate = state.estimate
     landed = state.status.landed is Landed.ON_GROUND
@@ -295,22 +295,25 @@ def autopilot_state_for_gimbal_device(state: AutopilotState) -> Values:
     )
 
 
-# --- the whole vehicle in 42 bytes, for links by satellite; here on request
+# --- summary of the vehicle in 42 bytes, for satellite links; sent on request here
 
-# Source: PX4 1.16, streams/HIGH_LATENCY2.hpp. PX4 gives the mean or the greatest value since the
-# last one was sent; here it is the present one.
+# Source: PX4 1.16, streams/HIGH_LATENCY2.hpp. PX4 sends the mean or the maximum since the last
+# message; here it is the current value.
 
 _UINT8_MAX: Final = 255
 _INT8_MIN: Final = -128
 _NO_TARGET = (0, 0)
-"""Altitude and distance of a target: PX4 has them of fixed wings alone."""
+"""Altitude and distance of a target: PX4 sends them for fixed-wing vehicles only."""
 _NO_AIRSPEEDS = (0, 0)
 _NO_WIND = (0, 0)
 _CUSTOM = (_INT8_MIN, _INT8_MIN, _INT8_MIN)
 
 
 def high_latency2(state: AutopilotState) -> Values:
-    """Place [1e-7 deg, m], headings [2 deg], speeds [0.2 m/s, 0.1 m/s], charge [%], what fails."""
+    """Return position, headings, speeds, charge and failures for HIGH_LATENCY2.
+
+    Units: [1e-7 deg, m], [2 deg], [0.2 m/s, 0.1 m/s], [%].
+    """
     estimate, gps = state.estimate, state.gps
     north, east, down = estimate.velocity.tolist()
     armed = state.status.arming is Arming.ARMED
@@ -340,7 +343,7 @@ def high_latency2(state: AutopilotState) -> Values:
 
 
 def _place(state: AutopilotState) -> tuple[int, int, int]:
-    """Return latitude and longitude [1e-7 deg] and altitude [m]; zeros while they are unknown."""
+    """Return latitude, longitude [1e-7 deg] and altitude [m]; zeros if unknown."""
     position = state.estimate.position
     if state.origin is None or not all(map(math.isfinite, position.tolist())):
         return 0, 0, 0
@@ -362,7 +365,7 @@ def _uint8(value: float) -> int:
 
 
 def _failures(state: AutopilotState) -> int:
-    """Return the HL_FAILURE_FLAG bits of what has failed."""
+    """Return the HL_FAILURE_FLAG bits of failed parts."""
     health, status = state.health, state.status
     offboard_lost = status.failsafe and status.intended_mode is Mode.OFFBOARD
     failed = {

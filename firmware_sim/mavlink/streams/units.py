@@ -1,4 +1,4 @@
-"""Numbers as MAVLink fields want them: scaled, rounded, saturated, or the "unknown" value."""
+"""Conversion to MAVLink field values: scaled, rounded, saturated, or the "unknown" value."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def uint32(value: float, unknown: int = 0) -> int:
 
 
 def boot_ms(time_us: int) -> int:
-    """Return time_boot_ms [ms] of simulated time [µs]; wraps after 49 days as the field does."""
+    """Return time_boot_ms [ms] of simulated time [µs]; wraps after 49 days, like the field."""
     return time_us // 1_000 & UINT32_MAX
 
 
@@ -73,15 +73,15 @@ def centidegrees(angle_rad: float) -> int:
 
 
 for _function in (saturate, int16, int32, uint16, uint32, boot_ms, deg_e7, mm, cm_s, centidegrees):
-    register_jitable(_function)  # so that kernels can call them, as Python can
+    register_jitable(_function)  # callable from kernels and from Python
 
 
 DIAGONAL = (0, 6, 11, 15, 18, 20)
-"""Where a 6 x 6 matrix that is sent as its upper triangle, row by row, has its diagonal."""
+"""Indices of the diagonal in the upper triangle of a 6 x 6 matrix, in row order."""
 
 
 def triangle(diagonal: Sequence[float]) -> tuple[float, ...]:
-    """Return a matrix as it is sent, by its diagonal (6,). The rest is not known: NaN."""
+    """Return an upper triangle with a diagonal (6,). Other elements are unknown (NaN)."""
     a, b, c, d, e, f = diagonal
     n = math.nan
     return a, n, n, n, n, n, b, n, n, n, n, c, n, n, n, d, n, n, e, n, f

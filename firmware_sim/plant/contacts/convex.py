@@ -1,8 +1,7 @@
 """Contacts of the vehicle's box with walls and obstacles: closed forms and separating axes.
 
-Everything is done in the obstacle's own axes, where it is a box, an upright cylinder or a sphere
-around the origin. The axis along which two bodies are furthest apart, or least into each other,
-gives the contact's normal.
+All computations use the obstacle's axes, where it is a box, an upright cylinder or a sphere around
+the origin. The contact normal is the axis of maximum separation, or of minimum penetration.
 """
 
 from __future__ import annotations
@@ -22,19 +21,19 @@ _CYLINDER = int(Shape.CYLINDER)
 _SPHERE = int(Shape.SPHERE)
 
 _LEVEL_M = 0.01
-"""Corners of the vehicle this much further out than the deepest one touch with it [m]."""
+"""Maximum distance of a touching corner above the deepest corner [m]."""
 
 _BESIDE_M = 1e-3
-"""A corner touches what lies under it, and this far around [m]."""
+"""Tolerance of the surface below a corner in contact [m]."""
 
 _STEPS = 30
-"""Projections to and fro that find where two bodies touch that do so with no corner."""
+"""Alternating projections that locate a contact without corners."""
 
 _PARALLEL = 1e-6
-"""Edges whose product is shorter have no axis of their own."""
+"""Minimum length of an axis. Shorter cross products of edges are skipped."""
 
 _MOST_AXES = 23
-"""Axes that may separate the vehicle from a box (15), or from a cylinder (7, and 16 of corners)."""
+"""Maximum number of separating axes: 15 for a box; 7, and 16 of corners, for a cylinder."""
 
 
 @kernel
@@ -44,12 +43,12 @@ def _clamped(x: float, most: float) -> float:
 
 @kernel
 def nearest_point(kind: int, size: Vec, x: Vec) -> Vec:
-    """Return the point of an obstacle around the origin that is nearest to x; x itself if inside.
+    """Return the nearest point to x of an obstacle around the origin; x if inside.
 
     Args:
         kind: Shape.
-        size: Its half extents, as `Obstacles.half_size` [m].
-        x: In the obstacle's axes [m].
+        size: Half extents of the obstacle, as `Obstacles.half_size` [m].
+        x: Point in the obstacle's axes [m].
     """
     if kind == _BOX:
         return _clamped(x[0], size[0]), _clamped(x[1], size[1]), _clamped(x[2], size[2])
@@ -64,7 +63,7 @@ def nearest_point(kind: int, size: Vec, x: Vec) -> Vec:
 
 @kernel
 def _support(kind: int, size: Vec, n: Vec) -> float:
-    """Return how far a box or cylinder reaches from its centre along a unit vector [m]."""
+    """Return the extent [m] of a box or cylinder from its centre along a unit vector."""
     if kind == _BOX:
         return abs(n[0]) * size[0] + abs(n[1]) * size[1] + abs(n[2]) * size[2]
     return math.hypot(n[0], n[1]) * size[0] + abs(n[2]) * size[2]
@@ -72,15 +71,15 @@ def _support(kind: int, size: Vec, n: Vec) -> float:
 
 @kernel
 def separation(kind: int, size: Vec, d: Vec, q: Quat, half: Vector) -> tuple[float, Vec]:
-    """Return how far the vehicle is from a box or cylinder [m], and the unit axis to it.
+    """Return the vehicle's distance from a box or cylinder [m], and the unit axis to it.
 
-    Below zero: how far into it. Above zero a lower bound, exact where faces or the side of a
-    cylinder are nearest.
+    Negative distances are penetration depths. Positive distances are lower bounds, exact if faces
+    or the side of a cylinder are nearest.
 
     Args:
         kind: Shape.
         size: Half extents of the obstacle [m].
-        d: The vehicle's centre, in the obstacle's axes [m].
+        d: Vehicle's centre, in the obstacle's axes [m].
         q: Attitude of the vehicle in the obstacle's axes.
         half: (3,) half extents of the vehicle [m].
     """
@@ -129,9 +128,9 @@ def separation(kind: int, size: Vec, d: Vec, q: Quat, half: Vector) -> tuple[flo
 def _meeting_point(
     kind: int, size: Vec, d: Vec, q: Quat, half: Vector, apart: float, n: Vec
 ) -> Vec:
-    """Return where the vehicle touches an obstacle, as an arm from its centre [m].
+    """Return the contact point with an obstacle, as an arm from the vehicle's centre [m].
 
-    The vehicle is taken to be moved along the normal until the two just touch.
+    The vehicle is first moved along the normal until the bodies just touch.
     """
     at = (d[0] - apart * n[0], d[1] - apart * n[1], d[2] - apart * n[2])
     back = conjugate(q)
@@ -153,7 +152,7 @@ def _touch_sphere(radius: float, d: Vec, q: Quat, half: Vector) -> tuple[float, 
     if away > 0.0:
         n = rotate(q, (off[0] / away, off[1] / away, off[2] / away))
         return away - radius, n, rotate(q, c)
-    # The centre is inside the vehicle: out through the face that is nearest.
+    # The centre is inside the vehicle: exit through the nearest face.
     room = (half[0] - abs(b[0]), half[1] - abs(b[1]), half[2] - abs(b[2]))
     axis = 0
     for i in range(1, 3):
@@ -185,24 +184,24 @@ def touch_obstacle(
 ) -> int:
     """Find the contacts with a wall or an obstacle.
 
-    As in Bullet, boxes touch where they overlap, and cylinders and spheres are close already
-    before.
+    As in Bullet, box contacts require overlap; cylinder and sphere contacts start earlier, at
+    `close`.
 
     Args:
         kind: Shape.
         size: Half extents [m].
         center: NED [m].
         yaw: Heading of a box's first axis [rad].
-        p: Of the vehicle's centre, NED [m].
+        p: Position of the vehicle's centre, NED [m].
         q: Attitude of the vehicle, body -> NED.
-        half: (3,) half extents of its box [m].
-        close: Cylinders and spheres further off are no contact [m].
-        rows: (MOST, ROW) contacts; written from `count` on.
-        count: How many there are already.
-        owner: Whose contacts these are.
+        half: (3,) half extents of the vehicle's box [m].
+        close: Maximum distance of a contact with a cylinder or sphere [m].
+        rows: (MOST, ROW) contacts; written from `count`.
+        count: Number of contacts so far.
+        owner: Owner id of the contacts.
 
     Returns:
-        How many there are now.
+        New number of contacts.
     """
     turn = (math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))
     d = rotate(conjugate(turn), (p[0] - center[0], p[1] - center[1], p[2] - center[2]))

@@ -1,13 +1,13 @@
-"""Contacts of the vehicle's box with the floor, and with hills: triangles above it.
+"""Contacts of the vehicle's box with the floor and with hills (triangles above the floor).
 
-Those with the floor are kept from tick to tick as Bullet keeps them. It finds one point at a time,
-the deepest corner, and remembers up to four of them, in the vehicle's axes
-(btConvexPlaneCollisionAlgorithm, btPersistentManifold). How a vehicle stands, tips and lifts off
-follows from that order, so it is the same here.
+Floor contacts are stored between ticks as in Bullet, which finds one point at a time, the deepest
+corner, and stores up to four, in vehicle axes (btConvexPlaneCollisionAlgorithm,
+btPersistentManifold). This order determines how a vehicle stands, tips and lifts off, so it is the
+same here.
 
-Of hills, the box's corners touch the triangle below them, the ground's points the face of the box
-that they are in. Where an edge of the box crosses a ridge of the ground from above, the two touch
-along what is square to both. A triangle that lies on the floor is the floor's.
+On hills, the box's corners touch the triangle below them, and ground vertices touch the box face in
+front of them. Where a box edge crosses a ground ridge from above, the contact normal is
+perpendicular to both. Triangles at floor height belong to the floor.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
 from firmware_sim.plant.contacts.box import corner_of, note
 
 KEPT = 4
-"""Points that are remembered (MANIFOLD_CACHE_SIZE)."""
+"""Maximum number of stored points (MANIFOLD_CACHE_SIZE)."""
 
 FLOOR_ID = 0
-"""Whose contacts these are."""
+"""Owner id of floor and hill contacts."""
 
 UP: Vec = (0.0, 0.0, -1.0)
 
 
 @kernel
 def deepest_corner(q: Quat, half: Vector) -> Vec:
-    """Return the corner, in the vehicle's axes, that is deepest at attitude q.
+    """Return the deepest corner at attitude q, in vehicle axes.
 
-    Of two as deep it is the one that Bullet takes: forward, left, up.
+    Of equally deep corners, it selects Bullet's choice: forward, left, up.
     """
     down = rotate(conjugate(q), (0.0, 0.0, 1.0))
     return (
@@ -49,7 +49,7 @@ def deepest_corner(q: Quat, half: Vector) -> Vec:
 
 @kernel
 def _spread(a: Vector | tuple[float, ...], b: Vector, c: Vector, d: Vector) -> float:
-    """Return the square of the area that is spanned by a - b and c - d."""
+    """Return the squared area of the parallelogram of a - b and c - d."""
     ax, ay, az = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     bx, by, bz = c[0] - d[0], c[1] - d[1], c[2] - d[2]
     x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
@@ -59,7 +59,7 @@ def _spread(a: Vector | tuple[float, ...], b: Vector, c: Vector, d: Vector) -> f
 
 @kernel
 def _least_needed(new: Vector | tuple[float, ...], deep: float, kept: Vector) -> int:
-    """Return which of four points a new one replaces: the deepest stays, and the area is large."""
+    """Return the index of the point to replace: keeps the deepest, and maximizes the area."""
     stays, deepest = -1, deep
     for i in range(KEPT):
         if kept[i, 6] < deepest:
@@ -89,18 +89,17 @@ def touch_floor(
     """Find the contacts with the floor.
 
     Args:
-        p: Of the vehicle's centre, NED [m].
+        p: Position of the vehicle's centre, NED [m].
         q: Attitude body -> NED.
-        half: (3,) half extents of its box [m].
-        close: Points further off are none [m].
-        kept: (4, 7) the points from before: in the vehicle's axes, on the floor NED, the distance
-            [m]; updated.
-        many: (1,) how many of them there are; updated.
-        rows: (MOST, ROW) contacts; written from `count` on.
-        count: How many there are already.
+        half: (3,) half extents of the box [m].
+        close: Maximum distance of a contact [m].
+        kept: (4, 7) stored points: in vehicle axes, on the floor NED, distance [m]; updated.
+        many: (1,) number of stored points; updated.
+        rows: (MOST, ROW) contacts; written from `count`.
+        count: Number of contacts so far.
 
     Returns:
-        How many there are now.
+        New number of contacts.
     """
     corner = deepest_corner(q, half)
     turned = rotate(q, corner)
@@ -140,18 +139,18 @@ def touch_floor(
 
 
 _BESIDE_M = 1e-3
-"""How far from an edge of the ground it is looked whether it is a ridge [m]."""
+"""Distance from a ground edge at which heights are compared to detect a ridge [m]."""
 
 _RIDGE = 1e-5
-"""A ridge is at least so much higher than what is beside it, on average, as a share of that way."""
+"""Minimum height of a ridge above its sides, on average, as a fraction of that distance."""
 
 _PARALLEL = 1e-3
-"""Edges of length 1 whose product is shorter touch with their ends: those are corners or points."""
+"""Minimum cross product of two unit edges in contact. Parallel edges touch at corners or points."""
 
 
 @kernel
 def near_ground(relief: Relief, p: Vec, radius: float, close: float) -> bool:
-    """Return whether a sphere around the vehicle may be close to hills."""
+    """Return True if a sphere around the vehicle may be close to hills."""
     if len(relief.heights) == 0 or -p[2] - radius - close > relief.grid[TOP]:
         return False
     return bool(-p[2] - radius < extreme_within(relief, p[0], p[1], radius + close, 1.0) + close)
@@ -164,16 +163,16 @@ def touch_ground(
     """Find the contacts with hills.
 
     Args:
-        p: Of the vehicle's centre, NED [m].
+        p: Position of the vehicle's centre, NED [m].
         q: Attitude body -> NED.
-        half: (3,) half extents of its box [m].
-        close: Points further off are none [m].
-        relief: The ground.
-        rows: (MOST, ROW) contacts; written from `count` on.
-        count: How many there are already.
+        half: (3,) half extents of the box [m].
+        close: Maximum distance of a contact [m].
+        relief: Ground.
+        rows: (MOST, ROW) contacts; written from `count`.
+        count: Number of contacts so far.
 
     Returns:
-        How many there are now.
+        New number of contacts.
     """
     for k in range(8):
         arm = rotate(q, corner_of(k, half))
@@ -200,9 +199,9 @@ def touch_ground(
 def _touch_points(
     p: Vec, q: Quat, half: Vector, close: float, relief: Relief, rows: Vector, count: int
 ) -> int:
-    """Find the points of the ground that are in the box, or just outside of a face.
+    """Find ground vertices inside the box, or just outside a face.
 
-    Of the faces that look down the one through which the way out is shortest touches it.
+    The contact is with the downward face that requires the shortest displacement.
     """
     heights, grid = relief.heights, relief.grid
     n_rows, n_columns = int(grid[ROWS]), int(grid[COLUMNS])
@@ -228,7 +227,7 @@ def _touch_points(
                 if side * b[axis] < -half[axis]:
                     best, face = math.inf, -1
                     break
-                # Of two it is the face that looks down more.
+                # Only faces within 60 degrees of straight down qualify.
                 if abs(down[axis]) > 0.5 and depth < best:
                     best, face = depth, axis
             if face < 0 or best < -close:
@@ -252,21 +251,21 @@ def _touch_points(
 def _touch_ridges(
     p: Vec, a: Vec, b: Vec, family: int, close: float, relief: Relief, rows: Vector, count: int
 ) -> int:
-    """Find where an edge of the box crosses ridges of the ground.
+    """Find the points where a box edge crosses ridges of the ground.
 
     Args:
-        p: Of the vehicle's centre, NED [m].
-        a: One end of the edge, from there [m].
-        b: The other end.
-        family: Which edges of the ground: 0 from west to east, 1 from south to north, 2 diagonals.
-        close: As of `touch_ground`, with the rest.
-        relief: The ground.
-        rows: Contacts.
-        count: How many there are already.
+        p: Position of the vehicle's centre, NED [m].
+        a: First end of the edge, relative to p [m].
+        b: Second end of the edge, relative to p [m].
+        family: Ground edges: 0 from west to east, 1 from south to north, 2 diagonals.
+        close: Maximum distance of a contact [m].
+        relief: Ground.
+        rows: (MOST, ROW) contacts; written from `count`.
+        count: Number of contacts so far.
     """
     grid = relief.grid
     d = (b[0] - a[0], b[1] - a[1], b[2] - a[2])
-    # In cells; edges are where a whole number is.
+    # In cells; ground edges are at whole numbers.
     x, y = (p[0] + a[0] - grid[0]) / grid[2], (p[1] + a[1] - grid[1]) / grid[3]
     dx, dy = d[0] / grid[2], d[1] / grid[3]
     at, step = x - y, dx - dy

@@ -1,7 +1,7 @@
-"""Impulses that keep a body out of what it touches: Bullet's sequential impulses for one body.
+"""Contact impulses on one body: Bullet's sequential impulses.
 
-Rows, their order, the two directions of friction in one cone and the constants are those of
-btMultiBodyConstraintSolver as pybullet sets it up. A vehicle on the floor moves alike.
+Rows, their order, the two friction directions in one cone and the constants match
+btMultiBodyConstraintSolver in pybullet's configuration. A vehicle on the floor moves the same.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
 
 FRICTION = 0.4
-"""The vehicle's 0.8 times the 0.5 that pybullet gives to everything else."""
+"""Friction coefficient: the vehicle's 0.8 times pybullet's default of 0.5 for other bodies."""
 
 ITERATIONS = 50
 ENOUGH = 1e-7
-"""Iterations end when no velocity changes by more than the root of this [m²/s²]."""
+"""Tolerance: iterations end when all velocity changes are below its square root [m²/s²]."""
 
 ERP = 0.08
-"""Share of a penetration that a tick takes away (m_erp2)."""
+"""Fraction of a penetration removed per tick (m_erp2)."""
 
 SLOP_M = 1e-5
-"""m_linearSlop [m]."""
+"""Linear slop (m_linearSlop) [m]."""
 
 _WIDTH = 16
-"""Numbers that describe a row: direction, arm x direction, velocities that a unit impulse gives
-(linear, angular), 1 / (direction . response), right-hand side, impulse so far."""
+"""Number of values in a row: direction, arm x direction, velocities per unit impulse (linear,
+angular), 1 / (direction . response), right-hand side, impulse so far."""
 
 
 @kernel
 def _sides(n: Vec) -> tuple[Vec, Vec]:
-    """Return two unit vectors square to n and to each other; on the floor south, then east."""
+    """Return two unit vectors normal to n and to each other; on the floor south, then east."""
     if abs(n[2]) > math.sqrt(0.5):
         k = 1.0 / math.sqrt(n[0] * n[0] + n[2] * n[2])
         a = (n[2] * k, 0.0, -n[0] * k)
@@ -74,7 +74,7 @@ def _describe(
 
 @kernel
 def _wanted(row: Vector, change: Vector) -> float:
-    """Return the impulse [N s] that a row still asks for after a change (6,) of the velocities."""
+    """Return the remaining impulse [N s] of a row after a velocity change (6,)."""
     along = 0.0
     for i in range(6):
         along += row[i] * change[i]
@@ -84,14 +84,14 @@ def _wanted(row: Vector, change: Vector) -> float:
 
 @kernel
 def _push(row: Vector, change: Vector, impulse: float) -> None:
-    """Add what an impulse [N s] along a row does to the change (6,) of the velocities."""
+    """Add the effect of an impulse [N s] along a row to the velocity change (6,)."""
     for i in range(6):
         change[i] += row[6 + i] * impulse
 
 
 @kernel
 def _rub(a: Vector, b: Vector, change: Vector, limit: float) -> float:
-    """Solve both directions of a contact's friction within a cone; return the velocity's change."""
+    """Solve both friction directions of a contact in a cone; return the velocity's change."""
     more_a, more_b = _wanted(a, change), _wanted(b, change)
     sum_a, sum_b = a[14] + more_a, b[14] + more_b
     if sum_a * sum_a + sum_b * sum_b >= limit * limit:
@@ -118,17 +118,17 @@ def resolve(
     tick_s: float,
     impulses: Vector,
 ) -> tuple[Vec, Vec]:
-    """Return the velocities with which a body goes into nothing that it touches.
+    """Return the velocities of a body without motion into its contacts.
 
     Args:
         v: Velocity after the tick's forces, NED [m/s].
-        spin: Angular velocity after them, NED [rad/s].
+        spin: Angular velocity after the tick's forces, NED [rad/s].
         q: Attitude body -> NED.
-        contacts: (MOST, ROW) as `box.ROW` says.
-        count: How many there are.
+        contacts: (MOST, ROW) contacts in the format of `box.ROW`.
+        count: Number of contacts.
         airframe: Mass and inertia.
         tick_s: Length of the tick [s].
-        impulses: (MOST,) overwritten with the normal impulses [N s].
+        impulses: (MOST,) output: normal impulses [N s].
 
     Returns:
         Velocity [m/s] and angular velocity [rad/s], both NED.
@@ -153,7 +153,7 @@ def resolve(
         for j in range(count):
             row = rows[3 * j]
             before = row[14]
-            # The right-hand side is what the row asks for in all; the change has what it got.
+            # The right-hand side is the row's total impulse; `change` is the effect so far.
             row[14] = max(0.0, before + _wanted(row, change))
             _push(row, change, row[14] - before)
             most = max(most, ((row[14] - before) / row[12]) ** 2)

@@ -1,6 +1,6 @@
 """Flies the vehicle with dronekit. Run by an interpreter that has dronekit and future.
 
-Prints one line of JSON: what it got.
+Prints one line of JSON with its readings.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Flies the vehicle with MAVSDK's gRPC API. Run by an interpreter that has mavsdk-grpc.
 
-Prints one line of JSON: what it got.
+Prints one line of JSON with its readings.
 """
 
 from __future__ import annotations

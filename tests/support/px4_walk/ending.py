@@ -29,7 +29,7 @@ def _failures(unit: str, expected: str = "ok", kinds: tuple[str, ...] = ("OFF", 
 
 
 def _returned(vehicle: Vehicle) -> float:
-    """Return the greatest height [m]."""
+    """Return the maximum height [m]."""
     heights = [0.0]
 
     def landed() -> bool:

@@ -15,7 +15,7 @@ from tests.support.px4_walk.row import Row
 from tests.support.px4_walk.vehicle import Vehicle
 
 HEIGHT_M = 8.0
-"""Of the take-off above home."""
+"""Take-off height above home."""
 
 ORBIT_M, ORBIT_M_S = 8.0, 3.0
 SLOW_M_S = 2.0

@@ -55,7 +55,7 @@ RATES = (
 )
 
 CLOCK_HZ = {"odometry": 50.0, "position_velocity_ned": 50.0}
-"""What the walk tells the time and the place by is not slowed down [Hz]."""
+"""Streams of the walk's clock and position; their rates are not lowered [Hz]."""
 
 NO_RATES = ("actuator_control_target", "raw_imu")
 

@@ -50,7 +50,7 @@ def fly(call: Callable[[Offboard], Any], seconds: float) -> Callable[[Vehicle], 
 
 
 def _about(*expected: float, within: float = 0.9) -> Callable[[Moved], bool]:
-    """Whether it moved so far; NaN = any."""
+    """Return a check that the vehicle moved by about `expected`; NaN = any."""
 
     def check(moved: Moved) -> bool:
         pairs = zip(moved, expected, strict=False)

@@ -27,7 +27,7 @@ def _upload(vehicle: Vehicle) -> None:
     places = [vehicle.place(*metres) for metres in ((10, 0), (10, 10), (0, 10), (0, 4))]
     items = [waypoint(*place, height_m=HEIGHT_M, speed_m_s=4.0) for place in places]
     _mission(vehicle).upload_mission(MissionPlan(items))
-    vehicle.wait(1.0)  # PX4 checks it first, and refuses to start it meanwhile
+    vehicle.wait(1.0)  # PX4 checks it first, and refuses to start it until then
 
 
 def _reached(item: int, limit_s: float) -> Any:

@@ -1,4 +1,4 @@
-"""One call and what PX4 answers."""
+"""One call and PX4's answer."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Row:
     expected: tuple[str, ...] = (OK,)
     """Outcomes that agree: `OK`, or names of MAVSDK's results. The first is PX4's."""
     check: Callable[[Any], bool] | None = None
-    """What the returned value must be like."""
+    """Check of the returned value."""
     slow: bool = False
-    """Whether the call takes seconds of wall time, on a real PX4 too: MAVSDK waits."""
+    """True if the call takes seconds of wall time, on a real PX4 too: MAVSDK waits."""
 
     @property
     def name(self) -> str:
@@ -35,7 +35,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a vehicle answered to a row."""
+    """Answer of a vehicle to a row."""
 
     row: Row
     outcome: str
@@ -43,7 +43,7 @@ class Answer:
 
     @property
     def agrees(self) -> bool:
-        """Whether it is what PX4 answers."""
+        """True if the answer matches PX4's."""
         if self.outcome not in self.row.expected:
             return False
         return self.outcome != OK or self.row.check is None or self.row.check(self.value)

@@ -23,7 +23,7 @@ GROUND: tuple[Row, ...] = (
     *commands.ROWS,
     *missions.ROWS,
 )
-"""Of a vehicle that stands."""
+"""Rows of a vehicle on the ground."""
 
 FLIGHT: tuple[Row, ...] = (
     *flight.GROUND,

@@ -18,7 +18,7 @@ from tests.support.mavlink_clients import Companion
 
 NO_ACK = "no ack"
 ACK_S = 6.0
-"""How long an acknowledgement is waited for, as MAVSDK's own retries would [s of wall time]."""
+"""Timeout of an acknowledgement, as with MAVSDK's own retries [s of wall time]."""
 
 _RESULTS = (
     *("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED"),
@@ -26,20 +26,20 @@ _RESULTS = (
 )
 
 _CLOCK_HZ = 50.0
-"""How often the vehicle tells its time and its place [Hz]."""
+"""Rate of the vehicle's time and position messages [Hz]."""
 
 _STANDS_STILL_S = 60.0
-"""So long may simulated time stand still before a wait is given up [wall s]."""
+"""Timeout of a wait while simulated time is stopped [wall s]."""
 
 _LATE_S = 4.0
-"""What MAVSDK tells may be so late [wall s]."""
+"""Maximum delay of MAVSDK's messages [wall s]."""
 
 FAST, OFFBOARD = 16.0, 4.0
-"""How fast a wait may run [simulated s a wall s]; MAVSDK repeats setpoints by the wall clock."""
+"""Maximum speed of a wait [simulated s a wall s]; MAVSDK repeats setpoints by the wall clock."""
 
 Plugin = TypeVar("Plugin")
 Pace = Callable[[float], AbstractContextManager[Callable[[float], None]]]
-"""Lets simulated time run at a speed meanwhile, where that can be chosen; is told what was seen."""
+"""Runs simulated time at a speed inside the context, where supported; receives the time read."""
 
 
 def _as_it_is(_speed: float) -> AbstractContextManager[Callable[[float], None]]:
@@ -99,7 +99,7 @@ class Vehicle:
         return float(self.telemetry.position().relative_altitude_m)
 
     def is_near(self, north: float, east: float, within: float = 1.0) -> bool:
-        """Whether it is within some metres of a place, horizontally."""
+        """Return True if the vehicle is within some metres of a place, horizontally."""
         n, e, _ = self.position
         return math.hypot(n - north, e - east) < within
 
@@ -154,7 +154,7 @@ class Vehicle:
                 due = now + 0.03
 
     def _ticks(self, speed: float) -> Any:
-        """Yield the simulated time whenever it has moved. RefusedError: it stands still."""
+        """Yield the simulated time whenever it has moved. RefusedError: it is stopped."""
         before, deadline = 0.0, time.monotonic() + _STANDS_STILL_S
         with self._pace(speed) as seen:
             while True:
@@ -167,7 +167,7 @@ class Vehicle:
                     raise RefusedError("simulated time stands still")
                 time.sleep(0.001)
 
-    # --- what is asked of it
+    # --- requests
 
     def plugin(self, kind: Callable[..., Plugin]) -> Plugin:
         """Return one of MAVSDK's plugins; each is made once."""
@@ -196,7 +196,7 @@ class Vehicle:
             # Once only: a loopback loses nothing, and a second answer would be taken for the next.
             self.send("COMMAND_LONG", command=number, confirmation=0, **fields)
             try:
-                # MAVSDK asks on its own, too: answers to that must not prolong the wait.
+                # MAVSDK sends requests, too: their answers must not prolong the wait.
                 deadline = time.monotonic() + wait_s
                 ack = {"command": None}
                 while ack["command"] != number:
