@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import math
 
+from numba.extending import register_jitable
+
 from airl_mav.core.constants import GRAVITY_M_S2
-from airl_mav.core.frames import Vector
+from airl_mav.core.frames import Vector, geodetic_to_local, local_to_geodetic
 from airl_mav.core.kernels import kernel
+from airl_mav.vehicle import atmosphere
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
+
+# Kernels call these functions as Python does.
+register_jitable(geodetic_to_local)
+register_jitable(local_to_geodetic)
+register_jitable(atmosphere.pressure_hpa)
+register_jitable(atmosphere.altitude_m)
+register_jitable(atmosphere.temperature_c)
 
 WIDTH = 16
 """Number of values in a row."""

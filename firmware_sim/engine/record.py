@@ -10,13 +10,10 @@ from __future__ import annotations
 from typing import Any, TypeAlias
 
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from airl_mav.control.gains import Gains
 from airl_mav.control.memory import MEMORY_SIZE
-from airl_mav.core.frames import geodetic_to_local, local_to_geodetic
-from airl_mav.vehicle import atmosphere
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import PowerModel
 from firmware_sim.autopilot.consistency import LOOK_BACK
@@ -24,14 +21,6 @@ from firmware_sim.autopilot.error_state import N_STATES, ROW_SIZE
 from firmware_sim.autopilot.turned_motion import WINDOW
 from firmware_sim.autopilot.yaw_estimator import LONGEST, MODEL_SIZE, N_MODELS, SHARED_SIZE
 from firmware_sim.engine.kinematics import WIDTH
-
-# Makes these functions callable from kernels, as from Python.
-_CALLED: tuple[Any, ...] = (
-    *(geodetic_to_local, local_to_geodetic),
-    *(atmosphere.pressure_hpa, atmosphere.altitude_m, atmosphere.temperature_c),
-)
-for _function in _CALLED:
-    register_jitable(_function)
 
 Record = NDArray[Any]
 """Array (1,) of a structured dtype."""
