@@ -36,7 +36,7 @@ import tyro
 from numpy.typing import NDArray
 from rich.console import Console
 
-from airl_mav.core.ports import LOOPBACK
+from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.provenance import provenance, usable_cores
 from airl_mav.latency.percentiles import summarize
 from airl_mav.profiles.vehicle import load_vehicle

@@ -23,8 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.core.clock import SimClock
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.ports import LOOPBACK
+from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.commander import Flight

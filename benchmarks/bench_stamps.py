@@ -29,7 +29,7 @@ from rich.table import Table
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import CommandKind
-from airl_mav.core.goals import Goal
+from airl_mav.core.frames import Goal
 from airl_mav.core.progress import Bar
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import AnyAction, flyable

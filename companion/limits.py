@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.goals import Goal, goal_height_m
+from airl_mav.core.frames import Goal, goal_height_m
 from airl_mav.policy.observation import Kinematics
 from airl_mav.profiles.distortion import sees_to, undistorted
 from airl_mav.scenario.model import LimitSettings, PilotSettings

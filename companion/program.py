@@ -15,7 +15,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import FieldError
-from airl_mav.core.goals import Goal
+from airl_mav.core.frames import Goal
 from airl_mav.core.provenance import describe_machine
 from airl_mav.flight.record import Part, Setup
 from airl_mav.latency.samplers import LatencySampler, latency_generator

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
+from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.signing import StoredSigning, frames_of
 from companion.interfaces import LinkError
 

@@ -34,9 +34,8 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.options import read_options, scenario_of
 from airl_mav.cli.sitl import SitlOptions
 from airl_mav.core.clock import SimClock, WallClock
-from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.constants import LOOPBACK, TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.signing import read_key
 from airl_mav.policy.actions import limited
 from airl_mav.policy.greedy import GreedyPolicy

@@ -37,7 +37,7 @@ from airl_mav.arena.appearance import (
 from airl_mav.arena.ground import Ground
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.fields import ArrayField
-from airl_mav.core.goals import Goal
+from airl_mav.core.frames import Goal
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.asset_files import MeshFile
 

@@ -15,7 +15,7 @@ from airl_mav.cli.options import check_installed, run_command, scenario_of
 from airl_mav.cli.shared_options import Gate, Viewing, leave, requirements_of, view_of
 from airl_mav.cli.telling import Telling, Voice
 from airl_mav.cli.video import video_shown, video_words, watcher_of
-from airl_mav.core.ports import LOOPBACK
+from airl_mav.core.constants import LOOPBACK
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
 from airl_mav.profiles.camera_kind import SLOW
 from airl_mav.scenario.model import Scenario

@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from typing import Final, Literal
 
+LOOPBACK = "127.0.0.1"
+
+
 GRAVITY_M_S2: Final = 9.80665
 """Standard gravity [m/s²] (CGPM 1901; PX4's CONSTANTS_ONE_G)."""
 

@@ -17,8 +17,7 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.files import replace_file
-from airl_mav.core.frames import quat_yaw
-from airl_mav.core.goals import Goal, goal_height_m
+from airl_mav.core.frames import Goal, goal_height_m, quat_yaw
 from airl_mav.core.plugins import names_code
 from airl_mav.experiments.fly import rehearse
 from airl_mav.flight.judge import Outcome

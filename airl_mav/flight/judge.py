@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.fields import quantity
-from airl_mav.core.goals import Goal, goal_distance_m
+from airl_mav.core.frames import Goal, goal_distance_m
 
 GOAL_RADIUS_M = 3.0
 """Default goal radius [m], from the paper's code; horizontal distance."""

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_S, US_PER_S, CommandKind
-from airl_mav.core.frames import quat_yaw
-from airl_mav.core.goals import goal_distance_m
+from airl_mav.core.frames import goal_distance_m, quat_yaw
 from airl_mav.envs.arenas import CEILING, FLOOR, NOTHING, WALL
 from airl_mav.envs.fleet import Flights, Verdict
 from airl_mav.envs.rendering import Moment

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MM_PER_M, Frame, depth_only
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.frames import Vector, ned_to_heading, quats_to_euler
-from airl_mav.core.goals import Goal
+from airl_mav.core.frames import Goal, Vector, ned_to_heading, quats_to_euler
 
 Rows = int | slice | Sequence[int] | NDArray[np.int64] | None
 """Index into n vehicles; None adds a leading axis of n = 1."""

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import EXIT_BROKEN
 from airl_mav.core.files import save_arrays
-from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.process_use import UseMeter
 from airl_mav.rehearsal import channel
 from airl_mav.scenario.resolved import ResolvedScenario

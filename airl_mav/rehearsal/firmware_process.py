@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.compiling import heard_compiling
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.signing import StoredSigning
 from airl_mav.faults.kinds import PROCESSES
 from airl_mav.faults.model import Fault, link_fails

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.goals import Goal, goal_distance_m
+from airl_mav.core.frames import Goal, goal_distance_m
 from airl_mav.core.progress import Progress
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord

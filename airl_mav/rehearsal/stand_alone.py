@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from airl_mav.arena.generate import generate
 from airl_mav.camera.conditions import check_noise, check_renderer
-from airl_mav.core.goals import Goal
+from airl_mav.core.frames import Goal
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile

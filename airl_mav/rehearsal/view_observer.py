@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from airl_mav.core.goals import Goal
+from airl_mav.core.frames import Goal
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.channel import State, Text
 from airl_mav.rehearsal.progress import WARNING, Observer

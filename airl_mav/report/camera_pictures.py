@@ -24,9 +24,9 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.flight.trajectory import pose_at
-from airl_mav.report.depth_colours import coloured
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.replay.flight import ReplayedFlight
+from airl_mav.report.theme import coloured
 
 ROOM = {
     primitives.CEILING: (236, 238, 240),

@@ -15,8 +15,8 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.files import Arrays
 from airl_mav.latency.stages import STAGES, decision_series
 from airl_mav.latency.stamps import NO_STAMP
-from airl_mav.report.depth_colours import shades
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision
+from airl_mav.report.theme import shades
 from airl_mav.report.tracking import EstimateErrors, Motion, TrackedFlight
 
 

@@ -24,9 +24,9 @@ from airl_mav.core.frames import quat_to_matrix
 from airl_mav.flight.trajectory import pose_at
 from airl_mav.profiles.camera import Camera
 from airl_mav.report.camera_pictures import Pixels, Shown
-from airl_mav.report.depth_colours import coloured
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.replay.flight import ReplayedFlight
+from airl_mav.report.theme import coloured
 
 TURNED_OVER_US = 20_000
 """Half-width of the difference for angular rates of a recorded flight [µs]."""

@@ -19,7 +19,7 @@ from airl_mav.camera.render import camera_pose
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import Arrays
-from airl_mav.core.goals import Goal
+from airl_mav.core.frames import Goal
 from airl_mav.core.plugins import names_code
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory, pose_at

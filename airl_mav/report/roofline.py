@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from airl_mav.envs.roofline import Bound, Roofline, RooflinePoint
-from airl_mav.latency.f1_model import f1_velocity
+from airl_mav.latency.stages import f1_velocity
 from airl_mav.report import theme
 from airl_mav.report.document import Document, Facts, Section, provenance_facts
 from airl_mav.report.table import TableView, columns_of

@@ -18,7 +18,7 @@ from airl_mav.arena.draw import GOAL_COLOUR, MOVING_COLOURS, START_COLOUR
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.arena.triangles import drawn, standing
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.goals import goal_height_m
+from airl_mav.core.frames import goal_height_m
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory

@@ -11,14 +11,13 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.depth_colours import palette
 from airl_mav.report.flight_data import chosen, flight_data
 from airl_mav.report.forensics.evidence import Cause, ranked
 from airl_mav.report.forensics.worst import flown_path
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision, policy_again, seen_decisions
 from airl_mav.report.run_figures import map_figure
 from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, scene_json, top_speed
-from airl_mav.report.theme import Picture
+from airl_mav.report.theme import Picture, palette
 from airl_mav.report.tracking import TrackedFlight, track
 from airl_mav.report.tracking_figure import IMAGES, tracking_figure
 

@@ -14,8 +14,8 @@ from matplotlib.transforms import Bbox, TransformedBbox
 from numpy.typing import NDArray
 
 from airl_mav.report import theme
-from airl_mav.report.depth_colours import pictured
 from airl_mav.report.policy_view import SeenDecision
+from airl_mav.report.theme import pictured
 from airl_mav.report.tracking import Commands, Floats, TrackedFlight
 
 TIME_POINTS = 300

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
-from airl_mav.core.goals import Goal
+from airl_mav.core.frames import Goal
 from airl_mav.flight.judge import Task
 from airl_mav.flight.record import BUILT_IN, EpisodeRecord, Part, Setup
 from airl_mav.latency.injection import Injection

@@ -9,8 +9,7 @@ import zmq
 from pydantic import ValidationError
 
 from airl_mav.core.clock import Clock, WallClock
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.ports import LOOPBACK
+from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.view.ends import ViewEnds
 from airl_mav.view.messages import Image, Message, Steering, Told, from_parts, to_parts
 

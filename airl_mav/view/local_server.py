@@ -15,7 +15,7 @@ import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from airl_mav.core.ports import LOOPBACK
+from airl_mav.core.constants import LOOPBACK
 
 OWN_PAGES = [re.compile(r"http://(127\.0\.0\.1|localhost)(:\d+)?"), None]
 """Accepted origins: pages served by this computer, and programs, which send no origin."""

@@ -14,7 +14,7 @@ from airl_mav.arena.appearance import OBSTACLE
 from airl_mav.arena.geometry import Arena, Bounds, Shape
 from airl_mav.arena.triangles import drawn, standing
 from airl_mav.core import frames
-from airl_mav.core.goals import goal_height_m
+from airl_mav.core.frames import goal_height_m
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE
 from airl_mav.view import style
 from airl_mav.view.messages import Episode, Vehicle, VehicleShape

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.goals import goal_distance_m
+from airl_mav.core.frames import goal_distance_m
 from airl_mav.view import messages
 
 STRIP_S = 20.0

@@ -10,8 +10,8 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from airl_mav.core.child_process import ChildProcess
+from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import FieldError
-from airl_mav.core.ports import LOOPBACK
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view.ends import Answer, Request, ViewEnds
 from airl_mav.view.pace import REAL_TIME

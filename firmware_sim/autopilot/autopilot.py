@@ -31,7 +31,6 @@ from firmware_sim.autopilot.commander import (
     Flight,
     Phase,
 )
-from firmware_sim.autopilot.error_filter import NewFilter
 from firmware_sim.autopilot.error_state import RATES, Q
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
@@ -40,6 +39,7 @@ from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Interven
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.flight_commander import Commanded, FlightCommander
+from firmware_sim.autopilot.fusion_horizon import NewFilter
 from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.home import Home
 from firmware_sim.autopilot.land_detector import LandDetector

@@ -23,14 +23,11 @@ from airl_mav.core.frames import (
 )
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.alignment import Alignment
+from firmware_sim.autopilot.alignment import Alignment, FieldCheck
 from firmware_sim.autopilot.autopilot_state import Estimate
-from firmware_sim.autopilot.error_filter import NewFilter
 from firmware_sim.autopilot.external_vision import Control, ExternalVision
 from firmware_sim.autopilot.filter_kernel import KernelFilter
-from firmware_sim.autopilot.fusion_horizon import FusionHorizon
-from firmware_sim.autopilot.magnetic_field import FieldCheck
-from firmware_sim.autopilot.measurement import Measurement, selecting
+from firmware_sim.autopilot.fusion_horizon import FusionHorizon, Measurement, NewFilter, selecting
 from firmware_sim.autopilot.optical_flow import OpticalFlow
 from firmware_sim.autopilot.range_finder import Aids, RangeFinder
 from firmware_sim.autopilot.recovery import Moment, Recovery

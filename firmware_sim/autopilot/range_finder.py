@@ -19,7 +19,7 @@ from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import rotate
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Clearance
-from firmware_sim.autopilot.measurement import Measurement
+from firmware_sim.autopilot.fusion_horizon import Measurement
 from firmware_sim.autopilot.range_sensor import LONGEST_INTERVAL_US, RangeConsistency, RangeSensor
 from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.interfaces import DOWNWARD, DistanceReading

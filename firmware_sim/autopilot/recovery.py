@@ -16,7 +16,7 @@ from airl_mav.core.frames import Vector
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.consistency import Compass, Consistency, Restart
 from firmware_sim.autopilot.emergency_yaw import EmergencyYaw, turn_to
-from firmware_sim.autopilot.error_filter import ErrorFilter
+from firmware_sim.autopilot.fusion_horizon import ErrorFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 
 PROBATION_US = 10 * US_PER_S

@@ -1,7 +1,6 @@
 """State of the built-in autopilot for clients, the recorder and tests."""
 
 # ruff: noqa: D102 (properties are documented in `AutopilotState`)
-
 from __future__ import annotations
 
 import math
@@ -12,9 +11,11 @@ from typing import Any, NamedTuple
 from airl_mav.control.demand import AnyDemand
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot.autopilot_state import (
+    NO_MISSION,
     Clearance,
     CommanderStatus,
     Health,
+    MissionProgress,
     Mode,
     OrbitStatus,
     Setpoint,
@@ -25,12 +26,21 @@ from firmware_sim.autopilot.flight_commander import FlightCommander
 from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.home import Home
 from firmware_sim.autopilot.navigation.navigator import Navigator
-from firmware_sim.autopilot.navigation.plan import Plans
-from firmware_sim.autopilot.navigation.progress import progress
+from firmware_sim.autopilot.navigation.plan import Kind, Plans
 from firmware_sim.autopilot.newest_sensors import NewestSensors
 from firmware_sim.engine.controller import Controller, ControlSetpoints
 from firmware_sim.engine.record import POSITION, TRAJECTORY
 from firmware_sim.interfaces import SensorSample
+
+
+def progress(plans: Plans) -> MissionProgress:
+    """Return the mission progress and the ids of the stored lists."""
+    mission, fence, rally = (plans.stored(kind) for kind in Kind)
+    if not (mission.items or fence.items or rally.items):
+        return NO_MISSION
+    return MissionProgress(
+        plans.current, len(mission.items), mission.identity, fence.identity, rally.identity
+    )
 
 
 def setpoint_of(tick: Any, velocity: Vector) -> Setpoint:

@@ -15,8 +15,7 @@ import numpy as np
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.error_filter import ErrorFilter
-from firmware_sim.autopilot.fusion_horizon import FusionHorizon
+from firmware_sim.autopilot.fusion_horizon import ErrorFilter, FusionHorizon
 
 STEP_S = 0.01
 """Time step of PX4's filter, 100 Hz [s]; its terrain noises are per step."""

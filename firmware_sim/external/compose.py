@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import LOOPBACK
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, FirmwareName
 from firmware_sim.external import airframe_check

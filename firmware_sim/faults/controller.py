@@ -17,8 +17,7 @@ import numpy as np
 from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic
 from airl_mav.faults.kinds import MOTORS, SENSORS
-from airl_mav.faults.model import Fault
-from airl_mav.faults.schedule import gust_share
+from airl_mav.faults.model import Fault, gust_share
 from airl_mav.profiles.sensors import Sensors
 from airl_mav.profiles.vehicle import Battery, VehicleProfile
 from airl_mav.vehicle.airframe import Airframe

@@ -10,8 +10,7 @@ import numpy as np
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.streams import Stream, stream
 from airl_mav.faults.kinds import Part
-from airl_mav.faults.model import Fault
-from airl_mav.faults.schedule import FOREVER_US, active, next_change_us
+from airl_mav.faults.model import FOREVER_US, Fault, active, next_change_us
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Flight, Phase
 

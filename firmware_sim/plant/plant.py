@@ -11,8 +11,9 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_HZ, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.streams import sensors_and_gusts
+from airl_mav.profiles.vehicle import Body as BodyProfile
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.scenario.aircraft import Aircraft
+from airl_mav.scenario.aircraft import Aircraft, PlantName
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import PowerModel, standing_power_w
 from airl_mav.vehicle.rotation import Quat, Vec
@@ -41,13 +42,35 @@ from firmware_sim.engine.ticks import (
     stretch,
 )
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, Truth
-from firmware_sim.plant.bodies import new_body
 from firmware_sim.plant.body import FLOOR, Body, Touch
 from firmware_sim.plant.contacts.box import BREAKING_SHARE
 from firmware_sim.plant.optical_flow import PlantOpticalFlow
 from firmware_sim.plant.rangefinder import PlantRangefinder
-from firmware_sim.plant.room import Room
 from firmware_sim.plant.sensors import SensorSuite
+from firmware_sim.plant.solids import Room
+
+
+def new_body(
+    name: PlantName, arena: Arena | None, body: BodyProfile, airframe: Airframe, tick_s: float
+) -> Body:
+    """Return a vehicle's body at rest on the floor at the start, facing north.
+
+    Args:
+        name: Type of body.
+        arena: Arena; None = an endless floor.
+        body: Collision box.
+        airframe: Mass and inertia.
+        tick_s: Length of a tick [s].
+    """
+    # Local imports: pybullet is not available everywhere, and numba compiles on import.
+    if name == "kernel":
+        from firmware_sim.plant.kernel_body import KernelBody
+
+        return KernelBody(arena, body, airframe, tick_s)
+    from firmware_sim.plant.bullet_body import BulletBody
+
+    return BulletBody(arena, body, airframe, tick_s)
+
 
 REST_SPEED_M_S = 0.1
 """Maximum speed of a floor contact that is not a collision (AirSim's kRestingVelocityMax) [m/s]."""

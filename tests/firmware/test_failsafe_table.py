@@ -21,9 +21,9 @@ from firmware_sim.autopilot.failsafes.conditions import (
     BatteryWarning,
     Conditions,
     FenceBreach,
+    Settings,
     can_run,
 )
-from firmware_sim.autopilot.failsafes.fallback import MODE_OF_ACTION, possible
 from firmware_sim.autopilot.failsafes.framework import (
     NO_INTERVENTION,
     FailsafeState,
@@ -32,8 +32,14 @@ from firmware_sim.autopilot.failsafes.framework import (
     Vehicle,
     update,
 )
-from firmware_sim.autopilot.failsafes.settings import Settings
-from firmware_sim.autopilot.failsafes.table import TABLE, Situation, Trigger, answers
+from firmware_sim.autopilot.failsafes.table import (
+    MODE_OF_ACTION,
+    TABLE,
+    Situation,
+    Trigger,
+    answers,
+    possible,
+)
 
 MS, S = 1_000, 1_000_000
 FINE = Conditions(

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from airl_mav.core.frames import MAGNETIC_FIELD_NED, quat_from_euler, quat_to_matrix
+from firmware_sim.autopilot.alignment import INCLINATION_RAD, STRENGTH_GAUSS, FieldCheck
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.autopilot.magnetic_field import INCLINATION_RAD, STRENGTH_GAUSS, FieldCheck
 from tests.support.flight_rig import Rig
 
 STRENGTH, INCLINATION = 1, 2

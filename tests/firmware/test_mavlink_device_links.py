@@ -7,8 +7,8 @@ from contextlib import ExitStack, closing
 
 import pytest
 
+from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import LOOPBACK
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gimbal_link, payload_link

@@ -16,7 +16,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.clock import WallClock
-from airl_mav.core.ports import LOOPBACK
+from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.signing import StoredSigning, read_key, write_key
 from companion.interfaces import LinkError
 from companion.mavsdk_link import MavsdkLink

@@ -7,8 +7,7 @@ import math
 import pytest
 
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.navigation.plan import Frame, Kind, NavCommand, PlanItem
-from firmware_sim.autopilot.navigation.triplet import TripletKind
+from firmware_sim.autopilot.navigation.plan import Frame, Kind, NavCommand, PlanItem, TripletKind
 from tests.support.mission_kit import NAN, ORIGIN, FakeFlight, at, do, place
 
 N = NavCommand

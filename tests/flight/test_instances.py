@@ -7,8 +7,8 @@ from contextlib import ExitStack, closing
 import pytest
 from pymavlink import mavutil
 
+from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import LOOPBACK
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.firmware_process import build_firmware
 from airl_mav.scenario.aircraft import Aircraft, Ports, RealFirmware

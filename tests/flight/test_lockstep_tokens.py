@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
-from airl_mav.core.goals import Goal
+from airl_mav.core.frames import Goal
 from airl_mav.core.signing import StoredSigning, write_key
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.flight import fly

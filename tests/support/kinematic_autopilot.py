@@ -38,9 +38,9 @@ from firmware_sim.autopilot.autopilot_state import (
 from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
-from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs, ParameterValue
 from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Obstacles, Request
+from firmware_sim.autopilot.snapshot import progress
 from firmware_sim.interfaces import (
     BatterySample,
     DistanceReading,

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from airl_mav.core.goals import Goal
+from airl_mav.core.frames import Goal
 from airl_mav.latency.samplers import FixedSampler
 from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.stage import Stage

@@ -2,7 +2,7 @@ import gc
 
 import pytest
 
-from airl_mav.core.collecting import YOUNG_OBJECTS, seldom_collected
+from airl_mav.report.run_report import YOUNG_OBJECTS, seldom_collected
 
 
 @pytest.mark.parametrize("before", [(700, 10, 10), (90_000, 5, 5), (0, 10, 10)])

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from airl_mav.latency.f1_model import f1_knee_hz, f1_velocity, max_acceleration
+from airl_mav.latency.stages import f1_knee_hz, f1_velocity, max_acceleration
 from airl_mav.profiles.vehicle import load_vehicle
 
 POSITIVE = st.floats(0.01, 100.0)

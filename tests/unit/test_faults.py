@@ -15,8 +15,7 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.faults.kinds import KINDS, Part, Phase
-from airl_mav.faults.model import Fault
-from airl_mav.faults.schedule import FOREVER_US, active, gust_share, next_change_us, window_us
+from airl_mav.faults.model import FOREVER_US, Fault, active, gust_share, next_change_us, window_us
 from airl_mav.scenario.file import read_scenario_file, save_scenario
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve

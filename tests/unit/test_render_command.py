@@ -19,7 +19,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from airl_mav.report.depth_colours import coloured
+from airl_mav.report.theme import coloured
 from tests.support.lenses import BARREL
 
 SMALL = ("--width-px", "64", "--height-px", "48")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.goals import Goal
+from airl_mav.core.frames import Goal
 from airl_mav.flight.paired import compare_pairs, percent_change
 from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import aggregate

@@ -10,8 +10,8 @@ from foxglove.websocket import ChannelView, Client, ServerListener
 
 from airl_mav.black_box.messages import Channel
 from airl_mav.core.clock import NS_PER_US, Clock, WallClock
+from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import FieldError
-from airl_mav.core.ports import LOOPBACK
 from airl_mav.report.export_log.recorded import RecordedFlight
 from airl_mav.report.export_log.told import FlightMessages
 

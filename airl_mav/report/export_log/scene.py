@@ -19,7 +19,7 @@ from airl_mav.black_box.messages import Channel
 from airl_mav.core import frames
 from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.goals import Goal, goal_height_m
+from airl_mav.core.frames import Goal, goal_height_m
 from airl_mav.profiles.vehicle import CORNERS
 from airl_mav.view import style
 from airl_mav.view.messages import VehicleShape

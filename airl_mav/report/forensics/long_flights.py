@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.footprints import bounding_boxes, segments_clear
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.goals import goal_distance_m
+from airl_mav.core.frames import goal_distance_m
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory

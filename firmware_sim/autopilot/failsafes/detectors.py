@@ -3,11 +3,110 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from firmware_sim.autopilot.error_state import Q
+from firmware_sim.autopilot.esc import current_a
+from firmware_sim.interfaces import BatterySample
+
+
+class Undercurrent(NamedTuple):
+    """Undercurrent thresholds of a motor."""
+
+    throttle: float
+    """FD_ACT_MOT_THR: minimum command 0..1 for the check."""
+    per_throttle_a: float
+    """FD_ACT_MOT_C2T: minimum current per command [A]."""
+    lasting_ms: float
+    """FD_ACT_MOT_TOUT: duration until failure [ms]."""
+
+
+class MotorFailure:
+    """Detector of motors with too little current for their command; latched while armed."""
+
+    def __init__(self) -> None:
+        """Start with all motors healthy."""
+        self.failed = False
+        """True if a motor has failed."""
+        self._since_us: dict[int, int] = {}
+
+    def take(
+        self,
+        time_us: int,
+        told: Sequence[float],
+        outputs: Sequence[float],
+        limits: Undercurrent,
+    ) -> None:
+        """Check all motors.
+
+        Args:
+            time_us: Time [µs].
+            told: Commands of the motors, 0..1.
+            outputs: Outputs of the motors, as reported by the speed controllers.
+            limits: Undercurrent thresholds.
+        """
+        for motor, (throttle, output) in enumerate(zip(told, outputs, strict=True)):
+            least_a = throttle * limits.per_throttle_a
+            if not (throttle > limits.throttle and current_a(output) < least_a):
+                self._since_us.pop(motor, None)
+            elif time_us - self._since_us.setdefault(motor, time_us) > (
+                limits.lasting_ms * US_PER_MS
+            ):
+                self.failed = True
+
+    def rest(self) -> None:
+        """Reset the detector: the vehicle is disarmed."""
+        self.failed = False
+        self._since_us.clear()
+
+
+AVERAGE_S = 50.0
+"""Time constant of the mean current [s]."""
+
+_S_PER_H = 3600.0
+_MA_PER_A = 1000.0
+
+
+class Endurance:
+    """Estimator of the remaining flight time from the mean current while armed."""
+
+    def __init__(self) -> None:
+        self._current_a: float | None = None
+        self._time_us = 0
+
+    def update(
+        self,
+        time_us: int,
+        battery: BatterySample,
+        capacity_mah: float,
+        expected_a: float,
+        *,
+        armed: bool,
+    ) -> float:
+        """Return the remaining battery time [s], infinite if the capacity is not set.
+
+        Args:
+            time_us: Time of the sample [µs].
+            battery: Reading of the power module.
+            capacity_mah: BAT1_CAPACITY; 0 or less: not set.
+            expected_a: BAT_AVRG_CURRENT, the initial mean.
+            armed: True if armed; the mean is only updated while armed.
+        """
+        if capacity_mah <= 0.0:
+            return math.inf
+        if self._current_a is None:
+            self._current_a = expected_a
+        elif armed:
+            share = -math.expm1(-(time_us - self._time_us) / (AVERAGE_S * US_PER_S))
+            self._current_a += share * (max(battery.current_a, 0.0) - self._current_a)
+        self._time_us = time_us
+        left_mah = battery.remaining * capacity_mah
+        return left_mah / max(self._current_a * _MA_PER_A, 1e-6) * _S_PER_H
+
 
 VALID_AFTER_US = US_PER_S
 """Time an estimate must be good again before it counts as valid [µs]."""

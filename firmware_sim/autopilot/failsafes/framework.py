@@ -13,10 +13,20 @@ from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Message, Mode
 from firmware_sim.autopilot.failsafes.actions import Action, Cause, Clear, Options, Takeover
 from firmware_sim.autopilot.failsafes.announcement import announcement
-from firmware_sim.autopilot.failsafes.conditions import BatteryWarning, Conditions, can_run
-from firmware_sim.autopilot.failsafes.fallback import mode_fallback, mode_of, possible
-from firmware_sim.autopilot.failsafes.settings import Settings
-from firmware_sim.autopilot.failsafes.table import Situation, Trigger, answers
+from firmware_sim.autopilot.failsafes.conditions import (
+    BatteryWarning,
+    Conditions,
+    Settings,
+    can_run,
+)
+from firmware_sim.autopilot.failsafes.table import (
+    Situation,
+    Trigger,
+    answers,
+    mode_fallback,
+    mode_of,
+    possible,
+)
 
 
 class Vehicle(NamedTuple):

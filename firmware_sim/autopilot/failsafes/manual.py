@@ -9,8 +9,7 @@ from firmware_sim.autopilot import prearm
 from firmware_sim.autopilot.autopilot_state import MODE_NAMES, Mode
 from firmware_sim.autopilot.failsafes.actions import Action, Clear, Options, Takeover
 from firmware_sim.autopilot.failsafes.conditions import NEEDS
-from firmware_sim.autopilot.failsafes.fallback import MODE_OF_ACTION, OFFBOARD_LOSS
-from firmware_sim.autopilot.failsafes.table import TABLE, Row
+from firmware_sim.autopilot.failsafes.table import MODE_OF_ACTION, OFFBOARD_LOSS, TABLE, Row
 
 ACTION_NAMES = {
     Action.NONE: "nothing",

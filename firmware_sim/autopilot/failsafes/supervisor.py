@@ -19,7 +19,13 @@ from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.autopilot.events.health_report import REPORT_US, HealthReporter
 from firmware_sim.autopilot.failsafes.actions import Action
-from firmware_sim.autopilot.failsafes.conditions import BatteryWarning, Conditions, Need, lacking
+from firmware_sim.autopilot.failsafes.conditions import (
+    BatteryWarning,
+    Conditions,
+    Need,
+    Settings,
+    lacking,
+)
 from firmware_sim.autopilot.failsafes.framework import (
     NO_INTERVENTION,
     FailsafeState,
@@ -27,7 +33,6 @@ from firmware_sim.autopilot.failsafes.framework import (
     Vehicle,
     update,
 )
-from firmware_sim.autopilot.failsafes.settings import Settings
 from firmware_sim.autopilot.failsafes.watch import Watch
 from firmware_sim.autopilot.prearm import Check
 from firmware_sim.autopilot.readiness import ArmingSettings, Readiness

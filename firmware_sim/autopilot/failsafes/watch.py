@@ -27,11 +27,12 @@ from firmware_sim.autopilot.failsafes.conditions import (
 from firmware_sim.autopilot.failsafes.detectors import (
     HYSTERESIS,
     AttitudeFailure,
+    Endurance,
+    MotorFailure,
+    Undercurrent,
     Validity,
     roll_and_pitch,
 )
-from firmware_sim.autopilot.failsafes.endurance import Endurance
-from firmware_sim.autopilot.failsafes.motor_failure import MotorFailure, Undercurrent
 from firmware_sim.autopilot.sensor_monitor import CALM_US, SensorMonitor
 from firmware_sim.engine.record import (
     ACCEL_ROW,

@@ -15,7 +15,7 @@ from firmware_sim.autopilot.autopilot_state import Clearance, Message, OrbitStat
 from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.manual_control import Sticks
-from firmware_sim.autopilot.navigation.triplet import STANDING, Triplet
+from firmware_sim.autopilot.navigation.plan import STANDING, Triplet
 from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Obstacles, Place, Request
 from firmware_sim.autopilot.travel import Travel
 

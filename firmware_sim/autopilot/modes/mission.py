@@ -12,7 +12,7 @@ from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, tr
 from firmware_sim.autopilot.modes.land import landing_speed
 from firmware_sim.autopilot.modes.precision_land import PrecisionLand
 from firmware_sim.autopilot.modes.takeoff import gentle, leave_ground
-from firmware_sim.autopilot.navigation.triplet import Triplet, TripletKind
+from firmware_sim.autopilot.navigation.plan import Triplet, TripletKind
 from firmware_sim.autopilot.requests import Request
 from firmware_sim.autopilot.trajectory import Leg, PathLimits
 

@@ -25,15 +25,17 @@ from firmware_sim.autopilot.navigation.flown_item import (
     as_flown,
 )
 from firmware_sim.autopilot.navigation.plan import (
+    STANDING,
     Frame,
     Kind,
     NavCommand,
     PlanItem,
     Plans,
+    Triplet,
+    TripletKind,
     go_to,
     next_places,
 )
-from firmware_sim.autopilot.navigation.triplet import STANDING, Triplet, TripletKind
 
 _MODE_LOCATION = 3
 """MAV_ROI_LOCATION."""

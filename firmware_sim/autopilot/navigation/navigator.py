@@ -19,9 +19,15 @@ from firmware_sim.autopilot.navigation.executor import PERIOD_US, Crew, MissionE
 from firmware_sim.autopilot.navigation.feasibility import Verdict, check
 from firmware_sim.autopilot.navigation.fence import FenceMonitor
 from firmware_sim.autopilot.navigation.flown_item import Situation
-from firmware_sim.autopilot.navigation.plan import Kind, PlanItem, Plans, distance_m
+from firmware_sim.autopilot.navigation.plan import (
+    STANDING,
+    Kind,
+    PlanItem,
+    Plans,
+    Triplet,
+    distance_m,
+)
 from firmware_sim.autopilot.navigation.return_path import return_height, return_time_s
-from firmware_sim.autopilot.navigation.triplet import STANDING, Triplet
 from firmware_sim.autopilot.navigation.way_home import (
     Destination,
     ReturnType,

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.frames import HOME
-from airl_mav.core.ports import LOOPBACK
 from firmware_sim.external.parameter_file import ardupilot_file
 from firmware_sim.external.process import StartCommand
 from firmware_sim.flight_controller import FirmwareMissingError

@@ -14,9 +14,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import LOOPBACK
 from firmware_sim.external.ardupilot.program import PORTS_PER_INSTANCE, SIMULATOR_PORT
 from firmware_sim.external.launcher import no_process
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError

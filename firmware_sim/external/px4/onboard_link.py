@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable
 
 from airl_mav.core.clock import Patience
-from airl_mav.core.ports import LOOPBACK
+from airl_mav.core.constants import LOOPBACK
 from firmware_sim.external.observer import SYSTEM_ID
 from firmware_sim.external.px4.program import API_LOCAL_PORT, API_PORT
 from firmware_sim.flight_controller import FirmwareLostError

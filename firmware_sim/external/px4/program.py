@@ -6,8 +6,8 @@ import socket
 from dataclasses import dataclass
 from pathlib import Path
 
+from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import LOOPBACK
 from firmware_sim.external.process import StartCommand
 from firmware_sim.flight_controller import FirmwareMissingError
 

@@ -14,9 +14,8 @@ from collections.abc import Callable
 from typing import Any
 
 from airl_mav.core.clock import Patience, WallClock
-from airl_mav.core.constants import MS_PER_S, TICK_HZ, TICK_US, US_PER_S
+from airl_mav.core.constants import LOOPBACK, MS_PER_S, TICK_HZ, TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import LOOPBACK
 from firmware_sim.external.launcher import no_process
 from firmware_sim.external.process import RunningProgram, program_at
 from firmware_sim.external.px4 import hil_messages as hil

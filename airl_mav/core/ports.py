@@ -1,3 +1,0 @@
-"""Default address for all sockets."""
-
-LOOPBACK = "127.0.0.1"
