@@ -84,7 +84,7 @@ def measure_ours() -> list[Result]:
     from airl_mav.envs.arenas import batch_of
     from airl_mav.envs.cameras import Eye, render_images
     from airl_mav.envs.colour_images import lens_of
-    from airl_mav.envs.fleet import Rules, Verdict, hover, new_fleet, vehicle_of
+    from airl_mav.envs.fleet import FlightStatus, Rules, hover, new_fleet, vehicle_of
     from airl_mav.envs.flight import advance
     from airl_mav.profiles.arena import ArenaSpec
     from airl_mav.profiles.loading import load_profile
@@ -120,7 +120,7 @@ def measure_ours() -> list[Result]:
                     render_images(
                         fleet,
                         arenas,
-                        fleet.verdict == Verdict.FLYING,
+                        fleet.verdict == FlightStatus.FLYING,
                         Eye(mount, lens, images, None),
                     )
                 seconds += time.process_time() - start

@@ -44,7 +44,7 @@ from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.vehicle.atmosphere import altitude_m, pressure_hpa
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.estimator import BIAS_STEP_S
 from firmware_sim.engine.ticks import PA_PER_HPA
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
@@ -123,7 +123,7 @@ def fly(vehicle: VehicleProfile, seed: int, seconds: float, nis: Noted, nees: No
         for _ in pilot(simulation, autopilot, np.random.default_rng(seed), seconds):
             truth = simulation.truth
             simulation.tick()
-            flying = autopilot.flight.phase is Phase.AIR
+            flying = autopilot.flight.phase is FlightPhase.AIR
             autopilot.estimator.innovations = nis.take if flying else None
             ticks += flying
             if flying and ticks % NEES_TICKS == 0:
@@ -137,7 +137,7 @@ def pilot(
     simulation: Simulation, autopilot: BuiltinAutopilot, rng: np.random.Generator, seconds: float
 ) -> Iterator[None]:
     """Command the vehicle; yield for every tick. Raises SystemExit if the flight fails."""
-    while autopilot.flight.phase is Phase.BOOT:
+    while autopilot.flight.phase is FlightPhase.BOOT:
         yield
     if autopilot.arm(force=False) is not Result.ACCEPTED:
         raise SystemExit("the vehicle cannot be armed")
@@ -165,7 +165,7 @@ def pilot(
         raise SystemExit(f"the flight ended in {flight.mode.name}")
     autopilot.set_mode(Mode.LAND)
     end_us = simulation.time_us + LONGEST_LANDING_S * US_PER_S
-    while autopilot.flight.phase >= Phase.GROUND and simulation.time_us < end_us:
+    while autopilot.flight.phase >= FlightPhase.GROUND and simulation.time_us < end_us:
         yield
 
 

@@ -25,8 +25,8 @@ from rich.table import Table
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.profiles.vehicle import load_vehicle
-from firmware_sim.autopilot.autopilot_state import Message
-from firmware_sim.autopilot.commander import Flight
+from firmware_sim.autopilot.autopilot_state import OperatorText
+from firmware_sim.autopilot.commander import CommanderState
 from firmware_sim.external.process import FirmwareProcess, StartCommand
 from firmware_sim.external.px4.program import (
     API_LOCAL_PORT,
@@ -55,10 +55,10 @@ class Flown:
     """A bridge as a flight controller."""
 
     internals = None
-    flight = Flight()
+    flight = CommanderState()
 
     def __init__(self, bridge: Px4Bridge) -> None:
-        self.on_message: Callable[[Message], None] | None = None
+        self.on_message: Callable[[OperatorText], None] | None = None
         self.rate_hz, self.step = bridge.rate_hz, bridge.step
         self.use_truth, self.close = bridge.use_truth, bridge.close
 

@@ -18,7 +18,14 @@ from rich.console import Console
 from rich.table import Table
 from scipy import special, stats
 
-from airl_mav.flight.sequential import ALPHA, HALF_SPENT, LOOKS, Look, error_spent, plan_looks
+from airl_mav.flight.sequential import (
+    ALPHA,
+    HALF_SPENT,
+    LOOKS,
+    InterimAnalysis,
+    error_spent,
+    plan_looks,
+)
 
 FLIGHTS = 500
 EITHER = 0.5 * ALPHA
@@ -38,11 +45,11 @@ def half_spent_by(half: int, n: int) -> float:
     return EITHER * n / (n + half)
 
 
-def e_process(threshold: float) -> list[Look]:
+def e_process(threshold: float) -> list[InterimAnalysis]:
     """The likelihood ratio, mixed evenly over all rates on one side, reaches 1 / error."""
     limit = 1.0 - threshold
 
-    def looked(n: int) -> Look:
+    def looked(n: int) -> InterimAnalysis:
         k = np.arange(n + 1)
         a, b = k + 1.0, n - k + 1.0
         whole = special.betaln(a, b) - k * np.log(limit) - (n - k) * np.log1p(-limit)
@@ -51,13 +58,13 @@ def e_process(threshold: float) -> list[Look]:
         enough = -np.log(EITHER)
         few = k[(fewer >= enough) & (k < limit * n)]
         many = k[(more >= enough) & (k > limit * n)]
-        return Look(n, few.max(initial=-1), many.min(initial=n + 1))
+        return InterimAnalysis(n, few.max(initial=-1), many.min(initial=n + 1))
 
     with np.errstate(divide="ignore"):
         return [looked(n) for n in NUMBERS]
 
 
-def follow(looks: Sequence[Look], rate: float) -> tuple[float, float]:
+def follow(looks: Sequence[InterimAnalysis], rate: float) -> tuple[float, float]:
     """Return the mean number of flights, and the probability of a verdict, at a true rate."""
     left = np.ones(1)
     mean, before = 0.0, 0

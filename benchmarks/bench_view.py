@@ -46,15 +46,15 @@ from airl_mav.core.frames import quat_from_euler  # noqa: E402
 from airl_mav.profiles.arena import ArenaSpec  # noqa: E402
 from airl_mav.profiles.loading import load_profile  # noqa: E402
 from airl_mav.profiles.vehicle import load_vehicle  # noqa: E402
-from airl_mav.view.ends import Request, ViewEnds  # noqa: E402
+from airl_mav.view.ends import ViewEnds, ViewSettings  # noqa: E402
 from airl_mav.view.feed import Feed  # noqa: E402
 from airl_mav.view.messages import (  # noqa: E402
+    CameraImage,
     Decided,
     Episode,
     Image,
-    Picture,
-    Vehicle,
     VehicleShape,
+    VehicleState,
 )
 from airl_mav.view.viewer import Viewer  # noqa: E402
 from tests.support.browser import Page, browser  # noqa: E402
@@ -196,7 +196,7 @@ class Circle:
         height, width = image.shape
         now_us = began_us + time_us
         feed.send(
-            Vehicle(
+            VehicleState(
                 time_us=now_us,
                 position=tuple(position.tolist()),
                 velocity=tuple(velocity.tolist()),
@@ -209,7 +209,7 @@ class Circle:
             )
         )
         if time_us % PICTURE_US == 0:
-            feed.send(Picture(captured_us=now_us, shape=(height, width)), image)
+            feed.send(CameraImage(captured_us=now_us, shape=(height, width)), image)
         if time_us % DECISION_US == 0:
             setpoint = (RADIUS_M * TURN_RAD_S, 0.0, 0.0, TURN_RAD_S)
             stamps = (now_us - 60_000, now_us - 50_000, now_us - 1_000, now_us)
@@ -239,7 +239,7 @@ class Circle:
 @contextmanager
 def viewed(*, paced: bool = False) -> Iterator[Viewer]:
     """Open a view; `paced`: of a flight whose pace and latency its watchers set."""
-    request = Request(
+    request = ViewSettings(
         run="bench",
         port=None,
         paced=paced,

@@ -12,7 +12,7 @@ from typing import get_args
 import numpy as np
 
 from airl_mav.envs.experts import Expert
-from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, ExpertName
 from airl_mav.flight.statistics import wilson
@@ -49,11 +49,11 @@ def main() -> None:
         expert = Expert(options.expert, navigation)
         navigation.begin(range(len(seeds)), seeds)
         expert.begin(range(len(seeds)))
-        while (navigation.fleet.verdict == Verdict.FLYING).any():
+        while (navigation.fleet.verdict == FlightStatus.FLYING).any():
             navigation.fly(commands(spec.action_spec, expert.decide()))
         flights = navigation.flights()
-        ended.update(Verdict(int(verdict)).name.lower() for verdict in flights.verdict)
-        reached = flights.verdict == Verdict.SUCCESS
+        ended.update(FlightStatus(int(verdict)).name.lower() for verdict in flights.verdict)
+        reached = flights.verdict == FlightStatus.SUCCESS
         times += flights.time_s[reached].tolist()
         ways += flights.distance_m[reached].tolist()
     n, goals = options.episodes, ended["success"]

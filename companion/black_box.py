@@ -28,7 +28,7 @@ from airl_mav.core.provenance import describe_machine, git_state, package_versio
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.observation import Kinematics
 from companion.interfaces import BatteryState, VehicleStatus
-from companion.pilot import OLDEST_FRAME_US, Decided
+from companion.pilot import OLDEST_FRAME_US, SentDecision
 
 SAMPLE_US = US_PER_S // 25
 """Interval of telemetry samples [µs]; the flight controller sends 50 per second."""
@@ -72,7 +72,7 @@ class BlackBoxRecorder:
         self._next_image_us = -math.inf
         self._unix_us = utc_us() - clock.time_us()
         """Calendar time at the clock's zero [µs since 1970], constant during the flight."""
-        self._told: deque[Decided | tuple[messages.Message, int]] = deque()
+        self._told: deque[SentDecision | tuple[messages.Message, int]] = deque()
         self._next_status_us = self._next_sync_us = 0
         self._process = psutil.Process()
         self._used_us, self._used_at_us = processor_time_us(), clock.time_us()
@@ -84,7 +84,7 @@ class BlackBoxRecorder:
         """Start a thread that calls `record` at the sample interval."""
         self._thread.start()
 
-    def decided(self, decided: Decided) -> None:
+    def decided(self, decided: SentDecision) -> None:
         """Queue a decision without blocking."""
         self._told.append(decided)
 
@@ -141,7 +141,7 @@ class BlackBoxRecorder:
     def _write_news(self, now_us: int) -> None:
         while self._told:
             told = self._told.popleft()
-            if isinstance(told, Decided):
+            if isinstance(told, SentDecision):
                 self._write_decision(told)
             else:
                 self._write(*told)
@@ -158,7 +158,7 @@ class BlackBoxRecorder:
     def _write(self, message: messages.Message, now_us: int) -> None:
         self._file.write(message, self._unix_us + now_us)
 
-    def _write_decision(self, told: Decided) -> None:
+    def _write_decision(self, told: SentDecision) -> None:
         frame = told.seen.frame
         age_us = told.started_us - frame.capture_time_us
         position, velocity, quaternion = _numbers(told.state)

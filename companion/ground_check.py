@@ -21,7 +21,7 @@ from companion.interfaces import LinkError
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import FRAME_TIMEOUT_S, check_camera
 from companion.pilot import age_of
-from companion.program import Mission, mission_camera
+from companion.program import MissionSetup, mission_camera
 from companion.signing_proxy import signed
 
 LOOK_S = 3.0
@@ -37,7 +37,7 @@ LEAST_SHARE = 0.5
 """Minimum share of the requested telemetry rate."""
 
 
-class Finding(NamedTuple):
+class CheckResult(NamedTuple):
     """Result of one check."""
 
     what: str
@@ -46,16 +46,16 @@ class Finding(NamedTuple):
 
 
 def check_on_ground(
-    asked: StandAloneCompanion, mission: Mission, stop: threading.Event
-) -> Iterator[Finding]:
+    asked: StandAloneCompanion, mission: MissionSetup, stop: threading.Event
+) -> Iterator[CheckResult]:
     """Check a flight's requirements one by one, skipping absent parts, until `stop` is set."""
     clock = WallClock(asked.speed)
-    yield Finding("policy", True, f"{asked.policy}, holds an action {mission.pilot.hold_s:g} s")
+    yield CheckResult("policy", True, f"{asked.policy}, holds an action {mission.pilot.hold_s:g} s")
     with held_to(asked.cpu_quota):
         try:
             camera = mission_camera(asked, mission, clock)
         except UsageError as error:
-            yield Finding("camera", False, str(error))
+            yield CheckResult("camera", False, str(error))
             return
         with closing(camera):
             yield from look_at_camera(mission, camera, clock, stop)
@@ -70,21 +70,21 @@ def check_on_ground(
                     if seen is not None and not stop.is_set():
                         yield time_decisions(mission, seen, link.kinematics())
             except (LinkError, UsageError) as error:
-                yield Finding("flight controller", False, str(error))
+                yield CheckResult("flight controller", False, str(error))
 
 
 def look_at_camera(
-    mission: Mission, camera: FrameSource, clock: Clock, stop: threading.Event
-) -> Iterator[Finding]:
+    mission: MissionSetup, camera: FrameSource, clock: Clock, stop: threading.Event
+) -> Iterator[CheckResult]:
     """Check rate, age and changes of frames, and if they fit the policy."""
     first = camera.wait(-1, FRAME_TIMEOUT_S)
     if first is None:
-        yield Finding("camera", False, f"no frame for {FRAME_TIMEOUT_S:g} s")
+        yield CheckResult("camera", False, f"no frame for {FRAME_TIMEOUT_S:g} s")
         return
     try:
         check_camera(mission.policy, camera, stop, mission.compensator)
     except UsageError as error:
-        yield Finding("camera", False, str(error))
+        yield CheckResult("camera", False, str(error))
         return
     # Frames are not stored: a driver may send thousands of large frames.
     watch, last, frozen, ages_us = WallClock(), first, True, []
@@ -96,7 +96,7 @@ def look_at_camera(
             ages_us.append(age_of(newer, clock.time_us()))
     lens, rate_hz = first.frame.intrinsics, len(ages_us) / LOOK_S
     if not ages_us:
-        yield Finding("camera", False, f"one frame in {LOOK_S:g} s")
+        yield CheckResult("camera", False, f"one frame in {LOOK_S:g} s")
         return
     kind = "" if lens.kind == "depth" else f"{lens.kind}, "
     told = f"{kind}{lens.width}x{lens.height} px, {rate_hz:.1f} frames/s"
@@ -106,10 +106,14 @@ def look_at_camera(
         # Not a fault: a simulator's images of a vehicle at rest may be without noise.
         told += "; every image is the same (a real camera has noise)"
     age_us = float(np.median(ages_us))
-    yield Finding("camera", True, f"{told}; {age_us / US_PER_MS:.0f} ms old where it is decided on")
+    yield CheckResult(
+        "camera", True, f"{told}; {age_us / US_PER_MS:.0f} ms old where it is decided on"
+    )
 
 
-def look_at_vehicle(link: MavsdkLink, mission: Mission, stop: threading.Event) -> Iterator[Finding]:
+def look_at_vehicle(
+    link: MavsdkLink, mission: MissionSetup, stop: threading.Event
+) -> Iterator[CheckResult]:
     """Check the telemetry rate, then the reported state."""
     watch, changes, last = WallClock(), 0, link.kinematics()
     while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
@@ -119,22 +123,22 @@ def look_at_vehicle(link: MavsdkLink, mission: Mission, stop: threading.Event) -
         last = now
     rate_hz = changes / LOOK_S
     status = link.status()
-    yield Finding(
+    yield CheckResult(
         "flight controller",
         link.connected,
         f"{link.dialect.name}, {'armed' if status.armed else 'disarmed'}, mode {status.mode}",
     )
     asked = f"position {rate_hz:.0f} times a second, {RATE_HZ:.0f} were asked for"
-    yield Finding("telemetry", rate_hz >= LEAST_SHARE * RATE_HZ, asked)
+    yield CheckResult("telemetry", rate_hz >= LEAST_SHARE * RATE_HZ, asked)
     missing = link.missing_health(by_gps=mission.pilot.origin is None)
     charge, least = status.battery, mission.limits.battery
-    yield Finding(
+    yield CheckResult(
         "battery",
         least is None or (charge is not None and charge >= least),
         ("not told" if charge is None else f"{100.0 * charge:.0f} %")
         + ("" if least is None else f"; the limit is {100.0 * least:g} %"),
     )
-    yield Finding(
+    yield CheckResult(
         "health",
         not missing,
         f"not yet: {', '.join(missing)}"
@@ -143,7 +147,7 @@ def look_at_vehicle(link: MavsdkLink, mission: Mission, stop: threading.Event) -
     )
 
 
-def time_decisions(mission: Mission, seen: ReceivedFrame, state: Kinematics) -> Finding:
+def time_decisions(mission: MissionSetup, seen: ReceivedFrame, state: Kinematics) -> CheckResult:
     """Measure the policy's inference time (t2) on a received frame."""
     frame, watch, took_us = seen.frame, WallClock(), []
     observation = observe(
@@ -159,12 +163,12 @@ def time_decisions(mission: Mission, seen: ReceivedFrame, state: Kinematics) -> 
     except Exception as error:
         # A policy may raise any exception.
         what = " ".join(f"{type(error).__name__}: {error}".split())
-        return Finding("decision", False, f"the policy failed: {what}")
+        return CheckResult("decision", False, f"the policy failed: {what}")
     del took_us[0]
     median_us = float(np.median(took_us))
     longest_s = max(took_us) / US_PER_S
     bound_s = mission.watchdog.timeout_s()
-    return Finding(
+    return CheckResult(
         "decision",
         longest_s < bound_s,
         f"t2 {median_us / US_PER_MS:.2f} ms, the median of {DECISIONS}; longest"

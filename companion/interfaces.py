@@ -68,7 +68,7 @@ Setpoint: TypeAlias = "BodyVelocity | Attitude | BodyRates"
 """Setpoint types, with four numbers each."""
 
 
-class Link(Protocol):
+class PilotLink(Protocol):
     """Link of the pilot to a flight controller. Calls raise LinkError if rejected."""
 
     @property

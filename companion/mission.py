@@ -24,7 +24,7 @@ from companion.dialects import ARDUPILOT
 from companion.interfaces import CAMERA_SILENT, LINK_LOST, STOP, TELEMETRY_FROZEN, LinkError
 from companion.limits import NOT_OURS, Limits
 from companion.mavsdk_link import MavsdkLink
-from companion.pilot import FRAME_WAIT_S, WAITING, Decided, Pilot
+from companion.pilot import FRAME_WAIT_S, WAITING, Pilot, SentDecision
 from companion.watchdog import Guard, Watchdog
 
 PREPARE_TIMEOUT_S = 10.0
@@ -79,7 +79,7 @@ def fly_mission(
     mount_pitch_up_rad: float = 0.0,
     mount_yaw_rad: float = 0.0,
     start: Start = "arm",
-    decided: Callable[[Decided], None] | None = None,
+    decided: Callable[[SentDecision], None] | None = None,
 ) -> MissionResult:
     """Fly one mission on a connected link; failures of a flight do not raise.
 

@@ -28,7 +28,7 @@ from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.memory import DecisionMemory
 from airl_mav.scenario.model import PilotSettings
 from companion.camera import FrameSource, ReceivedFrame
-from companion.interfaces import BodyVelocity, Link, Setpoint
+from companion.interfaces import BodyVelocity, PilotLink, Setpoint
 from companion.limits import Limits
 from companion.watchdog import Watchdog
 
@@ -45,7 +45,7 @@ WAITING = "waiting for a frame"
 """Stage of a decision, for the watchdog."""
 
 
-class Decided(NamedTuple):
+class SentDecision(NamedTuple):
     """Decision whose command was just sent; times in simulated µs."""
 
     seen: ReceivedFrame
@@ -67,7 +67,7 @@ class Decided(NamedTuple):
 class Pilot:
     """Pilot that flies a policy to a goal."""
 
-    link: Link
+    link: PilotLink
     frames: FrameSource
     policy: Policy
     watchdog: Watchdog
@@ -79,7 +79,7 @@ class Pilot:
     """Latency compensation of image and state, for one companion; None = no compensation."""
     limits: Limits | None = None
     """Plausibility and flight limits; None = no limits."""
-    decided: Callable[[Decided], None] | None = None
+    decided: Callable[[SentDecision], None] | None = None
     """Callback for every decision, called when its setpoint is sent. Must not block."""
     memory: DecisionMemory = field(init=False)
     """Setpoints and latencies so far."""
@@ -173,7 +173,7 @@ class Pilot:
             held_us = sent_us + (hold_us if settings.decisions == "sequential" else 0)
             times = started_us, ready_us, sent_us, held_us, self.held_us
             until_us = None if expires_us is None else int(expires_us)
-            self.decided(Decided(seen, state, setpoint, *times, until_us, observation.image))
+            self.decided(SentDecision(seen, state, setpoint, *times, until_us, observation.image))
         t2_us = np.array([ready_us - started_us])
         if self.compensator is None:
             self.memory.decided(ONE, np.array([setpoint]), t2_us)

@@ -41,7 +41,7 @@ STORAGES = ("storage_type", "storage_usage", "storage_total")
 LINKS = ("link_type", "link_tx_rate", "link_rx_rate", "link_tx_max", "link_rx_max")
 
 
-class Sender(Protocol):
+class MessageSender(Protocol):
     """Sender of MAVLink messages to the vehicle's network, such as `MavsdkLink`."""
 
     def send_message(self, name: str, fields: Mapping[str, Any]) -> bool:
@@ -82,7 +82,7 @@ def _measured(now_us: int) -> dict[str, Any]:
 
 
 def present(
-    link: Sender, clock: Clock, measure: Callable[[int], dict[str, Any]] = _measured
+    link: MessageSender, clock: Clock, measure: Callable[[int], dict[str, Any]] = _measured
 ) -> AbstractContextManager[None]:
     """Send the computer's status (`measure`) from a thread while the context is active."""
     return every(
@@ -111,7 +111,7 @@ SENSOR_TYPE_UNKNOWN, FRAME_BODY_FRD = 4, 12
 """MAV_DISTANCE_SENSOR and MAV_FRAME (common.xml)."""
 
 
-class Vehicle(Sender, Protocol):
+class VehicleLink(MessageSender, Protocol):
     """Source of the vehicle's attitude and sender of messages, such as `MavsdkLink`."""
 
     def kinematics(self) -> Kinematics:
@@ -154,7 +154,7 @@ def obstacle_distance(
 
 
 def obstacles_told(
-    link: Vehicle, frames: FrameSource, range_m: float, pitch_up_rad: float, clock: Clock
+    link: VehicleLink, frames: FrameSource, range_m: float, pitch_up_rad: float, clock: Clock
 ) -> AbstractContextManager[None]:
     """Send the message of a depth camera from a thread while the context is active."""
 

@@ -46,7 +46,7 @@ FLIGHT_S = 600.0
 
 
 @dataclass(frozen=True)
-class Mission:
+class MissionSetup:
     """Goal, policy and settings of a mission."""
 
     goal: Goal
@@ -74,7 +74,7 @@ class Mission:
         return math.radians(self.vehicle.camera.yaw_deg)
 
 
-def prepare(asked: StandAloneCompanion) -> Mission:
+def prepare(asked: StandAloneCompanion) -> MissionSetup:
     """Check the input and load the policy before any connection, or raise UsageError."""
     check_companion(asked)
     policy = find_policy(asked.policy, trust=asked.trust)
@@ -124,7 +124,7 @@ def prepare(asked: StandAloneCompanion) -> Mission:
         between_commands=piloting.between_commands(pilot, watchdog.hover_after_s),
         firmware="not known",
     )
-    return Mission(
+    return MissionSetup(
         asked.goal,
         loaded,
         pilot,
@@ -137,7 +137,7 @@ def prepare(asked: StandAloneCompanion) -> Mission:
     )
 
 
-def mission_camera(asked: StandAloneCompanion, mission: Mission, clock: Clock) -> OpenCamera:
+def mission_camera(asked: StandAloneCompanion, mission: MissionSetup, clock: Clock) -> OpenCamera:
     """Open the requested camera. Raises FieldError if it is unusable."""
     vehicle = mission.vehicle
     policy, cameras = mission.policy, vehicle.cameras
@@ -152,7 +152,7 @@ def mission_camera(asked: StandAloneCompanion, mission: Mission, clock: Clock) -
 @contextmanager
 def obstacles_reported(
     asked: StandAloneCompanion,
-    mission: Mission,
+    mission: MissionSetup,
     link: MavsdkLink,
     camera: FrameSource,
     clock: Clock,
@@ -168,7 +168,7 @@ def obstacles_reported(
 
 @contextmanager
 def recorded(
-    asked: StandAloneCompanion, mission: Mission, link: MavsdkLink, clock: Clock
+    asked: StandAloneCompanion, mission: MissionSetup, link: MavsdkLink, clock: Clock
 ) -> Iterator[BlackBoxRecorder | None]:
     """Record a mission if requested. Raises FieldError if no file can be written."""
     if asked.black_box is None:
@@ -183,7 +183,7 @@ def recorded(
         yield recorder
 
 
-def run_of(asked: StandAloneCompanion, mission: Mission) -> dict[str, Any]:
+def run_of(asked: StandAloneCompanion, mission: MissionSetup) -> dict[str, Any]:
     """Return the setup and configuration in the format of `run.json`."""
     config = asked.model_dump(mode="json")
     config |= {"pilot": asdict(mission.pilot), "limits": mission.limits.model_dump(mode="json")}
@@ -192,7 +192,7 @@ def run_of(asked: StandAloneCompanion, mission: Mission) -> dict[str, Any]:
 
 def fly_alone(
     asked: StandAloneCompanion,
-    mission: Mission,
+    mission: MissionSetup,
     stop: threading.Event,
     abandon: threading.Event,
     waiting: Callable[[], None],

@@ -18,7 +18,7 @@ from airl_mav.core.clock import Clock, SimClock
 from airl_mav.core.constants import US_PER_S
 from companion.camera import FrameSource, ReceivedFrame
 from companion.conducted import Abandoned, Poll
-from companion.tokens import NO_FRAME, Event, Phase, TurnBack, TurnGiven
+from companion.tokens import NO_FRAME, Event, PhaseToken, TurnBack, TurnGiven
 
 FAREWELL_S = 3
 """Wait of the companion at its end, in case its last text is lost [s of waiting]."""
@@ -79,7 +79,7 @@ class TokenTurns:
 
     def tell(self, phase: str) -> None:
         """Report that the mission enters a phase."""
-        self._send_text(Phase(self._number, phase).text())
+        self._send_text(PhaseToken(self._number, phase).text())
 
     def _end(self) -> None:
         self._give_back(TurnBack(self._number, ended=True))

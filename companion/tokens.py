@@ -86,7 +86,7 @@ class TurnBack:
 
 
 @dataclass(frozen=True)
-class Phase:
+class PhaseToken:
     """`P<number> <name>`: the companion has entered a phase of its mission during a turn."""
 
     number: int
@@ -97,7 +97,7 @@ class Phase:
         return f"P{self.number} {self.name}"
 
     @classmethod
-    def parse(cls, text: str) -> Phase | None:
+    def parse(cls, text: str) -> PhaseToken | None:
         """Parse a text; return None for any other text."""
         match = _PHASE.fullmatch(text)
         return None if match is None else cls(int(match[1]), match[2])

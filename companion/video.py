@@ -34,7 +34,7 @@ _CLOCK_HZ: Final = 90_000
 """Clock rate of H.264 time stamps in RTP (RFC 6184)."""
 
 
-class Watcher(NamedTuple):
+class VideoReceiver(NamedTuple):
     """Receiver of the video."""
 
     host: str

@@ -28,7 +28,7 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from companion.camera import FrameSource, ReceivedFrame
 from companion.cameras.by_name import OpenCamera, open_named_camera
 from companion.mavsdk_connection import open_connection
-from companion.video import RtpVideo, Watcher, picture_of, picture_size
+from companion.video import RtpVideo, VideoReceiver, picture_of, picture_size
 
 STREAM_ID: Final = 1
 """Id of the only stream; a request for 0 means all streams."""
@@ -92,7 +92,7 @@ Fields = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Stream:
+class VideoStream:
     """Description of camera and video."""
 
     model: str
@@ -103,7 +103,7 @@ class Stream:
     port: int
 
 
-def camera_information(stream: Stream) -> Fields:
+def camera_information(stream: VideoStream) -> Fields:
     """Return the fields of CAMERA_INFORMATION except the time; 0 = unknown lens sizes."""
     return {
         "vendor_name": _bytes("airl-mav"),
@@ -122,7 +122,7 @@ def camera_information(stream: Stream) -> Fields:
     }
 
 
-def stream_status(stream: Stream, *, running: bool) -> Fields:
+def stream_status(stream: VideoStream, *, running: bool) -> Fields:
     """Return the fields of VIDEO_STREAM_STATUS."""
     return {
         "stream_id": STREAM_ID,
@@ -136,7 +136,7 @@ def stream_status(stream: Stream, *, running: bool) -> Fields:
     }
 
 
-def stream_information(stream: Stream, *, running: bool) -> Fields:
+def stream_information(stream: VideoStream, *, running: bool) -> Fields:
     """Return the fields of VIDEO_STREAM_INFORMATION."""
     return {
         **stream_status(stream, running=running),
@@ -174,7 +174,7 @@ def _bytes(text: str) -> list[int]:
 class CameraComponent:
     """Camera component that answers requests in MAVSDK's threads."""
 
-    def __init__(self, mavsdk: Mavsdk, stream: Stream, clock: Clock) -> None:
+    def __init__(self, mavsdk: Mavsdk, stream: VideoStream, clock: Clock) -> None:
         """Announce a stream by a MAVSDK connected as a camera component (`open_connection`)."""
         self.running = True
         """True while the video is enabled; clients may stop and restart it."""
@@ -269,7 +269,7 @@ class OnNetwork:
         """True while the video is enabled, until a client stops it."""
         return self._component is None or self._component.running
 
-    def join(self, stream: Stream) -> bool:
+    def join(self, stream: VideoStream) -> bool:
         """Join the vehicle if it is received; return True if joined by this call."""
         if self._component is not None:
             return False
@@ -330,7 +330,7 @@ class ShownCamera(NamedTuple):
 
 def show_video(
     camera: ShownCamera,
-    watcher: Watcher,
+    watcher: VideoReceiver,
     network: OnNetwork | None,
     clock: Clock,
     stop: threading.Event,
@@ -345,7 +345,7 @@ def show_video(
             return 0
         lens = camera.image(first.frame).intrinsics
         size, rate_hz = picture_size(lens), own.rate_hz
-        stream = Stream(
+        stream = VideoStream(
             f"{camera.vehicle} {lens.kind}",
             size,
             rate_hz,

@@ -19,13 +19,13 @@ from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.actions import Attitude, BodyRates
 from airl_mav.scenario.model import WatchdogSettings
-from companion.interfaces import STOP, BodyVelocity, Link, LinkError, Setpoint
+from companion.interfaces import STOP, BodyVelocity, LinkError, PilotLink, Setpoint
 
 
 class Watchdog:
     """Watchdog of a mission's setpoints, sent by `command`; a guard calls `look` at deadlines."""
 
-    def __init__(self, link: Link, clock: Clock, settings: WatchdogSettings) -> None:
+    def __init__(self, link: PilotLink, clock: Clock, settings: WatchdogSettings) -> None:
         self.notes: list[str] = []
         """Actions of the watchdog, as text."""
         self.left_offboard = False

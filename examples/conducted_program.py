@@ -4,12 +4,12 @@ Simulated time stands still while the program computes and moves only while it s
 `stage.clock`. Run it twice: both runs print the same position, to the last digit.
 """
 
-from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.profiles.vehicle import load_vehicle
 from companion.interfaces import BodyVelocity
 from firmware_sim.simulation import EpisodeSetup
 
-with Stage() as stage:
+with LockstepStage() as stage:
 
     def program() -> None:
         """Take off, fly forward for five seconds, land."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.commander import Flight, Phase
+from firmware_sim.autopilot.commander import CommanderState, FlightPhase
 from firmware_sim.plant.body import FLOOR
 from firmware_sim.plant.plant import Collision
 from firmware_sim.simulation import Simulation
@@ -12,7 +12,7 @@ TOUCHDOWN_M_S = 2.0
 """Maximum speed of a landing on the floor [m/s]; PX4 lands at 0.7 to 1.5 m/s."""
 
 
-def is_crash(hit: Collision, flight: Flight) -> bool:
+def is_crash(hit: Collision, flight: CommanderState) -> bool:
     """Return True if a contact ends a flight.
 
     Contacts with the floor do not end a flight while the vehicle is on the ground, or if they are
@@ -21,7 +21,7 @@ def is_crash(hit: Collision, flight: Flight) -> bool:
     if hit.what != FLOOR:
         return True
     gentle = flight.mode not in (Mode.OFFBOARD, Mode.HOLD) and hit.speed_m_s < TOUCHDOWN_M_S
-    return flight.phase is Phase.AIR and not gentle
+    return flight.phase is FlightPhase.AIR and not gentle
 
 
 class CrashDetector:

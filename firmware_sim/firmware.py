@@ -15,14 +15,14 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
 from airl_mav.profiles.camera_kind import SLOW, Renderer
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
 from firmware_sim.engine.record import Record
 from firmware_sim.faults.link import FailingEndpoint
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.flight_log.flight_log import FlightLog
 from firmware_sim.flight_log.log_folder import ULOG_SUFFIX, LogFolder
-from firmware_sim.interfaces import Truth
+from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.tlog import TlogWriter
@@ -75,7 +75,7 @@ class FlightStack(Protocol):
         """
         ...
 
-    def connect(self, tick: Callable[[], int], truth: Callable[[], Truth]) -> None:
+    def connect(self, tick: Callable[[], int], truth: Callable[[], TrueState]) -> None:
         """Open MAVLink after the flight controller's first tick.
 
         Args:
@@ -156,7 +156,7 @@ class BuiltinFlightStack:
             autopilot.parameters.on_change(self._changed)
         return autopilot
 
-    def connect(self, tick: Callable[[], int], truth: Callable[[], Truth]) -> None:
+    def connect(self, tick: Callable[[], int], truth: Callable[[], TrueState]) -> None:
         """Attach the autopilot to the MAVLink server."""
         del tick
         if self._autopilot is not None:
@@ -182,11 +182,11 @@ class BuiltinFlightStack:
             return
         self._save_us = None
         if not self._autopilot.parameters.save():
-            self._autopilot.report(Message(Severity.CRITICAL, "Parameters could not be saved"))
+            self._autopilot.report(OperatorText(Severity.CRITICAL, "Parameters could not be saved"))
 
 
 @dataclass(frozen=True)
-class Loaded:
+class LoadedEpisode:
     """Start of a loaded episode."""
 
     time_us: int
@@ -220,7 +220,7 @@ class Firmware:
         """Callback after the ticks of each `step` (see `Simulation.truths`)."""
         self.on_frame: Callable[[Frame], None] | None = None
         """Callback for every camera frame, called before the frame is published."""
-        self.on_message: Callable[[Message], None] | None = None
+        self.on_message: Callable[[OperatorText], None] | None = None
         """Callback for every operator text of the autopilot."""
         self.on_log_lost: Callable[[str], None] | None = None
         """Callback for a flight log that can no longer be written; receives log and reason."""
@@ -248,7 +248,7 @@ class Firmware:
     slipped_us = property(lambda self: self._pacing.slipped_us)
     """Simulated time skipped since the start because the host could not keep up [µs]."""
 
-    def load(self, setup: EpisodeSetup, tlog: Path | None, start_unix_us: int) -> Loaded:
+    def load(self, setup: EpisodeSetup, tlog: Path | None, start_unix_us: int) -> LoadedEpisode:
         """Replace the episode: a new arena, the vehicle at rest, the autopilot booting.
 
         Args:
@@ -302,7 +302,7 @@ class Firmware:
             gc.freeze()
         # Loading took wall time that is not part of the episode.
         self._pacing.restart(simulation.time_us)
-        return Loaded(start_us, self.epoch_ns)
+        return LoadedEpisode(start_us, self.epoch_ns)
 
     def _camera_by(self, renderer: Renderer) -> CameraMaker:
         """Return the camera factory; with paced time, slow renderers run in a separate process."""
@@ -327,7 +327,7 @@ class Firmware:
         if self.on_log_lost is not None:
             self.on_log_lost(what)
 
-    def _hear(self, message: Message) -> None:
+    def _hear(self, message: OperatorText) -> None:
         if self.simulation is not None:
             now_us = self.simulation.time_us
             if self.epoch_ns is None and self.simulation.is_flying:

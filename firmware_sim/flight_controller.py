@@ -6,12 +6,12 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol
 
 from airl_mav.core.errors import UsageError
-from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
+from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
 
 if TYPE_CHECKING:  # Option checks of external firmware must not load the estimator.
     from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-    from firmware_sim.autopilot.autopilot_state import Message
-    from firmware_sim.autopilot.commander import Flight
+    from firmware_sim.autopilot.autopilot_state import OperatorText
+    from firmware_sim.autopilot.commander import CommanderState
 
 
 class FirmwareLostError(Exception):
@@ -31,7 +31,7 @@ class FlightController(Protocol):
     Either the built-in autopilot or a bridge to real firmware; a new object for each episode.
     """
 
-    on_message: Callable[[Message], None] | None
+    on_message: Callable[[OperatorText], None] | None
     """Callback for every operator text; None = no callback."""
 
     @property
@@ -39,7 +39,7 @@ class FlightController(Protocol):
         """Required sensor samples per second of simulated time [Hz]."""
 
     @property
-    def flight(self) -> Flight:
+    def flight(self) -> CommanderState:
         """Flight phase and mode."""
 
     @property
@@ -52,7 +52,7 @@ class FlightController(Protocol):
         External firmware may raise FirmwareLostError.
         """
 
-    def use_truth(self, truth: Callable[[], Truth]) -> None:
+    def use_truth(self, truth: Callable[[], TrueState]) -> None:
         """Set the source of the true state.
 
         Simulator interfaces of external firmware send the true state with the sensors.

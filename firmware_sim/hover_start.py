@@ -16,7 +16,7 @@ from airl_mav.core.constants import (
 )
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import Mode, Result
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 
 if TYPE_CHECKING:
     from firmware_sim.autopilot.autopilot import BuiltinAutopilot
@@ -82,11 +82,11 @@ class HoverStart(NamedTuple):
                 simulation.advance(look_us)
             flight, estimate = autopilot.flight, autopilot.estimator.estimate()
             down_m, down_m_s = estimate.position.item(2), estimate.velocity.item(2)
-            if flight.phase is Phase.STANDBY and simulation.time_us >= arm_us:
+            if flight.phase is FlightPhase.STANDBY and simulation.time_us >= arm_us:
                 start_m, arm_us = down_m, simulation.time_us + ARM_RETRY_US
                 if autopilot.arm(force=False) is Result.ACCEPTED:
                     autopilot.takeoff(self.altitude_m)
-            elif flight.phase is Phase.AIR and flight.mode is Mode.HOLD:
+            elif flight.phase is FlightPhase.AIR and flight.mode is Mode.HOLD:
                 height_m = start_m - down_m
                 climbs = height_m < self.altitude_m - TAKEOFF_REACHED_M
                 if not climbs and abs(down_m_s) < TAKEOFF_REACHED_M_S:

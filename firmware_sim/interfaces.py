@@ -141,7 +141,7 @@ class ActuatorControls(NamedTuple):
     armed: bool
 
 
-class Truth(NamedTuple):
+class TrueState(NamedTuple):
     """True state; hidden from the autopilot."""
 
     time_us: int

@@ -38,7 +38,7 @@ from firmware_sim.faults.controller import FailingParts
 from firmware_sim.faults.timeline import ClientFaults, FaultTimeline
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.hover_start import HoverStart
-from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
+from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
 from firmware_sim.pacing import Arrivals
 from firmware_sim.plant.camera_server import SimulatedCamera
 from firmware_sim.plant.onboard_camera import CameraMaker, OnboardCamera
@@ -201,7 +201,7 @@ class Simulation:
         return faults
 
     @property
-    def truth(self) -> Truth:
+    def truth(self) -> TrueState:
         """The true state now; a new object at every call."""
         return self.plant.truth()
 

@@ -30,7 +30,7 @@ from airl_mav.profiles.parameters import SPECS
 from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
-from firmware_sim.mavlink.codec import Encoder, Layout, dialect, message_id
+from firmware_sim.mavlink.codec import Encoder, WireLayout, dialect, message_id
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -163,7 +163,7 @@ class _Kind:
     """Message type: its layout, and the generators of its fields."""
 
     def __init__(self, kind: Any, dice: Dice, known: Mapping[str, tuple[int, ...]]) -> None:
-        self.layout = Layout(kind)
+        self.layout = WireLayout(kind)
         lengths = dict(zip(kind.ordered_fieldnames, kind.lengths, strict=True))
         self._fields = [
             _drawn(kind.msgname, name, of, lengths[name], dice, known)

@@ -27,7 +27,7 @@ NUMBERS = 5
 
 
 @dataclass(frozen=True)
-class Bodies:
+class AssetBodies:
     """n primitives without a position. Fields as in Obstacles."""
 
     shape: NDArray[np.int8]  # (n,)
@@ -49,7 +49,7 @@ class Bodies:
 
 def draw_bodies(
     rng: np.random.Generator, n: int, kind: StaticObstacles, altitude_m: float
-) -> Bodies:
+) -> AssetBodies:
     """Draw n bodies, widest first as they are hardest to place; spheres cross `altitude_m`."""
     allowed = _shapes(kind.shapes)
     shape = allowed[rng.integers(len(allowed), size=n)]
@@ -63,7 +63,7 @@ def draw_bodies(
 
 def bodies_of(
     numbers: Floats, shape: NDArray[np.int8], kind: StaticObstacles, altitude_m: float
-) -> Bodies:
+) -> AssetBodies:
     """Return bodies of a shape (n,) scaled from `numbers` (NUMBERS n,); see `_size`."""
     n = len(shape)
     half_size, yaw, center_height = np.empty((n, 3)), np.empty(n), np.empty(n)
@@ -71,7 +71,7 @@ def bodies_of(
         numbers, shape, kind.half_width_m, kind.height_m, altitude_m, half_size, yaw, center_height
     )
     half = bounding_half(shape, half_size, yaw)
-    return Bodies(shape, half_size, yaw, center_height, half)
+    return AssetBodies(shape, half_size, yaw, center_height, half)
 
 
 @kernel
@@ -109,7 +109,7 @@ def _size(
 def _widest_first(
     shape: NDArray[np.int8], half_size: Floats, yaw: Floats, center_height: Floats, half: Floats
 ) -> None:
-    """Sort the fields of `Bodies` stably by their widest side; insertion sort, as they are few."""
+    """Sort the fields of `AssetBodies` stably by their widest side. Insertion sort: few bodies."""
     for i in range(1, len(shape)):
         j = i
         while j > 0 and max(half[j, 0], half[j, 1]) > max(half[j - 1, 0], half[j - 1, 1]):
@@ -192,7 +192,7 @@ class _Seen:
 class Things:
     """n obstacles without a position, made of m primitives."""
 
-    parts: Bodies
+    parts: AssetBodies
     """m primitives, grouped by obstacle."""
     offset: Floats  # (m, 2) of a primitive from its obstacle's position, north, east [m]
     statics: Statics
@@ -221,7 +221,7 @@ class _Thing:
     """One obstacle of k primitives."""
 
     name: str
-    parts: Bodies
+    parts: AssetBodies
     offset: Floats  # (k, 2)
     materials: tuple[str | None, ...]
     seen: _Seen | None = None
@@ -245,7 +245,7 @@ def draw_things(rng: np.random.Generator, n: int, spec: ArenaSpec) -> Things:
     for i, name in enumerate(names):
         if (asset := spec.asset(name)) is None:
             row = slice(i, i + 1)
-            body = Bodies(
+            body = AssetBodies(
                 plain.shape[row],
                 plain.half_size[row],
                 plain.yaw[row],
@@ -270,7 +270,7 @@ def _turned(name: str, asset: Asset, yaw: float, scale: float) -> _Thing:
     cos, sin = math.cos(yaw), math.sin(yaw)
     headings = np.array([yaw + part.yaw_rad if part.shape == "box" else 0.0 for part in parts])
     half = bounding_half(shape, half_size, headings)
-    bodies = Bodies(shape, half_size, headings, bottom + half_size[:, 2], half)
+    bodies = AssetBodies(shape, half_size, headings, bottom + half_size[:, 2], half)
     offset = np.column_stack([cos * ahead - sin * right, sin * ahead + cos * right])
     seen = None if asset.mesh is None else _Seen(asset.mesh, yaw, scale)
     return _Thing(name, bodies, offset, tuple(part.material for part in parts), seen)
@@ -279,7 +279,7 @@ def _turned(name: str, asset: Asset, yaw: float, scale: float) -> _Thing:
 def _joined(things: list[_Thing]) -> Things:
     parts = [thing.parts for thing in things]
     return Things(
-        Bodies(
+        AssetBodies(
             np.concatenate([np.zeros(0, np.int8), *(part.shape for part in parts)]),
             np.concatenate([np.zeros((0, 3)), *(part.half_size for part in parts)]),
             np.concatenate([np.zeros(0), *(part.yaw for part in parts)]),

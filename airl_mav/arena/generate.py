@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from airl_mav.arena.appearance import Statics
-from airl_mav.arena.assets import Bodies, Things, draw_bodies, draw_things, generate_own
+from airl_mav.arena.assets import AssetBodies, Things, draw_bodies, draw_things, generate_own
 from airl_mav.arena.footprints import Boxes, Floats, bounding_boxes, footprint_areas, join
 from airl_mav.arena.gates import (
     Openings,
@@ -257,7 +257,7 @@ def _draw_static(
 ) -> tuple[Obstacles, Boxes, Statics | None, tuple[PlacedMesh, ...]]:
     """Draw and place the static obstacles; return bounding boxes, groups and meshes, too."""
     spec, (n, _) = request.spec, request.counts
-    bodies: Bodies | Things
+    bodies: AssetBodies | Things
     if spec.has_assets:
         bodies = things = draw_things(rng, n, spec)
         statics: Statics | None = things.statics

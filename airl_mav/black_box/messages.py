@@ -157,7 +157,7 @@ class End:
 
 
 @dataclass(frozen=True)
-class Time:
+class Timestamp:
     """Calendar time as in Foxglove's schemas."""
 
     sec: int
@@ -168,7 +168,7 @@ class Time:
 class RawImage:
     """foxglove.RawImage: input image of a decision before compensation."""
 
-    timestamp: Time
+    timestamp: Timestamp
     frame_id: str
     width: Whole
     height: Whole
@@ -184,7 +184,7 @@ class RawImage:
 class Log:
     """foxglove.Log: a text message."""
 
-    timestamp: Time
+    timestamp: Timestamp
     level: int
     message: str
     name: str
@@ -261,10 +261,10 @@ def text(message: str, name: str, unix_us: int, level: int = INFO) -> Log:
     return Log(time_of(unix_us), level, message, name)
 
 
-def time_of(unix_us: int) -> Time:
+def time_of(unix_us: int) -> Timestamp:
     """Convert a calendar time [µs since 1970] to Foxglove's schema."""
     seconds, rest_us = divmod(unix_us, US_PER_S)
-    return Time(seconds, rest_us * NS_PER_US)
+    return Timestamp(seconds, rest_us * NS_PER_US)
 
 
 UNKNOWN = "null: not known"

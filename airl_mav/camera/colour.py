@@ -29,7 +29,17 @@ from airl_mav.camera.raycast import (
     write_transposed,
 )
 from airl_mav.camera.reflections import draw_reflections
-from airl_mav.camera.shading import F32, ZERO, Canvas, Lit, Look, Packed, Plane, Points, Rays
+from airl_mav.camera.shading import (
+    F32,
+    ZERO,
+    Canvas,
+    Lit,
+    Packed,
+    PixelRays,
+    Plane,
+    Points,
+    SceneLook,
+)
 from airl_mav.camera.shadows import (
     CORNERS,
     Shaded,
@@ -56,7 +66,7 @@ class Work(NamedTuple):
     lit: Plane  # (n, m)
     clear: Plane  # (n, m)
     out: Packed  # (n m,)
-    rays: Rays
+    rays: PixelRays
     points: Points
     corners: NDArray[np.float64]  # (CORNERS, 3)
 
@@ -77,7 +87,7 @@ class Work(NamedTuple):
             floats(n, m),
             floats(n, m),
             np.zeros(n * m, np.int32),
-            Rays(floats(n * m), floats(n * m), floats(n * m)),
+            PixelRays(floats(n * m), floats(n * m), floats(n * m)),
             Points(np.zeros(block, np.int32), *(floats(block) for _ in range(5))),
             np.zeros((CORNERS, 3)),
         )
@@ -136,7 +146,7 @@ def render_colour(
     invert(far)
     pixel2 = F32(1.0 / (view.focal * view.focal))
     light = _lit(lights)
-    look = Look(texture, per_m, offset, albedo, gloss, light, atlas, pixel2)  # type: ignore[arg-type]
+    look = SceneLook(texture, per_m, offset, albedo, gloss, light, atlas, pixel2)  # type: ignore[arg-type]
     _show(rgb, far, ids, rectangles, faces, work, optics, scene, meshes, look, gloss)
     if cylindrical:
         write_transposed(depth, far)
@@ -169,7 +179,7 @@ def _show(
     optics: Optics,
     scene: Scene,
     meshes: Meshes | None,
-    look: Look,
+    look: SceneLook,
     gloss: Gloss | None,
 ) -> None:
     """Write the colours of the bodies drawn by `draw_bodies`.

@@ -40,7 +40,7 @@ LEAST_LIGHT: Final = 1e-5
 """Minimum mean light of an image: a thirtieth of code 1 in every pixel."""
 
 
-class Taken(NamedTuple):
+class FormedImage(NamedTuple):
     """Image as in `Frame`."""
 
     image: NDArray[Any]
@@ -73,7 +73,9 @@ class ImageFormation:
         """Gain of the newest image; None before the first image."""
         self._frame = 0
 
-    def take(self, arena: Arena, elapsed_us: int, motion: Motion, seed: int, frame: int) -> Taken:
+    def take(
+        self, arena: Arena, elapsed_us: int, motion: Motion, seed: int, frame: int
+    ) -> FormedImage:
         """Return an image; `elapsed_us` is the time of its mid-exposure and middle row.
 
         `motion` is the vehicle's then, `seed` the episode's, `frame` the number by the camera's
@@ -163,7 +165,7 @@ class ImageFormation:
                 break
         return float(gain)
 
-    def _formed(self, light: image_sensor.Light, gain: float, seed: int, frame: int) -> Taken:
+    def _formed(self, light: image_sensor.Light, gain: float, seed: int, frame: int) -> FormedImage:
         """Return the image of light (h, w, channels) after lens and sensor."""
         asked, channels = self._imaging, light.shape[2]
         if self._through is not None:
@@ -177,9 +179,9 @@ class ImageFormation:
             light = image_sensor.demosaiced(np.minimum(light, np.float32(1.0)))
         image: NDArray[Any] = image_sensor.codes_of(light)
         if asked.jpeg_quality is None:
-            return Taken(image, None)
+            return FormedImage(image, None)
         jpeg = jpeg_of(image, asked.jpeg_quality)
-        return Taken(image_of(jpeg, image.shape[0], image.shape[1], channels), jpeg)
+        return FormedImage(image_of(jpeg, image.shape[0], image.shape[1], channels), jpeg)
 
 
 def _off_by(asked: Imaging, seed: int, own: tuple[int, ...]) -> float:

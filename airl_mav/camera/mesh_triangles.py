@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from airl_mav.camera.primitives import Ids
 from airl_mav.camera.projection import (
     Image,
+    ImageProjection,
     Line,
     Lines,
     Pose,
     Rectangle,
     Span,
-    View,
     cut,
     cylinder_span,
     dot,
@@ -42,7 +42,7 @@ NOWHERE: Final = (0, 0, 0, 0)
 @borrowing_kernel
 def part_of(
     out: Image,
-    view: View,
+    view: ImageProjection,
     pose: Pose,
     boxes: NDArray[np.float32],
     node: int,
@@ -69,7 +69,7 @@ def part_of(
 
 
 @borrowing_kernel
-def _around(out: Image, view: View, span: Span, outer: Rectangle) -> Rectangle:
+def _around(out: Image, view: ImageProjection, span: Span, outer: Rectangle) -> Rectangle:
     """Return the pixels of a part of a cylinder within a span, at any number of turns."""
     low, high = max(span[2], outer[2]), min(span[3], outer[3])
     if span[0] == 0.0 and span[1] == float(out.shape[0]):
@@ -86,7 +86,7 @@ def _around(out: Image, view: View, span: Span, outer: Rectangle) -> Rectangle:
 
 @kernel
 def between(
-    view: View,
+    view: ImageProjection,
     near: float,
     far: float,
     left: float,
@@ -115,7 +115,7 @@ def _reach(axis: Vec, half: Vec) -> float:
 
 @kernel
 def pixels(
-    view: View, left: float, right: float, top: float, bottom: float, outer: Rectangle
+    view: ImageProjection, left: float, right: float, top: float, bottom: float, outer: Rectangle
 ) -> Rectangle:
     """Return the pixels of a part whose centres lie between slopes along and across a line."""
     u_centre, v_centre = view.pixel_centre, view.line_centre
@@ -186,7 +186,7 @@ def draw_triangle(
     number: int,
     lines: Lines,
     xs: Line,
-    view: View,
+    view: ImageProjection,
     pose: Pose,
     corners: NDArray[np.float32],
     i: int,
@@ -259,7 +259,7 @@ def draw_triangle(
 
 @borrowing_kernel
 def met(
-    corners: NDArray[np.float32], i: int, view: View, pose: Pose, start: Vec, x: float
+    corners: NDArray[np.float32], i: int, view: ImageProjection, pose: Pose, start: Vec, x: float
 ) -> float:
     """Return a triangle's inverse depth along a ray, as `draw_triangle`; 0 = missed.
 

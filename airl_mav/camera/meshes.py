@@ -84,7 +84,7 @@ def _draw_mesh(
     lines, xs, view, bvh, root = optics.lines, optics.xs, optics.lens, meshes.bvh, meshes.root[k]
     number, scale = OBSTACLE + meshes.first[k], meshes.pose[k, 4]
     pose = seen_from(optics, meshes.pose, k)
-    own = projection.View(
+    own = projection.ImageProjection(
         view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, view.cylindrical
     )
     per = 1.0 / scale
@@ -156,7 +156,9 @@ def _cast_mesh(
     number, scale = OBSTACLE + meshes.first[k], meshes.pose[k, 4]
     pose = seen_from(optics, meshes.pose, k)
     # The last argument (cylindrical) disables `met`'s limits, which hold for pinhole depth only.
-    own = projection.View(view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, True)
+    own = projection.ImageProjection(
+        view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, True
+    )
     per = 1.0 / scale
     box, c = bvh.boxes[root], pose.center
     half = (float(box[3]), float(box[4]), float(box[5]))
@@ -214,7 +216,7 @@ def _cast(
     u: int,
     start: Vec,
     x: float,
-    view: projection.View,
+    view: projection.ImageProjection,
     pose: projection.Pose,
     bvh: Bvh,
     root: int,

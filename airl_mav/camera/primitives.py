@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Shape
-from airl_mav.camera.projection import Body, Image, Optics, Pose, Rectangle, dot, ray_of
+from airl_mav.camera.projection import Image, Optics, Pose, ProjectedBody, Rectangle, dot, ray_of
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Vec
 
@@ -168,7 +168,9 @@ def _draw_room_around(
 
 
 @borrowing_kernel
-def draw_box(out: Image, ids: Ids | None, optics: Optics, body: Body, rectangle: Rectangle) -> bool:
+def draw_box(
+    out: Image, ids: Ids | None, optics: Optics, body: ProjectedBody, rectangle: Rectangle
+) -> bool:
     """Draw a box; return True if the camera is inside."""
     c, half, lines = body.pose.center, body.half, optics.lines
     i = _slab(c[0] - half[0], c[0] + half[0])
@@ -202,7 +204,7 @@ def draw_box(out: Image, ids: Ids | None, optics: Optics, body: Body, rectangle:
 
 @borrowing_kernel
 def draw_cylinder(
-    out: Image, ids: Ids | None, optics: Optics, body: Body, rectangle: Rectangle
+    out: Image, ids: Ids | None, optics: Optics, body: ProjectedBody, rectangle: Rectangle
 ) -> bool:
     """Draw a vertical cylinder with caps; return True if the camera is inside."""
     c, half, lines = body.pose.center, body.half, optics.lines
@@ -240,7 +242,7 @@ def draw_cylinder(
 
 @borrowing_kernel
 def draw_sphere(
-    out: Image, ids: Ids | None, optics: Optics, body: Body, rectangle: Rectangle
+    out: Image, ids: Ids | None, optics: Optics, body: ProjectedBody, rectangle: Rectangle
 ) -> bool:
     """Draw a sphere; return True if the camera is inside."""
     c, radius, lines = body.pose.center, body.half[0], optics.lines

@@ -36,7 +36,7 @@ Span = tuple[float, float, int, int]
 """Lines first..last, before clipping to the image, and pixels of each [begin, end)."""
 
 
-class View(NamedTuple):
+class ImageProjection(NamedTuple):
     """Projection constants and range of an image."""
 
     focal: float
@@ -75,7 +75,7 @@ class Optics(NamedTuple):
     lines: Lines
     xs: Line  # (m,) component of each ray of a line on the axis along
     bent: Bent | None  # a fisheye's rays
-    lens: View
+    lens: ImageProjection
     axes: Pose
     """Camera axes; the centre is unused."""
     camera: Vec
@@ -92,7 +92,7 @@ class Scene(NamedTuple):
     yaw: NDArray[np.float64]  # (n,)
 
 
-class Body(NamedTuple):
+class ProjectedBody(NamedTuple):
     """Obstacle in the world's axes or in its body axes."""
 
     number: int
@@ -160,14 +160,14 @@ def _reach(axis: Vec, half: Vec, sphere: bool) -> float:
 
 
 @borrowing_kernel
-def is_pinhole(bent: Bent | None, view: View) -> bool:
+def is_pinhole(bent: Bent | None, view: ImageProjection) -> bool:
     """Return True if an image is a pinhole's."""
     return not view.cylindrical if bent is None else False
 
 
 @borrowing_kernel
 def rectangle_of(
-    out: Image, bent: Bent | None, view: View, pose: Pose, half: Vec, sphere: bool
+    out: Image, bent: Bent | None, view: ImageProjection, pose: Pose, half: Vec, sphere: bool
 ) -> Rectangle:
     """Return the pixels of a pinhole or fisheye that can see a body; see `pinhole_rectangle`."""
     if bent is None:
@@ -176,7 +176,9 @@ def rectangle_of(
 
 
 @borrowing_kernel
-def pinhole_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Rectangle:
+def pinhole_rectangle(
+    out: Image, view: ImageProjection, pose: Pose, half: Vec, sphere: bool
+) -> Rectangle:
     """Return the pixels of a pinhole that can see a body; empty if invisible.
 
     `pose` contains the camera's axes in the body's frame and the body's centre, `half` the half
@@ -209,7 +211,7 @@ def pinhole_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: boo
 
 
 @borrowing_kernel
-def cylinder_span(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Span:
+def cylinder_span(out: Image, view: ImageProjection, pose: Pose, half: Vec, sphere: bool) -> Span:
     """Return the pixels of a cylinder that can see a body; arguments as in `pinhole_rectangle`.
 
     Lines are columns around the body's bearing, to which `cut` adds full turns.
@@ -241,7 +243,7 @@ def cylinder_span(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -
 
 
 @borrowing_kernel
-def cut(out: Image, view: View, span: Span, turns: int) -> Rectangle:
+def cut(out: Image, view: ImageProjection, span: Span, turns: int) -> Rectangle:
     """Return the part of a span inside the image after a number of full turns."""
     around = turns * 2.0 * math.pi * view.focal
     first, last = _pixels(span[0] + around, span[1] + around, out.shape[0])
@@ -250,7 +252,7 @@ def cut(out: Image, view: View, span: Span, turns: int) -> Rectangle:
 
 @borrowing_kernel
 def fisheye_rectangle(
-    out: Image, view: View, bent: Bent, pose: Pose, half: Vec, sphere: bool
+    out: Image, view: ImageProjection, bent: Bent, pose: Pose, half: Vec, sphere: bool
 ) -> Rectangle:
     """Return the pixels of a fisheye that can see a body; arguments as in `pinhole_rectangle`.
 
@@ -281,7 +283,7 @@ def fisheye_rectangle(
 
 
 @borrowing_kernel
-def _way_out(view: View, bent: Bent, angle: float) -> float:
+def _way_out(view: ImageProjection, bent: Bent, angle: float) -> float:
     """Return the distance of an angle from the middle of a fisheye's image [px], within its rim."""
     rim = bent.sees_to
     return view.focal * _distorted(min(max(angle, -rim), rim), bent.distortion)

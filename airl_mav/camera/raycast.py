@@ -43,14 +43,14 @@ from airl_mav.camera.primitives import (
 from airl_mav.camera.projection import (
     MIN_DEPTH_M,
     Bent,
-    Body,
     Image,
+    ImageProjection,
     Line,
     Lines,
     Optics,
     Pose,
+    ProjectedBody,
     Scene,
-    View,
     cut,
     cylinder_span,
     rectangle_of,
@@ -60,18 +60,18 @@ from airl_mav.vehicle.rotation import Quat, Vec, rotate
 
 
 @borrowing_kernel
-def body_of(scene: Scene, axes: Pose, camera: Vec, i: int) -> Body:
+def body_of(scene: Scene, axes: Pose, camera: Vec, i: int) -> ProjectedBody:
     """Return an obstacle in the world's axes."""
     center, half_size = scene.center, scene.half_size
     offset = (center[i, 0] - camera[0], center[i, 1] - camera[1], center[i, 2] - camera[2])
     half = (half_size[i, 0], half_size[i, 1], half_size[i, 2])
     pose = Pose(axes.forward, axes.across, axes.along, offset)
-    return Body(i, scene.shape[i], half, scene.yaw[i], pose)
+    return ProjectedBody(i, scene.shape[i], half, scene.yaw[i], pose)
 
 
 @borrowing_kernel
 def _draw_obstacle(
-    out: Image, ids: Ids | None, drawn_in: Rectangles | None, optics: Optics, body: Body
+    out: Image, ids: Ids | None, drawn_in: Rectangles | None, optics: Optics, body: ProjectedBody
 ) -> bool:
     """Draw one obstacle; return True if the camera is inside."""
     cos, sin = 1.0, 0.0
@@ -94,7 +94,7 @@ def _draw_obstacle(
         span = cylinder_span(out, view, pose, half, sphere)
     else:
         rectangle = rectangle_of(out, optics.bent, view, pose, half, sphere)
-    own = Body(body.number, shape, half, body.yaw, pose)
+    own = ProjectedBody(body.number, shape, half, body.yaw, pose)
     for turn in range(-turns, turns + 1):
         if view.cylindrical:
             rectangle = cut(out, view, span, turn)
@@ -148,7 +148,7 @@ def aim(
     cy: float,
     cylindrical: bool,
     max_range: float,
-) -> tuple[View, Pose]:
+) -> tuple[ImageProjection, Pose]:
     """Write the rays of an image's lines; return the view, and camera axes without a centre.
 
     `lines` (n, 2) receives the components of each line's first ray on the forward axis and the axis
@@ -168,12 +168,14 @@ def aim(
             lines[u, 0], lines[u, 1] = math.cos(angle), math.sin(angle)
         for v in range(len(xs)):
             xs[v] = (v - cy) / focal
-        return View(focal, cx, cy, s_min, cylindrical), Pose(forward, right, down, nowhere)
+        return ImageProjection(focal, cx, cy, s_min, cylindrical), Pose(
+            forward, right, down, nowhere
+        )
     for v in range(len(lines)):
         lines[v, 0], lines[v, 1] = 1.0, (v - cy) / focal
     for u in range(len(xs)):
         xs[u] = (u - cx) / focal
-    return View(focal, cy, cx, s_min, cylindrical), Pose(forward, down, right, nowhere)
+    return ImageProjection(focal, cy, cx, s_min, cylindrical), Pose(forward, down, right, nowhere)
 
 
 @borrowing_kernel

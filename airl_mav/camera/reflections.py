@@ -35,7 +35,7 @@ from airl_mav.camera.projection import Scene, dot
 from airl_mav.camera.scene_rays import (
     Bodies,
     Met,
-    Place,
+    SurfacePoint,
     advanced,
     bodies_of,
     meet,
@@ -58,10 +58,10 @@ _WAITING: Final = 48
 
 _RAY: Final = 12
 """Number of values per pending ray: origin, direction, share of red, green and blue, path length,
-depth in the tree, `Seen.blur`."""
+depth in the tree, `RayHit.blur`."""
 
 
-class Seen(NamedTuple):
+class RayHit(NamedTuple):
     """Hit of a ray, and its contribution to the pixel."""
 
     ray: Vec
@@ -87,11 +87,11 @@ class Seen(NamedTuple):
 def draw_reflections(
     out: shading.Packed,
     ids: Ids,
-    rays: shading.Rays,
+    rays: shading.PixelRays,
     camera: Vec,
     scene: Scene,
     meshes: Meshes | None,
-    look: shading.Look,
+    look: shading.SceneLook,
 ) -> None:
     """Redraw the pixels of surfaces that are not matt.
 
@@ -134,7 +134,7 @@ def _wait(
 
 @borrowing_kernel
 def _grown(
-    tree: NDArray[np.float64], tops: int, seen: Seen, ray: Vec, share: Vec, blur: float
+    tree: NDArray[np.float64], tops: int, seen: RayHit, ray: Vec, share: Vec, blur: float
 ) -> int:
     """Push a ray with a sufficient contribution; return the number of pending rays."""
     if max(max(share[0], share[1]), share[2]) < _COUNTS or tops == _WAITING:
@@ -167,7 +167,7 @@ def _follow(
     nodes: NDArray[np.int32],
     bodies: Bodies,
     meshes: Meshes | None,
-    look: shading.Look,
+    look: shading.SceneLook,
     pixel2: np.float32,
 ) -> None:
     """Write the linear RGB (3,) of a tree's first ray; `nodes` (STACK,) is a buffer."""
@@ -196,7 +196,7 @@ def _follow(
         place = place_of(bodies, meshes, met, origin, ray)
         way += met.distance
         albedo = albedo_at(look, row, bodies, met, place, meshes, ray, way, pixel2)
-        seen = Seen(
+        seen = RayHit(
             ray, share, way, depth, advanced(origin, ray, met.distance), place.normal, albedo,
             min(max(-dot(place.normal, ray), 0.0), 1.0), float(look.gloss.alpha[row]), blur,
         )  # fmt: skip
@@ -227,7 +227,7 @@ def _shines(light: shading.Lit) -> bool:
 
 
 @large_borrowing_kernel
-def _pass(tree: NDArray[np.float64], tops: int, seen: Seen) -> int:
+def _pass(tree: NDArray[np.float64], tops: int, seen: RayHit) -> int:
     """Push the transmitted and the reflected ray of a pane; return the number of pending rays."""
     back = gloss.pane_reflects(seen.cosine)
     away = gloss.mirrored(seen.ray, seen.normal)
@@ -238,7 +238,7 @@ def _pass(tree: NDArray[np.float64], tops: int, seen: Seen) -> int:
 
 @large_borrowing_kernel
 def _scatter(
-    colour: NDArray[np.float64], seen: Seen, kind: int, light: shading.Lit, arrives: float
+    colour: NDArray[np.float64], seen: RayHit, kind: int, light: shading.Lit, arrives: float
 ) -> None:
     """Add the matt scattering of a bare or varnished surface; `arrives` = share of sunlight."""
     facing, enters, sun_enters = max(dot(seen.normal, _sun(light)), 0.0), 1.0, 1.0
@@ -256,7 +256,7 @@ def _scatter(
 
 @large_borrowing_kernel
 def _shine(
-    colour: NDArray[np.float64], seen: Seen, kind: int, light: shading.Lit, arrives: float
+    colour: NDArray[np.float64], seen: RayHit, kind: int, light: shading.Lit, arrives: float
 ) -> None:
     """Add the sun's highlight on a rough surface; mirrors show the sun directly.
 
@@ -275,7 +275,7 @@ def _shine(
 
 
 @large_borrowing_kernel
-def _mirror(tree: NDArray[np.float64], tops: int, seen: Seen, kind: int) -> int:
+def _mirror(tree: NDArray[np.float64], tops: int, seen: RayHit, kind: int) -> int:
     """Push the mirrored rays of metal or varnish; return the number of pending rays."""
     many = 1 if seen.depth > 0 or gloss.is_smooth(seen.alpha) else gloss.SAMPLES
     for number in range(many):
@@ -305,11 +305,11 @@ def row_of(seen: int) -> int:
 
 @large_borrowing_kernel
 def albedo_at(
-    look: shading.Look,
+    look: shading.SceneLook,
     row: int,
     bodies: Bodies,
     met: Met,
-    place: Place,
+    place: SurfacePoint,
     meshes: Meshes | None,
     ray: Vec,
     way: float,

@@ -50,7 +50,7 @@ class Met(NamedTuple):
     """Index of the mesh's triangle."""
 
 
-class Place(NamedTuple):
+class SurfacePoint(NamedTuple):
     """Point on a body in the body's axes."""
 
     at: Vec
@@ -186,7 +186,9 @@ def meet(
 
 
 @large_borrowing_kernel
-def place_of(bodies: Bodies, meshes: Meshes | None, met: Met, origin: Vec, ray: Vec) -> Place:
+def place_of(
+    bodies: Bodies, meshes: Meshes | None, met: Met, origin: Vec, ray: Vec
+) -> SurfacePoint:
     """Return the point where a ray hits a body; any body except ceiling and sky."""
     p = advanced(origin, ray, met.distance)
     if meshes is not None and met.mesh >= 0:
@@ -197,7 +199,7 @@ def place_of(bodies: Bodies, meshes: Meshes | None, met: Met, origin: Vec, ray: 
         2 if met.seen == primitives.FLOOR else (0 if met.seen == primitives.WALL_NORTH_SOUTH else 1)
     )
     sign = -1.0 if ray[axis] > 0.0 else 1.0
-    return Place(p, _scaled_axis(axis, sign), axis)
+    return SurfacePoint(p, _scaled_axis(axis, sign), axis)
 
 
 @kernel
@@ -218,17 +220,17 @@ def _towards(normal: Vec, ray: Vec) -> Vec:
 
 
 @borrowing_kernel
-def _on_mesh(meshes: Meshes, met: Met, p: Vec, ray: Vec) -> Place:
+def _on_mesh(meshes: Meshes, met: Met, p: Vec, ray: Vec) -> SurfacePoint:
     """Return the point p on a mesh, with its normal."""
     k, n = met.mesh, meshes.bvh.normals[met.face]
     scale, cos, sin = meshes.pose[k, 4], meshes.pose[k, 2], meshes.pose[k, 3]
     at, _ = _from_mesh(meshes, k, p, ray)
     normal = primitives.turn_axes((float(n[0]), float(n[1]), float(n[2])), cos, -sin)
-    return Place((scale * at[0], scale * at[1], scale * at[2]), _towards(normal, ray), 3)
+    return SurfacePoint((scale * at[0], scale * at[1], scale * at[2]), _towards(normal, ray), 3)
 
 
 @borrowing_kernel
-def _on_obstacle(bodies: Bodies, i: int, p: Vec, ray: Vec) -> Place:
+def _on_obstacle(bodies: Bodies, i: int, p: Vec, ray: Vec) -> SurfacePoint:
     """Return the point p on obstacle i, with its normal."""
     center, half = bodies.center[i], bodies.half_size[i]
     cos, sin = bodies.turn[i, 0], bodies.turn[i, 1]
@@ -247,7 +249,7 @@ def _on_obstacle(bodies: Bodies, i: int, p: Vec, ray: Vec) -> Place:
         per = 1.0 / max(math.sqrt(a * a + b * b + height * height), 1e-9)
         normal = (per * a, per * b, per * height)
     # Inside glass the far side is visible from within.
-    return Place((a, b, c), _towards(primitives.turn_axes(normal, cos, -sin), ray), side)
+    return SurfacePoint((a, b, c), _towards(primitives.turn_axes(normal, cos, -sin), ray), side)
 
 
 @large_borrowing_kernel

@@ -62,7 +62,7 @@ class Points(NamedTuple):
     blue: Plane
 
 
-class Rays(NamedTuple):
+class PixelRays(NamedTuple):
     """Rays of all pixels, line by line, in north, east and down."""
 
     north: Plane  # (n,)
@@ -86,7 +86,7 @@ class Lit(NamedTuple):
     extinction: np.float32
 
 
-class Look(NamedTuple):
+class SceneLook(NamedTuple):
     """Appearance of an arena, as for `colour.render_colour`, and the pixel size."""
 
     texture: NDArray[np.int8]  # (2 + n,)
@@ -108,12 +108,12 @@ class Canvas(NamedTuple):
     far: Plane  # (n,) depth [m], 0 = no surface
     lit: Plane  # (n,) 1 in the sun, 0 in shadow
     clear: Plane  # (n,) transmission of fog
-    rays: Rays
+    rays: PixelRays
     points: Points
 
 
 @borrowing_kernel
-def surface_of(look: Look, i: int) -> Surface:
+def surface_of(look: SceneLook, i: int) -> Surface:
     """Return material i."""
     texture, per_m, offset, albedo = look.texture, look.per_m, look.offset, look.albedo
     dark = (albedo[i, 0, 0], albedo[i, 0, 1], albedo[i, 0, 2])
@@ -167,7 +167,7 @@ def irradiance(light: Lit, channel: int, direct: np.float32, rise: np.float32) -
 @borrowing_kernel
 def paint(
     canvas: Canvas,
-    look: Look,
+    look: SceneLook,
     surface: Surface,
     left: int,
     end: int,

@@ -21,11 +21,11 @@ from airl_mav.camera.meshes import inverse_of, seen_from, stopped_by
 from airl_mav.camera.primitives import BOX, CYLINDER, OBSTACLE, SKY, Ids, turned
 from airl_mav.camera.projection import (
     Bent,
-    Body,
+    ImageProjection,
     Optics,
     Pose,
+    ProjectedBody,
     Rectangle,
-    View,
     dot,
     is_pinhole,
     ray_of,
@@ -147,7 +147,7 @@ class Shaded(NamedTuple):
 
 @borrowing_kernel
 def shade_by_obstacle(
-    image: Shaded, optics: Optics, body: Body, to_sun: Vec, through: np.float32
+    image: Shaded, optics: Optics, body: ProjectedBody, to_sun: Vec, through: np.float32
 ) -> None:
     """Multiply `lit` by `through` where an obstacle hides the sun (unit vector NED)."""
     lit, far, ids, corners = image
@@ -226,7 +226,7 @@ def shadow_rectangle(
     corners: NDArray[np.float64],
     n_lines: int,
     n_pixels: int,
-    view: View,
+    view: ImageProjection,
     pose: Pose,
     half: Vec,
     sun: Vec,

@@ -18,7 +18,7 @@ from airl_mav.arena.appearance import WALLS as WALLS_ROW
 from airl_mav.camera import primitives, shading
 from airl_mav.camera.bvh import Meshes, material_row
 from airl_mav.camera.mesh_triangles import Faces
-from airl_mav.camera.projection import MIN_DEPTH_M, Body, Optics, Pose
+from airl_mav.camera.projection import MIN_DEPTH_M, Optics, Pose, ProjectedBody
 from airl_mav.camera.shading import (
     F32,
     I32,
@@ -27,8 +27,8 @@ from airl_mav.camera.shading import (
     ZERO,
     Canvas,
     Lit,
-    Look,
-    Rays,
+    PixelRays,
+    SceneLook,
     packed,
     paint,
     surface_of,
@@ -63,7 +63,7 @@ def span_of(
 
 
 @borrowing_kernel
-def write_rays(rays: Rays, optics: Optics) -> None:
+def write_rays(rays: PixelRays, optics: Optics) -> None:
     """Write the ray of every pixel of an image's lines."""
     axes, lines, xs = optics.axes, optics.lines, optics.xs
     r = along32(axes)
@@ -118,7 +118,7 @@ def draw_sky(canvas: Canvas, camera: Vec, light: Lit) -> None:
 
 
 @borrowing_kernel
-def shade_floor(canvas: Canvas, look: Look, camera: Vec) -> None:
+def shade_floor(canvas: Canvas, look: SceneLook, camera: Vec) -> None:
     """Shade the floor. Its pattern begins at the start position."""
     floor, rays, points = surface_of(look, FLOOR_ROW), canvas.rays, canvas.points
     ids, far, light, pixel2 = canvas.ids, canvas.far, look.light, look.pixel2
@@ -142,7 +142,7 @@ def shade_floor(canvas: Canvas, look: Look, camera: Vec) -> None:
 
 
 @borrowing_kernel
-def shade_walls(canvas: Canvas, look: Look, camera: Vec) -> None:
+def shade_walls(canvas: Canvas, look: SceneLook, camera: Vec) -> None:
     """Shade the walls. Their pattern begins at the foot, north and east of the start."""
     walls, rays, points = surface_of(look, WALLS_ROW), canvas.rays, canvas.points
     ids, far, light, pixel2 = canvas.ids, canvas.far, look.light, look.pixel2
@@ -171,7 +171,11 @@ def shade_walls(canvas: Canvas, look: Look, camera: Vec) -> None:
 
 @borrowing_kernel
 def shade_obstacle(
-    canvas: Canvas, look: Look, optics: Optics, body: Body, rectangle: NDArray[np.int32]
+    canvas: Canvas,
+    look: SceneLook,
+    optics: Optics,
+    body: ProjectedBody,
+    rectangle: NDArray[np.int32],
 ) -> None:
     """Shade an obstacle in a rectangle of the image.
 
@@ -253,7 +257,7 @@ def shade_obstacle(
 @large_borrowing_kernel
 def shade_meshes(
     canvas: Canvas,
-    look: Look,
+    look: SceneLook,
     optics: Optics,
     rectangles: primitives.Rectangles,
     meshes: Meshes,
@@ -268,7 +272,7 @@ def shade_meshes(
 @large_borrowing_kernel
 def _shade_mesh(
     canvas: Canvas,
-    look: Look,
+    look: SceneLook,
     optics: Optics,
     rectangle: NDArray[np.int32],
     meshes: Meshes,

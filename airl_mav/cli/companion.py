@@ -15,7 +15,7 @@ from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.conducted import Abandoned
 from companion.ground_check import check_on_ground
 from companion.interfaces import LinkError
-from companion.program import Mission, fly_alone, prepare
+from companion.program import MissionSetup, fly_alone, prepare
 from companion.systemd import service
 
 
@@ -87,7 +87,7 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
 
 
 def show_check(
-    options: CompanionOptions, mission: Mission, stop: threading.Event, console: Console
+    options: CompanionOptions, mission: MissionSetup, stop: threading.Event, console: Console
 ) -> int:
     """Print the findings of the ground check; return exit status 0 if all are good, else 1."""
     console.print(f"looking at {options.camera} and {options.connect}")

@@ -13,7 +13,7 @@ from rich.table import Table
 from airl_mav.cli.options import POSITIONAL
 from airl_mav.core.console import new_console
 from airl_mav.core.fields import ProfileModel
-from airl_mav.profiles.computer import Latency, Workload, load_computer
+from airl_mav.profiles.computer import LatencyDistribution, Workload, load_computer
 from airl_mav.profiles.loading import list_profiles
 
 SAYS = (
@@ -64,7 +64,7 @@ def _table(names: Sequence[str]) -> Table:
     return table
 
 
-def _mean_ms(latency: Latency) -> float:
+def _mean_ms(latency: LatencyDistribution) -> float:
     if latency.samples_ms is not None:
         return float(np.mean(latency.samples_ms))
     return latency.mean_ms or 0.0

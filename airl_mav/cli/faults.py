@@ -86,11 +86,11 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
     matrix = fault_matrix.resumed(
         file, provenance("airl faults"), fault_matrix.vehicle_digest(vehicle)
     )
-    done: list[fault_matrix.Cell] = []
+    done: list[fault_matrix.MatrixCell] = []
     with RichProgress(console) as progress:
         bar = progress.bar("faults", len(faults) * len(phases) * len(seeds), unit="flights")
 
-        def flown(cell: fault_matrix.Cell) -> None:
+        def flown(cell: fault_matrix.MatrixCell) -> None:
             done.append(cell)
             fault_matrix.save(fault_matrix.with_cells(matrix, done), file)
             bar.update(completed=len(done) * len(seeds))
@@ -106,7 +106,7 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
 
 
 def table_of(
-    faults: Sequence[str], phases: Sequence[Phase], cells: Sequence[fault_matrix.Cell]
+    faults: Sequence[str], phases: Sequence[Phase], cells: Sequence[fault_matrix.MatrixCell]
 ) -> TableView:
     """Return the matrix as a table with a row per fault, for a terminal of any width."""
     rows = tuple(

@@ -18,7 +18,7 @@ from airl_mav.rehearsal.stand_alone import Listener, aircraft_of, fly_vehicle
 from airl_mav.scenario.compile_plans import flight_plan
 from airl_mav.scenario.resolved import FIRMWARE_TITLES
 from airl_mav.scenario.stand_alone import StandAloneVehicle
-from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.flight_controller import FirmwareLostError
 
 
@@ -78,7 +78,7 @@ def _listener(options: FirmwareOptions, console: Console) -> Listener:
         else:
             say("Ctrl-C ends it.")
 
-    def text(message: Message) -> None:
+    def text(message: OperatorText) -> None:
         say(f"[{message.severity.name.lower()}] {message.text}")
 
     return Listener(lambda hint: say(f"waiting for {hint}"), ready, text, say)

@@ -18,14 +18,14 @@ from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, VehicleName
 from firmware_sim.external.airframe_check import (
     HITL_OUTPUT,
     SITL_OUTPUT,
-    Airframe,
+    RequiredAirframe,
     ardupilot_airframe,
     px4_airframe,
 )
 from firmware_sim.external.parameter_client import Value
 from firmware_sim.external.parameter_file import ardupilot_file, qgroundcontrol_file
 
-Kind = tuple[Callable[[VehicleProfile], Airframe], Callable[[Mapping[str, Value]], str]]
+Kind = tuple[Callable[[VehicleProfile], RequiredAirframe], Callable[[Mapping[str, Value]], str]]
 
 KINDS: dict[str, Kind] = {
     "px4": (lambda vehicle: px4_airframe(vehicle, SITL_OUTPUT), qgroundcontrol_file),

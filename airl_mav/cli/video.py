@@ -26,7 +26,7 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, GREATEST_PORT, VehicleName
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.stand_alone import CameraName
-from companion.video import GIMBAL_PORT, Watcher
+from companion.video import GIMBAL_PORT, VideoReceiver
 
 
 class VideoOptions(ProfileModel):
@@ -91,7 +91,7 @@ def run(options: VideoOptions, console: Console | None = None) -> int:
     return 0
 
 
-def watcher_of(address: str, field: str = "to") -> Watcher:
+def watcher_of(address: str, field: str = "to") -> VideoReceiver:
     """Return the address of HOST:PORT. Raises FieldError, naming the field, if it is invalid."""
     host, _, port = address.rpartition(":")
     # RTCP uses the next port.
@@ -101,7 +101,7 @@ def watcher_of(address: str, field: str = "to") -> Watcher:
         socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)
     except OSError as error:
         raise FieldError(field, address, problem=f"no such host: {error.strerror}") from None
-    return Watcher(host, int(port))
+    return VideoReceiver(host, int(port))
 
 
 if __name__ == "__main__":

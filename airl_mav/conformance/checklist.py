@@ -15,7 +15,7 @@ from companion.interfaces import LinkError
 LineKind = Literal["sent", "heard", "check", "note"]
 
 
-class Line(NamedTuple):
+class TranscriptLine(NamedTuple):
     """One line of the transcript."""
 
     time_s: float
@@ -27,11 +27,11 @@ class Line(NamedTuple):
 class Transcript:
     """Ordered log of all messages sent and received; written by any thread."""
 
-    def __init__(self, clock: Clock, progress: Callable[[Line], None]) -> None:
+    def __init__(self, clock: Clock, progress: Callable[[TranscriptLine], None]) -> None:
         """Start empty. `progress` is called with each line, by the thread that adds it."""
         self._clock, self._progress = clock, progress
         self._lock = threading.Lock()
-        self.lines: list[Line] = []
+        self.lines: list[TranscriptLine] = []
         self._repeated = 0
 
     @property
@@ -51,12 +51,12 @@ class Transcript:
             self._append(kind, text)
 
     def _append(self, kind: LineKind, text: str) -> None:
-        line = Line(self.time_s, kind, text)
+        line = TranscriptLine(self.time_s, kind, text)
         self.lines.append(line)
         self._progress(line)
 
 
-class Outcome(Enum):
+class CheckOutcome(Enum):
     """Outcome of a check."""
 
     PASSED = "pass"
@@ -64,11 +64,11 @@ class Outcome(Enum):
     NOT_APPLICABLE = "not applicable"
 
 
-class Check(NamedTuple):
+class ConformanceCheck(NamedTuple):
     """Completed check."""
 
     name: str
-    outcome: Outcome
+    outcome: CheckOutcome
     finding: str
     time_s: float
     """Duration by the transcript's clock [s]."""
@@ -105,7 +105,7 @@ class Checklist:
 
     def __init__(self, transcript: Transcript) -> None:
         self._transcript = transcript
-        self.checks: list[Check] = []
+        self.checks: list[ConformanceCheck] = []
 
     def perform(self, name: str, check: Callable[[], str]) -> bool:
         """Run a check and return True if it did not fail.
@@ -115,14 +115,14 @@ class Checklist:
         """
         start_s = self._transcript.time_s
         try:
-            self._note(name, Outcome.PASSED, check(), start_s)
+            self._note(name, CheckOutcome.PASSED, check(), start_s)
         except NotApplicableError as reason:
-            self._note(name, Outcome.NOT_APPLICABLE, str(reason), start_s)
+            self._note(name, CheckOutcome.NOT_APPLICABLE, str(reason), start_s)
         except CheckFailedError as finding:
-            self._note(name, Outcome.FAILED, str(finding), start_s)
+            self._note(name, CheckOutcome.FAILED, str(finding), start_s)
             return False
         except (LinkError, KeyboardInterrupt) as error:
-            self._note(name, Outcome.FAILED, str(error) or "interrupted", start_s)
+            self._note(name, CheckOutcome.FAILED, str(error) or "interrupted", start_s)
             raise
         return True
 
@@ -138,8 +138,10 @@ class Checklist:
 
     def skip(self, name: str, reason: str) -> None:
         """Record a check that could not be made as failed."""
-        self._note(name, Outcome.FAILED, reason, self._transcript.time_s)
+        self._note(name, CheckOutcome.FAILED, reason, self._transcript.time_s)
 
-    def _note(self, name: str, outcome: Outcome, finding: str, start_s: float) -> None:
-        self.checks.append(Check(name, outcome, finding, self._transcript.time_s - start_s))
+    def _note(self, name: str, outcome: CheckOutcome, finding: str, start_s: float) -> None:
+        self.checks.append(
+            ConformanceCheck(name, outcome, finding, self._transcript.time_s - start_s)
+        )
         self._transcript.add("check", f"{name}: {outcome.value}: {finding}")

@@ -11,7 +11,7 @@ from airl_mav.conformance.autopilots import Reaction
 from airl_mav.conformance.checklist import CheckDefinition, require
 from airl_mav.conformance.ground_checks import TEXT_S, require_answer
 from airl_mav.conformance.mavlink_names import LandedState, MavCommand, MavFrame, name_of
-from airl_mav.conformance.steps import STOP_BODY, STOP_NED, Setpoint
+from airl_mav.conformance.steps import STOP_BODY, STOP_NED, StepSetpoint
 from airl_mav.conformance.vehicle import (
     IGNORE_ALL,
     MODE_S,
@@ -19,7 +19,7 @@ from airl_mav.conformance.vehicle import (
     VELOCITY_FORCE_BIT,
     RawSetpoint,
     SetpointStream,
-    Vehicle,
+    VehicleConnection,
 )
 
 CLIMB_S = 60.0  # Take-off timeout [s]
@@ -45,12 +45,12 @@ DESCENT_M_S = (0.3, 1.2)
 TEXT_TIME_S = 0.02
 LOSS_MARGIN_S = 2.0  # Additional wait for the reaction to a loss [s]
 EAST_DEG = 90.0
-NORTH_NED = Setpoint("ned", CRUISE_M_S)
+NORTH_NED = StepSetpoint("ned", CRUISE_M_S)
 FACING_EAST = RawSetpoint(yaw_rad=math.radians(EAST_DEG))
 NORTH = RawSetpoint(vx=CRUISE_M_S)
 
 
-def takeoff(vehicle: Vehicle, altitude_m: float) -> str:
+def takeoff(vehicle: VehicleConnection, altitude_m: float) -> str:
     """Take off; expect landed_state ON_GROUND, TAKEOFF, IN_AIR, and the mode after take-off."""
     start_m, start_s = vehicle.height_m, vehicle.telemetry.boot_s
     vehicle.call(
@@ -77,7 +77,7 @@ def takeoff(vehicle: Vehicle, altitude_m: float) -> str:
     return f"{finding}, {vehicle.mode_name}"
 
 
-def start_offboard(vehicle: Vehicle, setpoint: Setpoint) -> None:
+def start_offboard(vehicle: VehicleConnection, setpoint: StepSetpoint) -> None:
     """Enter offboard by MAVSDK. Raises CheckFailedError without the mode change."""
     vehicle.fly(setpoint)
     vehicle.call("offboard.start()", vehicle.offboard.start, must_succeed=True)
@@ -89,7 +89,7 @@ def start_offboard(vehicle: Vehicle, setpoint: Setpoint) -> None:
 # --- commands and velocities by MAVSDK
 
 
-def _offboard_without_setpoint(vehicle: Vehicle) -> str:
+def _offboard_without_setpoint(vehicle: VehicleConnection) -> str:
     mode, since = vehicle.mode, len(vehicle.telemetry.texts)
     result = vehicle.set_mode(vehicle.autopilot.offboard, "no setpoint")
     finding = require_answer(vehicle, result, vehicle.autopilot.offboard_in_air, since)
@@ -102,7 +102,7 @@ def _offboard_without_setpoint(vehicle: Vehicle) -> str:
     return finding
 
 
-def _disarm(vehicle: Vehicle) -> str:
+def _disarm(vehicle: VehicleConnection) -> str:
     since = len(vehicle.telemetry.texts)
     result = vehicle.command(MavCommand.COMPONENT_ARM_DISARM, 0.0, note="disarm")
     finding = require_answer(vehicle, result, vehicle.autopilot.disarm_in_air, since)
@@ -111,7 +111,7 @@ def _disarm(vehicle: Vehicle) -> str:
     return finding
 
 
-def _offboard_ned(vehicle: Vehicle) -> str:
+def _offboard_ned(vehicle: VehicleConnection) -> str:
     start_offboard(vehicle, STOP_NED)
     vehicle.wait(FLY_S)
     finding = _velocity(vehicle, NORTH_NED, (CRUISE_M_S, 0.0, 0.0))
@@ -120,16 +120,18 @@ def _offboard_ned(vehicle: Vehicle) -> str:
     return finding
 
 
-def _offboard_body(vehicle: Vehicle) -> str:
-    vehicle.fly(Setpoint("ned", 0.0, 0.0, 0.0, EAST_DEG))
+def _offboard_body(vehicle: VehicleConnection) -> str:
+    vehicle.fly(StepSetpoint("ned", 0.0, 0.0, 0.0, EAST_DEG))
     vehicle.wait(FLY_S)
-    finding = _velocity(vehicle, Setpoint("body", CRUISE_M_S), (0.0, CRUISE_M_S, 0.0))
+    finding = _velocity(vehicle, StepSetpoint("body", CRUISE_M_S), (0.0, CRUISE_M_S, 0.0))
     vehicle.fly(STOP_BODY)
     vehicle.wait(FLY_S)
     return f"facing east: {finding}"
 
 
-def _velocity(vehicle: Vehicle, setpoint: Setpoint, expected: tuple[float, float, float]) -> str:
+def _velocity(
+    vehicle: VehicleConnection, setpoint: StepSetpoint, expected: tuple[float, float, float]
+) -> str:
     vehicle.fly(setpoint)
     vehicle.wait(FLY_S)
     mean = vehicle.telemetry.recent(1.0).velocity.mean(axis=0)
@@ -141,20 +143,20 @@ def _velocity(vehicle: Vehicle, setpoint: Setpoint, expected: tuple[float, float
 # --- raw setpoints: frames, type masks, NaN
 
 
-def _start_raw(vehicle: Vehicle) -> str:
+def _start_raw(vehicle: VehicleConnection) -> str:
     vehicle.wait(FLY_S / 4)
     _request_offboard(vehicle)
     vehicle.wait(FLY_S)
     return f"{vehicle.mode_name} with SET_POSITION_TARGET_LOCAL_NED"
 
 
-def _request_offboard(vehicle: Vehicle) -> None:
+def _request_offboard(vehicle: VehicleConnection) -> None:
     """Enter offboard with a stream of raw setpoints. Raises CheckFailedError."""
     require(vehicle.set_mode(vehicle.autopilot.offboard, "raw setpoints") == 0, "refused")
     require(vehicle.reaches_mode(vehicle.autopilot.offboard_mode), "no change of mode")
 
 
-def _react(stream: SetpointStream, setpoint: RawSetpoint, vehicle: Vehicle) -> str:
+def _react(stream: SetpointStream, setpoint: RawSetpoint, vehicle: VehicleConnection) -> str:
     """Send a setpoint of 1 m/s and determine the reaction: flown, refused or ignored."""
     frame, mask = setpoint.frame, setpoint.mask
     expected = vehicle.autopilot.frames[frame]
@@ -192,7 +194,7 @@ def _react(stream: SetpointStream, setpoint: RawSetpoint, vehicle: Vehicle) -> s
     return finding
 
 
-def _nan_velocity(stream: SetpointStream, vehicle: Vehicle) -> str:
+def _nan_velocity(stream: SetpointStream, vehicle: VehicleConnection) -> str:
     """Send a NaN velocity: it is ignored and does not count as a loss of setpoints.
 
     The check uses the last second's mean velocity: ArduCopter restarts its mode with each such
@@ -217,7 +219,7 @@ def _nan_velocity(stream: SetpointStream, vehicle: Vehicle) -> str:
 # --- loss of setpoints
 
 
-def _lose_setpoints(vehicle: Vehicle) -> str:
+def _lose_setpoints(vehicle: VehicleConnection) -> str:
     telemetry = vehicle.telemetry
     with SetpointStream(vehicle, NORTH) as stream:
         vehicle.wait(FLY_S / 4)
@@ -258,7 +260,7 @@ def _lose_setpoints(vehicle: Vehicle) -> str:
     return finding
 
 
-def _motion_after_loss(vehicle: Vehicle, cruise: float) -> str:
+def _motion_after_loss(vehicle: VehicleConnection, cruise: float) -> str:
     """Return the motion after the loss. Raises CheckFailedError if not as expected."""
 
     def level_m_s() -> float:
@@ -276,7 +278,7 @@ def _motion_after_loss(vehicle: Vehicle, cruise: float) -> str:
     return finding
 
 
-def _resume_setpoints(vehicle: Vehicle) -> str:
+def _resume_setpoints(vehicle: VehicleConnection) -> str:
     with SetpointStream(vehicle, NORTH):
         vehicle.transcript.add("sent", "setpoints again")
         offboard = vehicle.reaches_mode(vehicle.autopilot.offboard_mode)
@@ -290,7 +292,7 @@ def _resume_setpoints(vehicle: Vehicle) -> str:
 # --- the end of the flight
 
 
-def hold(vehicle: Vehicle) -> str:
+def hold(vehicle: VehicleConnection) -> str:
     """Leave offboard at 1 m/s; expect hold, a stop, and no drift."""
     start_offboard(vehicle, NORTH_NED)
     vehicle.wait(FLY_S)
@@ -311,7 +313,7 @@ def hold(vehicle: Vehicle) -> str:
     return finding
 
 
-def _land(vehicle: Vehicle) -> str:
+def _land(vehicle: VehicleConnection) -> str:
     telemetry = vehicle.telemetry
     before, start_s = len(telemetry.landed_states), telemetry.boot_s
     longest_s = max(vehicle.height_m, 0.0) / LANDING_M_S + LANDING_S
@@ -327,7 +329,7 @@ def _land(vehicle: Vehicle) -> str:
     return finding
 
 
-def _auto_disarm(vehicle: Vehicle) -> str:
+def _auto_disarm(vehicle: VehicleConnection) -> str:
     start_s = vehicle.telemetry.boot_s
     require(vehicle.wait_for(lambda: not vehicle.armed, DISARM_S), f"armed after {DISARM_S:g} s")
     vehicle.may_be_armed = False

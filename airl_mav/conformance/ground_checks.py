@@ -23,7 +23,7 @@ from airl_mav.conformance.mavlink_names import (
     version_name,
 )
 from airl_mav.conformance.telemetry import Fields
-from airl_mav.conformance.vehicle import Vehicle
+from airl_mav.conformance.vehicle import VehicleConnection
 from airl_mav.conformance.vehicle_clock import Method
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
@@ -51,7 +51,7 @@ ASKED_HZ: Mapping[str, tuple[int, float]] = {
 UNKNOWN_MAIN_MODE = 99
 
 
-def heartbeat(vehicle: Vehicle) -> str:
+def heartbeat(vehicle: VehicleConnection) -> str:
     """Wait for a heartbeat, and expect its autopilot's behaviour in later checks."""
     beat = _first(vehicle, "HEARTBEAT")
     vehicle.expect_autopilot(beat["autopilot"])
@@ -62,7 +62,9 @@ def heartbeat(vehicle: Vehicle) -> str:
     return f"{who}, {vehicle.mode_name}, disarmed"
 
 
-def require_answer(vehicle: Vehicle, result: int, expected: ExpectedAnswer, since: int) -> str:
+def require_answer(
+    vehicle: VehicleConnection, result: int, expected: ExpectedAnswer, since: int
+) -> str:
     """Return the finding of the expected MAV_RESULT. Raises CheckFailedError for others."""
     name = name_of(MavResult, result)
     require(result == expected.result, f"{name}, not {expected.result.name}")
@@ -73,7 +75,7 @@ def require_answer(vehicle: Vehicle, result: int, expected: ExpectedAnswer, sinc
     return f'{name}, "{heard.text}"'
 
 
-def _version(vehicle: Vehicle) -> str:
+def _version(vehicle: VehicleConnection) -> str:
     # MAVSDK requests it when it connects.
     if vehicle.telemetry.latest("AUTOPILOT_VERSION") is None:
         vehicle.command(MavCommand.REQUEST_MESSAGE, AUTOPILOT_VERSION_ID, note="AUTOPILOT_VERSION")
@@ -85,14 +87,14 @@ def _version(vehicle: Vehicle) -> str:
     return finding
 
 
-def _clock(vehicle: Vehicle) -> str:
+def _clock(vehicle: VehicleConnection) -> str:
     method = vehicle.clock.choose_method()
     if method is Method.TELEMETRY:
         raise NotApplicableError("neither TIMESYNC nor SYSTEM_TIME is answered: times are coarse")
     return f"read from {method.value}"
 
 
-def _unasked_streams(vehicle: Vehicle) -> str:
+def _unasked_streams(vehicle: VehicleConnection) -> str:
     counts, elapsed_s = vehicle.count_messages(COUNT_S)
     rates = {name: number / elapsed_s for name, number in counts.most_common()}
     listed = ", ".join(f"{name} {rate:.3g}" for name, rate in rates.items())
@@ -104,7 +106,7 @@ def _unasked_streams(vehicle: Vehicle) -> str:
     return f"{total}, as stored"
 
 
-def _ask_streams(vehicle: Vehicle) -> str:
+def _ask_streams(vehicle: VehicleConnection) -> str:
     for name, (number, rate_hz) in ASKED_HZ.items():
         period_us = round(US_PER_S / rate_hz)
         note = f"{name} {rate_hz:g} Hz"
@@ -113,7 +115,7 @@ def _ask_streams(vehicle: Vehicle) -> str:
     return ", ".join(f"{name} {rate:g} Hz" for name, (_, rate) in ASKED_HZ.items()) + " accepted"
 
 
-def _ready(vehicle: Vehicle) -> str:
+def _ready(vehicle: VehicleConnection) -> str:
     stopwatch, ready_us = WallClock(vehicle.speed), None
     telemetry = vehicle.telemetry
     while True:
@@ -132,18 +134,18 @@ def _ready(vehicle: Vehicle) -> str:
         vehicle.poll()
 
 
-def _asked_streams(vehicle: Vehicle) -> str:
+def _asked_streams(vehicle: VehicleConnection) -> str:
     counts, elapsed_s = vehicle.count_messages(COUNT_S)
     _require_rates(counts, elapsed_s, {name: rate for name, (_, rate) in ASKED_HZ.items()})
     return ", ".join(f"{name} {counts[name] / elapsed_s:.3g}" for name in ASKED_HZ) + " Hz"
 
 
-def _unknown_command(vehicle: Vehicle) -> str:
+def _unknown_command(vehicle: VehicleConnection) -> str:
     result = vehicle.command(UNKNOWN_COMMAND)
     return require_answer(vehicle, result, ExpectedAnswer(MavResult.UNSUPPORTED), 0)
 
 
-def _unknown_mode(vehicle: Vehicle) -> str:
+def _unknown_mode(vehicle: VehicleConnection) -> str:
     mode, since = vehicle.mode, len(vehicle.telemetry.texts)
     result = vehicle.command(MavCommand.DO_SET_MODE, CUSTOM_MODE_FLAG, UNKNOWN_MAIN_MODE)
     vehicle.wait(TEXT_S)
@@ -152,7 +154,7 @@ def _unknown_mode(vehicle: Vehicle) -> str:
     return f"{finding}, no change of mode"
 
 
-def _offboard_without_setpoint(vehicle: Vehicle) -> str:
+def _offboard_without_setpoint(vehicle: VehicleConnection) -> str:
     local = vehicle.call("offboard.start()", vehicle.offboard.start)
     require(local == "NO_SETPOINT_SET", f"MAVSDK: {local or 'SUCCESS'}, not NO_SETPOINT_SET")
     autopilot, since = vehicle.autopilot, len(vehicle.telemetry.texts)
@@ -169,7 +171,7 @@ def _offboard_without_setpoint(vehicle: Vehicle) -> str:
     return finding
 
 
-def _arm(vehicle: Vehicle) -> str:
+def _arm(vehicle: VehicleConnection) -> str:
     stopwatch, attempts = WallClock(vehicle.speed), 1
     vehicle.may_be_armed = True
     while reason := vehicle.call("action.arm()", vehicle.action.arm):
@@ -181,7 +183,7 @@ def _arm(vehicle: Vehicle) -> str:
     return "ACCEPTED, armed" + (f" at attempt {attempts}" if attempts > 1 else "")
 
 
-def _first(vehicle: Vehicle, name: str) -> Fields:
+def _first(vehicle: VehicleConnection, name: str) -> Fields:
     """Return the newest message of a name. Raises CheckFailedError on timeout."""
     stopwatch = WallClock()
     while (fields := vehicle.telemetry.latest(name)) is None:

@@ -7,7 +7,7 @@ import math
 from rich.table import Table
 from rich.text import Text
 
-from airl_mav.conformance.checklist import Line, Outcome
+from airl_mav.conformance.checklist import CheckOutcome, TranscriptLine
 from airl_mav.conformance.reference import JUDGED, Reference, StoredStep, deviations
 from airl_mav.conformance.result import ConformanceResult
 from airl_mav.conformance.steps import STEP_NAMES, StepResponse
@@ -24,10 +24,14 @@ FIGURES: dict[str, tuple[str, float, int]] = {
 """Column heading, scale and digits of each figure of a StepResponse."""
 
 LINE_MARKS = {"sent": ("->", "cyan"), "heard": ("<-", ""), "check": ("==", "bold")}
-COLOURS = {Outcome.PASSED: "green", Outcome.FAILED: "red", Outcome.NOT_APPLICABLE: "yellow"}
+COLOURS = {
+    CheckOutcome.PASSED: "green",
+    CheckOutcome.FAILED: "red",
+    CheckOutcome.NOT_APPLICABLE: "yellow",
+}
 
 
-def line_text(line: Line) -> Text:
+def line_text(line: TranscriptLine) -> Text:
     """Return a formatted line of the transcript."""
     mark, style = LINE_MARKS.get(line.kind, ("--", "dim"))
     return Text(f"{line.time_s:9.3f} {mark} {line.text}", style=style)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from airl_mav.conformance.checklist import Check, Line, Outcome
+from airl_mav.conformance.checklist import CheckOutcome, ConformanceCheck, TranscriptLine
 from airl_mav.conformance.reference import Reference
 from airl_mav.conformance.steps import STEP_NAMES, MeasuredStep, StepName, StepResponse
 from airl_mav.conformance.telemetry import Fields
@@ -19,7 +19,7 @@ SCHEMA = 1
 
 
 @dataclass(frozen=True)
-class Settings:
+class ConformanceSettings:
     """Settings of a run; see `check_conformance`."""
 
     connect: str
@@ -51,9 +51,9 @@ class Settings:
 class ConformanceResult:
     """Results of a complete or interrupted run."""
 
-    settings: Settings
-    checks: list[Check] = field(default_factory=list)
-    transcript: list[Line] = field(default_factory=list)
+    settings: ConformanceSettings
+    checks: list[ConformanceCheck] = field(default_factory=list)
+    transcript: list[TranscriptLine] = field(default_factory=list)
     steps: dict[StepName, MeasuredStep] = field(default_factory=dict)
     """Step responses, by step name."""
     reference: Reference | None = None
@@ -67,14 +67,14 @@ class ConformanceResult:
     @property
     def passed(self) -> bool:
         """True if checks were made and all passed."""
-        failed = any(check.outcome is Outcome.FAILED for check in self.checks)
+        failed = any(check.outcome is CheckOutcome.FAILED for check in self.checks)
         return bool(self.checks) and not failed and not self.interrupted
 
     @property
     def verdict(self) -> str:
         """Outcome in one line."""
-        failed = [check.name for check in self.checks if check.outcome is Outcome.FAILED]
-        passed = sum(check.outcome is Outcome.PASSED for check in self.checks)
+        failed = [check.name for check in self.checks if check.outcome is CheckOutcome.FAILED]
+        passed = sum(check.outcome is CheckOutcome.PASSED for check in self.checks)
         rest = len(self.checks) - passed - len(failed)
         counted = f"{passed} passed, {len(failed)} failed, {rest} not applicable"
         down = "" if self.known_to_be_down else "; NOT known to be down"

@@ -7,23 +7,29 @@ from contextlib import closing, suppress
 from functools import partial
 
 from airl_mav.conformance import flight_checks
-from airl_mav.conformance.checklist import CheckFailedError, Checklist, Line, Transcript, require
+from airl_mav.conformance.checklist import (
+    CheckFailedError,
+    Checklist,
+    Transcript,
+    TranscriptLine,
+    require,
+)
 from airl_mav.conformance.ground_checks import GROUND_CHECKS, heartbeat
 from airl_mav.conformance.reference import AUTO, judge, load_reference, summary
-from airl_mav.conformance.result import ConformanceResult, Settings
+from airl_mav.conformance.result import ConformanceResult, ConformanceSettings
 from airl_mav.conformance.steps import (
     BEFORE_S,
     MANOEUVRES,
     STEP_NAMES,
     STOP_NED,
-    Leg,
+    HeldSetpoint,
     MeasuredStep,
     StepName,
     StepResponse,
     measure,
     plan,
 )
-from airl_mav.conformance.vehicle import SetpointStream, Vehicle
+from airl_mav.conformance.vehicle import SetpointStream, VehicleConnection
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from companion.interfaces import LinkError
@@ -44,7 +50,7 @@ def check_conformance(
     repeat: int = 1,
     steps_only: bool = False,
     connect_timeout_s: float = 30.0,
-    progress: Callable[[Line], None] | None = None,
+    progress: Callable[[TranscriptLine], None] | None = None,
 ) -> ConformanceResult:
     """Fly a flight controller through all checks and step responses. It takes off.
 
@@ -66,7 +72,7 @@ def check_conformance(
         UsageError: Invalid value or connection, port taken, no heartbeat, or unknown autopilot;
             nothing was commanded.
     """
-    settings = Settings(
+    settings = ConformanceSettings(
         connect, reference, speed, altitude_m, tuple(steps), repeat, steps_only, connect_timeout_s
     )
     if reference != AUTO:
@@ -74,7 +80,7 @@ def check_conformance(
     transcript = Transcript(WallClock(speed), progress or (lambda _: None))
     checklist = Checklist(transcript)
     result = ConformanceResult(settings, checklist.checks, transcript.lines)
-    with closing(Vehicle(connect, speed, transcript)) as vehicle:
+    with closing(VehicleConnection(connect, speed, transcript)) as vehicle:
         transcript.add("note", f"waiting for a flight controller on {connect}")
         try:
             vehicle.connect(connect_timeout_s)
@@ -93,7 +99,7 @@ def check_conformance(
     return result
 
 
-def _check(vehicle: Vehicle, checklist: Checklist, result: ConformanceResult) -> None:
+def _check(vehicle: VehicleConnection, checklist: Checklist, result: ConformanceResult) -> None:
     """Make all checks until one blocks the next. Raises UsageError and LinkError."""
     settings = result.settings
     if not checklist.perform("heartbeat", lambda: heartbeat(vehicle)):
@@ -108,7 +114,9 @@ def _check(vehicle: Vehicle, checklist: Checklist, result: ConformanceResult) ->
         _bring_down(vehicle, result)
 
 
-def _check_in_air(vehicle: Vehicle, checklist: Checklist, result: ConformanceResult) -> None:
+def _check_in_air(
+    vehicle: VehicleConnection, checklist: Checklist, result: ConformanceResult
+) -> None:
     """Make the checks in the air; the vehicle is armed."""
     settings = result.settings
     checklist.perform("takeoff", lambda: flight_checks.takeoff(vehicle, settings.altitude_m))
@@ -129,7 +137,11 @@ def _check_in_air(vehicle: Vehicle, checklist: Checklist, result: ConformanceRes
     checklist.perform_all(flight_checks.LANDING_CHECKS, vehicle)
 
 
-def _fly_steps(vehicle: Vehicle, settings: Settings, measured: dict[StepName, MeasuredStep]) -> str:
+def _fly_steps(
+    vehicle: VehicleConnection,
+    settings: ConformanceSettings,
+    measured: dict[StepName, MeasuredStep],
+) -> str:
     """Fly the steps and add their responses. Raises CheckFailedError, LinkError."""
     steps = {leg.step.name: leg.step for legs in MANOEUVRES for leg in legs if leg.step}
     flight_checks.start_offboard(vehicle, STOP_NED)
@@ -148,7 +160,7 @@ def _fly_steps(vehicle: Vehicle, settings: Settings, measured: dict[StepName, Me
     return finding + (f", {inexact} setpoints only by the newest telemetry" if inexact else "")
 
 
-def _fly_leg(vehicle: Vehicle, leg: Leg) -> StepResponse | None:
+def _fly_leg(vehicle: VehicleConnection, leg: HeldSetpoint) -> StepResponse | None:
     """Hold a setpoint for its duration; return the response to its step."""
     sent_s = vehicle.fly(leg.setpoint)
     vehicle.wait(leg.seconds - (vehicle.telemetry.boot_s - sent_s))
@@ -164,7 +176,7 @@ def _fly_leg(vehicle: Vehicle, leg: Leg) -> StepResponse | None:
         raise CheckFailedError(f"{leg.step.name}: {error}") from None
 
 
-def _bring_down(vehicle: Vehicle, result: ConformanceResult) -> None:
+def _bring_down(vehicle: VehicleConnection, result: ConformanceResult) -> None:
     """Land if still armed; repeat the request until answered. Ctrl-C aborts the landing."""
     if not vehicle.may_be_armed:
         return

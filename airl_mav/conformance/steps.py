@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.conformance.telemetry import Motion
+from airl_mav.conformance.telemetry import EstimatedMotion
 from airl_mav.core.frames import wrap_pi
 
 StepName = Literal[
@@ -44,7 +44,7 @@ END_S = 1.0
 """Averaging time of the final error [s]."""
 
 
-class Setpoint(NamedTuple):
+class StepSetpoint(NamedTuple):
     """MAVSDK's set_velocity_ned [m/s, deg] or set_velocity_body [m/s, deg/s]."""
 
     frame: Literal["ned", "body"]
@@ -57,7 +57,7 @@ class Setpoint(NamedTuple):
 Quantity = Literal["north", "east", "down", "forward", "heading", "heading rate"]
 
 
-class Step(NamedTuple):
+class SetpointStep(NamedTuple):
     """Step of one quantity from one setpoint to another."""
 
     name: StepName
@@ -77,30 +77,30 @@ class Step(NamedTuple):
         return f"{self.quantity} {self.before:g} -> {self.after:g} {self.unit}"
 
     @property
-    def setpoint(self) -> Setpoint:
+    def setpoint(self) -> StepSetpoint:
         """New setpoint."""
         return {
-            "north": Setpoint("ned", self.after),
-            "east": Setpoint("ned", 0.0, self.after),
-            "down": Setpoint("ned", 0.0, 0.0, self.after),
-            "heading": Setpoint("ned", 0.0, 0.0, 0.0, self.after),
-            "forward": Setpoint("body", self.after),
-            "heading rate": Setpoint("body", 0.0, 0.0, 0.0, self.after),
+            "north": StepSetpoint("ned", self.after),
+            "east": StepSetpoint("ned", 0.0, self.after),
+            "down": StepSetpoint("ned", 0.0, 0.0, self.after),
+            "heading": StepSetpoint("ned", 0.0, 0.0, 0.0, self.after),
+            "forward": StepSetpoint("body", self.after),
+            "heading rate": StepSetpoint("body", 0.0, 0.0, 0.0, self.after),
         }[self.quantity]
 
-    def mirrored(self) -> Step:
+    def mirrored(self) -> SetpointStep:
         """Return the opposite step; vertical steps stay the same."""
         if self.quantity == "down":
             return self
         return self._replace(before=0.0 - self.before, after=0.0 - self.after)
 
 
-class Leg(NamedTuple):
+class HeldSetpoint(NamedTuple):
     """Setpoint held for a fixed time."""
 
-    setpoint: Setpoint
+    setpoint: StepSetpoint
     seconds: float
-    step: Step | None = None
+    step: SetpointStep | None = None
     """Measured step; None: a transition to the next leg."""
 
 
@@ -162,7 +162,7 @@ def step_response(
 class MeasuredStep(NamedTuple):
     """Step and its responses, one per repetition."""
 
-    step: Step
+    step: SetpointStep
     flights: list[StepResponse]
 
     @property
@@ -171,46 +171,64 @@ class MeasuredStep(NamedTuple):
         return StepResponse(*np.median(np.array(self.flights), axis=0).tolist())
 
 
-STOP_NED = Setpoint("ned")
+STOP_NED = StepSetpoint("ned")
 """Hover, facing north."""
-STOP_BODY = Setpoint("body")
+STOP_BODY = StepSetpoint("body")
 
 
-def _leg(seconds: float, name: StepName, quantity: Quantity, before: float, after: float) -> Leg:
+def _leg(
+    seconds: float, name: StepName, quantity: Quantity, before: float, after: float
+) -> HeldSetpoint:
     """Return the leg of a step."""
-    step = Step(name, quantity, before, after)
-    return Leg(step.setpoint, seconds, step)
+    step = SetpointStep(name, quantity, before, after)
+    return HeldSetpoint(step.setpoint, seconds, step)
 
 
 # Settling time by PX4's and ArduPilot's measurements, plus one second.
-MANOEUVRES: tuple[tuple[Leg, ...], ...] = (
+MANOEUVRES: tuple[tuple[HeldSetpoint, ...], ...] = (
     (
-        Leg(STOP_NED, 2.0),
+        HeldSetpoint(STOP_NED, 2.0),
         _leg(5.0, "north-2", "north", 0.0, 2.0),
         _leg(5.0, "north-2-stop", "north", 2.0, 0.0),
     ),
     (
-        Leg(STOP_NED, 1.0),
+        HeldSetpoint(STOP_NED, 1.0),
         _leg(6.0, "north-5", "north", 0.0, 5.0),
         _leg(6.0, "north-5-stop", "north", 5.0, 0.0),
     ),
-    (Leg(STOP_NED, 1.0), _leg(5.0, "east-2", "east", 0.0, 2.0), Leg(STOP_NED, 3.0)),
-    (Leg(STOP_BODY, 2.0), _leg(5.0, "forward-2", "forward", 0.0, 2.0), Leg(STOP_BODY, 3.0)),
     (
-        *(Leg(STOP_NED, 2.0), _leg(5.0, "up-2", "down", 0.0, -2.0)),
-        *(Leg(STOP_NED, 4.0), _leg(8.0, "down-1", "down", 0.0, 1.0), Leg(STOP_NED, 2.0)),
+        HeldSetpoint(STOP_NED, 1.0),
+        _leg(5.0, "east-2", "east", 0.0, 2.0),
+        HeldSetpoint(STOP_NED, 3.0),
     ),
-    (Leg(STOP_NED, 2.0), _leg(5.0, "yaw-90", "heading", 0.0, 90.0), Leg(STOP_NED, 4.0)),
     (
-        *(Leg(STOP_BODY, 2.0), _leg(4.0, "yawspeed-30", "heading rate", 0.0, 30.0)),
-        *(Leg(STOP_BODY, 2.0), Leg(STOP_NED, 4.0)),
+        HeldSetpoint(STOP_BODY, 2.0),
+        _leg(5.0, "forward-2", "forward", 0.0, 2.0),
+        HeldSetpoint(STOP_BODY, 3.0),
+    ),
+    (
+        *(HeldSetpoint(STOP_NED, 2.0), _leg(5.0, "up-2", "down", 0.0, -2.0)),
+        *(
+            HeldSetpoint(STOP_NED, 4.0),
+            _leg(8.0, "down-1", "down", 0.0, 1.0),
+            HeldSetpoint(STOP_NED, 2.0),
+        ),
+    ),
+    (
+        HeldSetpoint(STOP_NED, 2.0),
+        _leg(5.0, "yaw-90", "heading", 0.0, 90.0),
+        HeldSetpoint(STOP_NED, 4.0),
+    ),
+    (
+        *(HeldSetpoint(STOP_BODY, 2.0), _leg(4.0, "yawspeed-30", "heading rate", 0.0, 30.0)),
+        *(HeldSetpoint(STOP_BODY, 2.0), HeldSetpoint(STOP_NED, 4.0)),
     ),
 )
 """Manoeuvres in flight order, each from a hover facing north. One pass: 40 m north, 10 m east, 10 m
 up; a second, mirrored pass returns."""
 
 
-def plan(names: tuple[StepName, ...], *, mirrored: bool) -> list[Leg]:
+def plan(names: tuple[StepName, ...], *, mirrored: bool) -> list[HeldSetpoint]:
     """Return the legs of the manoeuvres that contain the named steps; others are not measured."""
     legs = []
     for manoeuvre in MANOEUVRES:
@@ -220,11 +238,13 @@ def plan(names: tuple[StepName, ...], *, mirrored: bool) -> list[Leg]:
             # The legs between steps are stops and need no mirroring.
             flown = step.mirrored() if step is not None and mirrored else step
             measured = flown if flown is not None and flown.name in names else None
-            legs.append(Leg(setpoint if flown is None else flown.setpoint, seconds, measured))
+            legs.append(
+                HeldSetpoint(setpoint if flown is None else flown.setpoint, seconds, measured)
+            )
     return legs
 
 
-def measure(step: Step, motion: Motion, sent_s: float) -> StepResponse:
+def measure(step: SetpointStep, motion: EstimatedMotion, sent_s: float) -> StepResponse:
     """Return a step's response from `BEFORE_S` before its arrival at `sent_s` [s] to its end."""
     position, heading = motion
     velocity, times_s = motion.velocity, position[:, 0]

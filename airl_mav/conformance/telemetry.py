@@ -32,7 +32,7 @@ MESSAGES = (
     "STATUSTEXT",
     "SYS_STATUS",
 )
-"""Messages that `Telemetry.receive` accepts."""
+"""Messages that `TelemetryBuffer.receive` accepts."""
 
 AUTOPILOT_COMPONENT = 1
 """MAV_COMP_ID_AUTOPILOT1: other components of the vehicle send separate heartbeats and clocks."""
@@ -42,7 +42,7 @@ MOTION_HZ = 250.0  # Above the requested sample rates
 Fields = Mapping[str, Any]
 
 
-class Motion(NamedTuple):
+class EstimatedMotion(NamedTuple):
     """The vehicle's estimated motion by the vehicle's clock, over a part of the flight."""
 
     position: NDArray[np.float64]
@@ -55,9 +55,11 @@ class Motion(NamedTuple):
         """(n, 3) north, east, down [m/s]."""
         return self.position[:, 4:7]
 
-    def between(self, start_s: float, end_s: float) -> Motion:
+    def between(self, start_s: float, end_s: float) -> EstimatedMotion:
         """Return the part between two times since boot [s]."""
-        return Motion(*(part[(part[:, 0] >= start_s) & (part[:, 0] <= end_s)] for part in self))
+        return EstimatedMotion(
+            *(part[(part[:, 0] >= start_s) & (part[:, 0] <= end_s)] for part in self)
+        )
 
 
 class StatusText(NamedTuple):
@@ -68,7 +70,7 @@ class StatusText(NamedTuple):
     text: str
 
 
-class Telemetry:
+class TelemetryBuffer:
     """Telemetry, texts and answers; written by MAVSDK's threads, read from any."""
 
     def __init__(self, transcript: Transcript) -> None:
@@ -122,12 +124,14 @@ class Telemetry:
         elif name == "EXTENDED_SYS_STATE":
             self._take_landed(fields["landed_state"])
 
-    def recent(self, seconds: float) -> Motion:
+    def recent(self, seconds: float) -> EstimatedMotion:
         """Return the motion of the last seconds, by the vehicle's clock [s]."""
         rows = int(seconds * MOTION_HZ) + 10  # Avoids copying the whole flight
         with self._lock:
             position, heading = self._position[-rows:], self._heading[-rows:]
-        motion = Motion(np.array(position).reshape(-1, 7), np.array(heading).reshape(-1, 3))
+        motion = EstimatedMotion(
+            np.array(position).reshape(-1, 7), np.array(heading).reshape(-1, 3)
+        )
         return motion.between(self.boot_s - seconds, self.boot_s)
 
     def find_text(self, part: str, since: int = 0) -> StatusText | None:

@@ -21,7 +21,7 @@ from mavsdk.plugins.offboard import Offboard, VelocityBodyYawspeed, VelocityNedY
 from airl_mav.conformance import mavlink_names, telemetry, vehicle_clock
 from airl_mav.conformance.autopilots import AUTOPILOTS, PX4, Autopilot
 from airl_mav.conformance.checklist import Transcript
-from airl_mav.conformance.steps import Setpoint
+from airl_mav.conformance.steps import StepSetpoint
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
@@ -47,14 +47,14 @@ VELOCITY_FORCE_BIT = 0xFC7
 IGNORE_ALL = 0xDFF
 
 
-class Vehicle:
+class VehicleConnection:
     """Vehicle connection with telemetry and commands."""
 
     def __init__(self, url: str, speed: float, transcript: Transcript) -> None:
         """Open a MAVSDK connection to a vehicle of some speed. Raises UsageError."""
         self.url, self.speed = url, speed
         self.transcript = transcript
-        self.telemetry = telemetry.Telemetry(transcript)
+        self.telemetry = telemetry.TelemetryBuffer(transcript)
         self.clock = vehicle_clock.VehicleClock(self.telemetry, self.send, speed)
         self.autopilot: Autopilot = PX4
         self.unasked_hz: Mapping[str, float] = {}
@@ -134,7 +134,7 @@ class Vehicle:
         flags = mavlink_names.CUSTOM_MODE_FLAG | (mavlink_names.ARMED_FLAG if self.armed else 0)
         return self.command(mavlink_names.MavCommand.DO_SET_MODE, flags, *mode, note=note)
 
-    def fly(self, setpoint: Setpoint) -> float:
+    def fly(self, setpoint: StepSetpoint) -> float:
         """Send a setpoint, repeated by MAVSDK at 20 Hz; return its arrival [s, vehicle time]."""
         reached: list[float] = []
 
@@ -265,7 +265,7 @@ class RawSetpoint(NamedTuple):
 class SetpointStream:
     """Repeats the newest raw setpoint until stopped, independent of heartbeats, unlike MAVSDK."""
 
-    def __init__(self, vehicle: Vehicle, setpoint: RawSetpoint) -> None:
+    def __init__(self, vehicle: VehicleConnection, setpoint: RawSetpoint) -> None:
         self._vehicle, self._setpoint = vehicle, setpoint
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="setpoints", daemon=True)

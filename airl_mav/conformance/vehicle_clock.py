@@ -14,7 +14,7 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 from airl_mav.conformance.mavlink_names import MavCommand, command_long
-from airl_mav.conformance.telemetry import AUTOPILOT_COMPONENT, Telemetry
+from airl_mav.conformance.telemetry import AUTOPILOT_COMPONENT, TelemetryBuffer
 from airl_mav.core.clock import NS_PER_US, WallClock
 from airl_mav.core.constants import MS_PER_S, US_PER_S
 
@@ -51,7 +51,7 @@ class VehicleClock:
     """Requests the vehicle's time, by the first supported method."""
 
     def __init__(
-        self, telemetry: Telemetry, send: Callable[[str, dict[str, Any]], None], speed: float
+        self, telemetry: TelemetryBuffer, send: Callable[[str, dict[str, Any]], None], speed: float
     ) -> None:
         self._telemetry, self._send, self._speed = telemetry, send, speed
         self.wall = WallClock()

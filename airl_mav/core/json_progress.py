@@ -16,7 +16,7 @@ EVERY_S = 1.0
 
 
 @dataclass(frozen=True)
-class Status(Event):
+class ActivityStatus(Event):
     """Current activity or wait."""
 
     event: ClassVar[str] = "status"
@@ -68,7 +68,7 @@ class JsonProgress(Progress):
     def status(self, text: str | None) -> None:
         """Write the status if it has changed."""
         if text is not None and text != self._status:
-            self.tell(Status(text))
+            self.tell(ActivityStatus(text))
             self._status = text
 
     def note(self, text: str, style: str | None = None) -> None:  # noqa: ARG002 (for drawing)

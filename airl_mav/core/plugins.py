@@ -30,7 +30,7 @@ _MODULE = re.compile(r"(?P<module>[^\W\d]\w*(\.[^\W\d]\w*)*):(?P<name>[^\W\d]\w*
 
 
 @dataclass(frozen=True)
-class Door:
+class PluginKind:
     """Kind of component that plug-ins can provide."""
 
     field: str
@@ -41,14 +41,18 @@ class Door:
     """Required type: "a class with a method act"."""
 
 
-POLICIES = Door("policy", "airl_mav.policies", "a class with a method act")
-REWARDS = Door("reward", "airl_mav.rewards", "a function, or a class whose objects can be called")
-NETWORKS = Door("network.kind", "airl_mav.networks", "a class of SB3's BaseFeaturesExtractor")
-LAYOUTS = Door("layout", "airl_mav.layouts", "a class with methods boxes and encode")
-ACTION_SETS = Door("actions", "airl_mav.action_sets", "a class with a method commands")
-GENERATORS = Door("generator", "airl_mav.generators", "a function that makes an Arena")
-CAMERAS = Door("camera", "airl_mav.cameras", "a class with a lens and a method read")
-MODELS = Door("model", "airl_mav.models", "a torch.nn.Module, or what makes one without arguments")
+POLICIES = PluginKind("policy", "airl_mav.policies", "a class with a method act")
+REWARDS = PluginKind(
+    "reward", "airl_mav.rewards", "a function, or a class whose objects can be called"
+)
+NETWORKS = PluginKind("network.kind", "airl_mav.networks", "a class of SB3's BaseFeaturesExtractor")
+LAYOUTS = PluginKind("layout", "airl_mav.layouts", "a class with methods boxes and encode")
+ACTION_SETS = PluginKind("actions", "airl_mav.action_sets", "a class with a method commands")
+GENERATORS = PluginKind("generator", "airl_mav.generators", "a function that makes an Arena")
+CAMERAS = PluginKind("camera", "airl_mav.cameras", "a class with a lens and a method read")
+MODELS = PluginKind(
+    "model", "airl_mav.models", "a torch.nn.Module, or what makes one without arguments"
+)
 
 DOORS = (POLICIES, REWARDS, NETWORKS, LAYOUTS, ACTION_SETS, GENERATORS, CAMERAS, MODELS)
 
@@ -63,23 +67,23 @@ def names_file(name: str) -> bool:
     return _FILE.fullmatch(name) is not None
 
 
-def announced(door: Door) -> dict[str, str]:
+def announced(door: PluginKind) -> dict[str, str]:
     """Return the components of installed packages, name to MODULE:NAME, without importing them."""
     return {each.name: f"{each.module}:{each.attr}" for each in entry_points(group=door.group)}
 
 
-def reference(door: Door, name: str) -> str | None:
+def reference(door: PluginKind, name: str) -> str | None:
     """Return a component's FILE.py:NAME or MODULE:NAME by any of its names; None = unknown."""
     return name if names_code(name) else announced(door).get(name)
 
 
-def accepted(door: Door, shipped: Sequence[str]) -> str:
+def accepted(door: PluginKind, shipped: Sequence[str]) -> str:
     """Return the accepted names as text for messages."""
     known = [repr(name) for name in (*shipped, *announced(door))]
     return f"{', '.join(known)}, FILE.py:NAME or MODULE:NAME"
 
 
-def part_name(door: Door, shipped: Sequence[str]) -> AfterValidator:
+def part_name(door: PluginKind, shipped: Sequence[str]) -> AfterValidator:
     """Return the validator of a field with the name of a built-in component or a plug-in.
 
     The component is not loaded: reading a file runs no code.
@@ -98,12 +102,12 @@ _loaded: set[tuple[str, str]] = set()
 """Kind and name of the components loaded by this process."""
 
 
-def is_loaded(door: Door, name: str) -> bool:
+def is_loaded(door: PluginKind, name: str) -> bool:
     """Return True if this process has loaded a component by this name, as given by the user."""
     return (door.group, name) in _loaded
 
 
-def load_part(door: Door, name: str, fits: Callable[[Any], bool] = callable) -> Any:
+def load_part(door: PluginKind, name: str, fits: Callable[[Any], bool] = callable) -> Any:
     """Return a component by any of its names. Its file or module runs once per process.
 
     The name is FILE.py:NAME, MODULE:NAME, or an installed package's entry point; `fits` accepts or

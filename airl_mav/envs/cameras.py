@@ -21,10 +21,10 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import ArenaBatch, move_obstacles, relief_of
-from airl_mav.envs.colour_images import ColourImages, Lens, Looks, lens_of
+from airl_mav.envs.colour_images import ColourImages, LensConstants, Looks, lens_of
 from airl_mav.envs.decision import FrameTimes
 from airl_mav.envs.faults import delays_of, later_us, twin_faults
-from airl_mav.envs.fleet import Fleet, Seen
+from airl_mav.envs.fleet import Fleet, FramePoses
 from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
 from airl_mav.envs.saved_state import Stateful
 from airl_mav.faults.kinds import NOISE_SEED
@@ -40,7 +40,7 @@ class Eye(NamedTuple):
     """Depth camera of n vehicles, as an argument for kernels."""
 
     mount: Mount
-    lens: Lens
+    lens: LensConstants
     image: NDArray[Any]
     """(n, h, w) newest depth images [mm]."""
     meshes: MeshBatch | None
@@ -90,7 +90,7 @@ class Eyes:
 
     def take(
         self,
-        fleet: Fleet | Seen,
+        fleet: Fleet | FramePoses,
         arenas: ArenaBatch,
         who: NDArray[np.bool_],
         seeds: NDArray[np.int64],
@@ -240,7 +240,7 @@ class Cameras(Stateful):
 
     def capture(
         self,
-        fleet: Fleet | Seen,
+        fleet: Fleet | FramePoses,
         arenas: ArenaBatch,
         who: NDArray[np.bool_],
         seeds: NDArray[np.int64],
@@ -251,7 +251,7 @@ class Cameras(Stateful):
         """
         frames = self._frames(fleet.time_us)
         # Always pass the same type, so that the kernels are compiled once.
-        fleet = Seen(*(getattr(fleet, name) for name in Seen._fields))
+        fleet = FramePoses(*(getattr(fleet, name) for name in FramePoses._fields))
         for eyes in (self._main, *self.further.values()):
             eyes.take(fleet, arenas, who, seeds, frames)
         for each in self._changed:
@@ -294,7 +294,7 @@ def _make_noisy(
 
 @large_kernel
 def render_images(
-    fleet: Fleet | Seen, arenas: ArenaBatch, who: NDArray[np.bool_], eye: Eye | None
+    fleet: Fleet | FramePoses, arenas: ArenaBatch, who: NDArray[np.bool_], eye: Eye | None
 ) -> None:
     """Render the depth image of every vehicle in `who` at its present pose.
 

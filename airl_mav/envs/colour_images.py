@@ -20,7 +20,7 @@ from airl_mav.camera.textures import atlas
 from airl_mav.core.errors import UsageError
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, copy_rows, move_obstacles, relief_of
-from airl_mav.envs.fleet import Fleet, Seen
+from airl_mav.envs.fleet import Fleet, FramePoses
 from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
 from airl_mav.profiles.asset_files import ImageFile
 
@@ -111,7 +111,7 @@ class Looks:
                 getattr(self.gloss, name)[i, :count] = rows
 
 
-class Lens(NamedTuple):
+class LensConstants(NamedTuple):
     """Constants of a camera; a tuple, because compiled loops require one."""
 
     focal: float
@@ -128,13 +128,13 @@ class Lens(NamedTuple):
     """Rays of a fisheye."""
 
 
-def lens_of(intrinsics: Intrinsics, range_m: float) -> Lens:
+def lens_of(intrinsics: Intrinsics, range_m: float) -> LensConstants:
     """Return the lens of a camera with a range `range_m` [m]."""
     k = intrinsics
-    return Lens(k.focal, k.cx, k.cy, range_m, k.cylindrical, bent_of(k))
+    return LensConstants(k.focal, k.cx, k.cy, range_m, k.cylindrical, bent_of(k))
 
 
-class Canvas(NamedTuple):
+class ImageBuffers(NamedTuple):
     """Work buffers for an image (h, w, ...)."""
 
     work: Work
@@ -156,10 +156,14 @@ class ColourImages:
         rgb = np.zeros((*shape, 3), np.uint8)
         depth, seen = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
         work = Work.of(k.width, k.height, k.cylindrical)
-        self._canvas = Canvas(work, rgb, depth, seen)
+        self._canvas = ImageBuffers(work, rgb, depth, seen)
 
     def render(
-        self, fleet: Fleet | Seen, arenas: ArenaBatch, who: NDArray[np.bool_], out: NDArray[Any]
+        self,
+        fleet: Fleet | FramePoses,
+        arenas: ArenaBatch,
+        who: NDArray[np.bool_],
+        out: NDArray[Any],
     ) -> None:
         """Write the images (n, h, w, 3), or (n, h, w, 1) in grey, of the vehicles in `who` (n,)."""
         looks, meshes = self._looks, self._meshes.batch
@@ -177,15 +181,15 @@ def _gloss_in(gloss: GlossBatch | None, i: int, surfaces: int) -> Gloss | None:
 
 @kernel
 def _render(
-    fleet: Fleet | Seen,
+    fleet: Fleet | FramePoses,
     arenas: ArenaBatch,
     looks: LookBatch,
     gloss: GlossBatch | None,
     meshes: MeshBatch | None,
     who: NDArray[np.bool_],
     mount: Mount,
-    lens: Lens,
-    canvas: Canvas,
+    lens: LensConstants,
+    canvas: ImageBuffers,
     patterns: NDArray[np.float32],
     out: NDArray[np.uint8],
 ) -> None:

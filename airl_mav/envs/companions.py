@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.policy.observation import Earlier, InFlight, Kinematics, Rows, View
+from airl_mav.policy.observation import CameraView, Earlier, InFlight, Kinematics, Rows
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.memory import DecisionMemory
 
@@ -172,10 +172,12 @@ class Companions:
 
     def views(
         self, images: Mapping[str, NDArray[Any]], lenses: Mapping[str, Intrinsics], rows: Rows
-    ) -> dict[str, View]:
+    ) -> dict[str, CameraView]:
         """Return the views of additional cameras from their newest images (n, ...) by name."""
         return {
-            name: View(image[rows], lenses[name], tuple(each[rows] for each in self._further[name]))
+            name: CameraView(
+                image[rows], lenses[name], tuple(each[rows] for each in self._further[name])
+            )
             for name, image in images.items()
         }
 

@@ -30,9 +30,9 @@ from airl_mav.envs.fleet import (
     VELOCITY,
     YAW_RATE,
     Fleet,
-    Seen,
+    FlightStatus,
+    FramePoses,
     State,
-    Verdict,
 )
 from airl_mav.policy.actions import ALTITUDE_P, MAX_VERTICAL_M_S
 
@@ -52,7 +52,7 @@ _END: Final = 4  # the next decision begins
 _ARRIVE: Final = 5  # a setpoint of an earlier decision arrives; higher numbers are older ones
 _MOST: Final = 6  # maximum events of a decision, without earlier setpoints
 
-_FLYING: Final = int(Verdict.FLYING)
+_FLYING: Final = int(FlightStatus.FLYING)
 
 
 class FrameTimes(NamedTuple):
@@ -86,7 +86,7 @@ class Timing(NamedTuple):
     frames: FrameTimes
 
 
-class Decision(NamedTuple):
+class DecisionBatch(NamedTuple):
     """Present decision of n vehicles; rows are updated in place."""
 
     timing: Timing
@@ -102,7 +102,7 @@ class Decision(NamedTuple):
     next: NDArray[np.int64]  # (n,) index of the next event
     age: NDArray[np.int64]  # (n,) age of the next observation's frame in ticks
     pause_us: NDArray[np.int64]  # (n,) time of the next call into Python
-    seen: Seen
+    seen: FramePoses
     accepted: NDArray[np.int64]  # (n,) tick
     left: NDArray[np.int64]  # (n, k) ticks until earlier setpoints arrive, newest first; 0 = none
     in_flight: NDArray[np.float64]  # (n, k, 4) the corresponding setpoints
@@ -111,7 +111,7 @@ class Decision(NamedTuple):
     sent_us: NDArray[np.int64]  # (n,) sending time of the last setpoint; 0 = none
 
 
-def new_decision(timing: Timing, errors: NDArray[np.float64]) -> Decision:
+def new_decision(timing: Timing, errors: NDArray[np.float64]) -> DecisionBatch:
     """Return empty decisions of n vehicles with telemetry errors (n, 9)."""
     # A pipelined decision takes at least one tick.
     n, room = len(errors), max(-(-timing.link_us // TICK_US), 1)
@@ -119,8 +119,8 @@ def new_decision(timing: Timing, errors: NDArray[np.float64]) -> Decision:
     def whole(*shape: int) -> NDArray[np.int64]:
         return np.zeros((n, *shape), np.int64)
 
-    seen = Seen(whole(), *(np.zeros((n, size)) for size in (3, 4, 3, 3)))
-    return Decision(
+    seen = FramePoses(whole(), *(np.zeros((n, size)) for size in (3, 4, 3, 3)))
+    return DecisionBatch(
         timing=timing,
         errors=errors,
         began_us=whole(),
@@ -144,14 +144,14 @@ def new_decision(timing: Timing, errors: NDArray[np.float64]) -> Decision:
     )
 
 
-def begin_decision(decision: Decision, i: int) -> None:
+def begin_decision(decision: DecisionBatch, i: int) -> None:
     """Start the flight of vehicle i with no setpoints in flight."""
     decision.left[i] = 0
     decision.newest[i], decision.wanted[i], decision.sent_us[i] = 0.0, False, 0
 
 
 @large_borrowing_kernel
-def plan(decision: Decision, fleet: Fleet) -> None:
+def plan(decision: DecisionBatch, fleet: Fleet) -> None:
     """Schedule the events of all decisions from their setpoints and inference times."""
     for i in range(len(decision.t2_us)):
         decision.began_us[i] = fleet.time_us[i]
@@ -164,7 +164,7 @@ def plan(decision: Decision, fleet: Fleet) -> None:
 
 
 @borrowing_kernel
-def _add(decision: Decision, i: int, tick: int, kind: int) -> None:
+def _add(decision: DecisionBatch, i: int, tick: int, kind: int) -> None:
     """Insert an event of vehicle i after all events at the same tick or earlier."""
     at = decision.events[i]
     ticks, kinds = decision.tick[i], decision.kind[i]
@@ -176,7 +176,7 @@ def _add(decision: Decision, i: int, tick: int, kind: int) -> None:
 
 
 @borrowing_kernel
-def _plan_sequential(decision: Decision, now_us: int, i: int, t2_us: int) -> None:
+def _plan_sequential(decision: DecisionBatch, now_us: int, i: int, t2_us: int) -> None:
     timing = decision.timing
     arrives_us = t2_us + timing.link_us + later_in(timing.uplink, now_us + t2_us)
     sent, accepted = ticks_of(t2_us), ticks_of(arrives_us)
@@ -202,7 +202,7 @@ def _plan_sequential(decision: Decision, now_us: int, i: int, t2_us: int) -> Non
 
 
 @borrowing_kernel
-def _plan_pipelined(decision: Decision, now_us: int, i: int, t2_us: int) -> None:
+def _plan_pipelined(decision: DecisionBatch, now_us: int, i: int, t2_us: int) -> None:
     timing = decision.timing
     sent, accepted = ticks_of(t2_us), ticks_of(t2_us + timing.link_us)
     # Rounded up, so that the frame is decoded by then.
@@ -232,14 +232,14 @@ def _plan_pipelined(decision: Decision, now_us: int, i: int, t2_us: int) -> None
 
 
 @borrowing_kernel
-def _overdue(decision: Decision, i: int, now_us: int) -> int:
+def _overdue(decision: DecisionBatch, i: int, now_us: int) -> int:
     """Return the ticks until the companion's timeout triggers a stop; negative = in the past."""
     overdue: int = (decision.sent_us[i] - now_us) // TICK_US + decision.timing.timeout
     return overdue
 
 
 @borrowing_kernel
-def next_stretch(decision: Decision, fleet: Fleet, i: int, state: State, j: int) -> int:
+def next_stretch(decision: DecisionBatch, fleet: Fleet, i: int, state: State, j: int) -> int:
     """Execute the due events of vehicle i's decision; the vehicle is in SIMD lane j.
 
     After the end of a flight all events are due. Time and verdict of `fleet` must be up to date.
@@ -280,7 +280,9 @@ def _until_published(time_us: int) -> int:
 
 
 @borrowing_kernel
-def _carry_out(decision: Decision, fleet: Fleet, i: int, state: State, j: int, event: int) -> None:
+def _carry_out(
+    decision: DecisionBatch, fleet: Fleet, i: int, state: State, j: int, event: int
+) -> None:
     """Execute an event of vehicle i; arguments as in `next_stretch`."""
     timing = decision.timing
     kind = decision.kind[i, event]
@@ -309,7 +311,12 @@ def _carry_out(decision: Decision, fleet: Fleet, i: int, state: State, j: int, e
 
 @borrowing_kernel
 def take(
-    decision: Decision, fleet: Fleet, setpoint: NDArray[np.float64], i: int, state: State, j: int
+    decision: DecisionBatch,
+    fleet: Fleet,
+    setpoint: NDArray[np.float64],
+    i: int,
+    state: State,
+    j: int,
 ) -> None:
     """Set the setpoint (4,) of vehicle i; arguments as in `next_stretch`."""
     if decision.timing.timeout >= 0:
@@ -326,7 +333,7 @@ def take(
 
 
 @borrowing_kernel
-def expire(decision: Decision, fleet: Fleet, i: int, state: State, j: int) -> None:
+def expire(decision: DecisionBatch, fleet: Fleet, i: int, state: State, j: int) -> None:
     """Stop vehicle i; with body rates, zero the rates first. Arguments as in `next_stretch`."""
     if decision.timing.timeout >= 0:
         for axis in range(3):
@@ -341,7 +348,7 @@ def expire(decision: Decision, fleet: Fleet, i: int, state: State, j: int) -> No
 
 
 @borrowing_kernel
-def _follow(decision: Decision, fleet: Fleet, i: int, state: State, j: int) -> None:
+def _follow(decision: DecisionBatch, fleet: Fleet, i: int, state: State, j: int) -> None:
     """Apply the newest setpoint of the control mode that vehicle i follows."""
     for axis in range(4):
         fleet.setpoint[i, axis] = decision.newest[i, axis] if fleet.by_rates[i] else 0.0
@@ -349,7 +356,7 @@ def _follow(decision: Decision, fleet: Fleet, i: int, state: State, j: int) -> N
 
 
 @borrowing_kernel
-def _look(seen: Seen, now_us: int, i: int, state: State, j: int) -> None:
+def _look(seen: FramePoses, now_us: int, i: int, state: State, j: int) -> None:
     """Record the capture pose of vehicle i, in SIMD lane j."""
     seen.time_us[i] = now_us
     for axis in range(3):
@@ -361,7 +368,7 @@ def _look(seen: Seen, now_us: int, i: int, state: State, j: int) -> None:
 
 
 @borrowing_kernel
-def _keep_in_flight(decision: Decision, i: int, ended: int) -> None:
+def _keep_in_flight(decision: DecisionBatch, i: int, ended: int) -> None:
     """Keep the setpoints of vehicle i still in flight when its decision ends at a tick."""
     left, in_flight = decision.left[i], decision.in_flight[i]
     for k in range(len(left) - 1, -1, -1):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.episode_arenas import CurriculumState
-from airl_mav.envs.fleet import Flights, Verdict
+from airl_mav.envs.fleet import FlightArrays, FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.rewards import Step, costs, reward_of
 from airl_mav.envs.spec import SHIPPED_REWARDS, Costs, EnvironmentSpec, gymnasium_spec
@@ -28,8 +28,8 @@ LAST_TRAINING_SEED = 2**31
 MOST_SEED = 2**63 - 1
 """Maximum seed of an episode."""
 
-FLYING = int(Verdict.FLYING)
-"""`Verdict.FLYING` as an integer; numpy compares integers several times faster."""
+FLYING = int(FlightStatus.FLYING)
+"""`FlightStatus.FLYING` as an integer; numpy compares integers several times faster."""
 
 _FREE = Costs()
 """Default: no action costs."""
@@ -38,7 +38,7 @@ UNBOUNDED = 1e6
 """Bound in place of infinity in unbounded spaces; Gymnasium's checker warns of infinity."""
 
 
-class Decisions:
+class FleetDecisions:
     """Flights of n vehicles, decision by decision; a base of the environments."""
 
     def __init__(self, spec: EnvironmentSpec | None, knobs: Mapping[str, Any], n: int) -> None:
@@ -59,7 +59,7 @@ class Decisions:
             self.curriculum = CurriculumState(self.environment.curriculum, stages)
         self._zone: int | None = None
         """Curriculum zone requested by `reset`."""
-        self._before: Flights | None = None
+        self._before: FlightArrays | None = None
         """Flights at the present decision; None before the first reset."""
 
     @property
@@ -68,7 +68,7 @@ class Decisions:
             return self.curriculum.zone
         return self._zone
 
-    def _begin(self, slots: Sequence[int], seeds: Sequence[int]) -> Flights:
+    def _begin(self, slots: Sequence[int], seeds: Sequence[int]) -> FlightArrays:
         """Start episodes in the requested zone, else the curriculum's, else the whole arena."""
         self.navigation.begin(slots, seeds, self._present_zone)
         self._before = self.navigation.flights()
@@ -76,7 +76,7 @@ class Decisions:
 
     def _decide(
         self, actions: Any, lead: tuple[int, ...]
-    ) -> tuple[Flights, NDArray[np.float64], NDArray[np.int64]]:
+    ) -> tuple[FlightArrays, NDArray[np.float64], NDArray[np.int64]]:
         """Fly one decision of every vehicle.
 
         Args:
@@ -108,11 +108,11 @@ class Decisions:
                 reward = reward - costs(costs_of, last, step)
         if self.curriculum is not None:
             for i in np.flatnonzero(ending):
-                success = bool(now.verdict[i] == Verdict.SUCCESS)
+                success = bool(now.verdict[i] == FlightStatus.SUCCESS)
                 self.curriculum.record(int(navigation.zones[i]), success=success)
         return now, reward, ending
 
-    def _quality(self, flights: Flights) -> dict[str, NDArray[Any]]:
+    def _quality(self, flights: FlightArrays) -> dict[str, NDArray[Any]]:
         """Return `info` of every flight: its seed, zone and quality so far."""
         return {
             "seed": self.navigation.seeds.copy(),
@@ -124,10 +124,10 @@ class Decisions:
         }
 
 
-def outcome(flights: Flights, i: int) -> dict[str, Any]:
+def outcome(flights: FlightArrays, i: int) -> dict[str, Any]:
     """Return the additional entries of `info` for a flight that has ended."""
-    verdict = Verdict(int(flights.verdict[i]))
-    return {"success": verdict == Verdict.SUCCESS, "outcome": verdict.name.lower()}
+    verdict = FlightStatus(int(flights.verdict[i]))
+    return {"success": verdict == FlightStatus.SUCCESS, "outcome": verdict.name.lower()}
 
 
 def observation_space(spec: ObservationSpec) -> gym.spaces.Dict:

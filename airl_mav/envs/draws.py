@@ -17,7 +17,7 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.core.frames import Vector
 from airl_mav.core.streams import Stream, sensors_and_gusts, stream
 from airl_mav.envs.faults import gusts, lasting, twin_faults
-from airl_mav.envs.fleet import Fleet, Verdict
+from airl_mav.envs.fleet import Fleet, FlightStatus
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.faults.model import Fault
 from airl_mav.latency.injection import Injection
@@ -150,7 +150,7 @@ class Winds(DrawnAhead):
         """Draw the next block of flights at the end of their block."""
         ends_us = self.ends_us()
         if ends_us is not None:
-            due = (fleet.verdict == Verdict.FLYING) & (fleet.time_us >= ends_us)
+            due = (fleet.verdict == FlightStatus.FLYING) & (fleet.time_us >= ends_us)
             for i in np.flatnonzero(due).tolist():
                 self._draw_block(i)
 

@@ -22,15 +22,15 @@ from airl_mav.policy.scans import (
     WIDEST_RAD,
     Floats,
     Moved,
-    Rays,
     Scanning,
+    ScanRays,
     Tilt,
     goes_round,
 )
 from airl_mav.vehicle.rotation import Quat, Vec, multiply, yaw_of
 
 
-def level_scan(depth_mm: NDArray[np.uint16], rays: Rays, tilt: Tilt, bearings: int) -> Floats:
+def level_scan(depth_mm: NDArray[np.uint16], rays: ScanRays, tilt: Tilt, bearings: int) -> Floats:
     """Return the same as `policy.scans.level_scan`."""
     found = np.full((len(depth_mm), bearings), np.inf)
     _level_scan(np.ascontiguousarray(depth_mm), rays, tilt, goes_round(rays.fov_rad), found)
@@ -50,7 +50,7 @@ COMPILED_SCANNING = Scanning(level_scan, carried)
 
 @kernel
 def _level_scan(
-    depth_mm: NDArray[np.uint16], rays: Rays, tilt: Tilt, whole: bool, found: Floats
+    depth_mm: NDArray[np.uint16], rays: ScanRays, tilt: Tilt, whole: bool, found: Floats
 ) -> None:
     bearings = found.shape[1]
     share = bearings / rays.fov_rad

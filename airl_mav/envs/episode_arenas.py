@@ -27,7 +27,7 @@ WIDEST_M = 50.0
 """Maximum gap between obstacles in an arena [m]."""
 
 
-class Stage(NamedTuple):
+class CurriculumStage(NamedTuple):
     """Arena and zone of a curriculum stage."""
 
     arena: ArenaSpec
@@ -35,13 +35,13 @@ class Stage(NamedTuple):
     """Zone of the arena that bounds the goal."""
 
 
-def stages_of(settings: Curriculum | None, arena: ArenaSpec) -> list[Stage]:
+def stages_of(settings: Curriculum | None, arena: ArenaSpec) -> list[CurriculumStage]:
     """Return the stages of a curriculum, easiest first; the arena's zones without a curriculum."""
     zones = len(arena.zones_m)
     settings = settings or Curriculum()
     count = settings.stages or zones
     return [
-        Stage(
+        CurriculumStage(
             _eased(settings, arena, k / (count - 1) if count > 1 else 1.0),
             round(k * (zones - 1) / (count - 1)) if count > 1 else zones - 1,
         )
@@ -49,7 +49,7 @@ def stages_of(settings: Curriculum | None, arena: ArenaSpec) -> list[Stage]:
     ]
 
 
-def check_stage(stages: list[Stage], arena: ArenaSpec, stage: int | None) -> None:
+def check_stage(stages: list[CurriculumStage], arena: ArenaSpec, stage: int | None) -> None:
     """Raise UsageError for a stage out of range."""
     if stage is None or 0 <= stage < len(stages):
         return

@@ -142,7 +142,7 @@ def step_error(drift: Drift, errors: Array, i: int, decision: int, ticks: int) -
         errors[i, k] = kept * errors[i, k] + added * drift.normals[i, row, k]
 
 
-class Telemetry(Stateful):
+class TelemetryErrors(Stateful):
     """Telemetry of n episodes: the true state plus errors that change once per decision."""
 
     def __init__(self, n: int, table: Estimation | None, noise: float = 1.0) -> None:

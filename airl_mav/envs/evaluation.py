@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import Outcome
@@ -30,10 +30,10 @@ SLOTS = 256
 """Default number of parallel flights."""
 
 OUTCOMES = {
-    Verdict.SUCCESS: Outcome.SUCCESS,
-    Verdict.COLLISION: Outcome.COLLISION,
-    Verdict.BATTERY: Outcome.BATTERY,
-    Verdict.TIMEOUT: Outcome.TIMEOUT,
+    FlightStatus.SUCCESS: Outcome.SUCCESS,
+    FlightStatus.COLLISION: Outcome.COLLISION,
+    FlightStatus.BATTERY: Outcome.BATTERY,
+    FlightStatus.TIMEOUT: Outcome.TIMEOUT,
 }
 """Recorded outcome of each verdict of the batch twin."""
 
@@ -43,7 +43,7 @@ class EpisodeResult:
     """Result of one episode."""
 
     seed: int
-    verdict: Verdict
+    verdict: FlightStatus
     flight_time_s: float
     distance_m: float
     energy_j: float
@@ -223,14 +223,14 @@ def fly_seeds(
         navigation.fly(pilots.decide(navigation.see(), busy))
         decisions += 1
         now = navigation.flights()
-        ended = np.flatnonzero(busy & (now.verdict != Verdict.FLYING)).tolist()
+        ended = np.flatnonzero(busy & (now.verdict != FlightStatus.FLYING)).tolist()
         for i in ended:
             busy[i] = False
             yield (
                 i,
                 EpisodeResult(
                     seed=int(navigation.seeds[i]),
-                    verdict=Verdict(int(now.verdict[i])),
+                    verdict=FlightStatus(int(now.verdict[i])),
                     flight_time_s=float(now.time_s[i]),
                     distance_m=float(now.distance_m[i]),
                     energy_j=float(now.energy_j[i]),
@@ -243,10 +243,10 @@ def fly_seeds(
 
 def success_rate(flown: Sequence[EpisodeResult]) -> float:
     """Return the share of episodes that reached the goal."""
-    return sum(each.verdict == Verdict.SUCCESS for each in flown) / len(flown)
+    return sum(each.verdict == FlightStatus.SUCCESS for each in flown) / len(flown)
 
 
 def mean_of_successes(flown: Iterable[EpisodeResult], quality: str) -> float | None:
     """Return the mean of a field over the episodes that reached the goal; None without one."""
-    good = [getattr(each, quality) for each in flown if each.verdict == Verdict.SUCCESS]
+    good = [getattr(each, quality) for each in flown if each.verdict == FlightStatus.SUCCESS]
     return float(np.mean(good)) if good else None

@@ -27,7 +27,7 @@ from airl_mav.vehicle.rotation import Quat, Vec
 from airl_mav.vehicle.rotor import N_ROTORS, command_for, hover_speeds, lag
 
 
-class Verdict(IntEnum):
+class FlightStatus(IntEnum):
     """Status of a flight: flying, or the reason of its end; `flight.judge.Outcome` for arrays."""
 
     FLYING = 0
@@ -70,7 +70,7 @@ class Fleet(NamedTuple):
     airframe: NDArray[np.float64]  # (n, fields of Airframe) parameters of each vehicle
 
 
-class Seen(NamedTuple):
+class FramePoses(NamedTuple):
     """Time and pose of the newest frames of n vehicles; rows are updated in place."""
 
     time_us: NDArray[np.int64]  # (n,) in each episode
@@ -80,11 +80,11 @@ class Seen(NamedTuple):
     omega: NDArray[np.float64]  # (n, 3) FRD [rad/s]
 
 
-class Flights(NamedTuple):
+class FlightArrays(NamedTuple):
     """Status of n flights; arrays (n,)."""
 
     verdict: NDArray[np.int64]
-    """`Verdict` of each flight."""
+    """`FlightStatus` of each flight."""
     touched: NDArray[np.int64]
     """Index of the touched obstacle, or `arenas.FLOOR`, `CEILING`, `WALL`, `NOTHING`."""
     time_s: NDArray[np.float64]
@@ -109,7 +109,7 @@ class Pack(NamedTuple):
     capacity_mah: float
 
 
-class Vehicle(NamedTuple):
+class FleetConstants(NamedTuple):
     """Constants shared by all vehicles of a fleet."""
 
     airframe: Airframe
@@ -126,7 +126,7 @@ class Vehicle(NamedTuple):
 
 def vehicle_of(
     profile: VehicleProfile, parameter: Callable[[str], float], computer_w: float = 0.0
-) -> Vehicle:
+) -> FleetConstants:
     """Return the constants of a vehicle profile.
 
     Args:
@@ -135,7 +135,7 @@ def vehicle_of(
         computer_w: Power of the onboard computer from the pack [W].
     """
     b = profile.battery
-    return Vehicle(
+    return FleetConstants(
         airframe=Airframe.from_profile(profile),
         gains=Gains.from_parameters(parameter),
         power=PowerModel.from_profile(profile),
@@ -170,7 +170,7 @@ def new_fleet(n: int) -> Fleet:
         battery=np.ones(n),
         room=np.zeros(n),
         touched=np.full(n, NOTHING, np.int64),
-        verdict=np.full(n, int(Verdict.FLYING), np.int64),
+        verdict=np.full(n, int(FlightStatus.FLYING), np.int64),
         airframe=np.zeros((n, len(Airframe._fields))),
     )
 
@@ -189,7 +189,7 @@ def hover(
     fleet: Fleet,
     i: int,
     altitude_m: float,
-    vehicle: Vehicle,
+    vehicle: FleetConstants,
     airframe: Airframe | None = None,
     battery: float = 1.0,
     wind: Vec = STILL,
@@ -229,7 +229,7 @@ def hover(
     trim_against_torque(fleet.memory[i], (c0, c1, c2, c3), vehicle.gains)
     fleet.battery[i] = battery
     fleet.touched[i] = NOTHING
-    fleet.verdict[i] = Verdict.FLYING
+    fleet.verdict[i] = FlightStatus.FLYING
 
 
 LANES = 4

@@ -53,7 +53,7 @@ from airl_mav.envs.arenas import (
     relief_of,
     touches,
 )
-from airl_mav.envs.decision import Decision, FrameTimes, Timing, new_decision, next_stretch
+from airl_mav.envs.decision import DecisionBatch, FrameTimes, Timing, new_decision, next_stretch
 from airl_mav.envs.fleet import (
     AIRFRAME,
     AIRFRAME_SIZE,
@@ -86,10 +86,10 @@ from airl_mav.envs.fleet import (
     WIND,
     YAW_RATE,
     Fleet,
+    FleetConstants,
+    FlightStatus,
     Rules,
     State,
-    Vehicle,
-    Verdict,
     load,
     quat,
     unload,
@@ -119,18 +119,18 @@ NAN3: Vec = (math.nan, math.nan, math.nan)
 _NOBODY = -1
 """Marker of an empty lane."""
 
-_FLYING = int(Verdict.FLYING)
-_SUCCESS = int(Verdict.SUCCESS)
-_COLLISION = int(Verdict.COLLISION)
-_BATTERY = int(Verdict.BATTERY)
-_TIMEOUT = int(Verdict.TIMEOUT)
+_FLYING = int(FlightStatus.FLYING)
+_SUCCESS = int(FlightStatus.SUCCESS)
+_COLLISION = int(FlightStatus.COLLISION)
+_BATTERY = int(FlightStatus.BATTERY)
+_TIMEOUT = int(FlightStatus.TIMEOUT)
 
 
 def advance(
     fleet: Fleet,
     arenas: ArenaBatch,
     ticks: NDArray[np.int64],
-    vehicle: Vehicle,
+    vehicle: FleetConstants,
     rules: Rules,
     air: NDArray[np.float64] | None,
 ) -> None:
@@ -168,10 +168,10 @@ def fly(
     fleet: Fleet,
     arenas: ArenaBatch,
     todo: NDArray[np.int64],
-    vehicle: Vehicle,
+    vehicle: FleetConstants,
     rules: Rules,
     air: NDArray[np.float64],
-    decision: Decision,
+    decision: DecisionBatch,
 ) -> None:
     """Fly vehicles as in `advance`, `LANES` at a time, where `todo` is not 0; it becomes 0.
 
@@ -223,7 +223,7 @@ def fly(
 @borrowing_kernel
 def _fill(
     fleet: Fleet,
-    decision: Decision,
+    decision: DecisionBatch,
     todo: NDArray[np.int64],
     coming: NDArray[np.int64],
     odd: int,
@@ -438,7 +438,7 @@ def _publish(state: State, j: int) -> None:
 
 
 @kernel
-def _move(state: State, vehicle: Vehicle, kept: float) -> None:
+def _move(state: State, vehicle: FleetConstants, kept: float) -> None:
     """Move the body in every lane by a tick; `kept` is `felt_share` of a tick."""
     pack = vehicle.pack
     for j in range(state.shape[1]):
@@ -500,7 +500,7 @@ def _verdict(here: Vec, goal: Vec, hit: int, battery: float, time_us: int, rules
 
 @kernel
 def _contact(
-    arenas: ArenaBatch, i: int, position: Vec, time_us: int, vehicle: Vehicle
+    arenas: ArenaBatch, i: int, position: Vec, time_us: int, vehicle: FleetConstants
 ) -> tuple[float, int]:
     """Return a lower bound of vehicle i's clearance [m], and the touched object."""
     move_obstacles(arenas, i, time_us)

@@ -25,16 +25,16 @@ from airl_mav.envs.decision import Timing, begin_decision, new_decision
 from airl_mav.envs.draws import BLOCK, DelayDraws, Winds
 from airl_mav.envs.encoding import COMPILED, EncodedBody
 from airl_mav.envs.episode_arenas import EpisodeArenas
-from airl_mav.envs.estimation import Telemetry
+from airl_mav.envs.estimation import TelemetryErrors
 from airl_mav.envs.faults import delays_of, later_us, twin_faults
 from airl_mav.envs.fleet import (
     STILL,
     Fleet,
-    Flights,
+    FleetConstants,
+    FlightArrays,
+    FlightStatus,
+    FramePoses,
     Rules,
-    Seen,
-    Vehicle,
-    Verdict,
     hover,
     new_fleet,
     put_vehicle,
@@ -73,7 +73,7 @@ class WholeTruth(NamedTuple):
 
     fleet: Fleet
     arenas: ArenaBatch
-    vehicle: Vehicle
+    vehicle: FleetConstants
 
 
 class Navigation(Stateful):
@@ -164,7 +164,7 @@ class Navigation(Stateful):
         check_spread(self.vehicle, randomisation, "randomisation")
         check_conditions(sight, spec, faults)
         table = self.vehicle.estimation if randomisation.estimation else None
-        self._telemetry = Telemetry(n, table, randomisation.navigation_noise)
+        self._telemetry = TelemetryErrors(n, table, randomisation.navigation_noise)
         pipelined = spec.decisions == "pipelined"
         check_twin(faults, pipelined=pipelined)
         self._winds = Winds(n, spec.wind, faults)
@@ -177,7 +177,7 @@ class Navigation(Stateful):
         own = spec.reward not in SHIPPED_REWARDS
         self._reward = -1 if own else SHIPPED_REWARDS.index(spec.reward)
         self._world: World | None = None
-        self._status: Flights | None = None
+        self._status: FlightArrays | None = None
         self.paid = np.zeros(n)
         """(n,) rewards of the last decisions if `spec` names a built-in reward."""
         self.ending = np.zeros(n, np.int64)
@@ -333,12 +333,12 @@ class Navigation(Stateful):
         """Return the states as reported by telemetry, with the estimator's error."""
         return self._telemetry.report(self.truth(rows), rows)
 
-    def flights(self) -> Flights:
+    def flights(self) -> FlightArrays:
         """Return the status of all flights; it is never modified."""
         if self._status is None:
             numbers, whole = self._room_for_status()
             status(self.fleet, self._places.batch.goal, numbers, whole)
-            self._status = Flights(*whole[:2], *numbers[:-1])
+            self._status = FlightArrays(*whole[:2], *numbers[:-1])
         return self._status
 
     def truth(self, rows: Rows = EVERYONE) -> Kinematics:
@@ -402,7 +402,7 @@ class Navigation(Stateful):
                 if self._trace is not None:
                     self._trace.sample(self.fleet)
             resumed = True
-        self._status = Flights(*whole[:2], *numbers[:-1])
+        self._status = FlightArrays(*whole[:2], *numbers[:-1])
         self.paid, self.ending = numbers[-1], whole[2]
         if not self._renders:
             self._take_frames(np.ones(self.n, np.bool_))
@@ -436,7 +436,7 @@ class Navigation(Stateful):
             if self._decision.timing.hover_us >= 0:
                 stop_us = sent_us + self._decision.timing.hold_us + self._decision.timing.hover_us
             self._companions.decided(decision.setpoint.copy(), t2_us.copy(), sent_us, stop_us)
-            self._look_ahead(self.fleet.verdict == Verdict.FLYING)
+            self._look_ahead(self.fleet.verdict == FlightStatus.FLYING)
 
     def _draw(self) -> None:
         """Draw the next block of latencies and errors where it is due."""
@@ -449,12 +449,14 @@ class Navigation(Stateful):
         self._before_draw = int(np.minimum(-then % BLOCK, -(then + 1) % BLOCK).min())
 
     def _room_for_status(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        return np.empty((len(Flights._fields) - 1, self.n)), np.empty((3, self.n), np.int64)
+        return np.empty((len(FlightArrays._fields) - 1, self.n)), np.empty((3, self.n), np.int64)
 
-    def _moving(self) -> Seen:
+    def _moving(self) -> FramePoses:
         """Return time and motion of the vehicles."""
         fleet = self.fleet
-        return Seen(fleet.time_us, fleet.position, fleet.quaternion, fleet.velocity, fleet.omega)
+        return FramePoses(
+            fleet.time_us, fleet.position, fleet.quaternion, fleet.velocity, fleet.omega
+        )
 
     def _made_world(self) -> World:
         """Return the kernels' arguments, rebuilt after changes of arenas or meshes."""

@@ -70,7 +70,7 @@ class Map(NamedTuple):
     """Time to the goal at 1 m/s [s]."""
 
 
-class Body(NamedTuple):
+class PlannerBody(NamedTuple):
     """Vehicle parameters of the planner."""
 
     radius: float
@@ -83,7 +83,7 @@ class Body(NamedTuple):
     """Goal radius [m]."""
 
 
-def map_of(batch: ArenaBatch, i: int, body: Body) -> Map:
+def map_of(batch: ArenaBatch, i: int, body: PlannerBody) -> Map:
     """Return the map of arena i."""
     south, north, west, east = batch.bounds[i, :4]
     cell = max(FINEST_M, max(north - south, east - west) / CELLS)
@@ -100,7 +100,7 @@ def map_of(batch: ArenaBatch, i: int, body: Body) -> Map:
 
 @kernel
 def beside(
-    batch: ArenaBatch, i: int, obstacle: int, body: Body, north: float, east: float
+    batch: ArenaBatch, i: int, obstacle: int, body: PlannerBody, north: float, east: float
 ) -> float:
     """Return the horizontal distance [m] from a position at flight altitude to an obstacle."""
     half_size = batch.half_size[i, obstacle]
@@ -161,7 +161,7 @@ def _fill_high(
 def _fill_gaps(
     batch: ArenaBatch,
     i: int,
-    body: Body,
+    body: PlannerBody,
     first: tuple[float, float],
     cell: float,
     gap: NDArray[np.float64],
@@ -280,7 +280,7 @@ LATENCIES = 64
 """Number of draws for the mean latency."""
 
 
-class Timing(NamedTuple):
+class PlannerTiming(NamedTuple):
     """Timing of a decision relative to its observation [s], and the vehicle's response."""
 
     lead: float
@@ -318,12 +318,12 @@ class Planner:
         vehicle, spec = navigation.whole_truth().vehicle, navigation.spec
         top = float(np.hypot(commands[:, 0], commands[:, 1]).max())
         rules = spec.episode
-        self._body = Body(
+        self._body = PlannerBody(
             vehicle.radius, vehicle.half_height, rules.altitude_m, top, rules.goal_radius_m
         )
         lead_us = np.mean([_mean_t2_us(each, spec.delay) for each in navigation.injections])
         lead_us += spec.delay.link_ms * US_PER_MS
-        self._timing = Timing(
+        self._timing = PlannerTiming(
             float(lead_us) / US_PER_S + response.dead_time_s,
             response.dead_time_s,
             rules.hold_s,
@@ -392,7 +392,12 @@ def _follow_movers(batch: ArenaBatch, i: int, time_s: float, places: NDArray[np.
 
 @kernel
 def _to_movers(
-    batch: ArenaBatch, i: int, body: Body, north: float, east: float, places: NDArray[np.float64]
+    batch: ArenaBatch,
+    i: int,
+    body: PlannerBody,
+    north: float,
+    east: float,
+    places: NDArray[np.float64],
 ) -> float:
     """Return the distance [m] to the nearest moving obstacle at positions `places` (movers, 2).
 
@@ -416,8 +421,8 @@ def best_command(
     batch: ArenaBatch,
     i: int,
     known: Map,
-    body: Body,
-    timing: Timing,
+    body: PlannerBody,
+    timing: PlannerTiming,
     commands: NDArray[np.float64],
     last: tuple[float, float, float],
     position: tuple[float, float],

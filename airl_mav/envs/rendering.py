@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.draw import GRID_COLOUR, MOVING_COLOURS, START_COLOUR, TEXT_COLOUR, draw_arena
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.fleet import Flights, Verdict
+from airl_mav.envs.fleet import FlightArrays, FlightStatus
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.profiles.camera_kind import CameraKind
 
@@ -39,11 +39,11 @@ RENDER_MODES = ("rgb_array", "human")
 """Render modes: pictures as arrays, or in a window."""
 
 
-class Moment(NamedTuple):
+class PictureContent(NamedTuple):
     """Content of a picture."""
 
     arena: Arena
-    flights: Flights
+    flights: FlightArrays
     """Status of one vehicle: arrays (1,)."""
     position: NDArray[np.float64]
     """True position (3,) NED [m]."""
@@ -83,14 +83,14 @@ class Pictures:
         self._spec, self._kind, self._mode = spec, kind, mode
         self._renderer: EpisodeRenderer | None = None
         self._trail: list[NDArray[np.float64]] = []
-        self._now: Moment | None = None
+        self._now: PictureContent | None = None
         self._window = Window(fps) if mode == "human" else None
 
     def begin(self) -> None:
         """Start an episode."""
         self._trail.clear()
 
-    def see(self, now: Moment) -> None:
+    def see(self, now: PictureContent) -> None:
         """Store the state at a decision; a window shows it."""
         self._now = now
         self._trail.append(now.position[:2].copy())
@@ -174,7 +174,7 @@ class EpisodeRenderer:
         )
         self._background = None
 
-    def draw(self, now: Moment, trail: Sequence[NDArray[np.float64]]) -> NDArray[np.uint8]:
+    def draw(self, now: PictureContent, trail: Sequence[NDArray[np.float64]]) -> NDArray[np.uint8]:
         """Return the picture of a state; `trail` is the path so far, north, east [m]."""
         arena = now.arena
         if arena is not self._arena:
@@ -190,7 +190,7 @@ class EpisodeRenderer:
         self._figure.draw_artist(self._text)
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _update(self, moment: Moment, trail: NDArray[np.float64]) -> None:
+    def _update(self, moment: PictureContent, trail: NDArray[np.float64]) -> None:
         arena, now, position = moment.arena, moment.flights, moment.position
         centers = arena.centers_at(moment.scene_us)[arena.n_static :, 1::-1]
         self._moving.set_verts(
@@ -200,7 +200,7 @@ class EpisodeRenderer:
         self._vehicle.set_xy(_arrow(moment.yaw) + position[1::-1])
         self._image.set_data(moment.image)
         self._text.set_text(
-            f"time   {now.time_s[0]:7.2f} s     {Verdict(int(now.verdict[0])).name.lower()}\n"
+            f"time   {now.time_s[0]:7.2f} s     {FlightStatus(int(now.verdict[0])).name.lower()}\n"
             f"goal   {now.goal_distance_m[0]:7.2f} m\n"
             f"speed  {now.speed_m_s[0]:7.2f} m/s\n"
             f"height {-position[2]:7.2f} m\n"

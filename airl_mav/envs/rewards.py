@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from airl_mav.core import plugins
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.kernels import kernel
-from airl_mav.envs.fleet import Flights, Verdict
+from airl_mav.envs.fleet import FlightArrays, FlightStatus
 from airl_mav.envs.spec import SHIPPED_REWARDS, Costs
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S
 from airl_mav.policy.actions import BodyRates
@@ -53,17 +53,17 @@ PAPER_BONUS = 1000.0
 J_PER_KJ = 1000.0
 
 _SHAPED, _TIMED, _PROGRESS, _PACED, _, _PAPER = range(len(SHIPPED_REWARDS))
-_SUCCESS, _COLLISION = int(Verdict.SUCCESS), int(Verdict.COLLISION)
-_BATTERY = int(Verdict.BATTERY)
+_SUCCESS, _COLLISION = int(FlightStatus.SUCCESS), int(FlightStatus.COLLISION)
+_BATTERY = int(FlightStatus.BATTERY)
 
 
 @dataclass(frozen=True)
 class Step:
     """Decision of n vehicles as executed; the input of a reward."""
 
-    before: Flights
+    before: FlightArrays
     """Status at the start of the decision."""
-    now: Flights
+    now: FlightArrays
     """Status at the end of the decision."""
     commands: NDArray[np.float64]
     """(n, 3) forward and right [m/s] in the heading frame, yaw rate [rad/s]; for body rate actions
@@ -74,14 +74,16 @@ class Step:
     @property
     def success(self) -> NDArray[np.bool_]:
         """(n,) True if the goal is reached."""
-        reached: NDArray[np.bool_] = self.now.verdict == Verdict.SUCCESS
+        reached: NDArray[np.bool_] = self.now.verdict == FlightStatus.SUCCESS
         return reached
 
     @property
     def failure(self) -> NDArray[np.bool_]:
         """(n,) True for a collision or an empty battery; False for a timeout."""
         verdict = self.now.verdict
-        failed: NDArray[np.bool_] = (verdict == Verdict.COLLISION) | (verdict == Verdict.BATTERY)
+        failed: NDArray[np.bool_] = (verdict == FlightStatus.COLLISION) | (
+            verdict == FlightStatus.BATTERY
+        )
         return failed
 
     @property

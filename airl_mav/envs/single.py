@@ -12,7 +12,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import quat_yaw
 from airl_mav.envs.decisions import (
     FLYING,
-    Decisions,
+    FleetDecisions,
     action_space,
     draw_seeds,
     episode_seed,
@@ -20,15 +20,15 @@ from airl_mav.envs.decisions import (
     outcome,
     zone_option,
 )
-from airl_mav.envs.fleet import Flights
-from airl_mav.envs.rendering import RENDER_MODES, Moment, Pictures
+from airl_mav.envs.fleet import FlightArrays
+from airl_mav.envs.rendering import RENDER_MODES, PictureContent, Pictures
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.world import GOES_ON, TERMINATED, TRUNCATED
 from airl_mav.policy.layouts import newest_frame
 from airl_mav.policy.observation_spec import Encoded
 
 
-class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
+class NavigationEnv(FleetDecisions, gym.Env[Encoded, Any]):
     """Environment of one vehicle that flies to its goal; a step is a decision and its hold.
 
     Observation: a Dict of `velocity`, `goal` and the image under the key `depth`, `rgb` or `grey`,
@@ -114,11 +114,11 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
             self._pictures.see(self._moment(seen))
         return seen
 
-    def _moment(self, seen: Encoded) -> Moment:
+    def _moment(self, seen: Encoded) -> PictureContent:
         navigation = self.navigation
         arena, flights, truth = navigation.arenas[0], navigation.flights(), navigation.truth()
         assert arena is not None  # noqa: S101 (an episode has begun)
-        return Moment(
+        return PictureContent(
             arena,
             flights,
             truth.position[0],
@@ -127,5 +127,5 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
             newest_frame(navigation.observation, seen),
         )
 
-    def _info(self, now: Flights) -> dict[str, Any]:
+    def _info(self, now: FlightArrays) -> dict[str, Any]:
         return {key: value.item() for key, value in self._quality(now).items()}

@@ -22,7 +22,15 @@ from airl_mav.core.fields import ProfileModel, validated
 from airl_mav.core.files import read_json, write_json
 from airl_mav.core.kernels import cache_folder
 from airl_mav.envs.arenas import ArenaBatch, empty_batch
-from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict, hover, new_fleet, vehicle_of
+from airl_mav.envs.fleet import (
+    Fleet,
+    FleetConstants,
+    FlightStatus,
+    Rules,
+    hover,
+    new_fleet,
+    vehicle_of,
+)
 from airl_mav.envs.flight import advance
 from airl_mav.envs.spec import Delay, EnvironmentSpec
 from airl_mav.latency.injection import Injection, choose_injection
@@ -169,7 +177,7 @@ def measure_braking(vehicle: VehicleProfile) -> Braking:
     )
 
 
-def twin_of(vehicle: VehicleProfile) -> Vehicle:
+def twin_of(vehicle: VehicleProfile) -> FleetConstants:
     """Return the batch twin's constants of a vehicle, with the vehicle's parameters."""
     return vehicle_of(vehicle, flown_values(vehicle.autopilot_parameters()).__getitem__)
 
@@ -183,7 +191,7 @@ def open_space(n: int, obstacles: int = 0) -> ArenaBatch:
     return batch
 
 
-def run_ups(vehicle: Vehicle, speeds: ArrayLike, moments_s: Sequence[float]) -> Fleet:
+def run_ups(vehicle: FleetConstants, speeds: ArrayLike, moments_s: Sequence[float]) -> Fleet:
     """Return vehicles during their acceleration north from hover, at several setpoint speeds.
 
     Args:
@@ -209,7 +217,7 @@ def run_ups(vehicle: Vehicle, speeds: ArrayLike, moments_s: Sequence[float]) -> 
     return Fleet._make(np.concatenate(arrays) for arrays in zip(*taken, strict=True))
 
 
-def stop(fleet: Fleet, arenas: ArenaBatch, vehicle: Vehicle) -> None:
+def stop(fleet: Fleet, arenas: ArenaBatch, vehicle: FleetConstants) -> None:
     """Set all setpoints to zero velocity and fly until no vehicle moves north.
 
     A vehicle remains at its turning point, or at its point of contact.
@@ -359,7 +367,7 @@ def fly_into(
     # A setpoint takes effect at the flight controller's next tick.
     advance(fleet, walls, -(-reaction_us // TICK_US), shared, RULES, None)
     stop(fleet, walls, shared)
-    touched: NDArray[np.bool_] = fleet.verdict == Verdict.COLLISION
+    touched: NDArray[np.bool_] = fleet.verdict == FlightStatus.COLLISION
     return touched
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S, CommandKind
-from airl_mav.envs.fleet import Fleet, Verdict
+from airl_mav.envs.fleet import Fleet, FlightStatus
 from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
 from airl_mav.latency.stamps import NO_STAMP, SETPOINTS
 
@@ -85,7 +85,7 @@ class Trace:
     def sample(self, fleet: Fleet) -> None:
         """Sample the flights that are at a sampling time, or at their end."""
         # The final state is always recorded, as in `TrajectoryRecorder`.
-        due = (fleet.time_us % SAMPLE_US == 0) | (fleet.verdict != Verdict.FLYING)
+        due = (fleet.time_us % SAMPLE_US == 0) | (fleet.verdict != FlightStatus.FLYING)
         self._take(fleet, np.flatnonzero(due & (fleet.time_us > self._sampled_us)))
 
     def _take(self, fleet: Fleet, who: NDArray[np.int64]) -> None:
@@ -100,7 +100,7 @@ class Trace:
 
     def deciding(self, fleet: Fleet, seen_us: NDArray[np.int64]) -> None:
         """Start a decision of every active flight, on a frame captured at `seen_us` (n,)."""
-        self._deciding = np.flatnonzero(fleet.verdict == Verdict.FLYING)
+        self._deciding = np.flatnonzero(fleet.verdict == FlightStatus.FLYING)
         self._started_us, self.seen_us = fleet.time_us.copy(), seen_us.copy()
 
     def decided(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.decisions import (
     FLYING,
-    Decisions,
+    FleetDecisions,
     action_space,
     draw_seeds,
     episode_seed,
@@ -23,7 +23,7 @@ from airl_mav.envs.decisions import (
     outcome,
     zone_option,
 )
-from airl_mav.envs.fleet import Flights, Verdict
+from airl_mav.envs.fleet import FlightArrays, FlightStatus
 from airl_mav.envs.saved_state import (
     State,
     Stateful,
@@ -42,7 +42,7 @@ AHEAD = 32
 """Number of arenas generated ahead at a time."""
 
 
-class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
+class NavigationVectorEnv(FleetDecisions, Stateful, VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
     """N flights; by default they reset in the step in which they end (Gymnasium's SAME_STEP).
 
     `info` has the format of Gymnasium's SyncVectorEnv with n `NavigationEnv`: `seed`, `zone`,
@@ -204,7 +204,9 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
             self.navigation.prepare([*seeds, *following], zone)
         return seeds
 
-    def _final(self, seen: Encoded, flights: Flights, ended: NDArray[np.bool_]) -> dict[str, Any]:
+    def _final(
+        self, seen: Encoded, flights: FlightArrays, ended: NDArray[np.bool_]
+    ) -> dict[str, Any]:
         """Return `final_obs` and `final_info` of the episodes that ended, and their masks."""
         info = self._quality(flights) | _outcomes(flights, ended)
         observation = np.full(self.num_envs, None, dtype=object)
@@ -257,12 +259,12 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
             raise UsageError(f"state: of an environment with another {', '.join(changed)}")
 
 
-def _outcomes(flights: Flights, ended: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+def _outcomes(flights: FlightArrays, ended: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
     """Return the additional entries of `info` for flights that have ended."""
     outcomes = np.full(len(ended), None, dtype=object)
     for i in np.flatnonzero(ended).tolist():
         outcomes[i] = outcome(flights, i)["outcome"]
-    return {"success": flights.verdict == Verdict.SUCCESS, "outcome": outcomes}
+    return {"success": flights.verdict == FlightStatus.SUCCESS, "outcome": outcomes}
 
 
 def _masked(

@@ -18,11 +18,11 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.envs.arenas import ArenaBatch
 from airl_mav.envs.cameras import Eye, render_images
-from airl_mav.envs.decision import Decision, plan
+from airl_mav.envs.decision import DecisionBatch, plan
 from airl_mav.envs.draws import BLOCK
 from airl_mav.envs.encoding import EncodedBody, encode_body
 from airl_mav.envs.estimation import Drift, step_error
-from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict
+from airl_mav.envs.fleet import Fleet, FleetConstants, FlightStatus, Rules
 from airl_mav.envs.flight import fly
 from airl_mav.envs.rewards import pay
 from airl_mav.policy.images import Bytes
@@ -30,7 +30,7 @@ from airl_mav.policy.images import Bytes
 GOES_ON, TERMINATED, TRUNCATED = 0, 1, 2
 """End of flight in a decision; GOES_ON also for flights that had ended before."""
 
-_FLYING, _TIMEOUT = int(Verdict.FLYING), int(Verdict.TIMEOUT)
+_FLYING, _TIMEOUT = int(FlightStatus.FLYING), int(FlightStatus.TIMEOUT)
 
 
 @structref.register
@@ -43,9 +43,9 @@ class World(structref.StructRefProxy):  # type: ignore[misc]
 
     fleet: Fleet
     arenas: ArenaBatch
-    vehicle: Vehicle
+    vehicle: FleetConstants
     rules: Rules
-    decision: Decision
+    decision: DecisionBatch
     t2_us: NDArray[np.int64]
     """(n, BLOCK) `DelayDraws.block`."""
     extra_us: NDArray[np.int64]
@@ -118,7 +118,7 @@ def decide(
 
 @borrowing_kernel
 def _begin(
-    decision: Decision,
+    decision: DecisionBatch,
     fleet: Fleet,
     goal: NDArray[np.float64],
     commands: NDArray[np.float64],
@@ -142,7 +142,7 @@ def _begin(
 
 @borrowing_kernel
 def _end(
-    decision: Decision,
+    decision: DecisionBatch,
     fleet: Fleet,
     drift: Drift | None,
     number: NDArray[np.int64],
@@ -170,7 +170,7 @@ def _encode(world: World, eye: Eye | None, encoding: Bytes | None, seen: Encoded
 
 @borrowing_kernel
 def _judge(
-    decision: Decision,
+    decision: DecisionBatch,
     commands: NDArray[np.float64],
     numbers: NDArray[np.float64],
     whole: NDArray[np.int64],

@@ -27,8 +27,8 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint
-from firmware_sim.autopilot.commander import Phase as Commander
-from firmware_sim.autopilot.navigation.plan import Frame, Kind, NavCommand, PlanItem
+from firmware_sim.autopilot.commander import FlightPhase as Commander
+from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand, PlanFrame, PlanItem
 from firmware_sim.crash_detector import TOUCHDOWN_M_S
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
@@ -167,7 +167,7 @@ class _Flight:
         place = local_to_geodetic(np.array([FENCE_M, 0.0, 0.0]), origin)
         return PlanItem(
             NavCommand.WAYPOINT,
-            Frame.GLOBAL_RELATIVE_ALT_INT,
+            PlanFrame.GLOBAL_RELATIVE_ALT_INT,
             (0.0, 0.0, 0.0, math.nan),
             place.latitude_deg,
             place.longitude_deg,
@@ -194,7 +194,7 @@ class _Flight:
         north = Mode.MISSION if self._told[1] == "mission" else Mode.OFFBOARD
         if autopilot.flight.mode is Mode.HOLD:
             if north is Mode.MISSION:
-                autopilot.plans.store(Kind.MISSION, (self._waypoint(),), 1, 0)
+                autopilot.plans.store(MissionType.MISSION, (self._waypoint(),), 1, 0)
             else:
                 self._streams = True
                 self._offer()
@@ -242,7 +242,7 @@ ANY: frozenset[End] = frozenset({"not armed", "landed", "crashed"})
 
 
 @dataclass(frozen=True)
-class Cell:
+class MatrixCell:
     """All flights with one fault in one phase."""
 
     fault: str
@@ -275,9 +275,9 @@ def fly_matrix(
     seeds: Sequence[int] = (1,),
     *,
     workers: int = 1,
-    known: Sequence[Cell] = (),
-    flown: Callable[[Cell], None] = lambda _: None,
-) -> list[Cell]:
+    known: Sequence[MatrixCell] = (),
+    flown: Callable[[MatrixCell], None] = lambda _: None,
+) -> list[MatrixCell]:
     """Fly every fault in every phase, except for `known` cells with equal seeds; deterministic."""
     kept = {
         (cell.fault, cell.phase): cell
@@ -285,7 +285,7 @@ def fly_matrix(
         if [flight.seed for flight in cell.flights] == list(seeds)
     }
     jobs = [(fault, phase) for fault in faults for phase in phases]
-    cells: list[Cell] = []
+    cells: list[MatrixCell] = []
     for cell in _flown_cells(vehicle, jobs, tuple(seeds), kept, workers):
         cells.append(cell)
         flown(cell)
@@ -296,9 +296,9 @@ def _flown_cells(
     vehicle: VehicleProfile,
     jobs: Sequence[tuple[str, Phase]],
     seeds: Sequence[int],
-    kept: Mapping[tuple[str, Phase], Cell],
+    kept: Mapping[tuple[str, Phase], MatrixCell],
     workers: int,
-) -> Iterator[Cell]:
+) -> Iterator[MatrixCell]:
     """Yield the cells of the jobs, in the order of the jobs."""
     if workers == 1:
         for job in jobs:
@@ -314,12 +314,14 @@ def _flown_cells(
             yield kept.get(job) or waiting[job].result()
 
 
-def _fly_cell(vehicle: VehicleProfile, fault: str, phase: Phase, seeds: Sequence[int]) -> Cell:
+def _fly_cell(
+    vehicle: VehicleProfile, fault: str, phase: Phase, seeds: Sequence[int]
+) -> MatrixCell:
     flights = tuple(fly_fault(vehicle, fault, phase, seed) for seed in seeds)
-    return Cell(fault, phase, flights)
+    return MatrixCell(fault, phase, flights)
 
 
-def markdown(cells: Sequence[Cell]) -> str:
+def markdown(cells: Sequence[MatrixCell]) -> str:
     """Return the matrix as a table with a row per fault; `!` marks undocumented ends."""
     phases = list(dict.fromkeys(cell.phase for cell in cells))
     by_key = {(cell.fault, cell.phase): cell for cell in cells}
@@ -330,7 +332,7 @@ def markdown(cells: Sequence[Cell]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def cell_text(cell: Cell) -> str:
+def cell_text(cell: MatrixCell) -> str:
     """Return the ends of a cell's flights: "19 landed (0.8 m/s), 1 crashed !"."""
     parts = []
     for end, count in cell.ends.items():
@@ -347,13 +349,13 @@ class Matrix(NamedTuple):
     """Software and machine of the flights (`core.provenance`)."""
     vehicle: str
     """SHA-256 of the vehicle profile."""
-    cells: tuple[Cell, ...]
+    cells: tuple[MatrixCell, ...]
 
 
 _FLIGHTS = TypeAdapter(tuple[FaultFlight, ...])
 
 
-def with_cells(matrix: Matrix, cells: Sequence[Cell]) -> Matrix:
+def with_cells(matrix: Matrix, cells: Sequence[MatrixCell]) -> Matrix:
     """Return a matrix with its cells of equal fault and phase replaced by these cells."""
     new = {(cell.fault, cell.phase) for cell in cells}
     kept = (cell for cell in matrix.cells if (cell.fault, cell.phase) not in new)
@@ -385,7 +387,7 @@ def load(path: Path) -> Matrix:
     cells: dict[tuple[str, Phase], list[FaultFlight]] = {}
     for flight in flights:
         cells.setdefault((flight.fault, flight.phase), []).append(flight)
-    return Matrix(made, vehicle, tuple(Cell(*key, tuple(of)) for key, of in cells.items()))
+    return Matrix(made, vehicle, tuple(MatrixCell(*key, tuple(of)) for key, of in cells.items()))
 
 
 def resumed(path: Path, made: Mapping[str, Any], vehicle: str) -> Matrix:

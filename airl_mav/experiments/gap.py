@@ -49,7 +49,7 @@ COMPENSATION_TITLES = {
 
 
 @dataclass(frozen=True)
-class Conditions:
+class ComputerConditions:
     """Computer and its latency."""
 
     name: str
@@ -219,26 +219,28 @@ def _mitigated(name: str, *, trust: bool = False) -> PolicyInfo | None:
         ) from None
 
 
-def _target(scenario: Scenario) -> Conditions:
+def _target(scenario: Scenario) -> ComputerConditions:
     """Return the onboard computer with its latency."""
     if scenario.latency is None:
         workload = DEFAULT_WORKLOAD if scenario.workload is None else scenario.workload
-        return Conditions(Path(scenario.computer).stem, scenario.computer, workload)
+        return ComputerConditions(Path(scenario.computer).stem, scenario.computer, workload)
     if scenario.workload is not None:
         raise FieldError("latency", scenario.latency, "without a workload")
-    return Conditions(scenario.latency, scenario.computer, None, scenario.latency)
+    return ComputerConditions(scenario.latency, scenario.computer, None, scenario.latency)
 
 
-def _reference(computer: str, workload: str | None, target: Conditions) -> Conditions:
+def _reference(
+    computer: str, workload: str | None, target: ComputerConditions
+) -> ComputerConditions:
     """Return the reference computer with its workload."""
     if workload is None and target.workload in load_computer(computer).workloads:
         workload = target.workload
-    return Conditions(Path(computer).stem, computer, workload)
+    return ComputerConditions(Path(computer).stem, computer, workload)
 
 
 def _training(
-    mitigated: PolicyInfo | None, target: Conditions
-) -> tuple[tuple[Conditions, ...], tuple[str, ...]]:
+    mitigated: PolicyInfo | None, target: ComputerConditions
+) -> tuple[tuple[ComputerConditions, ...], tuple[str, ...]]:
     """Return a policy's training conditions per latency source, and remarks."""
     if mitigated is None:
         return (), ()
@@ -263,8 +265,8 @@ def _training(
     elif found.workload in load_computer(found.computer).workloads:
         sources = (f"{found.computer}/{found.workload}",)
     else:  # An estimate needs the policy and the computer.
-        return (Conditions("training", found.computer, found.workload),), remarks
-    return tuple(Conditions(s, target.computer, None, s) for s in sources), remarks
+        return (ComputerConditions("training", found.computer, found.workload),), remarks
+    return tuple(ComputerConditions(s, target.computer, None, s) for s in sources), remarks
 
 
 def training_environment(card: PolicyCard) -> Mapping[str, Any] | None:

@@ -19,7 +19,7 @@ from airl_mav.envs.evaluation import (
     fly_seeds,
 )
 from airl_mav.envs.faults import acted
-from airl_mav.envs.fleet import Flights
+from airl_mav.envs.fleet import FlightArrays
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.envs.trace import Trace
@@ -215,7 +215,9 @@ def pilots_of(scenario: ResolvedScenario) -> Pilots:
     return SinglePilots(lambda: scenario.fresh_policy(seed), pilot.max_speed_m_s, pilot.commands)
 
 
-def _reason(outcome: Outcome, flights: Flights, slot: int, arena: Arena, limit_s: float) -> str:
+def _reason(
+    outcome: Outcome, flights: FlightArrays, slot: int, arena: Arena, limit_s: float
+) -> str:
     """Return the reason for a flight's end, in the referee's words."""
     if outcome is Outcome.COLLISION:
         return f"hit {_name(arena, int(flights.touched[slot]))}"

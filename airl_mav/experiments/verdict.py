@@ -18,7 +18,7 @@ from airl_mav.experiments.fly import fly_scenario, workers_of
 from airl_mav.experiments.gap import NOT_MITIGATED, declare_gap
 from airl_mav.experiments.live import Ended, FlownRun
 from airl_mav.flight.requirements import Requirement
-from airl_mav.flight.sequential import LOOKS, Decision
+from airl_mav.flight.sequential import LOOKS, RequirementDecision
 from airl_mav.flight.statistics import reached_goals
 from airl_mav.rehearsal.run_folder import RUN_FILE, check_folder, load_info
 from airl_mav.report.comparison.model import Comparison, comparison_file
@@ -75,7 +75,9 @@ def seek_verdict(
             if flown.ended != "complete":
                 return SoughtVerdict(out, flown.ended)
             reached = reached_goals(flown.episodes)
-            decided = all(test.decide(reached) is not Decision.UNDECIDED for test in tests)
+            decided = all(
+                test.decide(reached) is not RequirementDecision.UNDECIDED for test in tests
+            )
             # Flights that remain invalid prevent a verdict; further flights do not help.
             if decided or len(reached) < n:
                 break

@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 
 from airl_mav.core.errors import FieldError
 from airl_mav.flight.paired import PairedComparison
-from airl_mav.flight.sequential import Decision, RateTest
+from airl_mav.flight.sequential import RateTest, RequirementDecision
 from airl_mav.flight.statistics import Aggregate, Estimate, wilson
 
 MOST_FLIGHTS = 1_000_000
@@ -103,7 +103,7 @@ class Finding:
     """Requirement with its decision."""
 
     requirement: Requirement
-    decision: Decision
+    decision: RequirementDecision
     estimate: Estimate
     """Figure in the requirement's unit."""
     more_flights: int | None = None
@@ -118,7 +118,7 @@ class Finding:
         if estimate.low is not None and estimate.high is not None:
             seen += f" [{estimate.low:.1f}, {estimate.high:.1f}]"
         line = f"{self.decision.value}: {self.requirement} ({seen}, n = {estimate.n:,}"
-        if self.decision is Decision.UNDECIDED:
+        if self.decision is RequirementDecision.UNDECIDED:
             line += (
                 f"; about {self.more_flights:,} more flights would tell"
                 if self.more_flights is not None
@@ -161,7 +161,7 @@ def find(requirement: Requirement, quality: Aggregate, against: PairedComparison
         estimate = getattr(quality, measure.attribute).scaled(1.0 / measure.per_unit)
     decision = decide(requirement, estimate)
     more = None
-    if decision is Decision.UNDECIDED:
+    if decision is RequirementDecision.UNDECIDED:
         rate = requirement.measure == "success" and not requirement.gap
         more = _more_flights(requirement, estimate, wilson_percent if rate else None)
     return Finding(requirement, decision, estimate, more)
@@ -177,20 +177,20 @@ def settle(finding: Finding, reached: Sequence[bool]) -> Finding:
         return finding
     test, n = finding.requirement.test(), len(reached)
     decision, more = test.decide(reached), None
-    if decision is Decision.UNDECIDED and n:
+    if decision is RequirementDecision.UNDECIDED and n:
         needed = test.flights_needed(sum(reached) / n, n)
         more = None if needed is None else needed - n
     return replace(finding, decision=decision, more_flights=more)
 
 
-def decide(requirement: Requirement, estimate: Estimate) -> Decision:
+def decide(requirement: Requirement, estimate: Estimate) -> RequirementDecision:
     """Return the decision of an estimate in the requirement's unit."""
     if estimate.low is None or estimate.high is None:
-        return Decision.UNDECIDED
+        return RequirementDecision.UNDECIDED
     kept = {requirement.fulfilled_by(end) for end in (estimate.low, estimate.high)}
     if len(kept) == 2:
-        return Decision.UNDECIDED
-    return Decision.MET if kept == {True} else Decision.NOT_MET
+        return RequirementDecision.UNDECIDED
+    return RequirementDecision.MET if kept == {True} else RequirementDecision.NOT_MET
 
 
 def wilson_percent(rate: float, n: int) -> Estimate:
@@ -218,7 +218,7 @@ def _more_flights(
         needed = math.ceil(estimate.n * (half / away) ** 2)
         return needed - estimate.n if needed <= MOST_FLIGHTS else None
     n = max(1, estimate.n)
-    while decide(requirement, project(value, n)) is Decision.UNDECIDED:
+    while decide(requirement, project(value, n)) is RequirementDecision.UNDECIDED:
         n = math.ceil(1.02 * n) + 1
         if n > MOST_FLIGHTS:
             return None

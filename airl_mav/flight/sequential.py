@@ -33,7 +33,7 @@ HALF_SPENT = 100
 `benchmarks/bench_verdict.py` compares the flights needed with this and other spending functions."""
 
 
-class Decision(str, Enum):
+class RequirementDecision(str, Enum):
     """Decision on a requirement."""
 
     MET = "meets"
@@ -51,7 +51,7 @@ def error_spent(flights: int) -> float:
 
 
 @dataclass(frozen=True)
-class Look:
+class InterimAnalysis:
     """Decision bounds after a number of flights."""
 
     flights: int
@@ -60,18 +60,20 @@ class Look:
     many: int
     """Minimum number of failures for "does not meet"."""
 
-    def decide(self, failures: int) -> Decision:
+    def decide(self, failures: int) -> RequirementDecision:
         """Return the decision for a number of failures."""
         if failures <= self.few:
-            return Decision.MET
-        return Decision.NOT_MET if failures >= self.many else Decision.UNDECIDED
+            return RequirementDecision.MET
+        return (
+            RequirementDecision.NOT_MET if failures >= self.many else RequirementDecision.UNDECIDED
+        )
 
 
 def plan_looks(
     threshold: float,
     looks: Sequence[int] = LOOKS,
     spent: Callable[[int], float] = error_spent,
-) -> Iterator[Look]:
+) -> Iterator[InterimAnalysis]:
     """Yield the looks of a test in order.
 
     Both errors are at their maximum at the threshold. There, the distribution of failures among
@@ -92,12 +94,12 @@ def plan_looks(
         error_few += float(undecided[:n_few].sum())
         error_many += float(undecided[kept:].sum())
         # The minimum possible count of failures is 0, or one more than decided before.
-        yield Look(flights, fewest + n_few - 1, fewest + kept)
+        yield InterimAnalysis(flights, fewest + n_few - 1, fewest + kept)
         undecided, fewest = undecided[n_few:kept], fewest + n_few
 
 
 @cache
-def _planned(threshold: float, looks: int) -> tuple[Look, ...]:
+def _planned(threshold: float, looks: int) -> tuple[InterimAnalysis, ...]:
     return tuple(plan_looks(threshold, LOOKS[:looks]))
 
 
@@ -113,19 +115,19 @@ class RateTest:
         if not 0.0 < self.threshold < 1.0:
             raise ValueError(f"threshold={self.threshold}: must be > 0 and < 1")
 
-    def decide(self, reached: Sequence[bool]) -> Decision:
+    def decide(self, reached: Sequence[bool]) -> RequirementDecision:
         """Return the decision of the first deciding look; later flights do not change it."""
         done = sum(look <= len(reached) for look in LOOKS)
         for look in _planned(self.threshold, done):
             decision = look.decide(look.flights - sum(reached[: look.flights]))
-            if decision is not Decision.UNDECIDED:
+            if decision is not RequirementDecision.UNDECIDED:
                 return decision
-        return Decision.UNDECIDED
+        return RequirementDecision.UNDECIDED
 
     def flights_needed(self, rate: float, flown: int = 0) -> int | None:
         """Return the number of flights at which a rate would decide; None: not within `LOOKS`."""
         for look in plan_looks(self.threshold):
             failures = round((1.0 - rate) * look.flights)
-            if look.flights > flown and look.decide(failures) is not Decision.UNDECIDED:
+            if look.flights > flown and look.decide(failures) is not RequirementDecision.UNDECIDED:
                 return look.flights
         return None

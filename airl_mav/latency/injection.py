@@ -10,7 +10,7 @@ import numpy as np
 
 from airl_mav.core.errors import UsageError
 from airl_mav.latency.samplers import LatencySampler, build_sampler
-from airl_mav.profiles.computer import ComputerProfile, Latency, Workload
+from airl_mav.profiles.computer import ComputerProfile, LatencyDistribution, Workload
 
 Origin = Literal["measured", "injected", "estimated"]
 
@@ -28,7 +28,7 @@ class Injection:
     """Description in one line."""
     source: str = ""
     assumed: str = ""
-    latency: Latency | None = None
+    latency: LatencyDistribution | None = None
     """Distribution to draw from; None injects nothing."""
 
     def sampler(self, rng: np.random.Generator) -> LatencySampler | None:
@@ -97,7 +97,7 @@ def _estimate(computer: ComputerProfile, macs: int | None) -> Injection:
     return Injection("estimated", label, work.source, assumed, latency)
 
 
-def _scaled(work: Workload, factor: float) -> Latency:
+def _scaled(work: Workload, factor: float) -> LatencyDistribution:
     """Return a workload's latency with every time multiplied by `factor`."""
     latency = work.latency
     return latency.model_copy(
@@ -112,7 +112,7 @@ def _scaled(work: Workload, factor: float) -> Latency:
     )
 
 
-def moments(latency: Latency) -> str:
+def moments(latency: LatencyDistribution) -> str:
     """Return mean and standard deviation of a latency as text."""
     if latency.samples_ms is not None:
         samples = np.array(latency.samples_ms)

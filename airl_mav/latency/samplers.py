@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from airl_mav.core.constants import US_PER_MS
-from airl_mav.profiles.computer import Latency
+from airl_mav.profiles.computer import LatencyDistribution
 
 LATENCY_STREAM = 2
 """Second word of the seed of latencies with another `draw`."""
@@ -103,7 +103,7 @@ def latency_generator(seed: int, draw: int = 0) -> np.random.Generator:
     return np.random.default_rng((seed, LATENCY_STREAM, draw) if draw else seed)
 
 
-def build_sampler(latency: Latency, rng: np.random.Generator) -> LatencySampler:
+def build_sampler(latency: LatencyDistribution, rng: np.random.Generator) -> LatencySampler:
     """Build the sampler of a latency whose sample file `load_computer` has read."""
     if latency.distribution == "samples":
         if latency.samples_ms is None:

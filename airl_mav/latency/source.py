@@ -18,7 +18,7 @@ from airl_mav.latency.samplers import lognormal_parameters
 from airl_mav.profiles.computer import (
     LONGEST_MS,
     ComputerProfile,
-    Latency,
+    LatencyDistribution,
     load_computer,
     read_samples,
 )
@@ -57,7 +57,7 @@ def parse_latency(text: str, option: str = "--latency") -> Injection:
     """Return the latency of a text source; a UsageError names the option."""
     path = Path(text)
     if path.is_file():
-        latency = Latency(distribution="samples", samples_ms=read_samples(path, option))
+        latency = LatencyDistribution(distribution="samples", samples_ms=read_samples(path, option))
         label = f"replayed from {path.name} ({moments(latency)})"
         return Injection("injected", label, f"{path}", latency=latency)
     kind, colon, values = text.partition(":")
@@ -72,7 +72,7 @@ def parse_latency(text: str, option: str = "--latency") -> Injection:
     raise UsageError(f"{option} {text}: accepted: {ACCEPTED}")
 
 
-def longest_ms(latency: Latency) -> float:
+def longest_ms(latency: LatencyDistribution) -> float:
     """Return the maximum latency [ms], for an unbounded distribution the 99.9 % quantile."""
     if latency.samples_ms is not None:
         return max(latency.samples_ms)
@@ -94,8 +94,8 @@ def _parametric(kind: str, values: str, text: str, option: str) -> Injection:
     return Injection("injected", f"{kind}, {moments(latency)}", latency=latency)
 
 
-def _latency(fields: dict[str, object], text: str, option: str) -> Latency:
-    return validated(Latency, fields, f"{option} {text}")
+def _latency(fields: dict[str, object], text: str, option: str) -> LatencyDistribution:
+    return validated(LatencyDistribution, fields, f"{option} {text}")
 
 
 def duration_ms(text: str) -> float | None:

@@ -14,10 +14,10 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_S, US_PER_S, CommandKind
 from airl_mav.core.frames import goal_distance_m, quat_yaw
 from airl_mav.envs.arenas import CEILING, FLOOR, NOTHING, WALL
-from airl_mav.envs.fleet import Flights, Verdict
-from airl_mav.envs.rendering import Moment
+from airl_mav.envs.fleet import FlightArrays, FlightStatus
+from airl_mav.envs.rendering import PictureContent
 from airl_mav.flight.judge import Outcome, Referee
-from airl_mav.lockstep.flight import Flight
+from airl_mav.lockstep.flight import LockstepFlight
 from airl_mav.policy.actions import Action, AnyAction, BodyRates
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import FlownEpisode
@@ -26,12 +26,12 @@ from firmware_sim.engine.record import TRUE_TICK
 from firmware_sim.simulation import Simulation
 
 VERDICTS = {
-    Outcome.SUCCESS: Verdict.SUCCESS,
-    Outcome.COLLISION: Verdict.COLLISION,
-    Outcome.BATTERY: Verdict.BATTERY,
-    Outcome.TIMEOUT: Verdict.TIMEOUT,
+    Outcome.SUCCESS: FlightStatus.SUCCESS,
+    Outcome.COLLISION: FlightStatus.COLLISION,
+    Outcome.BATTERY: FlightStatus.BATTERY,
+    Outcome.TIMEOUT: FlightStatus.TIMEOUT,
     # Aborted flights count neither as success nor as failure of the policy.
-    Outcome.ABORTED: Verdict.FLYING,
+    Outcome.ABORTED: FlightStatus.FLYING,
 }
 
 IDLE: dict[CommandKind, AnyAction] = {
@@ -56,7 +56,7 @@ class AskedFlight:
         self._events: SimpleQueue[Observation | FlownEpisode | BaseException] = SimpleQueue()
         self._answers: SimpleQueue[AnyAction] = SimpleQueue()
         self._idle = IDLE[resolved.pilot.commands]
-        self._flight = Flight(
+        self._flight = LockstepFlight(
             resolved,
             self,
             0,
@@ -100,7 +100,7 @@ class AskedFlight:
         self._answers.put(action)
         return self.asked()
 
-    def flights(self) -> Flights:
+    def flights(self) -> FlightArrays:
         """Return the state of the flight, frozen at its verdict: arrays (1,)."""
         return self._account.flights()
 
@@ -108,7 +108,7 @@ class AskedFlight:
         """Return the outcome; None = not decided yet."""
         return self._account.outcome()
 
-    def moment(self, image: NDArray[np.uint8]) -> Moment:
+    def moment(self, image: NDArray[np.uint8]) -> PictureContent:
         """Return the rendering data of the current time, with the policy's input image."""
         return self._account.moment(image)
 
@@ -145,7 +145,7 @@ class _Account:
         self._newest = np.zeros((), TRUE_TICK)
         """True state of the newest tick, or of the verdict."""
         self._distance_m = self._energy_j = 0.0
-        self._at_verdict: Flights | None = None
+        self._at_verdict: FlightArrays | None = None
 
     def ticked(self, simulation: Simulation, referee: Referee, hit: str | None) -> None:
         """Process the true states of the newest ticks."""
@@ -163,7 +163,7 @@ class _Account:
         if verdict is not None:
             self._at_verdict = self._now()
 
-    def flights(self) -> Flights:
+    def flights(self) -> FlightArrays:
         """Return the state of the flight, frozen at its verdict."""
         return self._at_verdict or self._now()
 
@@ -172,25 +172,29 @@ class _Account:
         verdict = None if self._referee is None else self._referee.verdict
         return None if verdict is None else verdict.outcome
 
-    def moment(self, image: NDArray[np.uint8]) -> Moment:
+    def moment(self, image: NDArray[np.uint8]) -> PictureContent:
         """Return the data of a rendered frame at the current time."""
         simulation, _ = self._flown()
         truth, scene_us = simulation.truth, simulation.time_us - simulation.start_us
         yaw = quat_yaw(truth.quaternion)
-        return Moment(self._arena, self.flights(), np.array(truth.position), yaw, scene_us, image)
+        return PictureContent(
+            self._arena, self.flights(), np.array(truth.position), yaw, scene_us, image
+        )
 
     def _flown(self) -> tuple[Simulation, Referee]:
         assert self._simulation is not None  # noqa: S101 (set by the first tick)
         assert self._referee is not None  # noqa: S101
         return self._simulation, self._referee
 
-    def _now(self) -> Flights:
+    def _now(self) -> FlightArrays:
         _, referee = self._flown()
         tick, outcome = self._newest, self.outcome()
         time_us, motion = int(tick["time_us"]), tick["motion"]
         began_us = time_us if referee.navigation_us is None else referee.navigation_us
-        return Flights(
-            verdict=np.array([Verdict.FLYING if outcome is None else VERDICTS[outcome]], np.int64),
+        return FlightArrays(
+            verdict=np.array(
+                [FlightStatus.FLYING if outcome is None else VERDICTS[outcome]], np.int64
+            ),
             time_s=np.array([(time_us - began_us) / US_PER_S]),
             distance_m=np.array([self._distance_m]),
             energy_j=np.array([self._energy_j]),

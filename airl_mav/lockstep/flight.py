@@ -21,7 +21,7 @@ from airl_mav.latency.stamps import DecisionLog
 from airl_mav.lockstep.digest import FlightDigest, Unwitnessed, WitnessedPolicy
 from airl_mav.lockstep.judging import Judge
 from airl_mav.lockstep.link import real_vehicle
-from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.lockstep.threaded import PATIENCE_S
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.policy.actions import Policy
@@ -30,12 +30,12 @@ from airl_mav.rehearsal.episode import faults_of, join_stamps, judged_record, pa
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
 from airl_mav.rehearsal.progress import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
-from airl_mav.rehearsal.supervisor import Order, Supervisor
+from airl_mav.rehearsal.supervisor import EpisodeSupervisor, Order
 from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view.ends import ViewEnds
 from companion.mission import MissionResult, Start, check_camera, fly_mission
-from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.flight_controller import FirmwareLostError
 from firmware_sim.simulation import Simulation
 from firmware_sim.warm_up import warm_up
@@ -118,7 +118,9 @@ def fly(
     observer = observer or Observer()
     notes: list[str] = []
     while True:
-        flight = Flight(resolved, policy, index, seed, observer=observer, notes=notes, view=view)
+        flight = LockstepFlight(
+            resolved, policy, index, seed, observer=observer, notes=notes, view=view
+        )
         try:
             return flight.fly(tlog, log)
         except FirmwareLostError as error:
@@ -133,7 +135,7 @@ def fly(
             policy = resolved.fresh_policy(seed)
 
 
-class Flight:
+class LockstepFlight:
     """One flight from take-off to landing; call `fly` once."""
 
     def __init__(
@@ -183,7 +185,7 @@ class Flight:
         self._witnessed = resolved.scenario.firmware == "builtin"
         self._digest = FlightDigest() if self._witnessed else Unwitnessed()
         self._stop = threading.Event()
-        self._supervisor = Supervisor(Referee(resolved.task(self._goal)), 0)
+        self._supervisor = EpisodeSupervisor(Referee(resolved.task(self._goal)), 0)
         self._judge = Judge(self._supervisor, self._digest, order=self._order, judged=self._decided)
         self._result: MissionResult | None = None
 
@@ -212,7 +214,7 @@ class Flight:
 
                 self._watched = held.enter_context(closing(Watched(self._view, resolved)))
             self._stage = held.enter_context(
-                Stage(
+                LockstepStage(
                     transport_us=TRANSPORT_US,
                     digest=self._digest,
                     # A viewer controls the pace.
@@ -308,7 +310,7 @@ class Flight:
         if self._start == "hover" and self._lands:
             self.call_off()
 
-    def _hear(self, message: Message) -> None:
+    def _hear(self, message: OperatorText) -> None:
         now_us = self._stage.conductor.clock.time_us()
         severity = int(message.severity)
         self._observer.text(Text(time_us=now_us, severity=severity, text=message.text))

@@ -21,7 +21,7 @@ from airl_mav.envs.decisions import (
     zone_option,
 )
 from airl_mav.envs.draws import source_of
-from airl_mav.envs.fleet import Flights
+from airl_mav.envs.fleet import FlightArrays
 from airl_mav.envs.rendering import RENDER_MODES, Pictures
 from airl_mav.envs.rewards import Step, costs, reward_of
 from airl_mav.envs.sight import sight_of
@@ -201,7 +201,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         """Return a copy of the newest observation, which the caller may modify."""
         return {key: array.copy() for key, array in self._newest.items()}
 
-    def _info(self, now: Flights) -> dict[str, Any]:
+    def _info(self, now: FlightArrays) -> dict[str, Any]:
         zone = self._resolved.scenario.zone
         return {
             "seed": self._seed,

@@ -16,7 +16,7 @@ from firmware_sim.autopilot.mode_numbers import MAIN_OFFBOARD
 from firmware_sim.mavlink.codec import (
     Decoder,
     Encoder,
-    Layout,
+    WireLayout,
     WireMessage,
     dialect,
     layout,
@@ -93,7 +93,7 @@ class Inbound:
     def __init__(self) -> None:
         self.next_repeat_us: int | None = None
         """Time of the next setpoint repetition [µs]; None = no repetition."""
-        self._setpoint: tuple[tuple[int, int], Layout, bytes] | None = None
+        self._setpoint: tuple[tuple[int, int], WireLayout, bytes] | None = None
         """Newest setpoint: sender, layout, and payload after the time stamp."""
         self._counted = 0
         """Number of the companion's setpoints delivered so far."""

@@ -10,7 +10,7 @@ import numpy as np
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Referee, TruthSample, Verdict
 from airl_mav.lockstep.digest import FlightDigest
-from airl_mav.rehearsal.supervisor import Order, Supervisor
+from airl_mav.rehearsal.supervisor import EpisodeSupervisor, Order
 from firmware_sim.crash_detector import CrashDetector
 from firmware_sim.engine.record import Record
 from firmware_sim.simulation import Simulation
@@ -21,7 +21,7 @@ class Judge:
 
     def __init__(
         self,
-        supervisor: Supervisor | None,
+        supervisor: EpisodeSupervisor | None,
         digest: FlightDigest,
         *,
         order: Callable[[Order], None],
@@ -72,7 +72,7 @@ class Judge:
             for time_us, motion, _, charge in truths[first:].tolist():
                 self._see(supervisor, TruthSample(time_us, motion[:3], self._crash.hit, charge))
 
-    def _see(self, supervisor: Supervisor, sample: TruthSample) -> None:
+    def _see(self, supervisor: EpisodeSupervisor, sample: TruthSample) -> None:
         before = supervisor.verdict
         order = supervisor.see(sample)
         if before is None and supervisor.verdict is not None:

@@ -24,9 +24,9 @@ from airl_mav.lockstep.tokens import TokenPartner
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
 from airl_mav.lockstep.wire import Wire
 from airl_mav.rehearsal.stand_alone import Listener, aircraft_of, episode_of
-from airl_mav.rehearsal.supervisor import Supervisor
+from airl_mav.rehearsal.supervisor import EpisodeSupervisor
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
-from firmware_sim.firmware import Firmware, FrameServer, Loaded
+from firmware_sim.firmware import Firmware, FrameServer, LoadedEpisode
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.simulation import EpisodeSetup
@@ -93,7 +93,7 @@ class RemoteStage:
         """Simulated time [µs]."""
         return self._conductor.clock.time_us()
 
-    def load(self, setup: EpisodeSetup, tlog: Path | None) -> Loaded:
+    def load(self, setup: EpisodeSetup, tlog: Path | None) -> LoadedEpisode:
         """Load the episode; the companion starts shortly afterwards.
 
         Args:
@@ -104,7 +104,7 @@ class RemoteStage:
         loaded = self.firmware.load(setup, tlog, BOOT_UNIX_US)
         if asked.goal_radius_m is not None and setup.arena is not None:
             task = Task(setup.arena.goal_point, asked.goal_radius_m, asked.time_limit_s)
-            supervisor = Supervisor(Referee(task), loaded.time_us)
+            supervisor = EpisodeSupervisor(Referee(task), loaded.time_us)
             self._judge = Judge(
                 supervisor, self._digest, order=self._partner.order, judged=self._decide
             )

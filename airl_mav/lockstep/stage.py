@@ -22,7 +22,7 @@ from companion.conducted import ConductedClock
 from companion.interfaces import LinkError
 from companion.mavsdk_connection import RAW_TIMEOUT_S, RAW_URL
 from companion.mavsdk_link import MavsdkLink
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.faults.timeline import FaultTimeline
 from firmware_sim.firmware import Firmware
 from firmware_sim.simulation import EpisodeSetup, Simulation
@@ -36,7 +36,7 @@ CUT_TIMEOUT_S = 0.5
 STOPPED = "stopped"
 
 
-class Stage:
+class LockstepStage:
     """One flight with any companion program. Use as a context manager."""
 
     def __init__(
@@ -79,7 +79,7 @@ class Stage:
         """Fault that ended the companion for good, such as `companion killed`; otherwise empty."""
         self._open = ExitStack()
 
-    def __enter__(self) -> Stage:
+    def __enter__(self) -> LockstepStage:
         """Create the link."""
         # Reverse order of closing: the companion's thread ends before its link.
         self._open.enter_context(closing(self.firmware))
@@ -199,7 +199,7 @@ class Stage:
     def _down(self) -> bool:
         """Return True if the motors are stopped."""
         simulation = self.firmware.simulation
-        return simulation is None or simulation.autopilot.flight.phase < Phase.GROUND
+        return simulation is None or simulation.autopilot.flight.phase < FlightPhase.GROUND
 
     def _raise_what_broke(self) -> None:
         error = self._partner.error

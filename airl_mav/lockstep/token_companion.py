@@ -14,7 +14,7 @@ from companion.camera import open_camera
 from companion.conducted import ConductedClock
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
-from companion.program import Mission
+from companion.program import MissionSetup
 from companion.signing_proxy import signed
 from companion.token_clock import TokenFrameSource, TokenTurns
 
@@ -25,7 +25,7 @@ flights, even if a process is suspended for a while, but MAVSDK notices a lost s
 
 def fly_in_lockstep(
     asked: StandAloneCompanion,
-    mission: Mission,
+    mission: MissionSetup,
     stop: threading.Event,
     abandon: threading.Event,
     waiting: Callable[[], None],

@@ -22,7 +22,7 @@ from airl_mav.lockstep.wire import Heard, Wire
 from airl_mav.rehearsal.supervisor import Order
 from airl_mav.scenario.stand_alone import COMPANION_TIMEOUT_S, LONGEST_REST_US, TURN_US
 from companion.tokens import Order as Word
-from companion.tokens import Phase, TurnBack, TurnGiven
+from companion.tokens import PhaseToken, TurnBack, TurnGiven
 from firmware_sim.mavlink.codec import Encoder, dialect
 
 KNOCK_S = 0.1
@@ -246,13 +246,13 @@ class TokenPartner:
                     f"the companion's {text!r}; accepted: D<turn> [<wake_us> [<setpoints> "
                     "[frame|stop]]], D<turn> end"
                 )
-            elif (phase := Phase.parse(text)) is not None:
+            elif (phase := PhaseToken.parse(text)) is not None:
                 self._enter(phase, given)
             else:
                 handle(bytes(message.get_msgbuf()))
         return found
 
-    def _enter(self, phase: Phase, given: TurnGiven) -> None:
+    def _enter(self, phase: PhaseToken, given: TurnGiven) -> None:
         """Report a phase once per turn, even if it is repeated."""
         if phase.number == given.number and phase.name not in self._phases:
             self._phases.add(phase.name)

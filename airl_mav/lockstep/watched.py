@@ -10,7 +10,7 @@ from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view.ends import ViewEnds
 from airl_mav.view.pace import REAL_TIME, Pace
 from airl_mav.view.taps import CompanionTap, SimulationTap
-from companion.pilot import Decided
+from companion.pilot import SentDecision
 from firmware_sim.simulation import Simulation
 
 
@@ -45,7 +45,7 @@ class Watched:
         self._simulation.tick(simulation, collision, self._pace.tick)
         self._pace.tick(simulation.time_us)
 
-    def decided(self, decision: Decided) -> None:
+    def decided(self, decision: SentDecision) -> None:
         """Show an executed decision."""
         self.companion.decided(decision)
         self._pace.decided()

@@ -74,7 +74,7 @@ class InFlight:
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """Image of an additional camera, of one vehicle or with a leading axis of n."""
 
     image: NDArray[Any]
@@ -82,10 +82,10 @@ class View:
     earlier: tuple[NDArray[Any], ...] = ()
     """Images of the previous decisions, as far as stored, the newest first."""
 
-    def rows(self, index: Rows) -> View:
+    def rows(self, index: Rows) -> CameraView:
         """Return the view of one or several of n vehicles."""
         earlier = tuple(image[index] for image in self.earlier)
-        return View(self.image[index], self.intrinsics, earlier)
+        return CameraView(self.image[index], self.intrinsics, earlier)
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class Observation:
     of `earlier`."""
     goal_down: Vector | None = None
     """(...) distance of the goal below the vehicle [m]; None = the goal has no height."""
-    further: Mapping[str, View] = field(default_factory=dict)
+    further: Mapping[str, CameraView] = field(default_factory=dict)
     """Views of additional cameras, by name, at the same time."""
 
     def rows(self, index: Rows) -> Observation:
@@ -172,10 +172,12 @@ def encode(frame: Frame, state: Kinematics, goal: Goal) -> Observation:
     return observe(frame.image, frame.intrinsics, state, where, further=views_of(frame))
 
 
-def views_of(frame: Frame, earlier: Sequence[Mapping[str, NDArray[Any]]] = ()) -> dict[str, View]:
+def views_of(
+    frame: Frame, earlier: Sequence[Mapping[str, NDArray[Any]]] = ()
+) -> dict[str, CameraView]:
     """Return the additional cameras' views of a frame; `earlier` images are the newest first."""
     return {
-        name: View(each.image, each.intrinsics, tuple(then[name] for then in earlier))
+        name: CameraView(each.image, each.intrinsics, tuple(then[name] for then in earlier))
         for name, each in frame.further.items()
     }
 
@@ -187,7 +189,7 @@ def observe(
     goal: Vector,
     in_flight: InFlight | None = None,
     earlier: Earlier = (),
-    further: Mapping[str, View] | None = None,
+    further: Mapping[str, CameraView] | None = None,
 ) -> Observation:
     """Return the observation of one vehicle, or of n.
 

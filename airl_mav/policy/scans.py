@@ -37,7 +37,7 @@ WIDEST_RAD = 1.0
 """Maximum half width of a moved return [rad], however near it is."""
 
 
-class Rays(NamedTuple):
+class ScanRays(NamedTuple):
     """Rays of a camera along the nose, in the body frame at a depth of 1."""
 
     forward: Floats
@@ -72,20 +72,20 @@ class Moved(NamedTuple):
 class Scanning(NamedTuple):
     """Functions that compute scans."""
 
-    level: Callable[[NDArray[np.uint16], Rays, Tilt, int], Floats]
+    level: Callable[[NDArray[np.uint16], ScanRays, Tilt, int], Floats]
     carried: Callable[[Floats, Moved, float], Floats]
 
 
 @cache
-def rays_of(camera: Intrinsics) -> Rays:
+def rays_of(camera: Intrinsics) -> ScanRays:
     """Return the rays of a pinhole or cylindrical camera. Raises UsageError for a fisheye."""
     if camera.projection == "fisheye":
         raise UsageError("a fisheye gives no level scan; accepted: a pinhole or a cylinder")
     columns: Floats = (np.arange(camera.width, dtype=np.float64) - camera.cx) / camera.focal
     down: Floats = (np.arange(camera.height, dtype=np.float64) - camera.cy) / camera.focal
     if camera.cylindrical:
-        return Rays(np.cos(columns), np.sin(columns), down, camera.horizontal_fov_rad)
-    return Rays(np.ones(camera.width), columns, down, camera.horizontal_fov_rad)
+        return ScanRays(np.cos(columns), np.sin(columns), down, camera.horizontal_fov_rad)
+    return ScanRays(np.ones(camera.width), columns, down, camera.horizontal_fov_rad)
 
 
 def tilt_of(roll: Floats, pitch: Floats) -> Tilt:
@@ -93,7 +93,7 @@ def tilt_of(roll: Floats, pitch: Floats) -> Tilt:
     return Tilt(np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch))
 
 
-def level_scan(depth_mm: NDArray[np.uint16], rays: Rays, tilt: Tilt, bearings: int) -> Floats:
+def level_scan(depth_mm: NDArray[np.uint16], rays: ScanRays, tilt: Tilt, bearings: int) -> Floats:
     """Return the nearest horizontal ranges (n, bearings) [m] at about the height of the cameras.
 
     `depth_mm` are (n, h, w) images, 0 = no return. Bearings run from the left edge of the field of

@@ -34,7 +34,7 @@ GREATEST_BYTES = 1_900_000_000
 """Maximum size of an .onnx file with weights, below the encoding's limit of 2 GiB."""
 
 
-class Size(NamedTuple):
+class NetworkSize(NamedTuple):
     """Size of a network."""
 
     parameters: int
@@ -50,7 +50,7 @@ def template_size(
     outputs: int,
     channels: int = 1,
     vector_inputs: int = VECTOR_INPUTS,
-) -> Size:
+) -> NetworkSize:
     """Return the size of a network of the template; `channels` is the number of image channels."""
     pixels = height_px * width_px
     weights, biases, macs = 0, 0, 0
@@ -62,7 +62,7 @@ def template_size(
     for units in (*[filters] * layers, outputs):
         weights, biases, macs = weights + inputs * units, biases + units, macs + inputs * units
         inputs = units
-    return Size(weights + biases, macs)
+    return NetworkSize(weights + biases, macs)
 
 
 def write_template(

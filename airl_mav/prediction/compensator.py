@@ -28,14 +28,14 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Vector, quat_from_euler, quat_to_matrix, quats_to_euler
 from airl_mav.policy.observation import Kinematics
 from airl_mav.prediction.memory import DecisionMemory
-from airl_mav.prediction.reprojection import CameraPose, Reprojector, Sight
+from airl_mav.prediction.reprojection import CameraPose, PosedImage, Reprojector
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.vehicle import Response, VehicleProfile
 
 Array = NDArray[np.float64]
 
 
-class Motion(NamedTuple):
+class MotionBatch(NamedTuple):
     """Motion of n vehicles."""
 
     position: Array  # (n, 3) NED [m]
@@ -44,7 +44,9 @@ class Motion(NamedTuple):
     heading_rate: Array  # (n,) [rad/s]
 
 
-def flown_on(motion: Motion, command: Array, response: Response, seconds: Array) -> Motion:
+def flown_on(
+    motion: MotionBatch, command: Array, response: Response, seconds: Array
+) -> MotionBatch:
     """Return the motion of vehicles after (n,) seconds on one setpoint (n, 4) each.
 
     With the heading turning at the rate w from psi on, the horizontal velocity v as a complex
@@ -66,7 +68,7 @@ def flown_on(motion: Motion, command: Array, response: Response, seconds: Array)
     velocity = follows * np.exp(1j * turned) + velocity * fading
     sinking = motion.velocity[:, 2] - command[:, 2]
     sunk = command[:, 2] * seconds + sinking * (lag * (1.0 - fading))
-    return Motion(
+    return MotionBatch(
         motion.position + np.stack([moved.real, moved.imag, sunk], axis=1),
         np.stack([velocity.real, velocity.imag, command[:, 2] + sinking * fading], axis=1),
         motion.heading + turned + lead * (1.0 - turn_fading),
@@ -74,7 +76,7 @@ def flown_on(motion: Motion, command: Array, response: Response, seconds: Array)
     )
 
 
-def leaning(motion: Motion, command: Array, response: Response) -> tuple[Array, Array]:
+def leaning(motion: MotionBatch, command: Array, response: Response) -> tuple[Array, Array]:
     """Return the roll and pitch (n,) [rad] of vehicles that fly a setpoint (n, 4).
 
     The thrust carries the weight, accelerates the vehicle and balances the drag, so it lies along
@@ -188,7 +190,7 @@ class Compensator:
         at `now_us` (n,).
         """
         roll, pitch, heading = quats_to_euler(state.quaternion)
-        now = Motion(state.position, state.velocity, heading, self._heading_rate(now_us))
+        now = MotionBatch(state.position, state.velocity, heading, self._heading_rate(now_us))
         then, command = self._carried(now, now_us)
         quaternion = state.quaternion.copy()
         tilted = leaning(then, command, self._response)
@@ -204,7 +206,7 @@ class Compensator:
                 float(tilted[0][i]), float(tilted[1][i]), float(then.heading[i])
             )
             sights = [
-                Sight(self._depth_mm[i, k], CameraPose(self._position[i, k], self._axes[i, k]))
+                PosedImage(self._depth_mm[i, k], CameraPose(self._position[i, k], self._axes[i, k]))
                 for k in range(int(self._kept[i]))
             ]
             pose = self._mount.pose(then.position[i], quaternion[i])
@@ -244,7 +246,9 @@ class Compensator:
             rate = turn + (rate - turn) * kept
         return rate
 
-    def _carried(self, motion: Motion, now_us: NDArray[np.int64]) -> tuple[Motion, Vector]:
+    def _carried(
+        self, motion: MotionBatch, now_us: NDArray[np.int64]
+    ) -> tuple[MotionBatch, Vector]:
         """Return the predicted motion, and the setpoints (n, 4) that will be in effect."""
         acts_us = now_us + self.memory.latency.expected_us() + LINK_US
         flown = [*self._setpoint.swapaxes(0, 1)[::-1], np.zeros_like(self._setpoint[:, 0])]

@@ -39,7 +39,7 @@ class CameraPose(NamedTuple):
     axes: NDArray[np.float64]  # (3, 3) columns: forward (optical axis), right, down, in NED
 
 
-class Sight(NamedTuple):
+class PosedImage(NamedTuple):
     """Depth image and its camera pose."""
 
     depth_mm: Image  # (h, w), 0 = no return
@@ -69,7 +69,7 @@ class Reprojector:
         self._sees = self._rays.any(axis=0)
         """(h w) True if a pixel has a direction: inside a fisheye's circle."""
 
-    def image(self, sights: Sequence[Sight], pose: CameraPose) -> Image:
+    def image(self, sights: Sequence[PosedImage], pose: CameraPose) -> Image:
         """Return the depth image (h, w) [mm] from a pose. The newest sight is first."""
         k, size = self._k, self._rays.shape[1]
         nearest = np.full(size, _UNSEEN, np.uint32)
@@ -84,7 +84,7 @@ class Reprojector:
         return out.reshape(k.height, k.width)
 
     def _carried(
-        self, sight: Sight, pose: CameraPose
+        self, sight: PosedImage, pose: CameraPose
     ) -> tuple[NDArray[np.intp], NDArray[np.uint32]]:
         """Return the pixels hit by the points of an image, and their depths [mm]."""
         k = self._k

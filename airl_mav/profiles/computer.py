@@ -50,7 +50,7 @@ class Network(ProfileModel):
     runtime: str = Field(description="what ran it: framework and version")
 
 
-class Latency(ProfileModel):
+class LatencyDistribution(ProfileModel):
     """The distribution of t2: inference start -> action ready.
 
     `fixed`: always `mean_ms`. `lognormal`: `min_ms` plus a log-normal; `mean_ms` and `std_ms` apply
@@ -70,7 +70,7 @@ class Latency(ProfileModel):
     )
 
     @model_validator(mode="after")
-    def _complete(self) -> Latency:
+    def _complete(self) -> LatencyDistribution:
         sampled = (self.samples_ms is not None) + (self.samples_file is not None)
         if self.distribution == "samples":
             if sampled != 1:
@@ -94,7 +94,7 @@ class Latency(ProfileModel):
         return self
 
 
-class Measured(ProfileModel):
+class MeasurementConditions(ProfileModel):
     """Measurement conditions of a workload in a shared profile."""
 
     date_utc: str = Field(description="when")
@@ -110,7 +110,7 @@ class Measured(ProfileModel):
 
 
 def samples_digest(samples_ms: Sequence[float]) -> str:
-    """Return the SHA-256 of samples [ms], as in `Measured.samples_sha256`."""
+    """Return the SHA-256 of samples [ms], as in `MeasurementConditions.samples_sha256`."""
     return hashlib.sha256("".join(f"{each:.3f}\n" for each in samples_ms).encode()).hexdigest()
 
 
@@ -125,10 +125,10 @@ class Workload(ProfileModel):
     policy_sha256: str | None = optional(
         "digest of the policy file that was timed, if it was one of ours"
     )
-    latency: Latency
+    latency: LatencyDistribution
     source: str = Field(description="where the latency comes from")
     assumed: str = Field(default="", description="what the source does not give and we assume")
-    measured: Measured | None = later_field(
+    measured: MeasurementConditions | None = later_field(
         None, "how it was timed, in a profile that airl profile --share wrote"
     )
 
@@ -197,7 +197,7 @@ def load_computer(name: str) -> ComputerProfile:
     return profile.model_copy(update={"workloads": workloads})
 
 
-def _with_samples(latency: Latency, folder: Path) -> Latency:
+def _with_samples(latency: LatencyDistribution, folder: Path) -> LatencyDistribution:
     """Replace `samples_file`, relative to `folder`, by its values."""
     if latency.samples_file is None:
         return latency

@@ -16,7 +16,7 @@ from airl_mav.profiles.parameters import SPECS, parameter_values
 from airl_mav.profiles.sensors import Sensors
 
 
-class Body(ProfileModel):
+class BodyProfile(ProfileModel):
     """The rigid body."""
 
     mass_kg: float = quantity("take-off mass", "kg", gt=0.05, le=100)
@@ -205,7 +205,7 @@ ParameterTable = dict[str, Annotated[float, Strict()]]
 TypedParameterTable = dict[str, Annotated[int, Strict()] | Annotated[float, Strict()]]
 
 
-class RealFirmware(ProfileModel):
+class FirmwareRequirements(ProfileModel):
     """Settings required in real firmware to fly this vehicle."""
 
     motors: tuple[Corner, Corner, Corner, Corner] = Field(
@@ -216,20 +216,20 @@ class RealFirmware(ProfileModel):
     )
 
     @model_validator(mode="after")
-    def _every_corner_once(self) -> RealFirmware:
+    def _every_corner_once(self) -> FirmwareRequirements:
         if len(set(self.motors)) != len(CORNERS):
             corners = ", ".join(CORNERS)
             raise ValueError(f"motors = {list(self.motors)}: accepted: each once of {corners}")
         return self
 
 
-class Px4(RealFirmware):
+class Px4(FirmwareRequirements):
     """Settings for PX4; rotor geometry and thrust curve follow from the vehicle."""
 
     airframe: int = quantity("SYS_AUTOSTART, airframe of PX4's simulator", "1", ge=1, le=99_999)
 
 
-class ArduPilot(RealFirmware):
+class ArduPilot(FirmwareRequirements):
     """Settings for ArduCopter."""
 
     frame_class: int = quantity("FRAME_CLASS, 1 = quad", "1", ge=1, le=1)
@@ -241,7 +241,7 @@ class VehicleProfile(ProfileModel):
 
     description: str = Field(description="one line for people")
     source: str = Field(description="where the numbers come from")
-    body: Body
+    body: BodyProfile
     rotor: Rotor
     drag: Drag
     battery: Battery

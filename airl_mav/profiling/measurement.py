@@ -23,8 +23,8 @@ from airl_mav.latency.stages import Samples, pool, stage_samples
 from airl_mav.policy.card import PolicyCard
 from airl_mav.profiles.computer import (
     ComputerProfile,
-    Latency,
-    Measured,
+    LatencyDistribution,
+    MeasurementConditions,
     Network,
     samples_digest,
     with_workload,
@@ -162,7 +162,7 @@ def save(measured: ComputerMeasurement, path: Path) -> tuple[Path, ...]:
     stem = f"{measured.computer}.{measured.workload}"
     samples, arrays, facts = (path.with_name(stem + end) for end in (".txt", ".npz", ".json"))
     workload = profile.workloads[measured.workload]
-    by_file = Latency(distribution="samples", samples_file=samples.name)
+    by_file = LatencyDistribution(distribution="samples", samples_file=samples.name)
     written = workload.model_copy(update={"latency": by_file})
     title = f"t2 of {measured.card.name} on {profile.cpu}, {measured.network.runtime}, ms, in order"
     more: tuple[Path, ...] = ()
@@ -184,7 +184,7 @@ def share(measured: ComputerMeasurement, path: Path) -> Path:
     workload = measured.profile.workloads[measured.workload]
     samples_ms = tuple(round(each, 3) for each in workload.latency.samples_ms or ())
     machine, soaked = measured.machine, measured.soak
-    how = Measured(
+    how = MeasurementConditions(
         date_utc=utc_now().isoformat(timespec="seconds"),
         machine=f"{machine['os']}, {machine['architecture']}, {machine['python']}",
         state=dict(measured.before.rows()),
@@ -192,7 +192,7 @@ def share(measured: ComputerMeasurement, path: Path) -> Path:
         versions=package_versions(),
         samples_sha256=samples_digest(samples_ms),
     )
-    inline = Latency(distribution="samples", samples_ms=samples_ms)
+    inline = LatencyDistribution(distribution="samples", samples_ms=samples_ms)
     told = workload.model_copy(update={"latency": inline, "measured": how})
     profile = measured.profile.model_copy(update={"workloads": {measured.workload: told}})
     try:

@@ -19,7 +19,7 @@ from airl_mav.core.provenance import describe_machine
 from airl_mav.profiles.computer import (
     LONGEST_MS,
     ComputerProfile,
-    Latency,
+    LatencyDistribution,
     Workload,
     existing_profile,
     with_workload,
@@ -28,7 +28,7 @@ from airl_mav.profiling import measurement
 from airl_mav.profiling.bare import BareLoop
 from airl_mav.profiling.policy_under_test import PolicyUnderTest, open_policy
 from airl_mav.profiling.request import ProfileRequest
-from airl_mav.profiling.soak import Reading, Soak, soak
+from airl_mav.profiling.soak import MachineReading, Soak, soak
 from airl_mav.rehearsal.signals import stop_on_signals
 
 BUSY_SHARE = 0.25
@@ -106,7 +106,7 @@ def profile(
     workload = Workload(
         network=network,
         policy_sha256=None if request.network is not None else card.sha256,
-        latency=Latency(distribution="samples", samples_ms=tuple(samples_ms)),
+        latency=LatencyDistribution(distribution="samples", samples_ms=tuple(samples_ms)),
         source=f"airl profile --level {request.level}, {len(t2_us)} decisions after "
         f"{request.warm_up} of warm-up, {date}",
         assumed="; ".join(recording.remarks),
@@ -165,9 +165,9 @@ def _soak(
     loop = BareLoop(request, policy)
     meter = None if source is None else PowerMeter(source, loop.clock)
 
-    def read() -> Reading:
+    def read() -> MachineReading:
         watts = None if meter is None else meter.sample()
-        return Reading(mean_frequency_mhz(), temperature_c(), watts)
+        return MachineReading(mean_frequency_mhz(), temperature_c(), watts)
 
     with stop_on_signals() as stop:
         progress.note(

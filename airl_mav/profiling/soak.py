@@ -27,7 +27,7 @@ FREQUENCY_DROP = 0.05
 second."""
 
 
-class Reading(NamedTuple):
+class MachineReading(NamedTuple):
     """Machine state at one moment; None: not available."""
 
     frequency_mhz: float | None
@@ -85,7 +85,7 @@ class Soak:
             "window_s": self.window_s,
             "first_us": asdict(summarize(self.first_us)),
             "last_us": asdict(summarize(self.last_us)),
-            **{name: self.ends(name) for name in Reading._fields},
+            **{name: self.ends(name) for name in MachineReading._fields},
             "frequency_dropped": self.frequency_dropped,
             "throttled": self.throttled,
         }
@@ -127,7 +127,7 @@ def soak(
     duration_s: float,
     clock: Clock,
     *,
-    read: Callable[[], Reading],
+    read: Callable[[], MachineReading],
     state: Callable[[], MachineState],
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float], None] = lambda _: None,
@@ -162,7 +162,7 @@ def soak(
         rows.append((since_us / US_PER_S, len(samples), p50_ms, max_ms, *told))
         progress(since_us / US_PER_S)
         now_us = clock.time_us()
-    names = ("time_s", "n", "p50_ms", "max_ms", *Reading._fields)
+    names = ("time_s", "n", "p50_ms", "max_ms", *MachineReading._fields)
     lasted_us = last[-1][0]
     window_us = min(WINDOW_US, lasted_us // 2)
     early = [part for end, part in first if end <= window_us] or [first[0][1]]

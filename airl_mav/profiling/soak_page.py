@@ -67,7 +67,7 @@ def write_soak_page(
     return write_document(document, folder)
 
 
-def soak_figure(soaked: Soak, name: str) -> theme.Picture:
+def soak_figure(soaked: Soak, name: str) -> theme.FigureImage:
     """Draw the series, one below the other."""
     series = soaked.series
     told = [axis for axis in AXES if np.isfinite(series[axis[0]]).any()]

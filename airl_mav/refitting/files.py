@@ -16,7 +16,13 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.files import replace_file, write_json
 from airl_mav.policy.registry import find_policy
-from airl_mav.profiles.computer import ComputerProfile, Latency, Network, Workload, write_samples
+from airl_mav.profiles.computer import (
+    ComputerProfile,
+    LatencyDistribution,
+    Network,
+    Workload,
+    write_samples,
+)
 from airl_mav.profiles.parameters import SPECS, parameter_values
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.refitting.air import Air
@@ -152,7 +158,7 @@ def computer_profile(
     workload = Workload(
         network=network[0],
         policy_sha256=network[1],
-        latency=Latency(distribution="samples", samples_file=LATENCY_FILE),
+        latency=LatencyDistribution(distribution="samples", samples_file=LATENCY_FILE),
         source=f"measured in flight: {samples} decisions, {source}",
         assumed=f"latency in that flight: {how}",
     )

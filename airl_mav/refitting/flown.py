@@ -14,7 +14,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import SETPOINT, commanded
 from airl_mav.report.recorded_flight import NAVIGATING, path_of, stamps_of
-from airl_mav.vehicle_log.alignment import Alignment, align
+from airl_mav.vehicle_log.alignment import ClockAlignment, align
 from airl_mav.vehicle_log.ulog import MOTORS, VehicleLog
 
 AIRBORNE_M = 0.8
@@ -45,7 +45,7 @@ class Flown:
     airborne_us: tuple[int, int]
     """Airborne interval, clear of the ground [µs]."""
     log: VehicleLog | None = None
-    clocks: Alignment | None = None
+    clocks: ClockAlignment | None = None
     """Relation of the companion's and the log's clocks; None without both."""
 
     @property

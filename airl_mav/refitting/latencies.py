@@ -13,7 +13,7 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.latency.percentiles import integrated_time
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.refitting.quantity import LEVEL, RESAMPLES, FittedQuantity
-from airl_mav.vehicle_log.alignment import Alignment
+from airl_mav.vehicle_log.alignment import ClockAlignment
 
 LEAST = 5
 """Minimum decisions for the interval of a mean."""
@@ -44,7 +44,7 @@ def no_latencies() -> Latencies:
 
 
 def fit_latencies(
-    stamps: Mapping[str, NDArray[np.int64]], clocks: Alignment | None, rng: np.random.Generator
+    stamps: Mapping[str, NDArray[np.int64]], clocks: ClockAlignment | None, rng: np.random.Generator
 ) -> Latencies:
     """Return the latencies of a flight's decisions; `clocks` = None without a log."""
     t2_us = stamps["action_ready_us"] - stamps["infer_start_us"]
@@ -76,7 +76,7 @@ def _mean(
     return of.found((mean, low, high), source)
 
 
-def _link(clocks: Alignment | None) -> FittedQuantity:
+def _link(clocks: ClockAlignment | None) -> FittedQuantity:
     if clocks is None:
         return LINK.without("a black box knows neither end of it: give the vehicle's log")
     if clocks.round_trip_us is None or clocks.accepted_range_us is None:

@@ -185,7 +185,7 @@ class Saved(_Line):
     """In lockstep, hashes of the flight by lane; see docs/explanation/lockstep.md."""
 
 
-class Progress(_Line):
+class PhaseEntered(_Line):
     """Event: the mission has entered a phase."""
 
     type: Literal["progress"] = "progress"
@@ -222,7 +222,17 @@ Request = Annotated[
     Begin | LoadEpisode | FinishEpisode | Fly | Abort | Shutdown, Field(discriminator="type")
 ]
 Event = Annotated[
-    Compiling | Ready | Loaded | State | Text | LogLost | Due | Saved | Progress | Ended | Failed,
+    Compiling
+    | Ready
+    | Loaded
+    | State
+    | Text
+    | LogLost
+    | Due
+    | Saved
+    | PhaseEntered
+    | Ended
+    | Failed,
     Field(discriminator="type"),
 ]
 _REQUESTS: TypeAdapter[Any] = TypeAdapter(Request)

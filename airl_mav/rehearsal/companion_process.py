@@ -124,7 +124,7 @@ class Missions:
                 )
 
     def _announce(self, phase: str) -> None:
-        self._harness.send(channel.Progress(phase=phase, time_us=self._clock.time_us()))
+        self._harness.send(channel.PhaseEntered(phase=phase, time_us=self._clock.time_us()))
 
 
 def fly(begin: channel.Begin, harness: channel.ChildChannel) -> None:

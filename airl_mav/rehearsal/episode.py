@@ -25,7 +25,7 @@ from airl_mav.profiles.camera_kind import SLOW
 from airl_mav.rehearsal.channel import Ended, Loaded, State
 from airl_mav.rehearsal.process_pair import ProcessFaults
 from airl_mav.rehearsal.run_folder import TICK_LATENESS, FlownEpisode
-from airl_mav.rehearsal.supervisor import Supervisor
+from airl_mav.rehearsal.supervisor import EpisodeSupervisor
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.interfaces import CAMERA_SILENT, FRAMES_LATE, LINK_LOST, TELEMETRY_FROZEN
 
@@ -38,13 +38,13 @@ DISTURBING = (*PROCESSES, *LINKS, "camera")
 
 
 @dataclass
-class Episode:
+class RunningEpisode:
     """State of a running episode."""
 
     index: int
     seed: int
     loaded: Loaded
-    supervisor: Supervisor
+    supervisor: EpisodeSupervisor
     stopwatch: WallClock
     faults: ProcessFaults
     notes: list[str]
@@ -78,7 +78,7 @@ class Episode:
 
 
 def join_episode(
-    episode: Episode, scenario: ResolvedScenario, record_path: Path, decisions_path: Path
+    episode: RunningEpisode, scenario: ResolvedScenario, record_path: Path, decisions_path: Path
 ) -> FlownEpisode:
     """Join both processes' outputs of a judged episode; the companion's log may be missing."""
     arrays = _read(record_path)
@@ -143,7 +143,7 @@ def _told_of_images(stamps: Mapping[str, NDArray[Any]]) -> tuple[str, ...]:
 
 
 def _record(
-    episode: Episode,
+    episode: RunningEpisode,
     scenario: ResolvedScenario,
     trajectory: Trajectory,
     latency: Mapping[str, NDArray[Any]],

@@ -8,7 +8,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.frames import Geodetic, quat_yaw
 from airl_mav.rehearsal.channel import State
 from airl_mav.scenario.resolved import ResolvedScenario
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.hover_start import HoverStart
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
@@ -42,7 +42,7 @@ def state_of(simulation: Simulation, collision: str | None, slipped_us: int = 0)
         battery=truth.battery_remaining,
         collision=collision,
         mode=flight.mode.name.lower(),
-        armed=flight.phase >= Phase.GROUND,
-        landed=flight.phase < Phase.AIR,
+        armed=flight.phase >= FlightPhase.GROUND,
+        landed=flight.phase < FlightPhase.AIR,
         slipped_us=slipped_us,
     )

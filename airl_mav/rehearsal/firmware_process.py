@@ -22,7 +22,7 @@ from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.resolved import ResolvedScenario
-from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.crash_detector import CrashDetector
 from firmware_sim.external.compose import Wanted, real_firmware
 from firmware_sim.external.parameter_file import KeptParameters
@@ -203,7 +203,7 @@ class Service:
             self._harness.send(channel.Due(time_us=now_us, fault=str(fault), begins=begins))
         self._due = acting
 
-    def _tell(self, message: Message) -> None:
+    def _tell(self, message: OperatorText) -> None:
         simulation = self._firmware.simulation
         time_us = 0 if simulation is None else simulation.time_us
         self._harness.send(

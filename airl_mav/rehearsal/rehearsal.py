@@ -16,7 +16,7 @@ from airl_mav.core.constants import MAX_ATTEMPTS, US_PER_S
 from airl_mav.flight.judge import Referee, TruthSample, Verdict
 from airl_mav.flight.validity import BY_HAND
 from airl_mav.rehearsal import channel
-from airl_mav.rehearsal.episode import Episode, disturbances, disturbing, join_episode
+from airl_mav.rehearsal.episode import RunningEpisode, disturbances, disturbing, join_episode
 from airl_mav.rehearsal.process_pair import (
     COMPANION,
     FIRMWARE,
@@ -28,7 +28,7 @@ from airl_mav.rehearsal.process_pair import (
 )
 from airl_mav.rehearsal.progress import WARNING, Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
-from airl_mav.rehearsal.supervisor import TAKEOFF_LIMIT_S, Order, Supervisor
+from airl_mav.rehearsal.supervisor import TAKEOFF_LIMIT_S, EpisodeSupervisor, Order
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view.ends import ViewEnds
 from firmware_sim.external.programs import load_timeout_s
@@ -155,9 +155,9 @@ class Rehearsal:
             lambda event: self._look(event, known),
             load_timeout_s(scenario.scenario),
         )
-        supervisor = Supervisor(Referee(scenario.task(loaded.goal)), loaded.time_us)
+        supervisor = EpisodeSupervisor(Referee(scenario.task(loaded.goal)), loaded.time_us)
         faults = ProcessFaults(pair, self._speed)
-        episode = Episode(index, seed, loaded, supervisor, WallClock(), faults, known)
+        episode = RunningEpisode(index, seed, loaded, supervisor, WallClock(), faults, known)
         self._observer.episode(index, seed, loaded.goal)
         pair.send(
             COMPANION,
@@ -204,7 +204,7 @@ class Rehearsal:
         flown_s = TAKEOFF_LIMIT_S + asked.time_limit_s + WRAP_UP_S
         return (flown_s + stands_s) / self._speed
 
-    def _call_back(self, pair: ProcessPair, episode: Episode) -> None:
+    def _call_back(self, pair: ProcessPair, episode: RunningEpisode) -> None:
         """Resume suspended processes; an aborted companion reports its log."""
         episode.faults.undo()
         if episode.ended is None and pair.lives(COMPANION):
@@ -217,7 +217,7 @@ class Rehearsal:
                 # The companion was to be aborted anyway: its decision log is lost.
                 pair.stop_one(COMPANION)
 
-    def _follow(self, pair: ProcessPair, episode: Episode, event: channel.Event) -> bool:
+    def _follow(self, pair: ProcessPair, episode: RunningEpisode, event: channel.Event) -> bool:
         """Handle one event of a flight; return True when the companion has ended it."""
         referee = episode.referee
         if isinstance(event, channel.State):
@@ -226,7 +226,7 @@ class Rehearsal:
             episode.notes.append(event.what)
         elif isinstance(event, channel.Due):
             self._carry_out(episode, event)
-        elif isinstance(event, channel.Progress):
+        elif isinstance(event, channel.PhaseEntered):
             self._observer.phase(event.phase, event.time_us)
             if event.phase == "navigating":
                 episode.navigating_us = event.time_us
@@ -242,13 +242,13 @@ class Rehearsal:
             return True
         return False
 
-    def _end(self, episode: Episode, reason: str) -> None:
+    def _end(self, episode: RunningEpisode, reason: str) -> None:
         """Abort a flight without a verdict."""
         if episode.referee.verdict is None:
             now_us = episode.state.time_us if episode.state else episode.loaded.time_us
             self._judge(episode, episode.referee.abort(now_us, reason))
 
-    def _carry_out(self, episode: Episode, due: channel.Due) -> None:
+    def _carry_out(self, episode: RunningEpisode, due: channel.Due) -> None:
         """Suspend, kill or resume a process for a due fault."""
         faults = episode.faults
         if (done := faults.carry_out(due)) is not None:
@@ -256,7 +256,7 @@ class Rehearsal:
         if faults.out(FIRMWARE) == KILLED and faults.reason is not None:
             self._end(episode, faults.reason)
 
-    def _over_alone(self, episode: Episode) -> bool:
+    def _over_alone(self, episode: RunningEpisode) -> bool:
         """Return True if a flight without a companion is over: judged, or landed."""
         faults, state = episode.faults, episode.state
         if not faults.out(COMPANION) or faults.reason is None:
@@ -265,7 +265,7 @@ class Rehearsal:
             self._end(episode, faults.reason)
         return episode.referee.verdict is not None
 
-    def _see(self, pair: ProcessPair, episode: Episode, state: channel.State) -> None:
+    def _see(self, pair: ProcessPair, episode: RunningEpisode, state: channel.State) -> None:
         episode.state = state
         self._observer.state(state, episode.loaded.time_us)
         judged = episode.referee.verdict is not None
@@ -278,14 +278,14 @@ class Rehearsal:
         if order is not None:
             pair.send(COMPANION, channel.Abort(land=order is Order.LAND))
 
-    def _judge(self, episode: Episode, verdict: Verdict) -> None:
+    def _judge(self, episode: RunningEpisode, verdict: Verdict) -> None:
         if episode.wall_us is None:
             episode.wall_us = episode.stopwatch.time_us()
             episode.paused_us = episode.faults.paused_us
             episode.verdict_state = episode.state
         self._observer.phase(verdict.outcome.value, verdict.time_us)
 
-    def _watch_failsafe(self, pair: ProcessPair, episode: Episode) -> list[str]:
+    def _watch_failsafe(self, pair: ProcessPair, episode: RunningEpisode) -> list[str]:
         """Watch the flight controller without its companion until disarmed; return its texts."""
         self._observer.waiting("companion lost: watching the failsafe land the vehicle")
         said: list[str] = []

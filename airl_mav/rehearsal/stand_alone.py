@@ -17,7 +17,7 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.firmware_process import build_firmware, unix_us
 from airl_mav.scenario.checks import check_fitted
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
-from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.external.programs import how_to_start
 from firmware_sim.mavlink.link import LinkConfig
 from firmware_sim.mavlink.udp_links import bind_device_links
@@ -35,7 +35,7 @@ class Listener:
     """Called while real firmware must be started by the user, with instructions."""
     ready: Callable[[str, Goal], None] = field(default=lambda _camera, _goal: None)
     """Called when the vehicle is ready, with the ZeroMQ address of its camera and the goal."""
-    text: Callable[[Message], None] = field(default=lambda _message: None)
+    text: Callable[[OperatorText], None] = field(default=lambda _message: None)
     """Called for a text of the autopilot."""
     say: Callable[[str], None] = field(default=lambda _line: None)
     """Called for each line of progress."""

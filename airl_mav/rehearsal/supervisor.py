@@ -25,7 +25,7 @@ class Order(Enum):
     """End the mission; landing is impossible."""
 
 
-class Supervisor:
+class EpisodeSupervisor:
     """Supervisor of one episode. Pure: no clock, no I/O."""
 
     def __init__(self, referee: Referee, started_us: int) -> None:

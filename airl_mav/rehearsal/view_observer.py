@@ -8,7 +8,7 @@ from airl_mav.rehearsal.channel import State, Text
 from airl_mav.rehearsal.progress import WARNING, Observer
 from airl_mav.view.ends import ViewEnds
 from airl_mav.view.feed import Feed
-from airl_mav.view.messages import Flight, Phase, Said
+from airl_mav.view.messages import Flight, PhaseStart, Said
 
 INFO = 6
 """MAV_SEVERITY_INFO."""
@@ -33,7 +33,7 @@ class ViewObserver(Observer):
 
     def phase(self, phase: str, time_us: int) -> None:
         """Report the phase."""
-        self._feed.send(Phase(time_us=time_us, phase=phase))
+        self._feed.send(PhaseStart(time_us=time_us, phase=phase))
         self._onwards.phase(phase, time_us)
 
     def state(self, state: State, started_us: int) -> None:

@@ -83,7 +83,7 @@ def conduct_table(run: LoadedRun, summary: measures.RunSummary) -> TableView | N
     greatest_step = f"{steps.max():.2f} m/s" if steps.size else NONE
     rms = f"{np.mean(command_rms):,.2f} m/s³" if command_rms else NONE
 
-    def mean(measure: measures.Measure) -> tuple[str, ...]:
+    def mean(measure: measures.QualityMeasure) -> tuple[str, ...]:
         of = measure.of(q)
         interval = NONE if of.low is None else f"{measure.plain(of.low)} … {measure.plain(of.high)}"
         return measure.title, measure.plain(of.value, unit=True), interval, f"{of.n:,}"

@@ -21,7 +21,7 @@ from airl_mav.report.measures import interval_of
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-    from airl_mav.report.theme import Picture
+    from airl_mav.report.theme import FigureImage
 
 REPORT_FILE = "report.html"
 """File name of a run's page in its folder."""
@@ -53,7 +53,7 @@ class Section:
     sentences: tuple[str, ...] = ()
     facts: Facts = ()
     tables: tuple[table.TableView, ...] = ()
-    draw: Callable[[], Sequence[Picture]] | None = None
+    draw: Callable[[], Sequence[FigureImage]] | None = None
     """Function that draws the pictures; called only for output with pictures."""
     sheet: str = ""
     """File name of a PNG with all pictures; empty = one PNG per picture."""

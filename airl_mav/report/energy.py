@@ -142,7 +142,7 @@ def _flight_row(flight: FlightEnergy) -> tuple[str, ...]:
     )
 
 
-def energy_figure(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -> theme.Picture:
+def energy_figure(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -> theme.FigureImage:
     """Draw the energy of each flight (at least one) with stacked parts."""
     figure = theme.new_figure(6.4, 3.4)
     ax = figure.subplots()

@@ -17,7 +17,7 @@ from airl_mav.latency.stages import STAGES, decision_series
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision
 from airl_mav.report.theme import shades
-from airl_mav.report.tracking import EstimateErrors, Motion, TrackedFlight
+from airl_mav.report.tracking import EstimateErrors, TrackedFlight, TrackedMotion
 
 
 class Steps(TypedDict):
@@ -98,7 +98,7 @@ def flight_data(
     }
 
 
-def _lines(of: Motion | EstimateErrors, keep: NDArray[np.int64]) -> dict[str, Steps]:
+def _lines(of: TrackedMotion | EstimateErrors, keep: NDArray[np.int64]) -> dict[str, Steps]:
     known = {name: values for name, values in vars(of).items() if values is not None}
     return {name: steps_of(values[keep], _unit(name)) for name, values in known.items()}
 

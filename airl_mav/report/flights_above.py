@@ -37,7 +37,7 @@ MARGIN_M = 0.5
 
 
 @dataclass(frozen=True)
-class Panel:
+class RunFlights:
     """Flights of one run."""
 
     title: str
@@ -63,7 +63,7 @@ class _Extent:
         return min(max(tall, 0.45), 1.6)
 
 
-def flight_pictures(prefix: str, panels: Sequence[Panel]) -> list[theme.Picture]:
+def flight_pictures(prefix: str, panels: Sequence[RunFlights]) -> list[theme.FigureImage]:
     """Draw each panel as a picture with common axes; names are the prefix and a number."""
     extent = _extent(panels)
     return [
@@ -78,16 +78,16 @@ def flight_pictures(prefix: str, panels: Sequence[Panel]) -> list[theme.Picture]
     ]
 
 
-def overview_picture(run: LoadedRun, arenas: Mapping[int, Arena]) -> theme.Picture:
+def overview_picture(run: LoadedRun, arenas: Mapping[int, Arena]) -> theme.FigureImage:
     """Draw all flights of a run by outcome; `arenas` (by episode index) supply the walls."""
     bounds = {arena.bounds for arena in arenas.values()}
     arena = next(iter(arenas.values())) if len(bounds) == 1 else None
-    panel = Panel("", "", run.episodes, run.trajectories, arena)
+    panel = RunFlights("", "", run.episodes, run.trajectories, arena)
     alt = f"The paths of {len(run.episodes)} flights from above, coloured by how they ended"
     return _draw_panel(OVERVIEW_NAME, alt, panel, _extent([panel]), width_in=4.6)
 
 
-def _extent(panels: Sequence[Panel]) -> _Extent:
+def _extent(panels: Sequence[RunFlights]) -> _Extent:
     low, high = np.zeros(2), np.zeros(2)
     for panel in panels:
         points = [np.array([flight.goal[:2] for flight in panel.episodes])]
@@ -106,8 +106,8 @@ def _extent(panels: Sequence[Panel]) -> _Extent:
 
 
 def _draw_panel(
-    name: str, alt: str, panel: Panel, extent: _Extent, *, width_in: float
-) -> theme.Picture:
+    name: str, alt: str, panel: RunFlights, extent: _Extent, *, width_in: float
+) -> theme.FigureImage:
     """Draw one panel, with obstacles only if all its flights share an arena seed."""
     figure = theme.new_figure(width_in, 1.05 + 0.9 * width_in * extent.tall)
     ax: Axes = figure.subplots()

@@ -75,7 +75,7 @@ def colours() -> Colormap:
     return ListedColormap(colormaps["YlGnBu"](np.linspace(0.06, 0.92, 256)), name="fields")
 
 
-def heat_picture(name: str, alt: str, heat: HeatMap) -> theme.Picture:
+def heat_picture(name: str, alt: str, heat: HeatMap) -> theme.FigureImage:
     """Draw a heat map as a picture."""
     figure = theme.new_figure(*heat.size_in)
     draw_heat_map(figure, heat)

@@ -31,7 +31,7 @@ S_PER_MIN = 60.0
 
 
 @dataclass(frozen=True)
-class Measure:
+class QualityMeasure:
     """Measure of flight quality."""
 
     key: Literal[
@@ -78,20 +78,20 @@ class Measure:
         return with_interval(self.of(quality).scaled(self.scale), self.digits)
 
 
-SUCCESS_RATE = Measure("success_rate", "success rate", "%", 100.0, 1, "points")
-FLIGHT_TIME = Measure("flight_time_s", "flight time", "s", 1.0, 2)
-DISTANCE = Measure("distance_m", "distance", "m", 1.0, 2)
-ENERGY = Measure("energy_j", "energy, vehicle", "kJ", 1e-3, 2)
-COMPUTER_ENERGY = Measure("computer_energy_j", "energy, computer", "kJ", 1e-3, 2)
-MEAN_SPEED = Measure("mean_speed_m_s", "mean speed", "m/s", 1.0, 2)
-TOTAL_ENERGY = Measure("total_energy_j", "energy, both", "kJ", 1e-3, 2)
-ENDURANCE = Measure("endurance_s", "endurance", "min", 1.0 / S_PER_MIN, 1)
-RANGE = Measure("range_m", "range", "km", 1e-3, 2)
-MISSIONS = Measure("missions_per_charge", "missions per charge", "", 1.0, 1)
+SUCCESS_RATE = QualityMeasure("success_rate", "success rate", "%", 100.0, 1, "points")
+FLIGHT_TIME = QualityMeasure("flight_time_s", "flight time", "s", 1.0, 2)
+DISTANCE = QualityMeasure("distance_m", "distance", "m", 1.0, 2)
+ENERGY = QualityMeasure("energy_j", "energy, vehicle", "kJ", 1e-3, 2)
+COMPUTER_ENERGY = QualityMeasure("computer_energy_j", "energy, computer", "kJ", 1e-3, 2)
+MEAN_SPEED = QualityMeasure("mean_speed_m_s", "mean speed", "m/s", 1.0, 2)
+TOTAL_ENERGY = QualityMeasure("total_energy_j", "energy, both", "kJ", 1e-3, 2)
+ENDURANCE = QualityMeasure("endurance_s", "endurance", "min", 1.0 / S_PER_MIN, 1)
+RANGE = QualityMeasure("range_m", "range", "km", 1e-3, 2)
+MISSIONS = QualityMeasure("missions_per_charge", "missions per charge", "", 1.0, 1)
 
-DEADLINE_MISSES = Measure("deadline_misses", "deadline misses", "%", 100.0, 1, "points")
-JERK = Measure("jerk_rms_m_s3", "jerk, flown, RMS", "m/s³", 1.0, 2)
-COMMAND_STEP = Measure("command_step_m_s", "step of the command, mean", "m/s", 1.0, 2)
+DEADLINE_MISSES = QualityMeasure("deadline_misses", "deadline misses", "%", 100.0, 1, "points")
+JERK = QualityMeasure("jerk_rms_m_s3", "jerk, flown, RMS", "m/s³", 1.0, 2)
+COMMAND_STEP = QualityMeasure("command_step_m_s", "step of the command, mean", "m/s", 1.0, 2)
 
 CONDUCT = (DEADLINE_MISSES, JERK, COMMAND_STEP)
 """Measures of deadlines and smoothness; empty for runs recorded without them."""

@@ -23,7 +23,7 @@ from airl_mav.report.run_report import verdict_of
 from airl_mav.report.scene import SceneFlight, top_speed
 from airl_mav.report.shown_flights import pictured
 from airl_mav.report.table import TableView, columns_of
-from airl_mav.report.theme import Picture
+from airl_mav.report.theme import FigureImage
 from airl_mav.report.verdict import OverallVerdict, load_verdict
 
 
@@ -53,7 +53,7 @@ def _figures(headlines: list[Headline]) -> TableView:
     return TableView("figures", "", columns, rows)
 
 
-def _picture(run: LoadedRun) -> Picture:
+def _picture(run: LoadedRun) -> FigureImage:
     arenas = _arenas(run)
     if len(run.episodes) > 1:
         return overview_picture(run, arenas)
@@ -71,7 +71,7 @@ def _arenas(run: LoadedRun) -> dict[int, Arena]:
 
 
 def _html(
-    verdict: OverallVerdict, table: TableView | None, picture: Picture | None, place: str
+    verdict: OverallVerdict, table: TableView | None, picture: FigureImage | None, place: str
 ) -> str:
     image = None if picture is None else base64.b64encode(picture.png).decode()
     return (

@@ -163,11 +163,11 @@ class _Further:
         self._lens = lens
         self._earlier: deque[NDArray[Any]] = deque(maxlen=MOST_FRAMES - 1)
 
-    def view(self, time_us: int) -> observation.View:
+    def view(self, time_us: int) -> observation.CameraView:
         """Return a decision's view with the image of a time; store the image for later ones."""
         image, earlier = self._lens.image(time_us), tuple(self._earlier)
         self._earlier.appendleft(image)
-        return observation.View(image, self._lens.camera.intrinsics, earlier)
+        return observation.CameraView(image, self._lens.camera.intrinsics, earlier)
 
 
 class _Companion:
@@ -192,7 +192,7 @@ class _Companion:
         goal: Goal,
         age_us: int,
         now_us: int,
-        further: Mapping[str, observation.View],
+        further: Mapping[str, observation.CameraView],
     ) -> observation.Observation:
         """Return the policy's observation: current, or predicted for the time of sending."""
         age = np.array([age_us])

@@ -22,7 +22,7 @@ from airl_mav.latency.stamps import SETPOINTS, commanded
 from airl_mav.rehearsal.run_folder import RUN_FILE, FlownEpisode, RunFolder, load_info
 from airl_mav.report.recorded_flight import DIGEST, episode_of, info_of, path_of, stamps_of
 from airl_mav.report.tracking import MOTOR_OUTPUTS, MOTOR_TIMES
-from airl_mav.vehicle_log.alignment import Alignment, align
+from airl_mav.vehicle_log.alignment import ClockAlignment, align
 from airl_mav.vehicle_log.ulog import VehicleLog
 
 
@@ -49,7 +49,7 @@ def logged_episode_of(box: BlackBox, log: VehicleLog) -> FlownEpisode:
     return FlownEpisode(episode.record, path, columns)
 
 
-def offset_us(clocks: Alignment) -> float:
+def offset_us(clocks: ClockAlignment) -> float:
     """Return the offset from log to companion time [µs]; assumes equal delays if both are known."""
     if clocks.accepted_us is None:
         return clocks.told_us

@@ -152,7 +152,7 @@ def reaction_table(found: Roofline) -> TableView:
     return TableView("reaction", "Reaction time", columns, rows, notes)
 
 
-def roofline_picture(found: Roofline) -> theme.Picture:
+def roofline_picture(found: Roofline) -> theme.FigureImage:
     """Draw safe velocity against 1 / T with the curves and points of each computer."""
     figure = theme.new_figure(7.2, 4.6)
     ax = figure.add_subplot()

@@ -55,7 +55,7 @@ def speed_colours() -> Colormap:
     return ListedColormap(colormaps["viridis"](np.linspace(0.05, 0.9, 256)), name="speed")
 
 
-def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> theme.Picture:
+def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> theme.FigureImage:
     """Draw a stage's durations [µs]: a histogram, and a cumulative curve with percentiles."""
     margins = theme.Margins(left=0.58, right=0.14, bottom=0.42, top=0.27, between=0.1)
     figure, (top, bottom) = theme.stacked_axes(2, 4.2, 2.6, margins, height_ratios=(1.1, 1.0))
@@ -117,7 +117,7 @@ def _bin_edges(values: NDArray[np.float64]) -> list[float]:
 
 def map_figure(
     episode: EpisodeRecord, trajectory: Trajectory | None, arena: Arena | None, top_speed: float
-) -> theme.Picture:
+) -> theme.FigureImage:
     """Draw a map of a flight over its arena, if known, in its state at the flight's end."""
     tall = 1.0
     if arena is not None:

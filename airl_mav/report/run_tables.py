@@ -28,7 +28,7 @@ from airl_mav.report.measures import (
     MEAN_SPEED,
     PACK,
     SUCCESS_RATE,
-    Measure,
+    QualityMeasure,
     RunSummary,
     rate_digits,
 )
@@ -172,7 +172,7 @@ def quality_table(summary: RunSummary, *, computer: bool = True) -> table.TableV
     return table.TableView("quality", "Quality of flight", columns, rows, tuple(notes))
 
 
-def _estimate_row(measure: Measure, mean: Estimate, median: Estimate) -> tuple[str, ...]:
+def _estimate_row(measure: QualityMeasure, mean: Estimate, median: Estimate) -> tuple[str, ...]:
 
     def interval(of: Estimate) -> str:
         return (

@@ -17,7 +17,7 @@ from airl_mav.report.forensics.worst import flown_path
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision, policy_again, seen_decisions
 from airl_mav.report.run_figures import map_figure
 from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, scene_json, top_speed
-from airl_mav.report.theme import Picture, palette
+from airl_mav.report.theme import FigureImage, palette
 from airl_mav.report.tracking import TrackedFlight, track
 from airl_mav.report.tracking_figure import IMAGES, tracking_figure
 
@@ -34,7 +34,7 @@ class PicturedFlight:
 
     record: EpisodeRecord
     cause: Cause | None
-    pictures: tuple[Picture, ...]
+    pictures: tuple[FigureImage, ...]
     scene: int | None
     """Number in the view of single flights; None without a path."""
 
@@ -128,7 +128,7 @@ def pictured_flights(
 def page_data(
     run: LoadedRun,
     view: ShownFlights,
-    pictures: Sequence[Picture],
+    pictures: Sequence[FigureImage],
     vehicle: VehicleProfile | None,
 ) -> str:
     """Return the data of the page's script as JSON: pictures, views and flights."""

@@ -107,7 +107,7 @@ _FONT = re.compile(r"(font: [^;\"]*?px) [^;\"]*")
 
 
 @dataclass(frozen=True)
-class Picture:
+class FigureImage:
     """Figure as SVG and PNG."""
 
     name: str
@@ -195,13 +195,13 @@ def share_grid(axes: Sequence[Axes]) -> None:
         ax.add_collection(grid, autolim=False)
 
 
-def render(figure: Figure, name: str, alt: str) -> Picture:
+def render(figure: Figure, name: str, alt: str) -> FigureImage:
     """Render a figure. The output is reproducible: no dates, no random identifiers."""
     png = render_png(figure)
     svg = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(svg, format="svg", dpi=SVG_DPI, metadata={"Date": None, "Creator": None})
-    return Picture(name, alt, themed(slim(svg.getvalue())), png)
+    return FigureImage(name, alt, themed(slim(svg.getvalue())), png)
 
 
 def render_png(figure: Figure) -> bytes:
@@ -308,7 +308,7 @@ def line_style(index: int) -> LineStyle:
     return LineStyle(LINE_COLOURS[index % len(LINE_COLOURS)], DASHES[(index + step) % len(DASHES)])
 
 
-def montage(pictures: Sequence[Picture], columns: int) -> bytes:
+def montage(pictures: Sequence[FigureImage], columns: int) -> bytes:
     """Return a PNG with all pictures (one or more) in rows."""
     images = [Image.open(io.BytesIO(picture.png)).convert("RGB") for picture in pictures]
     rows = [images[start : start + columns] for start in range(0, len(images), columns)]

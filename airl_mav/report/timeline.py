@@ -101,7 +101,7 @@ def timeline_of(run: LoadedRun) -> Timeline:
     )
 
 
-def timeline_figure(timeline: Timeline, stages: Sequence[Stage]) -> theme.Picture:
+def timeline_figure(timeline: Timeline, stages: Sequence[Stage]) -> theme.FigureImage:
     """Draw the stages (at least one) of all decisions in flown order."""
     margins = theme.Margins(left=0.62, right=0.12, bottom=0.42, top=0.22, between=0.26)
     figure, rows = theme.stacked_axes(len(stages), 10.6, 0.62 + 1.0 * len(stages), margins)

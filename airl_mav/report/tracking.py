@@ -24,7 +24,7 @@ MOTOR_TIMES, MOTOR_OUTPUTS = "motors/time_us", "motors/output"
 
 
 @dataclass(frozen=True)
-class Motion:
+class TrackedMotion:
     """True or estimated motion of a vehicle at m times."""
 
     forward_m_s: Floats
@@ -49,8 +49,8 @@ COMMANDED: Mapping[str, tuple[str, ...]] = {
     ATTITUDE: ("roll_deg", "pitch_deg", "heading_deg", "thrust"),
     RATES: ("body_roll_rate_deg_s", "body_pitch_rate_deg_s", "body_yaw_rate_deg_s", "thrust"),
 }
-"""Names of a setpoint's four numbers by its column: fields of `Motion`, and the thrust. Numbers
-with an empty name are not shown. Values named _deg or _deg_s are recorded in rad."""
+"""Names of a setpoint's four numbers by its column: fields of `TrackedMotion`, and the thrust.
+Numbers with an empty name are not shown. Values named _deg or _deg_s are recorded in rad."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,8 @@ class TrackedFlight:
     record: EpisodeRecord
     time_s: Floats
     """Time (m,) since the start of navigation; negative before."""
-    flown: Motion
-    estimated: Motion | None
+    flown: TrackedMotion
+    estimated: TrackedMotion | None
     """Estimated motion; None if not recorded."""
     errors: EstimateErrors | None
     commands: Commands
@@ -157,12 +157,12 @@ def commands_of(stamps: Arrays, zero_us: int) -> Commands:
 
 def _motion(
     time_us: NDArray[np.int64], position: Floats, velocity: Floats, quaternion: Floats
-) -> tuple[Motion, Floats]:
+) -> tuple[TrackedMotion, Floats]:
     roll, pitch, yaw = quats_to_euler(quaternion)
     heading: Floats = np.unwrap(yaw)
     level = ned_to_heading(velocity, heading)
     rate = np.gradient(heading, time_us / US_PER_S)
-    motion = Motion(
+    motion = TrackedMotion(
         forward_m_s=level[:, 0],
         right_m_s=level[:, 1],
         height_m=-position[:, 2],
@@ -174,7 +174,7 @@ def _motion(
 
 
 def _turned(path: Trajectory) -> dict[str, Floats]:
-    """Return the body rates (m,) [deg/s] by their names in `Motion`."""
+    """Return the body rates (m,) [deg/s] by their names in `TrackedMotion`."""
     q = path.quaternion
     turn = quat_multiply((q[:-1] * (1.0, -1.0, -1.0, -1.0)).T, q[1:].T).T
     sine = np.linalg.norm(turn[:, 1:], axis=1)
@@ -211,10 +211,10 @@ def _at(stamps: Arrays, time_us: NDArray[np.int64]) -> Trajectory:
 
 def _errors(
     path: Trajectory,
-    flown: Motion,
+    flown: TrackedMotion,
     heading: Floats,
     believed: Trajectory,
-    estimated: Motion,
+    estimated: TrackedMotion,
     estimated_heading: Floats,
 ) -> EstimateErrors:
     away = believed.position - path.position

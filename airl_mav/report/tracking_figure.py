@@ -63,7 +63,7 @@ class _Line:
 
 def tracking_figure(
     flight: TrackedFlight, seen: Sequence[SeenDecision] = (), range_m: float = 0.0
-) -> theme.Picture:
+) -> theme.FigureImage:
     """Draw a flight over navigation time, with up to `IMAGES` images of decisions above."""
     rows = _rows(flight)
     strip = STRIP_IN if seen else 0.0

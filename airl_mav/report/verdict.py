@@ -20,7 +20,7 @@ from airl_mav.core.files import read_typed, replace_file, write_json
 from airl_mav.flight.paired import PairedComparison
 from airl_mav.flight.record import EpisodeRecord, Setup
 from airl_mav.flight.requirements import Finding, Requirement, find
-from airl_mav.flight.sequential import Decision
+from airl_mav.flight.sequential import RequirementDecision
 from airl_mav.flight.statistics import Aggregate, Estimate
 from airl_mav.rehearsal.run_folder import RunInfo
 from airl_mav.report.document import environment
@@ -68,9 +68,9 @@ class OverallVerdict:
         decisions = {finding.decision for finding in self.findings}
         if self.invalid:
             return "invalid"
-        if Decision.NOT_MET in decisions:
+        if RequirementDecision.NOT_MET in decisions:
             return "not met"
-        if Decision.UNDECIDED in decisions:
+        if RequirementDecision.UNDECIDED in decisions:
             return "undecided"
         return "met" if decisions else "nothing required"
 
@@ -201,7 +201,7 @@ def requirements_of(folder: Path) -> tuple[Requirement, ...]:
 def write_junit(verdict: OverallVerdict, path: Path, suite: str) -> None:
     """Write a verdict as JUnit XML, with a case in `suite` for validity and each requirement."""
     cases = len(verdict.findings) + 1
-    failures = sum(finding.decision is not Decision.MET for finding in verdict.findings)
+    failures = sum(finding.decision is not RequirementDecision.MET for finding in verdict.findings)
     counts = {
         "tests": str(cases),
         "failures": str(failures),
@@ -217,8 +217,8 @@ def write_junit(verdict: OverallVerdict, path: Path, suite: str) -> None:
         case = ET.SubElement(
             part, "testcase", {"classname": suite, "name": str(finding.requirement)}
         )
-        if finding.decision is not Decision.MET:
-            kind = "not met" if finding.decision is Decision.NOT_MET else "undecided"
+        if finding.decision is not RequirementDecision.MET:
+            kind = "not met" if finding.decision is RequirementDecision.NOT_MET else "undecided"
             failure = ET.SubElement(case, "failure", {"type": kind, "message": finding.sentence()})
             failure.text = "\n".join(verdict.sentences)
     ET.SubElement(part, "system-out").text = "\n".join(verdict.lines)

@@ -15,7 +15,7 @@ from airl_mav.report import theme
 from airl_mav.report.document import Document, Facts, Headline, Section, provenance_facts
 from airl_mav.report.heatmap import Field, HeatMap, heat_picture
 from airl_mav.report.table import NONE
-from airl_mav.report.theme import Picture
+from airl_mav.report.theme import FigureImage
 from airl_mav.sweep.store import SWEEP_FILE, as_data
 from airl_mav.sweep.summary import NetworkSummary, Sweep, published_best
 from airl_mav.sweep.tables import count, interval, networks_table, percent, t2_ms
@@ -28,7 +28,7 @@ LABELLED = 20
 """Maximum number of labelled networks in the trade-off; beyond, only each arena's best."""
 
 
-def success_picture(sweep: Sweep, arena: str) -> theme.Picture:
+def success_picture(sweep: Sweep, arena: str) -> theme.FigureImage:
     """Draw the mean success rate of each network of an arena, with its standard deviation."""
     best = sweep.best(arena)
     known = [cell for cell in sweep.of(arena) if cell.success_rate.value is not None]
@@ -61,7 +61,7 @@ def _success_text(cell: NetworkSummary) -> str:
     return text
 
 
-def cost_picture(sweep: Sweep, arena: str) -> theme.Picture:
+def cost_picture(sweep: Sweep, arena: str) -> theme.FigureImage:
     """Draw the cost of each network: multiply-accumulates, or the latency estimated from them."""
     cells = sweep.of(arena)
     values = [_cost(sweep, cell) for cell in cells]
@@ -115,7 +115,7 @@ def _cost(sweep: Sweep, cell: NetworkSummary) -> float:
     return cell.t2_ms if sweep.computer is not None and cell.t2_ms is not None else cell.macs
 
 
-def trade_picture(sweep: Sweep) -> theme.Picture:
+def trade_picture(sweep: Sweep) -> theme.FigureImage:
     """Draw success against cost: a dot with its interval for each network."""
     figure = theme.new_figure(7.4, 4.2)
     ax: Axes = figure.subplots()
@@ -217,7 +217,7 @@ def document_of(sweep: Sweep) -> Document:
     )
 
 
-def _arena_pictures(sweep: Sweep, arena: str) -> list[Picture]:
+def _arena_pictures(sweep: Sweep, arena: str) -> list[FigureImage]:
     return [success_picture(sweep, arena), cost_picture(sweep, arena)]
 
 

@@ -30,7 +30,7 @@ from airl_mav.sweep.config import SweepConfig, load_sweep
 from airl_mav.sweep.store import SweepFolder, declaration
 from airl_mav.sweep.summary import Computer, Sweep, estimated_ms, summarize, write_sweep
 from airl_mav.sweep.trial import (
-    Trained,
+    TrainedTrial,
     Trial,
     TrialResult,
     result_of,
@@ -57,7 +57,7 @@ def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> T
         seeds = folder.config.evaluation
         flown = fly_best(training, config, range(seeds.seed, seeds.seed + seeds.episodes))
         last = training.evaluations()[-1]
-        trained = Trained(last.steps, best.steps, best.success_rate, last.seconds)
+        trained = TrainedTrial(last.steps, best.steps, best.success_rate, last.seconds)
         size = size_of(folder.config, trial)
         result = result_of(trial, size.parameters, size.macs, trained, flown)
         folder.finish(result, training.checkpoints)

@@ -14,7 +14,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import write_json
 from airl_mav.flight.statistics import CONFIDENCE, Estimate, wilson
 from airl_mav.latency.injection import ESTIMATE, choose_injection
-from airl_mav.profiles.computer import ComputerProfile, Latency
+from airl_mav.profiles.computer import ComputerProfile, LatencyDistribution
 from airl_mav.profiles.published import load_published
 from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.store import SCHEMA, SWEEP_FILE, SweepFolder, as_data
@@ -184,7 +184,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 def estimated_ms(computer: ComputerProfile, macs: int) -> float:
     """Return a network's mean t2 [ms] by MACs. Raises UsageError without workload."""
     latency = choose_injection(computer, ESTIMATE, macs=macs).latency
-    if not isinstance(latency, Latency):
+    if not isinstance(latency, LatencyDistribution):
         raise UsageError("--computer: has no workload to estimate from")
     if latency.samples_ms is not None:
         return float(np.mean(latency.samples_ms))

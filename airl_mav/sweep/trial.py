@@ -11,7 +11,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.envs.evaluation import OUTCOMES, EpisodeResult, mean_of_successes
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy.runtime import outputs_of
-from airl_mav.policy.template import Size, template_size
+from airl_mav.policy.template import NetworkSize, template_size
 from airl_mav.profiles.camera_kind import CHANNELS
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.sweep.config import SweepConfig
@@ -74,7 +74,7 @@ def training_of(config: SweepConfig, trial: Trial) -> TrainingConfig:
     )
 
 
-def size_of(config: SweepConfig, trial: Trial) -> Size:
+def size_of(config: SweepConfig, trial: Trial) -> NetworkSize:
     """Return the size of a trial's network, as it flies."""
     environment = config.training.environment
     if environment.cameras:
@@ -92,7 +92,7 @@ def size_of(config: SweepConfig, trial: Trial) -> Size:
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainedTrial:
     """Training result."""
 
     steps: int
@@ -111,7 +111,7 @@ class TrialResult:
     trial: Trial
     parameters: int
     macs: int
-    trained: Trained
+    trained: TrainedTrial
     episodes: int
     successes: int
     outcomes: dict[Outcome, int]
@@ -127,7 +127,7 @@ class TrialResult:
 
 
 def result_of(
-    trial: Trial, parameters: int, macs: int, trained: Trained, flown: Sequence[EpisodeResult]
+    trial: Trial, parameters: int, macs: int, trained: TrainedTrial, flown: Sequence[EpisodeResult]
 ) -> TrialResult:
     """Return the figures of a trial's flights, at least one."""
     # Flights end in arbitrary order: sums must not depend on it.

@@ -267,7 +267,7 @@ def export(asked: export_request.ExportRequest, command: str) -> PolicyCard:
         raise UsageError(f"{out}: {error.strerror}") from None
 
 
-def taken_by(model: BaseAlgorithm) -> export_request.Taken:
+def taken_by(model: BaseAlgorithm) -> export_request.ModelProperties:
     """Return the image and action set of a model's spaces."""
     seen, space = model.observation_space, model.action_space
     images = seen.spaces if isinstance(seen, spaces.Dict) else {}
@@ -279,9 +279,9 @@ def taken_by(model: BaseAlgorithm) -> export_request.Taken:
     goal = images.get(GOAL)
     tells_height = goal is not None and goal.shape == (4,)
     if kind is None or shape is None or len(shape) != 3:
-        return export_request.Taken(actions=actions)
+        return export_request.ModelProperties(actions=actions)
     image = f"{shape[2]}x{shape[1]}"
-    return export_request.Taken(
+    return export_request.ModelProperties(
         image, shape[0] // CHANNELS[kind], actions, kind, tells_height or None
     )
 

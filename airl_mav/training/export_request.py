@@ -121,7 +121,7 @@ DEFAULTS: dict[str, Any] = {
 """Default model metadata."""
 
 
-class Taken(NamedTuple):
+class ModelProperties(NamedTuple):
     """Properties read from a model: its images, and its action set."""
 
     image: str | None = None
@@ -229,7 +229,7 @@ class ExportRequest(BaseModel):
         """True for a custom module."""
         return names_code(self.model)
 
-    def facts(self, command: str, taken: Taken | None = None) -> PolicyFacts:
+    def facts(self, command: str, taken: ModelProperties | None = None) -> PolicyFacts:
         """Return the card data, `taken` from the loaded model; UsageError for a wrong field."""
         if self.algorithm is None and not self.own_module:
             raise FieldError("algorithm", accepted="the class that wrote the .zip: DQN, PPO, ...")

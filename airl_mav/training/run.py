@@ -24,7 +24,7 @@ from airl_mav.core.files import replace_file
 from airl_mav.core.provenance import package_versions
 from airl_mav.envs.decisions import FIRST_TRAINING_SEED, LAST_TRAINING_SEED
 from airl_mav.envs.evaluation import EpisodeResult, fly_episodes, mean_of_successes, success_rate
-from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.sb3 import NavigationVecEnv, Watcher
 from airl_mav.envs.spec import EnvironmentSpec, Randomisation
@@ -334,7 +334,7 @@ def summary(
     zone: int | None,
 ) -> Evaluation:
     """Return the summary of evaluation flights."""
-    crashed = sum(each.verdict == Verdict.COLLISION for each in flown)
+    crashed = sum(each.verdict == FlightStatus.COLLISION for each in flown)
     return Evaluation(
         steps=steps,
         seconds=seconds,

@@ -26,7 +26,7 @@ from airl_mav.policy.layouts import newest_frame
 from airl_mav.policy.observation_spec import Encoded
 from airl_mav.training.store import Evaluation, TrainingProgress
 from airl_mav.view import messages
-from airl_mav.view.ends import Request, ViewEnds
+from airl_mav.view.ends import ViewEnds, ViewSettings
 from airl_mav.view.feed import Feed
 from airl_mav.view.pace import Pace
 from airl_mav.view.shown import OFFBOARD
@@ -49,9 +49,9 @@ LOOK_S = 0.1
 INFO = 6
 
 
-def request_of(name: str, port: int | None = None) -> Request:
+def request_of(name: str, port: int | None = None) -> ViewSettings:
     """Return the request for the view of a training; `name` is the configuration's name."""
-    return Request(
+    return ViewSettings(
         run=f"{name}, training",
         port=port,
         paced=True,
@@ -76,7 +76,7 @@ class Taped:
     """Outcome; empty while the episode is running."""
 
 
-class Moment(NamedTuple):
+class TimedMessage(NamedTuple):
     """Message to show at a time of a flight [simulated µs since its start]."""
 
     time_us: int
@@ -163,7 +163,7 @@ class WatchedTraining(TrainingProgress):
     # --- the view's side, in a thread
 
     def _run(self) -> None:
-        refly, shown_us = Reflight(self._environment), 0
+        refly, shown_us = EpisodeReplay(self._environment), 0
         while not self._ended.is_set():
             if self._newest:
                 shown_us = self._show(refly, self._newest.pop(), shown_us)
@@ -172,7 +172,7 @@ class WatchedTraining(TrainingProgress):
         self._pace.close()
         self._feed.close()
 
-    def _show(self, refly: Reflight, taped: Taped, began_us: int) -> int:
+    def _show(self, refly: EpisodeReplay, taped: Taped, began_us: int) -> int:
         """Show a flight that begins at a time of the view [µs]; return the time of its end."""
         now_us = began_us
         for moment in refly.moments(taped, began_us):
@@ -196,7 +196,7 @@ class WatchedTraining(TrainingProgress):
         return now_us + END_US
 
 
-class Reflight:
+class EpisodeReplay:
     """Replay of episodes, decision by decision, with all messages of a view."""
 
     def __init__(self, environment: EnvironmentSpec) -> None:
@@ -205,11 +205,11 @@ class Reflight:
         self.navigation = Navigation(environment, 1, trace=self._trace)
         self._environment = environment
 
-    def moments(self, taped: Taped, began_us: int) -> Iterator[Moment]:
+    def moments(self, taped: Taped, began_us: int) -> Iterator[TimedMessage]:
         """Replay a recorded episode; yield moments by time, with messages offset by `began_us`."""
         navigation, trace = self.navigation, self._trace
         navigation.begin([0], [taped.seed], taped.zone)
-        yield from (Moment(0, message) for message in self._beginning(taped, began_us))
+        yield from (TimedMessage(0, message) for message in self._beginning(taped, began_us))
         yield self._picture(began_us)
         seen, shown, decisions = navigation.observe(), 0, len(taped.actions)
         for k in range(decisions):
@@ -229,7 +229,7 @@ class Reflight:
                         flown.velocity[row],
                         flown.quaternion[row],
                     )
-                    yield Moment(time_us, vehicle)
+                    yield TimedMessage(time_us, vehicle)
             shown = last + 1
             seen = navigation.observe()
             yield self._picture(began_us)
@@ -253,15 +253,15 @@ class Reflight:
                 goal=goal,
                 goal_radius_m=self._environment.episode.goal_radius_m,
             ),
-            messages.Phase(time_us=began_us, phase="navigating"),
+            messages.PhaseStart(time_us=began_us, phase="navigating"),
         ]
 
-    def _picture(self, began_us: int) -> Moment:
+    def _picture(self, began_us: int) -> TimedMessage:
         image = self.navigation.cameras.image[0].copy()
         now_us = self._now_us()
-        return Moment(
+        return TimedMessage(
             now_us,
-            messages.Picture(captured_us=began_us + now_us, shape=messages.shape_of(image)),
+            messages.CameraImage(captured_us=began_us + now_us, shape=messages.shape_of(image)),
             image,
         )
 
@@ -276,7 +276,7 @@ class Reflight:
         depth: messages.Image = np.maximum(np.rint(image * (far_mm / 255.0)), 1.0).astype(np.uint16)
         return depth
 
-    def _decided(self, image: messages.Image, began_us: int) -> Moment:
+    def _decided(self, image: messages.Image, began_us: int) -> TimedMessage:
         """Return the newest decision, at its start time."""
         record = self._trace.latency(0)
         stamp = {name: int(column[-1]) for name, column in record.items() if column.ndim == 1}
@@ -300,9 +300,9 @@ class Reflight:
             compensated=self._environment.compensate,
             shape=messages.shape_of(image),
         )
-        return Moment(began, message, image)
+        return TimedMessage(began, message, image)
 
-    def _trained(self, taped: Taped, k: int, began_us: int) -> Moment:
+    def _trained(self, taped: Taped, k: int, began_us: int) -> TimedMessage:
         """Return action and reward of decision k; the training's progress is unknown here."""
         began = int(self._trace.latency(0)["infer_start_us"][-1])
         action, count = taped.actions[k], discrete_actions(self._environment.action_spec)
@@ -310,7 +310,7 @@ class Reflight:
             text = ", ".join(f"{number:+.2f}" for number in np.ravel(action).tolist())
         else:
             text = f"{int(action)} of 0 to {count - 1}"
-        return Moment(
+        return TimedMessage(
             began,
             messages.Trained(
                 time_us=began_us + began,
@@ -326,10 +326,10 @@ class Reflight:
         position: NDArray[np.float64],
         velocity: NDArray[np.float64],
         quaternion: NDArray[np.float64],
-    ) -> messages.Vehicle:
+    ) -> messages.VehicleState:
         """Return the vehicle at a time; rotors and battery are from the end of the decision."""
         fleet = self.navigation.whole_truth().fleet
-        return messages.Vehicle(
+        return messages.VehicleState(
             time_us=time_us,
             position=tuple(position.tolist()),
             velocity=tuple(velocity.tolist()),
@@ -341,11 +341,15 @@ class Reflight:
             collision=None,
         )
 
-    def _ending(self, taped: Taped, began_us: int) -> list[Moment]:
+    def _ending(self, taped: Taped, began_us: int) -> list[TimedMessage]:
         now_us = self._now_us()
         text = f"episode {taped.number}: {taped.outcome} after {now_us / US_PER_S:.1f} s, return"
         said = f"{text} {sum(taped.rewards):+.3f}"
         return [
-            Moment(now_us, messages.Phase(time_us=began_us + now_us, phase=taped.outcome)),
-            Moment(now_us, messages.Said(time_us=began_us + now_us, severity=INFO, text=said)),
+            TimedMessage(
+                now_us, messages.PhaseStart(time_us=began_us + now_us, phase=taped.outcome)
+            ),
+            TimedMessage(
+                now_us, messages.Said(time_us=began_us + now_us, severity=INFO, text=said)
+            ),
         ]

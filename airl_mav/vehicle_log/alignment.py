@@ -53,7 +53,7 @@ LONGEST_LINK_US = US_PER_S
 
 
 @dataclass(frozen=True)
-class Alignment:
+class ClockAlignment:
     """Relation of the clocks of a recording and a log of the same flight."""
 
     told_us: float
@@ -81,7 +81,7 @@ def align(
     sent_us: NDArray[np.int64],
     setpoints: NDArray[np.float64],
     commands: CommandKind = "velocity",
-) -> Alignment:
+) -> ClockAlignment:
     """Return the clock relation of a recorded flight and its vehicle's log, or raise UsageError."""
     told_us = _refined(path, log, _coarse(path, log))
     flown, logged = path.velocity[:, :2], log.motion.at(path.time_us - told_us)[:, 3:5]
@@ -95,7 +95,7 @@ def align(
         )
     low_us, high_us, count = _accepted(sent_us, setpoints, commands, log, told_us)
     known = count >= LEAST_SETPOINTS
-    return Alignment(
+    return ClockAlignment(
         told_us=told_us,
         correlation=correlation,
         error_m_s=float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),

@@ -25,7 +25,7 @@ class ViewEnds(BaseModel):
     """Address on which the view publishes its viewers' `Steering`."""
 
 
-class Request(BaseModel):
+class ViewSettings(BaseModel):
     """Configuration of a view process."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -43,7 +43,7 @@ class Request(BaseModel):
     compensated: bool
 
 
-class Answer(BaseModel):
+class ViewAnswer(BaseModel):
     """Port and addresses of a started view."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

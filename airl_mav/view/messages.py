@@ -95,7 +95,7 @@ class Episode(Message):
     goal_radius_m: float
 
 
-class Vehicle(Message):
+class VehicleState(Message):
     """True state of the vehicle."""
 
     kind: Literal["vehicle"] = "vehicle"
@@ -113,7 +113,7 @@ class Vehicle(Message):
     collision: str | None
 
 
-class Picture(Message):
+class CameraImage(Message):
     """Newest image of the camera."""
 
     kind: Literal["picture"] = "picture"
@@ -151,7 +151,7 @@ class Flight(Message):
     goal: Goal
 
 
-class Phase(Message):
+class PhaseStart(Message):
     """Phase that the companion entered, or the verdict on the flight."""
 
     kind: Literal["phase"] = "phase"
@@ -187,7 +187,7 @@ class Trained(Message):
 
 
 Told = Annotated[
-    Episode | Vehicle | Picture | Decided | Flight | Phase | Said | Trained,
+    Episode | VehicleState | CameraImage | Decided | Flight | PhaseStart | Said | Trained,
     Field(discriminator="kind"),
 ]
 _TOLD: TypeAdapter[Told] = TypeAdapter(Told)
@@ -221,7 +221,7 @@ def from_parts(parts: list[bytes]) -> tuple[Told, Image | None] | None:
         message = _TOLD.validate_json(parts[0])
     except (ValidationError, IndexError):
         return None
-    if not isinstance(message, Picture | Decided):
+    if not isinstance(message, CameraImage | Decided):
         return message, None
     shape, number = message.shape, np.dtype(_number(message.shape))
     if len(parts) != 2 or min(shape) < 1 or len(parts[1]) != number.itemsize * math.prod(shape):

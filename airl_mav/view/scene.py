@@ -17,7 +17,7 @@ from airl_mav.core import frames
 from airl_mav.core.frames import goal_height_m
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE
 from airl_mav.view import style
-from airl_mav.view.messages import Episode, Vehicle, VehicleShape
+from airl_mav.view.messages import Episode, VehicleShape, VehicleState
 from airl_mav.view.pictures import camera_picture
 from airl_mav.view.shown import Shown
 
@@ -52,7 +52,10 @@ class FlightScene:
     """Scene of one server. Call from one thread."""
 
     def __init__(
-        self, server: viser.ViserServer, root: str = "/flight", look: style.Look = style.FIRST
+        self,
+        server: viser.ViserServer,
+        root: str = "/flight",
+        look: style.FlightColours = style.FIRST,
     ) -> None:
         """Prepare an empty scene with all nodes below `root`."""
         self._server = server
@@ -271,7 +274,7 @@ class FlightScene:
 
     # --- every time
 
-    def _move(self, shown: Shown, vehicle: Vehicle, episode: Episode) -> None:
+    def _move(self, shown: Shown, vehicle: VehicleState, episode: Episode) -> None:
         at = np.array(vehicle.position)
         self._vehicle.position, self._vehicle.wxyz = at, np.array(vehicle.quaternion)
         self._place.position = at

@@ -1,7 +1,7 @@
 """View process: draws snapshots for all viewers and returns their requests.
 
-The first line of its input is a `Request`, the first line of its output an `Answer`. The process
-ends with the run, at the end of its input.
+The first line of its input is a `ViewSettings`, the first line of its output a `ViewAnswer`. The
+process ends with the run, at the end of its input.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import viser
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.scheduling import give_way
-from airl_mav.view.ends import Answer, Request
+from airl_mav.view.ends import ViewAnswer, ViewSettings
 from airl_mav.view.feed import Ends
 from airl_mav.view.local_server import LocalServer
 from airl_mav.view.messages import Steering
@@ -113,10 +113,10 @@ NICENESS = 10
 """Nice value of the view; flights have priority on a busy machine."""
 
 
-class View:
+class RunPage:
     """Page of a run."""
 
-    def __init__(self, server: viser.ViserServer, ends: Ends, request: Request) -> None:
+    def __init__(self, server: viser.ViserServer, ends: Ends, request: ViewSettings) -> None:
         """Build the page."""
         self._server, self._ends = server, ends
         self._shown = Shown()
@@ -165,16 +165,16 @@ def main() -> int:
     outgoing = os.fdopen(os.dup(1), "wb", buffering=0)
     # Output of libraries must not reach the harness as an answer.
     os.dup2(2, 1)
-    request = Request.model_validate_json(sys.stdin.buffer.readline())
+    request = ViewSettings.model_validate_json(sys.stdin.buffer.readline())
     give_way(NICENESS)
     warnings.simplefilter("ignore", DeprecationWarning)
     server = LocalServer(request.port or 0)
     port = server.get_port()
     if request.port not in (None, port):
-        outgoing.write(Answer().model_dump_json().encode() + b"\n")
+        outgoing.write(ViewAnswer().model_dump_json().encode() + b"\n")
         return 0
     ends = Ends()
-    outgoing.write(Answer(port=port, ends=ends.ends).model_dump_json().encode() + b"\n")
+    outgoing.write(ViewAnswer(port=port, ends=ends.ends).model_dump_json().encode() + b"\n")
     ended = threading.Event()
 
     def listen() -> None:
@@ -183,7 +183,7 @@ def main() -> int:
         ended.set()
 
     threading.Thread(target=listen, name="harness", daemon=True).start()
-    View(server, ends, request).run(ended)
+    RunPage(server, ends, request).run(ended)
     server.stop()
     ends.close()
     return 0

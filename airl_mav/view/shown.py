@@ -42,7 +42,7 @@ class Shown:
     """True if the surroundings are known; False while an arena is being generated."""
     episodes: int = 0
     """Number of episodes started so far; a new number requires a new scene."""
-    vehicle: messages.Vehicle | None = None
+    vehicle: messages.VehicleState | None = None
     trail: list[Point] = field(default_factory=list)
     """Past positions of the vehicle in this episode, NED [m]."""
     picture: messages.Image | None = None
@@ -58,16 +58,16 @@ class Shown:
 
     def take(self, message: messages.Told, image: messages.Image | None) -> None:
         """Update the state with a message and its image."""
-        if isinstance(message, messages.Vehicle):
+        if isinstance(message, messages.VehicleState):
             self._move(message)
-        elif isinstance(message, messages.Picture):
+        elif isinstance(message, messages.CameraImage):
             self.picture = image
         elif isinstance(message, messages.Decided):
             self.decided, self.decided_image = message, image
             self.decisions += 1
         elif isinstance(message, messages.Episode):
             self._begin(message)
-        elif isinstance(message, messages.Phase):
+        elif isinstance(message, messages.PhaseStart):
             self.phase = message.phase
         elif isinstance(message, messages.Said):
             self.texts.append(message)
@@ -84,7 +84,7 @@ class Shown:
         self.trail, self.decisions = [], 0
         self.ages.clear()
 
-    def _move(self, vehicle: messages.Vehicle) -> None:
+    def _move(self, vehicle: messages.VehicleState) -> None:
         self.vehicle = vehicle
         if not self.trail or math.dist(self.trail[-1], vehicle.position) >= TRAIL_STEP_M:
             self.trail.append(vehicle.position)

@@ -31,7 +31,7 @@ LEAST_ARROW_M = 0.02
 
 
 @dataclass(frozen=True)
-class Look:
+class FlightColours:
     """Colours of one flight among several in the same scene."""
 
     trail: Colour
@@ -41,8 +41,8 @@ class Look:
     """True if arena, camera and commanded velocity are drawn, too."""
 
 
-FIRST = Look((47, 127, 196), (47, 54, 61), (40, 104, 168))
-OTHER = Look((150, 80, 170), (110, 50, 130), (150, 80, 170), whole=False)
+FIRST = FlightColours((47, 127, 196), (47, 54, 61), (40, 104, 168))
+OTHER = FlightColours((150, 80, 170), (110, 50, 130), (150, 80, 170), whole=False)
 
 
 Floats = NDArray[np.float64]

@@ -18,8 +18,8 @@ from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view import messages
 from airl_mav.view.ends import ViewEnds
 from airl_mav.view.feed import Asked, Feed
-from companion.pilot import Decided as Decision
-from firmware_sim.autopilot.commander import Phase
+from companion.pilot import SentDecision as Decision
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.engine.kinematics import POSITION, QUATERNION, VELOCITY
 from firmware_sim.simulation import Simulation
 
@@ -142,7 +142,7 @@ class SimulationTap:
                 continue
             self._vehicle_due = due
             self._feed.send(
-                messages.Vehicle(
+                messages.VehicleState(
                     time_us=time_us,
                     position=tuple(motion[POSITION].tolist()),
                     velocity=tuple(motion[VELOCITY].tolist()),
@@ -150,7 +150,7 @@ class SimulationTap:
                     rotors=rotors,
                     battery=charge,
                     mode=flight.mode.name.lower().replace("_", " "),
-                    armed=flight.phase >= Phase.GROUND,
+                    armed=flight.phase >= FlightPhase.GROUND,
                     collision=collision,
                 )
             )
@@ -162,7 +162,7 @@ class SimulationTap:
         if due == self._picture_due:
             return
         self._picture_due = due
-        shown = messages.Picture(
+        shown = messages.CameraImage(
             captured_us=frame.capture_time_us, shape=messages.shape_of(frame.image)
         )
         self._feed.send(shown, frame.image)

@@ -13,7 +13,7 @@ from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import FieldError
 from airl_mav.scenario.resolved import ResolvedScenario
-from airl_mav.view.ends import Answer, Request, ViewEnds
+from airl_mav.view.ends import ViewAnswer, ViewEnds, ViewSettings
 from airl_mav.view.pace import REAL_TIME
 
 MODULE = "airl_mav.view.server"
@@ -23,10 +23,10 @@ class ViewError(Exception):
     """Error for a view that failed to start; the message contains the cause."""
 
 
-def request_of(scenario: ResolvedScenario, name: str, port: int | None = None) -> Request:
-    """Return the request for a view of a scenario's flights; `name` and `port` as in `Request`."""
+def request_of(scenario: ResolvedScenario, name: str, port: int | None = None) -> ViewSettings:
+    """Return the settings of a view of a scenario's flights; arguments as in `ViewSettings`."""
     paced = scenario.scenario.level == "lockstep"
-    return Request(
+    return ViewSettings(
         run=name,
         port=port,
         paced=paced,
@@ -40,7 +40,7 @@ def request_of(scenario: ResolvedScenario, name: str, port: int | None = None) -
 class Viewer:
     """Page that shows flights until closed."""
 
-    def __init__(self, request: Request) -> None:
+    def __init__(self, request: ViewSettings) -> None:
         """Start the viewer and wait for it; raise FieldError if the port is in use."""
         self._folder = tempfile.TemporaryDirectory(prefix="airl-view-")
         self._child = ChildProcess(
@@ -62,7 +62,7 @@ class Viewer:
         self.url = f"http://{LOOPBACK}:{answer.port}"
         """URL of the page for a browser."""
 
-    def _answer(self, request: Request) -> Answer:
+    def _answer(self, request: ViewSettings) -> ViewAnswer:
         stdin, stdout = self._child.stdin, self._child.stdout
         line = b""
         if stdin is not None and stdout is not None:
@@ -71,7 +71,7 @@ class Viewer:
                 stdin.flush()
                 line = stdout.readline()
         try:
-            return Answer.model_validate_json(line)
+            return ViewAnswer.model_validate_json(line)
         except ValidationError:
             self._child.stop()
             raise ViewError(f"the view did not start\n{self._child.log_tail()}") from None

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.commander import Event, Flight, Phase
+from firmware_sim.autopilot.commander import CommanderEvent, CommanderState, FlightPhase
 
-_GROUND, _AIR = Phase.GROUND, Phase.AIR
+_GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR
 _TERMINATION = Mode.TERMINATION
 
 
@@ -29,7 +29,7 @@ class AutoDisarm:
         """Start a flight: earlier time on the ground does not count."""
         self._standing_since_us = None
 
-    def event(self, flight: Flight, time_us: int, *, idle: bool) -> Event | None:
+    def event(self, flight: CommanderState, time_us: int, *, idle: bool) -> CommanderEvent | None:
         """Return the event of an expired timeout, or None.
 
         `idle`: the motors are stopped. Spool-up and take-off ramp do not count as ground time.
@@ -40,7 +40,7 @@ class AutoDisarm:
                 self._stopped_since_us = time_us
             due_us = self._stopped_since_us + self._value("COM_KILL_DISARM") * US_PER_S
             if time_us >= due_us:
-                return Event.LOCKDOWN_TIMEOUT
+                return CommanderEvent.LOCKDOWN_TIMEOUT
             self.due_us = due_us
             return None
         self._stopped_since_us = None
@@ -54,5 +54,5 @@ class AutoDisarm:
         due_us = self._standing_since_us + limit_s * US_PER_S
         self.due_us = due_us if limit_s > 0.0 and time_us < due_us else math.inf
         if limit_s > 0.0 and time_us >= due_us:
-            return Event.LANDED_TIMEOUT if self._flown else Event.DISARM_TIMEOUT
+            return CommanderEvent.LANDED_TIMEOUT if self._flown else CommanderEvent.DISARM_TIMEOUT
         return None

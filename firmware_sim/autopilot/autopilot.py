@@ -15,8 +15,8 @@ from firmware_sim.autopilot.autopilot_state import (
     UNTOLD,
     WITH_STICKS,
     AutopilotState,
-    Message,
     Mode,
+    OperatorText,
     Result,
     Setpoint,
     Severity,
@@ -27,14 +27,14 @@ from firmware_sim.autopilot.commander import (
     COMMANDED,
     READINESS,
     Ask,
-    Event,
-    Flight,
-    Phase,
+    CommanderEvent,
+    CommanderState,
+    FlightPhase,
 )
 from firmware_sim.autopilot.error_state import RATES, Q
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import Event as Told
+from firmware_sim.autopilot.events.definition import MavlinkEvent as Told
 from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.filter_kernel import KernelFilter
@@ -44,7 +44,7 @@ from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.home import Home
 from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.manual_control import ManualControl, Source, Sticks
-from firmware_sim.autopilot.navigation.flown_item import Situation
+from firmware_sim.autopilot.navigation.flown_item import ExecutorState
 from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.whereabouts import Whereabouts
@@ -54,9 +54,9 @@ from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
 from firmware_sim.autopilot.requests import (
     FollowedTarget,
     LandingTarget,
-    Obstacles,
-    Place,
-    Request,
+    ModeRequest,
+    ObstacleBins,
+    PositionYaw,
 )
 from firmware_sim.autopilot.snapshot import Parts, Snapshot
 from firmware_sim.engine.controller import Controller
@@ -68,14 +68,14 @@ from firmware_sim.interfaces import (
     FlowReading,
     Odometry,
     SensorSample,
-    Truth,
+    TrueState,
 )
 
 CLIENTS_SENSOR = 1
 """Source id of ranges from a client, as opposed to the vehicle's sensor."""
 
 # Bound once: looking up an enum member in every tick is slow.
-_GROUND, _AIR = Phase.GROUND, Phase.AIR
+_GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR
 
 
 class BuiltinAutopilot:
@@ -107,14 +107,14 @@ class BuiltinAutopilot:
         self._controller = Controller(Gains.from_parameters(value), record)
         self._memory: Vector = record["memory"][0]
         parameters.on_change(self._parameters_changed)
-        self._messages: list[Message] = []
+        self._messages: list[OperatorText] = []
         self._demand: AnyDemand | None = None
         """Active demand; None = the motors are stopped."""
         self._taken_us = -1
         """Time of the newest sample in the estimator [µs]."""
         self._due_us: float = 0
         """Time of the next decision [µs]."""
-        self._decided_on: tuple[Flight | None, object] = (None, None)
+        self._decided_on: tuple[CommanderState | None, object] = (None, None)
         """Commander state and setpoint at the newest decision."""
         self._decided_healthy = 0
         """Health of the estimator at the newest decision, 0 or 1."""
@@ -157,7 +157,7 @@ class BuiltinAutopilot:
         """Flight logs for clients. Set by the log writer."""
         self.on_setpoint: Callable[[Wire, int], None] | None = None
         """Callback for accepted setpoints: setpoint as received, time of receipt [µs]."""
-        self.on_message: Callable[[Message], None] | None = None
+        self.on_message: Callable[[OperatorText], None] | None = None
         """Callback for operator texts."""
         self._say_all(parameters.take_texts())
 
@@ -202,7 +202,7 @@ class BuiltinAutopilot:
         if not self.record["aligned"].item(0) and self.estimator.align():
             self._navigator.due_us = 0
         if self._commander.flight.phase is _AIR and self._guidance.is_done(self._state):
-            self._commander.handle(Event.MODE_DONE)
+            self._commander.handle(CommanderEvent.MODE_DONE)
         if self._home.place is None and self.estimator.origin is not None:
             if self._commander.flight.phase < _GROUND:
                 self._home.set_here()
@@ -371,18 +371,18 @@ class BuiltinAutopilot:
         """Return whether the navigator has no work, as in its newest step."""
         return self._navigator.idle and self._navigates_on() == self._navigated_on
 
-    def _return_place(self) -> Place | None:
+    def _return_place(self) -> PositionYaw | None:
         """Return the destination of Return: home, or the place selected by RTL_TYPE."""
         context, now = self._guidance.context, self._situation()
-        home = Place(context.home, context.home_yaw)
+        home = PositionYaw(context.home, context.home_yaw)
         return home if now is None else self._navigator.return_place(now, home)
 
-    def _situation(self) -> Situation | None:
+    def _situation(self) -> ExecutorState | None:
         return self._whereabouts.situation(landed=self._commander.flight.phase is not _AIR)
 
     def _handle_detected(self) -> None:
         landed = self._commander.flight.phase is _AIR
-        self._commander.handle(Event.LANDED if landed else Event.LIFTED)
+        self._commander.handle(CommanderEvent.LANDED if landed else CommanderEvent.LIFTED)
 
     # --- texts
 
@@ -393,7 +393,7 @@ class BuiltinAutopilot:
             self.supervisor.watch.reports.mission_missing = not valid
         self._commander.look()
 
-    def _say(self, message: Message) -> None:
+    def _say(self, message: OperatorText) -> None:
         self._messages.append(message)
         if message.event is not None:
             self._events.append(message.event)
@@ -407,12 +407,12 @@ class BuiltinAutopilot:
         self.supervisor.read_parameters()
         self._say_all(self.parameters.take_texts())
 
-    def _say_all(self, messages: Sequence[Message]) -> None:
+    def _say_all(self, messages: Sequence[OperatorText]) -> None:
         for message in messages:
             self._say(message)
 
     @property
-    def flight(self) -> Flight:
+    def flight(self) -> CommanderState:
         """Commander state."""
         return self._commander.flight
 
@@ -446,17 +446,17 @@ class BuiltinAutopilot:
         """The autopilot itself: all internals are accessible."""
         return self
 
-    def use_truth(self, truth: Callable[[], Truth]) -> None:
+    def use_truth(self, truth: Callable[[], TrueState]) -> None:
         """Ignore the true state: the autopilot flies by its estimate."""
 
     def close(self) -> None:
         """Do nothing: there are no resources to release."""
 
-    def report(self, message: Message) -> None:
+    def report(self, message: OperatorText) -> None:
         """Send a text to the operator that does not come from flying."""
         self._say(message)
 
-    def take_messages(self) -> list[Message]:
+    def take_messages(self) -> list[OperatorText]:
         """Return texts for the operator since the last call."""
         taken, self._messages, self._unsaid = self._messages, [], 0
         return taken
@@ -476,11 +476,13 @@ class BuiltinAutopilot:
         """Request arming. The pre-arm checks also run for a forced request, as in PX4."""
         del force
         if self.sample is None or self.flight.phase >= _GROUND:
-            return self._commander.handle(Event.ARM)
+            return self._commander.handle(CommanderEvent.ARM)
         self._look_anew(self.flight.mode)
         refusals = self.supervisor.refusals(self.sample, self.flight)
         self._say_all(refusals)
-        return self._commander.handle(Event.ARM_UNREADY if refusals else Event.ARM)
+        return self._commander.handle(
+            CommanderEvent.ARM_UNREADY if refusals else CommanderEvent.ARM
+        )
 
     def terminate(self) -> Result:
         """Request permanent motor stop (MAV_CMD_DO_FLIGHTTERMINATION)."""
@@ -488,7 +490,7 @@ class BuiltinAutopilot:
 
     def disarm(self, *, force: bool) -> Result:
         """Request disarming; force = kill, also in the air."""
-        return self._commander.handle(Event.KILL if force else Event.DISARM)
+        return self._commander.handle(CommanderEvent.KILL if force else CommanderEvent.DISARM)
 
     def takeoff(self, altitude_m: float | None, place: tuple[float, float] | None = None) -> Result:
         """Request a take-off to a height above home [m] and a place; None = default."""
@@ -497,7 +499,7 @@ class BuiltinAutopilot:
         return self._ask(Mode.TAKEOFF)
 
     def set_mode(
-        self, mode: Mode, request: Request | None = None, *, commanded: bool = False
+        self, mode: Mode, request: ModeRequest | None = None, *, commanded: bool = False
     ) -> Result:
         """Request a mode with its optional arguments; see `port.AutopilotPort`."""
         if mode is Mode.TAKEOFF:
@@ -505,7 +507,7 @@ class BuiltinAutopilot:
         return self._ask(mode, request, COMMANDED.get(mode) if commanded else None)
 
     def _ask(
-        self, mode: Mode, request: Request | None = None, granted: Message | None = None
+        self, mode: Mode, request: ModeRequest | None = None, granted: OperatorText | None = None
     ) -> Result:
         self._look_anew(mode)
         if self.flight.phase >= _GROUND:
@@ -522,7 +524,7 @@ class BuiltinAutopilot:
     def start_mission(self, index: int) -> Result:
         """Arm and fly the mission from an item (MAV_CMD_MISSION_START); -1 = current item."""
         if not self._navigator.mission_is_valid(self._situation()):
-            self.say(Message.of(Severity.CRITICAL, events.MISSION_DENIED))
+            self.say(OperatorText.of(Severity.CRITICAL, events.MISSION_DENIED))
             return Result.DENIED
         if not -1 <= index < len(self.plans.mission):
             return Result.DENIED
@@ -535,7 +537,7 @@ class BuiltinAutopilot:
 
     # --- towards the mission (navigation.executor.Crew)
 
-    def say(self, message: Message) -> None:
+    def say(self, message: OperatorText) -> None:
         """Send a text to the operator."""
         self._say(message)
 
@@ -551,7 +553,7 @@ class BuiltinAutopilot:
         PX4 also moves it in flight and shifts all local positions.
         """
         if self.flight.phase >= _GROUND:
-            self.say(Message(Severity.WARNING, "Origin is not moved while armed"))
+            self.say(OperatorText(Severity.WARNING, "Origin is not moved while armed"))
             return Result.TEMPORARILY_REJECTED
         self.estimator.move_origin(place)
         self._home.find()
@@ -602,7 +604,7 @@ class BuiltinAutopilot:
             return
         if takes_over and self.flight.phase is _AIR and flown is not Mode.ORBIT:
             self._commander.handle(Ask(Mode.POSITION))
-            self._say(Message.of(Severity.INFO, events.PILOT_TOOK_OVER))
+            self._say(OperatorText.of(Severity.INFO, events.PILOT_TOOK_OVER))
 
     def see(self, odometry: Odometry) -> None:
         """Pass on a pose from an external estimator."""
@@ -618,7 +620,7 @@ class BuiltinAutopilot:
         """Pass on a reading from a client's optical flow sensor."""
         self.estimator.look_down(reading)
 
-    def see_obstacles(self, obstacles: Obstacles) -> None:
+    def see_obstacles(self, obstacles: ObstacleBins) -> None:
         """Pass on the distances to obstacles."""
         self._guidance.context.obstacles = obstacles
 

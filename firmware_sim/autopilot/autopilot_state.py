@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.events.definition import Definition, Event
+from firmware_sim.autopilot.events.definition import Definition, MavlinkEvent
 from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.interfaces import (
     BatterySample,
@@ -111,18 +111,18 @@ class Severity(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class OperatorText:
     """Text for the operator (STATUSTEXT)."""
 
     severity: Severity
     text: str
-    event: Event | None = field(default=None, compare=False)
+    event: MavlinkEvent | None = field(default=None, compare=False)
     """Equivalent event for ground stations with event support; None = no event."""
 
     @classmethod
     def of(
         cls, severity: Severity, definition: Definition, *values: float, text: str | None = None
-    ) -> Message:
+    ) -> OperatorText:
         """Return an event with its arguments and its text; None = the event's message."""
         words = definition.message if text is None else text
         return cls(severity, words, definition.event(*values))
@@ -161,7 +161,7 @@ class Setpoint(NamedTuple):
     acceleration: Vector = np.full(3, math.nan)  # (3,) NED [m/s²]
 
 
-class Estimate(NamedTuple):
+class StateEstimate(NamedTuple):
     """Output of the estimator."""
 
     time_us: int
@@ -292,7 +292,7 @@ class AutopilotState(Protocol):
         """Same object while log data outside the tick's log is unchanged; None = unknown."""
 
     @property
-    def estimate(self) -> Estimate:
+    def estimate(self) -> StateEstimate:
         """The estimator's output."""
 
     @property

@@ -16,18 +16,18 @@ from firmware_sim.autopilot.autopilot_state import (
     Arming,
     CommanderStatus,
     Landed,
-    Message,
     Mode,
+    OperatorText,
     Result,
     Severity,
 )
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import Event as Told
+from firmware_sim.autopilot.events.definition import MavlinkEvent as Told
 from firmware_sim.autopilot.events.enumerations import ArmingReason, words
 from firmware_sim.autopilot.mode_numbers import custom_mode, named
 
 
-class Phase(IntEnum):
+class FlightPhase(IntEnum):
     """Phase of a flight."""
 
     BOOT = 0
@@ -48,7 +48,7 @@ class Ask(NamedTuple):
     """True if the mode's requirements are met; offboard: a fresh setpoint."""
 
 
-class Event(Enum):
+class CommanderEvent(Enum):
     """Events other than mode requests."""
 
     READY = auto()
@@ -78,10 +78,10 @@ class Event(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Flight:
+class CommanderState:
     """Complete state of the commander."""
 
-    phase: Phase = Phase.BOOT
+    phase: FlightPhase = FlightPhase.BOOT
     mode: Mode = Mode.HOLD
     """Active mode."""
     intended: Mode = Mode.HOLD
@@ -98,94 +98,105 @@ class Choice(Enum):
     KEEP = auto()
     """No change."""
     ASK = auto()
-    """Switch to `Row.mode`, requested by the user."""
+    """Switch to `TransitionCell.mode`, requested by the user."""
     RESTORE = auto()
     """Disarmed: return to the last lasting mode."""
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TransitionCell:
     """Cell of the transition table."""
 
-    phase: Phase | None = None
+    phase: FlightPhase | None = None
     """Next phase; None = unchanged."""
     choice: Choice = Choice.KEEP
     mode: Mode = Mode.HOLD
     result: Result = Result.ACCEPTED
-    text: Message | None = None
+    text: OperatorText | None = None
 
 
-def _info(text: str, event: Told) -> Message:
-    return Message(Severity.INFO, text, event)
+def _info(text: str, event: Told) -> OperatorText:
+    return OperatorText(Severity.INFO, text, event)
 
 
-def _critical(text: str, event: Told) -> Message:
-    return Message(Severity.CRITICAL, text, event)
+def _critical(text: str, event: Told) -> OperatorText:
+    return OperatorText(Severity.CRITICAL, text, event)
 
 
 _BY_COMMAND = events.ARMED_BY.event(ArmingReason.COMMAND_EXTERNAL)
-_IGNORE = Row()
+_IGNORE = TransitionCell()
 _TEMP = Result.TEMPORARILY_REJECTED
-_NO_ARM = Row(result=_TEMP, text=Message.of(Severity.CRITICAL, events.ARM_DENIED))
-_NOT_LANDED = Row(result=_TEMP, text=Message.of(Severity.CRITICAL, events.DISARM_DENIED))
-_B, _S, _G, _A = Phase
-_ARMED = Row(phase=_G, text=_info("Armed by external command", _BY_COMMAND))
-_LIFTED = Row(phase=_A, text=Message.of(Severity.INFO, events.TAKEOFF_DETECTED))
-_LANDED = Row(phase=_G, text=Message.of(Severity.INFO, events.LANDING_DETECTED))
+_NO_ARM = TransitionCell(result=_TEMP, text=OperatorText.of(Severity.CRITICAL, events.ARM_DENIED))
+_NOT_LANDED = TransitionCell(
+    result=_TEMP, text=OperatorText.of(Severity.CRITICAL, events.DISARM_DENIED)
+)
+_B, _S, _G, _A = FlightPhase
+_ARMED = TransitionCell(phase=_G, text=_info("Armed by external command", _BY_COMMAND))
+_LIFTED = TransitionCell(phase=_A, text=OperatorText.of(Severity.INFO, events.TAKEOFF_DETECTED))
+_LANDED = TransitionCell(phase=_G, text=OperatorText.of(Severity.INFO, events.LANDING_DETECTED))
 
 
-def _ask(mode: Mode) -> Row:
-    return Row(choice=Choice.ASK, mode=mode)
+def _ask(mode: Mode) -> TransitionCell:
+    return TransitionCell(choice=Choice.ASK, mode=mode)
 
 
-def _unavailable(mode: Mode) -> Row:
+def _unavailable(mode: Mode) -> TransitionCell:
     text = f"Switching to {MODE_NAMES[mode]} is currently not available"
     event = events.MODE_NOT_AVAILABLE.event(custom_mode(mode), named(mode))
-    return Row(result=_TEMP, text=_critical(text, event))
+    return TransitionCell(result=_TEMP, text=_critical(text, event))
 
 
-def _asked(mode: Mode) -> tuple[Row, Row, Row, Row]:
+def _asked(mode: Mode) -> tuple[TransitionCell, TransitionCell, TransitionCell, TransitionCell]:
     # PX4 also accepts the mode on the ground and disarmed; the vehicle stays.
     return (_ask(mode),) * 4
 
 
-def _asked_in_vain(mode: Mode) -> tuple[Row, Row, Row, Row]:
+def _asked_in_vain(
+    mode: Mode,
+) -> tuple[TransitionCell, TransitionCell, TransitionCell, TransitionCell]:
     # Disarmed, PX4 accepts any mode and rejects arming if its requirements are unmet.
     return (_ask(mode), _ask(mode), _unavailable(mode), _unavailable(mode))
 
 
-def _disarm(reason: ArmingReason) -> Row:
+def _disarm(reason: ArmingReason) -> TransitionCell:
     text = _info(f"Disarmed by {words(reason)}", events.DISARMED_BY.event(reason))
-    return Row(phase=_S, choice=Choice.RESTORE, text=text)
+    return TransitionCell(phase=_S, choice=Choice.RESTORE, text=text)
 
 
 COMMANDED = {
-    Mode.LAND: Message.of(Severity.INFO, events.LANDING_HERE),
+    Mode.LAND: OperatorText.of(Severity.INFO, events.LANDING_HERE),
     Mode.PRECISION_LAND: _info("Precision landing", events.LANDING_PRECISELY.event()),
-    Mode.RETURN: Message.of(Severity.INFO, events.RETURNING),
+    Mode.RETURN: OperatorText.of(Severity.INFO, events.RETURNING),
 }
 """Texts for modes with a separate MAVLink command, armed or not; DO_SET_MODE has no text."""
 
 _DISARMED = _disarm(ArmingReason.COMMAND_EXTERNAL)
 _UNUSED = _disarm(ArmingReason.AUTO_DISARM_PREFLIGHT)
 _LOCKED, _CUT = _disarm(ArmingReason.LOCKDOWN), _disarm(ArmingReason.FAILSAFE)
-_DENIED = Row(result=Result.DENIED)
+_DENIED = TransitionCell(result=Result.DENIED)
 
-TABLE: dict[Ask | Event, tuple[Row, Row, Row, Row]] = {
-    Event.READY: (Row(phase=_S), _IGNORE, _IGNORE, _IGNORE),
+TABLE: dict[
+    Ask | CommanderEvent, tuple[TransitionCell, TransitionCell, TransitionCell, TransitionCell]
+] = {
+    CommanderEvent.READY: (TransitionCell(phase=_S), _IGNORE, _IGNORE, _IGNORE),
     # No transition from air back to boot: the vehicle continues with the estimate as is.
-    Event.NOT_READY: (_IGNORE, Row(phase=_B), _IGNORE, _IGNORE),
-    Event.ARM: (_NO_ARM, _ARMED, _IGNORE, _IGNORE),
-    Event.ARM_UNREADY: (_NO_ARM, _NO_ARM, _IGNORE, _IGNORE),
-    Event.DISARM: (_IGNORE, _IGNORE, _DISARMED, _NOT_LANDED),
-    Event.KILL: (_IGNORE, _IGNORE, _DISARMED, _DISARMED),
-    Event.LIFTED: (_IGNORE, _IGNORE, _LIFTED, _IGNORE),
-    Event.LANDED: (_IGNORE, _IGNORE, _IGNORE, _LANDED),
-    Event.MODE_DONE: (_IGNORE, _IGNORE, _IGNORE, _ask(Mode.HOLD)),
-    Event.DISARM_TIMEOUT: (_IGNORE, _IGNORE, _UNUSED, _IGNORE),
-    Event.LANDED_TIMEOUT: (_IGNORE, _IGNORE, _disarm(ArmingReason.AUTO_DISARM_LAND), _IGNORE),
-    Event.LOCKDOWN_TIMEOUT: (_IGNORE, _IGNORE, _LOCKED, _LOCKED),
-    Event.FAILSAFE_DISARM: (_IGNORE, _IGNORE, _CUT, _CUT),
+    CommanderEvent.NOT_READY: (_IGNORE, TransitionCell(phase=_B), _IGNORE, _IGNORE),
+    CommanderEvent.ARM: (_NO_ARM, _ARMED, _IGNORE, _IGNORE),
+    CommanderEvent.ARM_UNREADY: (_NO_ARM, _NO_ARM, _IGNORE, _IGNORE),
+    CommanderEvent.DISARM: (_IGNORE, _IGNORE, _DISARMED, _NOT_LANDED),
+    CommanderEvent.KILL: (_IGNORE, _IGNORE, _DISARMED, _DISARMED),
+    CommanderEvent.LIFTED: (_IGNORE, _IGNORE, _LIFTED, _IGNORE),
+    CommanderEvent.LANDED: (_IGNORE, _IGNORE, _IGNORE, _LANDED),
+    CommanderEvent.MODE_DONE: (_IGNORE, _IGNORE, _IGNORE, _ask(Mode.HOLD)),
+    CommanderEvent.DISARM_TIMEOUT: (_IGNORE, _IGNORE, _UNUSED, _IGNORE),
+    CommanderEvent.LANDED_TIMEOUT: (
+        _IGNORE,
+        _IGNORE,
+        _disarm(ArmingReason.AUTO_DISARM_LAND),
+        _IGNORE,
+    ),
+    CommanderEvent.LOCKDOWN_TIMEOUT: (_IGNORE, _IGNORE, _LOCKED, _LOCKED),
+    CommanderEvent.FAILSAFE_DISARM: (_IGNORE, _IGNORE, _CUT, _CUT),
     **{Ask(mode): _asked(mode) for mode in Mode},
     **{Ask(mode, available=False): _asked_in_vain(mode) for mode in Mode},
     # There is nothing to terminate while disarmed.
@@ -194,13 +205,13 @@ TABLE: dict[Ask | Event, tuple[Row, Row, Row, Row]] = {
 """[event][phase]: effect of an event in BOOT, STANDBY, GROUND and AIR; tests cover every pair."""
 
 
-def _unless_ignored(event: Event, phase: Phase) -> Event | None:
+def _unless_ignored(event: CommanderEvent, phase: FlightPhase) -> CommanderEvent | None:
     return None if TABLE[event][phase] is _IGNORE else event
 
 
 READINESS = tuple(
-    (_unless_ignored(Event.NOT_READY, phase), _unless_ignored(Event.READY, phase))
-    for phase in Phase
+    (_unless_ignored(CommanderEvent.NOT_READY, phase), _unless_ignored(CommanderEvent.READY, phase))
+    for phase in FlightPhase
 )
 """[phase][estimator healthy]: event to handle, None if the table ignores it. Looked up in every
 tick."""
@@ -212,22 +223,22 @@ _PASSING = {
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class EventOutcome:
     """Outcome of an event."""
 
-    flight: Flight
+    flight: CommanderState
     result: Result
-    text: Message | None
+    text: OperatorText | None
 
 
-def transition(flight: Flight, event: Ask | Event) -> Step:
+def transition(flight: CommanderState, event: Ask | CommanderEvent) -> EventOutcome:
     """Return the outcome of an event for a flight. Termination has no exit."""
     if flight.mode is Mode.TERMINATION:
         if isinstance(event, Ask):
             refused = _unavailable(event.mode)
-            return Step(flight, refused.result, refused.text)
-        if event is Event.MODE_DONE:
-            return Step(flight, Result.ACCEPTED, None)
+            return EventOutcome(flight, refused.result, refused.text)
+        if event is CommanderEvent.MODE_DONE:
+            return EventOutcome(flight, Result.ACCEPTED, None)
     row = TABLE[event][flight.phase]
     phase = flight.phase if row.phase is None else row.phase
     moved = replace(flight, phase=phase)
@@ -239,13 +250,13 @@ def transition(flight: Flight, event: Ask | Event) -> Step:
     elif row.choice is Choice.RESTORE:
         mode = flight.after_disarm
         moved = replace(moved, mode=mode, intended=mode, failsafe=False)
-    return Step(moved, row.result, row.text)
+    return EventOutcome(moved, row.result, row.text)
 
 
-def status_of(flight: Flight) -> CommanderStatus:
+def status_of(flight: CommanderState) -> CommanderStatus:
     """Return the reported status of a state."""
     arming = (Arming.BOOT, Arming.STANDBY, Arming.ARMED, Arming.ARMED)[flight.phase]
-    if flight.phase is not Phase.AIR:
+    if flight.phase is not FlightPhase.AIR:
         landed = Landed.ON_GROUND
     elif flight.mode is Mode.TAKEOFF:
         landed = Landed.TAKEOFF

@@ -52,7 +52,7 @@ _OUTLIER = 12.0
 """Upper limit of a sample's contribution: one outlier, which differs twice, is not yet noise."""
 
 
-class Limits(NamedTuple):
+class SigmaLimits(NamedTuple):
     """Minimum and maximum standard deviation after a restart."""
 
     least: float
@@ -63,13 +63,13 @@ class Limits(NamedTuple):
         return min(max(sigma, self.least), self.greatest)
 
 
-VELOCITY = Limits(0.3, 10.0)
+VELOCITY = SigmaLimits(0.3, 10.0)
 """[m/s]"""
-ATTITUDE = Limits(0.1, 0.3)
+ATTITUDE = SigmaLimits(0.1, 0.3)
 """[rad]"""
-ACCEL_BIAS = Limits(0.5, 5.0)
+ACCEL_BIAS = SigmaLimits(0.5, 5.0)
 """[m/s²]"""
-GYRO_BIAS = Limits(0.04, 0.2)
+GYRO_BIAS = SigmaLimits(0.04, 0.2)
 """2.3 to 11 °/s [rad/s]"""
 
 
@@ -98,7 +98,7 @@ def restart_for(velocity_m_s: float, seconds: float) -> Restart:
     )
 
 
-class Run:
+class InnovationCounter:
     """Counter for consecutive large innovations on the same side."""
 
     def __init__(self, needed: int) -> None:
@@ -205,8 +205,8 @@ class Consistency:
         """Number of filter restarts."""
         self.restarted_us: int | None = None
         """Time of the last restart."""
-        self._runs = [Run(VELOCITY_RUN) for _ in range(3)]
-        self._heading = Run(HEADING_RUN)
+        self._runs = [InnovationCounter(VELOCITY_RUN) for _ in range(3)]
+        self._heading = InnovationCounter(HEADING_RUN)
 
     @property
     def velocity_deviates(self) -> bool:

@@ -24,13 +24,13 @@ from airl_mav.core.frames import (
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.alignment import Alignment, FieldCheck
-from firmware_sim.autopilot.autopilot_state import Estimate
+from firmware_sim.autopilot.autopilot_state import StateEstimate
 from firmware_sim.autopilot.external_vision import Control, ExternalVision
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.fusion_horizon import FusionHorizon, Measurement, NewFilter, selecting
-from firmware_sim.autopilot.optical_flow import OpticalFlow
+from firmware_sim.autopilot.optical_flow import OpticalFlowFusion
 from firmware_sim.autopilot.range_finder import Aids, RangeFinder
-from firmware_sim.autopilot.recovery import Moment, Recovery
+from firmware_sim.autopilot.recovery import Recovery, RecoveryState
 from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 from firmware_sim.engine.record import (
@@ -70,7 +70,7 @@ _QUATERNION, _ANGULAR_VELOCITY = slice(es.Q, es.RATES), slice(es.RATES, es.GYRO_
 _GYRO_BIAS = slice(es.GYRO_BIAS, es.ACCEL_BIAS)
 _ACCEL_BIAS = slice(es.ACCEL_BIAS, es.BARO_OFFSET)
 _SIGMA, _INNOVATION_RATIO = slice(es.SIGMA, es.RATIO), slice(es.RATIO, None)
-"""Slices of the state for the fields of an `Estimate`."""
+"""Slices of the state for the fields of an `StateEstimate`."""
 
 
 class Estimator:
@@ -114,7 +114,7 @@ class Estimator:
         self._time_us = 0
         self._fixed_us: int | None = None
         """Time of alignment with a GPS position; None: not aligned, or aligned without GPS."""
-        self._estimate: Estimate | None = None
+        self._estimate: StateEstimate | None = None
         horizontal = selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
         record["gps_horizontal_h"] = horizontal
         record["gps_vertical_h"] = selecting(es.POS + 2, es.VEL + 2)
@@ -143,7 +143,7 @@ class Estimator:
         """Time of arrival of the pose [µs]."""
         self.range: RangeFinder | None = None
         """Range fusion for the height above ground; None before the first range or flow reading."""
-        self.flow: OpticalFlow | None = None
+        self.flow: OpticalFlowFusion | None = None
         """Optical flow fusion; None before the first reading."""
         self.is_changed = True
         """True if Python has changed inputs of compiled ticks; see `prepare`."""
@@ -302,7 +302,7 @@ class Estimator:
         if not self.aligned:
             return
         if self.flow is None:
-            self.flow = OpticalFlow(self._value, self.state, self._know_ground(), self._fuse)
+            self.flow = OpticalFlowFusion(self._value, self.state, self._know_ground(), self._fuse)
             self._horizons.append(self.flow.horizon)
         self.flow.take(reading, self._time_us)
 
@@ -317,12 +317,12 @@ class Estimator:
             self.vision.on_height_moved = self.range.moved
         return self.range
 
-    def estimate(self) -> Estimate:
+    def estimate(self) -> StateEstimate:
         """Return a copy of the estimate after the newest tick."""
         if self._estimate is None:
             row = self.state.copy()
             # Positional arguments and prebuilt slices: this runs in nearly every tick.
-            self._estimate = Estimate(
+            self._estimate = StateEstimate(
                 self._time_us,
                 row[_POSITION],
                 row[_VELOCITY],
@@ -566,8 +566,8 @@ class Estimator:
     # --- inertial sensor faults
 
     @property
-    def _now(self) -> Moment:
-        return Moment(self._time_us, self.flying, self._gps_horizontal.fused_us)
+    def _now(self) -> RecoveryState:
+        return RecoveryState(self._time_us, self.flying, self._gps_horizontal.fused_us)
 
     def _judge(self, innovation: Vector, variance: Vector) -> float:
         """Check a velocity of external vision against the inertial sensors, at GPS's rate."""

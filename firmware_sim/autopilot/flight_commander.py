@@ -8,17 +8,24 @@ from typing import NamedTuple
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot.auto_disarm import AutoDisarm
-from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
-from firmware_sim.autopilot.commander import Ask, Event, Flight, Phase, status_of, transition
+from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Result, Severity
+from firmware_sim.autopilot.commander import (
+    Ask,
+    CommanderEvent,
+    CommanderState,
+    FlightPhase,
+    status_of,
+    transition,
+)
 from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.home import Home
 from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.newest_sensors import NewestSensors
-from firmware_sim.autopilot.requests import Request
+from firmware_sim.autopilot.requests import ModeRequest
 
-_GROUND, _AIR = Phase.GROUND, Phase.AIR
+_GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR
 
 REFUSAL_US = 2 * US_PER_S
 """Time within which a rejected setpoint explains the loss of offboard [µs]."""
@@ -42,7 +49,7 @@ class FlightCommander:
         commanded: Commanded,
         newest: NewestSensors,
         state: Vector,
-        say: Callable[[Message], None],
+        say: Callable[[OperatorText], None],
     ) -> None:
         """Boot.
 
@@ -53,7 +60,7 @@ class FlightCommander:
             say: Sends a text to the operator.
         """
         self._commanded, self._newest, self._state, self._say = commanded, newest, state, say
-        self.flight = Flight()
+        self.flight = CommanderState()
         self.status = status_of(self.flight)
         """Reported status of `flight`, replaced with every change."""
         self.refusal = ("", 0)
@@ -73,7 +80,10 @@ class FlightCommander:
         self.obey(NO_INTERVENTION)
 
     def handle(
-        self, event: Ask | Event, request: Request | None = None, granted: Message | None = None
+        self,
+        event: Ask | CommanderEvent,
+        request: ModeRequest | None = None,
+        granted: OperatorText | None = None,
     ) -> Result:
         """Process an event.
 
@@ -96,7 +106,9 @@ class FlightCommander:
             self._become(step.flight, flown, request if asked else None)
         return step.result
 
-    def _become(self, flight: Flight, flown: Mode, request: Request | None = None) -> None:
+    def _become(
+        self, flight: CommanderState, flown: Mode, request: ModeRequest | None = None
+    ) -> None:
         """Set a new state; `flown` is the mode in guidance, `request` the user's."""
         before = self.flight
         self.flight, self.status = flight, status_of(flight)
@@ -120,7 +132,7 @@ class FlightCommander:
         self,
         intervention: Intervention,
         flown: Mode | None = None,
-        request: Request | None = None,
+        request: ModeRequest | None = None,
     ) -> None:
         """Apply the failsafes' decision; see `_become`."""
         flown, asked = self.flight.mode if flown is None else flown, self.flight.mode
@@ -134,9 +146,9 @@ class FlightCommander:
         if flight != self.flight or flight.mode is not flown or request is not None:
             self._become(flight, flown, request)
         if decision.disarm:
-            self.handle(Event.FAILSAFE_DISARM)
+            self.handle(CommanderEvent.FAILSAFE_DISARM)
 
-    def _note_times(self, phase: Phase) -> None:
+    def _note_times(self, phase: FlightPhase) -> None:
         """Record the times of arming and take-off; reset both when disarmed."""
         now_us = self._now_us
         if phase < _GROUND:
@@ -150,4 +162,4 @@ class FlightCommander:
         """Report the reason of recently rejected setpoints."""
         reason, refused_us = self.refusal
         if reason and self._now_us - refused_us <= REFUSAL_US:
-            self._say(Message(Severity.WARNING, f"Offboard setpoints refused: {reason}"))
+            self._say(OperatorText(Severity.WARNING, f"Offboard setpoints refused: {reason}"))

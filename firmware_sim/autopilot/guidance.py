@@ -8,17 +8,17 @@ from collections.abc import Callable
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, RateDemand
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
+from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Severity
 from firmware_sim.autopilot.climb import Climb
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.modes import MODES
 from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, here
-from firmware_sim.autopilot.requests import Request
+from firmware_sim.autopilot.requests import ModeRequest
 from firmware_sim.engine.record import Record
 
 # Bound once: looking up an enum member in every tick is slow.
-_GROUND, _AIR = Phase.GROUND, Phase.AIR
+_GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR
 
 
 class Guidance:
@@ -28,7 +28,7 @@ class Guidance:
     """
 
     def __init__(
-        self, value: Callable[[str], float], say: Callable[[Message], None], record: Record
+        self, value: Callable[[str], float], say: Callable[[OperatorText], None], record: Record
     ) -> None:
         """Start in Hold.
 
@@ -45,7 +45,7 @@ class Guidance:
         """True if the motors are stopped permanently."""
         self._spool_since_us: int | None = None
 
-    def enter(self, mode: Mode, state: Vector, request: Request | None = None) -> None:
+    def enter(self, mode: Mode, state: Vector, request: ModeRequest | None = None) -> None:
         """Start a mode at the current state, with the optional arguments of a user request."""
         self.context.climb.stop()
         self._stopped = mode is Mode.TERMINATION
@@ -83,11 +83,13 @@ class Guidance:
         if altitude_m is None:
             default = context.value("MIS_TAKEOFF_ALT")
             text = f"Using default takeoff altitude: {default:.1f} m"
-            context.say(Message(Severity.INFO, text, events.TAKEOFF_DEFAULT.event(default)))
+            context.say(OperatorText(Severity.INFO, text, events.TAKEOFF_DEFAULT.event(default)))
             altitude_m = default + height
         if altitude_m < height:
             higher = events.TAKEOFF_ALREADY_HIGHER.event()
-            context.say(Message(Severity.CRITICAL, "Already higher than takeoff altitude", higher))
+            context.say(
+                OperatorText(Severity.CRITICAL, "Already higher than takeoff altitude", higher)
+            )
             altitude_m = height
         context.takeoff_altitude_m = altitude_m
 
@@ -100,7 +102,7 @@ class Guidance:
         """Destination of the active mode, local NED [m]; None = no destination."""
         return None if self._stopped else self._flown.destination
 
-    def demand(self, state: Vector, phase: Phase, time_us: int) -> AnyDemand | None:
+    def demand(self, state: Vector, phase: FlightPhase, time_us: int) -> AnyDemand | None:
         """Return the current demand; None = the motors are stopped."""
         self.context.standing = phase is not _AIR
         if self._stopped:
@@ -113,7 +115,7 @@ class Guidance:
         self._spool_since_us = None
         return None
 
-    def is_steady(self, phase: Phase) -> bool:
+    def is_steady(self, phase: FlightPhase) -> bool:
         """Return whether the demand is constant until the next request or decision."""
         if self._stopped or phase < _GROUND:
             return True

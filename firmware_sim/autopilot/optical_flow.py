@@ -57,7 +57,7 @@ _STANDING_M, _STANDING_M_S = 0.01, 0.001
 """Standard deviations of the zero-motion measurement on the ground."""
 
 
-class OpticalFlow:
+class OpticalFlowFusion:
     """Fusion of one optical flow sensor."""
 
     def __init__(

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.parameters import SPEC_BY_NAME, SPECS, flown_values, parameter_values
-from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.port import ParameterValue
 
 _INDEX = {spec.name: i for i, spec in enumerate(SPECS)}
@@ -62,7 +62,9 @@ class Parameters:
         self._listeners: list[Callable[[], None]] = []
         self._bounded: set[str] = {name for name in overrides or () if self._is_bounded(name)}
         """Parameters whose value is clipped for flight, and reported as such."""
-        self._texts: list[Message] = [self._bounded_text(name) for name in sorted(self._bounded)]
+        self._texts: list[OperatorText] = [
+            self._bounded_text(name) for name in sorted(self._bounded)
+        ]
         self._keeper = keeper
         if keeper is not None:
             for name, value in keeper.read().items():
@@ -73,7 +75,7 @@ class Parameters:
         self._listeners.append(listener)
         return lambda: self._listeners.remove(listener)
 
-    def take_texts(self) -> list[Message]:
+    def take_texts(self) -> list[OperatorText]:
         """Return new texts about clipped values since the last call.
 
         Each is reported once, and again only after an unclipped value.
@@ -175,6 +177,6 @@ class Parameters:
             self._flown[name], stored, rel_tol=FLOAT32_RELATIVE
         )
 
-    def _bounded_text(self, name: str) -> Message:
+    def _bounded_text(self, name: str) -> OperatorText:
         value, flown = self._values[_INDEX[name]], self._flown[name]
-        return Message(Severity.WARNING, f"{name} {value:g} is flown as {flown:g}")
+        return OperatorText(Severity.WARNING, f"{name} {value:g} is flown as {flown:g}")

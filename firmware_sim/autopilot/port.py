@@ -13,16 +13,16 @@ from airl_mav.faults.model import Fault
 from firmware_sim.autopilot.autopilot_state import (
     UNTOLD,
     AutopilotState,
-    Message,
     Mode,
+    OperatorText,
     Result,
     Setpoint,
     Wire,
 )
-from firmware_sim.autopilot.events.definition import Event
+from firmware_sim.autopilot.events.definition import MavlinkEvent
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
-from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Obstacles, Request
+from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, ModeRequest, ObstacleBins
 from firmware_sim.interfaces import DistanceReading, FlowReading, Odometry, SensorSample
 
 
@@ -162,10 +162,10 @@ class AutopilotPort(Protocol):
         """Estimated attitude quaternion (4,) body -> NED."""
         ...
 
-    def take_messages(self) -> list[Message]:
+    def take_messages(self) -> list[OperatorText]:
         """Return texts for the operator since the last call."""
 
-    def take_events(self) -> list[Event]:
+    def take_events(self) -> list[MavlinkEvent]:
         """Return events since the last call: operator texts with events, and reports."""
 
     def tell_checks(self) -> None:
@@ -187,7 +187,7 @@ class AutopilotPort(Protocol):
         """
 
     def set_mode(
-        self, mode: Mode, request: Request | None = None, *, commanded: bool = False
+        self, mode: Mode, request: ModeRequest | None = None, *, commanded: bool = False
     ) -> Result:
         """Request a mode.
 
@@ -239,7 +239,7 @@ class AutopilotPort(Protocol):
     def look_down(self, reading: FlowReading) -> None:
         """Pass on a reading from a client's optical flow sensor, received now."""
 
-    def see_obstacles(self, obstacles: Obstacles) -> None:
+    def see_obstacles(self, obstacles: ObstacleBins) -> None:
         """Pass on the distances to obstacles."""
 
     def follow(self, target: FollowedTarget) -> None:

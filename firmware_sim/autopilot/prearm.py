@@ -15,13 +15,13 @@ from firmware_sim.autopilot.events import check_events as events
 from firmware_sim.autopilot.events.check_events import CheckEvent
 from firmware_sim.autopilot.events.definition import Level
 from firmware_sim.autopilot.failsafes.conditions import NEEDS, BatteryWarning, Conditions, Need
-from firmware_sim.autopilot.readiness import SUPPLY_CHECK_OFF, Part, Readiness
+from firmware_sim.autopilot.readiness import SUPPLY_CHECK_OFF, HealthComponent, Readiness
 
 
-class Check(NamedTuple):
+class PrearmCheck(NamedTuple):
     """Pre-arm check."""
 
-    part: Part
+    part: HealthComponent
     fails: Callable[[Readiness], bool]
     event: CheckEvent
     """Event for ground stations."""
@@ -62,9 +62,9 @@ def _global_required(r: Readiness) -> bool:
 
 def _estimate(
     name: str, event: CheckEvent, need: Need, fails: Callable[[Conditions], bool]
-) -> Check:
-    return Check(
-        Part.ESTIMATOR,
+) -> PrearmCheck:
+    return PrearmCheck(
+        HealthComponent.ESTIMATOR,
         lambda r: fails(r.conditions),
         event,
         f"Preflight Fail: No valid {name} estimate",
@@ -73,24 +73,26 @@ def _estimate(
     )
 
 
-def _fence(kind: str, event: CheckEvent) -> Check:
+def _fence(kind: str, event: CheckEvent) -> PrearmCheck:
     def breached(r: Readiness) -> bool:
         return getattr(r.conditions.geofence, kind) and r.settings.gf_action != 0
 
-    return Check(Part.SYSTEM, breached, event, prefix="")
+    return PrearmCheck(HealthComponent.SYSTEM, breached, event, prefix="")
 
 
-def _sensor(part: Part, name: str, event: CheckEvent, fails: Callable[[Readiness], bool]) -> Check:
-    return Check(part, fails, event, f"Preflight Fail: No valid data from {name}")
+def _sensor(
+    part: HealthComponent, name: str, event: CheckEvent, fails: Callable[[Readiness], bool]
+) -> PrearmCheck:
+    return PrearmCheck(part, fails, event, f"Preflight Fail: No valid data from {name}")
 
 
 def _field_fails(r: Readiness, as_asked: int) -> bool:
     return r.field_disturbed and not r.armed and r.settings.com_arm_mag_str == as_asked
 
 
-def _battery(level: BatteryWarning, event: CheckEvent) -> Check:
-    return Check(
-        Part.BATTERY,
+def _battery(level: BatteryWarning, event: CheckEvent) -> PrearmCheck:
+    return PrearmCheck(
+        HealthComponent.BATTERY,
         lambda r: _supply_checked(r) and _battery_level(r) is level,
         event,
         prefix="",
@@ -144,28 +146,28 @@ def _no_sticks_wanted(r: Readiness) -> bool:
     return r.settings.com_rc_in_mode == _STICKS_DISABLED
 
 
-CHECKS: tuple[Check, ...] = (
-    _sensor(Part.ACCEL, "Accel 0", events.ACCEL_NO_DATA, lambda r: not r.accel),
-    _sensor(Part.GYRO, "Gyro 0", events.GYRO_NO_DATA, lambda r: not r.gyro),
+CHECKS: tuple[PrearmCheck, ...] = (
+    _sensor(HealthComponent.ACCEL, "Accel 0", events.ACCEL_NO_DATA, lambda r: not r.accel),
+    _sensor(HealthComponent.GYRO, "Gyro 0", events.GYRO_NO_DATA, lambda r: not r.gyro),
     _sensor(
-        Part.BARO,
+        HealthComponent.BARO,
         "Baro 0",
         events.BARO_NO_DATA,
         lambda r: bool(r.settings.sys_has_baro) and not r.baro,
     ),
     _sensor(
-        Part.MAG,
+        HealthComponent.MAG,
         "Compass 0",
         events.MAG_NO_DATA,
         lambda r: bool(r.settings.sys_has_mag) and not r.mag,
     ),
-    Check(
-        Part.GPS,
+    PrearmCheck(
+        HealthComponent.GPS,
         lambda r: bool(r.settings.sys_has_gps) and not r.gps and r.settings.com_arm_wo_gps == 0,
         events.GPS_FIX_TOO_LOW,
     ),
-    Check(
-        Part.GPS,
+    PrearmCheck(
+        HealthComponent.GPS,
         lambda r: (
             bool(r.settings.sys_has_gps)
             and not r.gps
@@ -179,14 +181,14 @@ CHECKS: tuple[Check, ...] = (
         level=lambda _: Level.WARNING,
         shown=lambda _: _POSITION,
     ),
-    Check(
-        Part.DISTANCE_SENSOR,
+    PrearmCheck(
+        HealthComponent.DISTANCE_SENSOR,
         lambda r: r.settings.sys_has_num_dist > 0 and r.distance is None,
         events.DISTANCE_SENSOR_MISSING,
         told="Preflight Fail: Distance Sensor 0 missing",
     ),
-    Check(
-        Part.DISTANCE_SENSOR,
+    PrearmCheck(
+        HealthComponent.DISTANCE_SENSOR,
         lambda r: r.settings.sys_has_num_dist > 0 and r.distance is False,
         events.DISTANCE_SENSOR_INVALID,
         told="Preflight Fail: no valid data from distance sensor 0",
@@ -194,34 +196,38 @@ CHECKS: tuple[Check, ...] = (
     _battery(BatteryWarning.LOW, events.BATTERY_LOW),
     _battery(BatteryWarning.CRITICAL, events.BATTERY_CRITICAL),
     _battery(BatteryWarning.EMERGENCY, events.BATTERY_EMERGENCY),
-    Check(
-        Part.BATTERY,
+    PrearmCheck(
+        HealthComponent.BATTERY,
         lambda r: _supply_checked(r) and r.conditions.battery_unhealthy,
         events.BATTERY_UNHEALTHY,
     ),
-    Check(
-        Part.BATTERY,
+    PrearmCheck(
+        HealthComponent.BATTERY,
         lambda r: _supply_checked(r) and r.conditions.battery_low_remaining_time,
         events.BATTERY_TIME_LOW,
         prefix="",
         said=False,
     ),
-    Check(
-        Part.ESTIMATOR,
+    PrearmCheck(
+        HealthComponent.ESTIMATOR,
         lambda r: not r.converged and not r.armed,
         events.ESTIMATOR_MISSING,
         told="Preflight Fail: ekf2 missing data",
         said=False,
     ),
-    Check(
-        Part.ESTIMATOR,
+    PrearmCheck(
+        HealthComponent.ESTIMATOR,
         lambda r: not r.compass_agrees and not r.armed,
         events.HEADING_UNSTABLE,
         told="Preflight Fail: heading estimate not stable",
     ),
-    Check(Part.ESTIMATOR, lambda r: _field_fails(r, _FIELD_REQUIRED), events.MAG_INTERFERENCE),
-    Check(
-        Part.ESTIMATOR,
+    PrearmCheck(
+        HealthComponent.ESTIMATOR,
+        lambda r: _field_fails(r, _FIELD_REQUIRED),
+        events.MAG_INTERFERENCE,
+    ),
+    PrearmCheck(
+        HealthComponent.ESTIMATOR,
         lambda r: _field_fails(r, _FIELD_WARNED),
         events.MAG_INTERFERENCE,
         prefix="Preflight: ",
@@ -229,24 +235,26 @@ CHECKS: tuple[Check, ...] = (
         blocks=lambda r: not r.converged,
         severity=Severity.WARNING,
     ),
-    Check(
-        Part.SYSTEM,
+    PrearmCheck(
+        HealthComponent.SYSTEM,
         lambda r: r.rolled,
         events.ROLLED,
         told="Preflight Fail: Attitude failure (roll)",
     ),
-    Check(
-        Part.SYSTEM,
+    PrearmCheck(
+        HealthComponent.SYSTEM,
         lambda r: r.pitched and not r.rolled,
         events.PITCHED,
         told="Preflight Fail: Attitude failure (pitch)",
     ),
-    Check(Part.SYSTEM, lambda r: r.conditions.fd_motor_failure, events.MOTOR_FAILED),
+    PrearmCheck(
+        HealthComponent.SYSTEM, lambda r: r.conditions.fd_motor_failure, events.MOTOR_FAILED
+    ),
     _fence("distance", events.FENCE_DISTANCE),
     _fence("altitude", events.FENCE_ALTITUDE),
     _fence("custom", events.FENCE_CUSTOM),
-    Check(
-        Part.SYSTEM,
+    PrearmCheck(
+        HealthComponent.SYSTEM,
         lambda r: (
             r.settings.gf_action == _FENCE_RETURN
             and r.conditions.home_position_invalid
@@ -254,21 +262,26 @@ CHECKS: tuple[Check, ...] = (
         ),
         events.FENCE_NO_HOME,
     ),
-    Check(Part.SYSTEM, lambda r: r.conditions.mission_failure, events.MISSION_FAILURE, prefix=""),
-    Check(
-        Part.SYSTEM,
+    PrearmCheck(
+        HealthComponent.SYSTEM,
+        lambda r: r.conditions.mission_failure,
+        events.MISSION_FAILURE,
+        prefix="",
+    ),
+    PrearmCheck(
+        HealthComponent.SYSTEM,
         lambda r: r.conditions.flight_time_limit_exceeded,
         events.FLIGHT_TIME,
         prefix="",
     ),
-    Check(
-        Part.LINK,
+    PrearmCheck(
+        HealthComponent.LINK,
         lambda r: r.conditions.gcs_connection_lost and r.settings.nav_dll_act > 0,
         events.NO_GCS,
         severity=Severity.WARNING,
     ),
-    Check(
-        Part.LINK,
+    PrearmCheck(
+        HealthComponent.LINK,
         lambda r: r.conditions.gcs_connection_lost and r.settings.nav_dll_act <= 0,
         events.NO_GCS,
         prefix="",
@@ -276,20 +289,20 @@ CHECKS: tuple[Check, ...] = (
         blocks=never,
         level=lambda _: Level.INFO,
     ),
-    Check(Part.SYSTEM, lambda r: r.terminated, events.TERMINATED),
-    Check(
-        Part.SYSTEM,
+    PrearmCheck(HealthComponent.SYSTEM, lambda r: r.terminated, events.TERMINATED),
+    PrearmCheck(
+        HealthComponent.SYSTEM,
         lambda r: _global_required(r) and r.conditions.global_position_invalid,
         events.NO_GLOBAL_POSITION,
     ),
-    Check(
-        Part.SYSTEM,
+    PrearmCheck(
+        HealthComponent.SYSTEM,
         lambda r: _global_required(r) and r.conditions.home_position_invalid,
         events.NO_HOME,
     ),
     # Mode requirements. Like PX4, reported by events only until arming is rejected.
-    Check(
-        Part.SYSTEM,
+    PrearmCheck(
+        HealthComponent.SYSTEM,
         lambda r: _needs(r, Need.NOT_ARMING) and not r.terminated and not r.armed,
         events.MODE_CANNOT_ARM,
         said=False,
@@ -309,8 +322,8 @@ CHECKS: tuple[Check, ...] = (
         lambda c: c.global_position_invalid and not c.local_position_invalid,
     ),
     _estimate("altitude", events.MODE_ALTITUDE, Need.ALTITUDE, lambda c: c.local_altitude_invalid),
-    Check(
-        Part.SYSTEM,
+    PrearmCheck(
+        HealthComponent.SYSTEM,
         lambda r: (
             r.conditions.auto_mission_missing
             and (bool(r.settings.com_arm_mis_req) or _needs(r, Need.MISSION))
@@ -318,20 +331,20 @@ CHECKS: tuple[Check, ...] = (
         events.MODE_MISSION,
         said=False,
     ),
-    Check(
-        Part.SYSTEM,
+    PrearmCheck(
+        HealthComponent.SYSTEM,
         lambda r: r.conditions.offboard_control_signal_lost and _needs(r, Need.OFFBOARD_SIGNAL),
         events.MODE_OFFBOARD,
         said=False,
     ),
-    Check(
-        Part.SYSTEM,
+    PrearmCheck(
+        HealthComponent.SYSTEM,
         lambda r: r.conditions.home_position_invalid and _needs(r, Need.HOME),
         events.MODE_HOME,
         said=False,
     ),
-    Check(
-        Part.MANUAL_CONTROL,
+    PrearmCheck(
+        HealthComponent.MANUAL_CONTROL,
         lambda r: r.conditions.manual_control_signal_lost and _needs(r, Need.MANUAL_CONTROL),
         events.MODE_MANUAL,
         said=False,
@@ -343,16 +356,16 @@ CHECKS: tuple[Check, ...] = (
 
 
 @lru_cache(maxsize=256)
-def failing(readiness: Readiness) -> tuple[Check, ...]:
+def failing(readiness: Readiness) -> tuple[PrearmCheck, ...]:
     """Return the failing checks."""
     return tuple(check for check in CHECKS if check.fails(readiness))
 
 
-def blocking(checks: tuple[Check, ...], readiness: Readiness) -> tuple[Check, ...]:
+def blocking(checks: tuple[PrearmCheck, ...], readiness: Readiness) -> tuple[PrearmCheck, ...]:
     """Return the failing checks that prevent arming in the mode."""
     return tuple(check for check in checks if check.blocks is None or check.blocks(readiness))
 
 
-def can_arm(readiness: Readiness) -> tuple[Check, ...]:
+def can_arm(readiness: Readiness) -> tuple[PrearmCheck, ...]:
     """Return the checks that prevent arming in a mode; empty = armable."""
     return blocking(failing(readiness), readiness)

@@ -13,7 +13,7 @@ SUPPLY_CHECK_OFF = 894281
 """Value of CBRK_SUPPLY_CHK that disables the battery checks."""
 
 
-class Part(IntFlag):
+class HealthComponent(IntFlag):
     """Vehicle components of the checks."""
 
     GYRO = auto()

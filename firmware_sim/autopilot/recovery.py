@@ -23,7 +23,7 @@ PROBATION_US = 10 * US_PER_S
 """Time for which a faulty inertial sensor is doubted (EKF2: BADACC_PROBATION) [µs]."""
 
 
-class Moment(NamedTuple):
+class RecoveryState(NamedTuple):
     """Time and flight state of a decision."""
 
     time_us: int
@@ -62,24 +62,32 @@ class Recovery:
         restarted = self.consistency.restarted_us
         return restarted is not None and now_us - restarted < PROBATION_US
 
-    def take_velocity(self, innovation: Vector, variance: float | Vector, now: Moment) -> None:
+    def take_velocity(
+        self, innovation: Vector, variance: float | Vector, now: RecoveryState
+    ) -> None:
         """Check the innovation (3,) NED of a velocity with a variance."""
         sigma = np.sqrt(self._filter.covariance.diagonal()[es.VEL : es.ATT] + variance)
         acceleration = self._state[es.ACCELERATION : es.SIGMA]
         self._answer(self.consistency.velocity(innovation, sigma, acceleration, now.time_us), now)
 
-    def take_heading(self, innovation: float, ratio: float, now: Moment) -> None:
+    def take_heading(self, innovation: float, ratio: float, now: RecoveryState) -> None:
         """Check the innovation of a heading and its test ratio: above 1 it was rejected."""
         self.compass.tested(innovation, ratio, now.time_us)
         deviations = math.copysign(es.GATE * ratio, innovation)
         self._answer(self.consistency.heading(deviations, now.time_us, within=ratio <= 1.0), now)
 
-    def heading_is_wrong(self, now: Moment) -> bool:
+    def heading_is_wrong(self, now: RecoveryState) -> bool:
         """Return whether the heading must be reset now."""
         return self._is_due(now) and self._is_suspected(now)
 
     def turn(
-        self, place: Vector, velocity: Vector, then: Vector, r_p: float, r_v: float, now: Moment
+        self,
+        place: Vector,
+        velocity: Vector,
+        then: Vector,
+        r_p: float,
+        r_v: float,
+        now: RecoveryState,
     ) -> None:
         """Reset heading to the yaw estimator and motion to GPS, and disable the compass.
 
@@ -109,13 +117,13 @@ class Recovery:
         self.compass.fail()
         self.emergency.resets += 1
 
-    def _is_due(self, now: Moment) -> bool:
+    def _is_due(self, now: RecoveryState) -> bool:
         return self.emergency.is_due(now.time_us, self._yaw, now.gps_us)
 
-    def _is_suspected(self, now: Moment) -> bool:
+    def _is_suspected(self, now: RecoveryState) -> bool:
         return now.flying and self.emergency.is_suspected(self._state, self._yaw)
 
-    def _answer(self, restart: Restart | None, now: Moment) -> None:
+    def _answer(self, restart: Restart | None, now: RecoveryState) -> None:
         """Restart the filter, unless the heading is reset for the same reason."""
         if restart is None:
             return

@@ -11,7 +11,7 @@ from airl_mav.vehicle.rotation import Vec
 NAN = math.nan
 
 
-class Place(NamedTuple):
+class PositionYaw(NamedTuple):
     """Position with a heading."""
 
     position: Vec
@@ -20,22 +20,22 @@ class Place(NamedTuple):
     """Heading [rad]; in some requests NaN = towards the place."""
 
 
-class Request:
+class ModeRequest:
     """Base class for the arguments of a mode request, one subclass per type."""
 
 
 @dataclass(frozen=True, slots=True)
-class ClimbOn(Request):
+class ClimbOn(ModeRequest):
     """Hold: finish the climb of a take-off that has ended near its altitude."""
 
-    place: Place
+    place: PositionYaw
 
 
 @dataclass(frozen=True, slots=True)
-class Reposition(Request):
+class Reposition(ModeRequest):
     """Hold: fly to a place first (MAV_CMD_DO_REPOSITION). NaN on an axis = unchanged."""
 
-    place: Place
+    place: PositionYaw
     speed_m_s: float = NAN
     """Speed [m/s]; NaN = unchanged."""
     altitude_alone: bool = False
@@ -43,7 +43,7 @@ class Reposition(Request):
 
 
 @dataclass(frozen=True, slots=True)
-class OrbitRequest(Request):
+class OrbitRequest(ModeRequest):
     """Orbit: circle parameters (MAV_CMD_DO_ORBIT). NaN = unchanged."""
 
     centre: Vec = (NAN, NAN, NAN)
@@ -64,7 +64,7 @@ class LandingTarget(NamedTuple):
     """Time of arrival, in simulated time."""
 
 
-class Obstacles(NamedTuple):
+class ObstacleBins(NamedTuple):
     """Distances to the nearest obstacle in bins around the vehicle, as in OBSTACLE_DISTANCE."""
 
     distances_cm: tuple[int, ...]

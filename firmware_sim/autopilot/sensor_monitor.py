@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import Event
+from firmware_sim.autopilot.events.definition import MavlinkEvent
 from firmware_sim.autopilot.events.enumerations import SensorFailure, SensorType
 from firmware_sim.engine.record import CHANGED, FIRST, SEEN, WATCHES
 from firmware_sim.engine.record import GPS as GPS_BIT
@@ -52,7 +52,7 @@ class SensorKind:
     """Silence after which the sensor has failed."""
     stale_us: int
     """Time of repeated values in flight after which the sensor has failed."""
-    event: Callable[[int], Event] | None = None
+    event: Callable[[int], MavlinkEvent] | None = None
     """Returns the event for a reason (`SensorFailure`); None = no event in PX4."""
 
 
@@ -128,7 +128,7 @@ class SensorWatch:
         self.repeats, self._times[SEEN] = True, now_us
         self.noisy = self.noisy or False
 
-    def judge(self, now_us: int, times_us: Sequence[int], *, flying: bool) -> Message | None:
+    def judge(self, now_us: int, times_us: Sequence[int], *, flying: bool) -> OperatorText | None:
         """Return a text if the sensor fails now; `times_us` is its row of `watch`.
 
         At rest a noise-free sensor may repeat its values.
@@ -149,7 +149,7 @@ class SensorWatch:
             return None
         text, event = f"{self.kind.name} #0 failed: {self.failed}!", self.kind.event
         told = None if event is None else event(_REASONS[self.failed])
-        return Message(Severity.EMERGENCY, text, told)
+        return OperatorText(Severity.EMERGENCY, text, told)
 
 
 class Valid(NamedTuple):
@@ -216,12 +216,12 @@ class SensorMonitor:
         """Return whether the newest sample must not be fused, from the first repetition."""
         return watch.failed == "STALE" or (watch.repeats and self._flying)
 
-    def judge(self, sample: SensorSample, *, flying: bool) -> list[Message]:
+    def judge(self, sample: SensorSample, *, flying: bool) -> list[OperatorText]:
         """Check all sensors, including inertial ones; return new failures."""
         now_us, self._flying = sample.time_us, flying
         self.gyro.take(sample)
         self.accel.take(sample)
-        texts: list[Message] = []
+        texts: list[OperatorText] = []
         for watch, times_us in zip(self.all, self._times.tolist(), strict=True):
             if watch.noisy and not watch.failed and now_us - times_us[CHANGED] < CALM_US:
                 continue  # usual case: new data

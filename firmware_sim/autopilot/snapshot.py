@@ -26,7 +26,7 @@ from firmware_sim.autopilot.flight_commander import FlightCommander
 from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.home import Home
 from firmware_sim.autopilot.navigation.navigator import Navigator
-from firmware_sim.autopilot.navigation.plan import Kind, Plans
+from firmware_sim.autopilot.navigation.plan import MissionType, Plans
 from firmware_sim.autopilot.newest_sensors import NewestSensors
 from firmware_sim.engine.controller import Controller, ControlSetpoints
 from firmware_sim.engine.record import POSITION, TRAJECTORY
@@ -35,7 +35,7 @@ from firmware_sim.interfaces import SensorSample
 
 def progress(plans: Plans) -> MissionProgress:
     """Return the mission progress and the ids of the stored lists."""
-    mission, fence, rally = (plans.stored(kind) for kind in Kind)
+    mission, fence, rally = (plans.stored(kind) for kind in MissionType)
     if not (mission.items or fence.items or rally.items):
         return NO_MISSION
     return MissionProgress(

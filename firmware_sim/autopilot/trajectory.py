@@ -141,7 +141,7 @@ class PathLimits(NamedTuple):
     """Share of the acceleration used for a turn at a waypoint (MPC_XY_TRAJ_P)."""
 
 
-class Leg(NamedTuple):
+class PathSegment(NamedTuple):
     """Path to a target. Previous and following waypoint shape the turns."""
 
     target: Vec
@@ -156,7 +156,7 @@ class Leg(NamedTuple):
     """Velocity of a moving target, NED [m/s]."""
 
 
-class Trajectory:
+class SmoothTrajectory:
     """Setpoint that moves smoothly to a target."""
 
     def __init__(self) -> None:
@@ -189,7 +189,7 @@ class Trajectory:
         x, y, z = self.axes
         return x.acceleration, y.acceleration, z.acceleration
 
-    def advance(self, vehicle: Vec, leg: Leg, limits: PathLimits, seconds: float) -> None:
+    def advance(self, vehicle: Vec, leg: PathSegment, limits: PathLimits, seconds: float) -> None:
         """Advance by a time [s] with the vehicle at a position NED [m]."""
         wanted = self._wanted(leg, limits)
         share = self._waiting(vehicle, limits.error_m)
@@ -207,7 +207,7 @@ class Trajectory:
         z.plan(velocity[2], vertical, limits.jerk_m_s3)
         synchronise(self.axes)
 
-    def _wanted(self, leg: Leg, limits: PathLimits) -> Vec:
+    def _wanted(self, leg: PathSegment, limits: PathLimits) -> Vec:
         """Return the velocity NED towards the target."""
         here, target = self.position, leg.target
         turning = leg.previous is not None and self._is_turning(target, limits.acceptance_m)
@@ -239,7 +239,7 @@ class Trajectory:
             return False
         return (vx * north + vy * east) / (speed * distance) < TURNING_COSINE
 
-    def _vertical_speed(self, leg: Leg, limits: PathLimits) -> float:
+    def _vertical_speed(self, leg: PathSegment, limits: PathLimits) -> float:
         """Return the maximum vertical speed now [m/s]."""
         here, target, after = self.position, leg.target, leg.following
         climbing = target[2] < here[2]
@@ -276,7 +276,7 @@ def braking_speed(
     return max(final_m_s, 0.5 * (math.sqrt(b * b + 4.0 * c) - b))
 
 
-def _horizontal_speed(here: Vec, leg: Leg, limits: PathLimits) -> float:
+def _horizontal_speed(here: Vec, leg: PathSegment, limits: PathLimits) -> float:
     """Return the maximum horizontal speed now [m/s]."""
     target, after = leg.target, leg.following
     acceleration, jerk = limits.acceleration_m_s2, limits.jerk_m_s3

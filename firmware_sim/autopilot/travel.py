@@ -13,7 +13,7 @@ from airl_mav.core.constants import DEG, US_PER_S
 from airl_mav.core.frames import Vector, quat_yaw, wrap_pi
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
-from firmware_sim.autopilot.trajectory import Leg, PathLimits, Trajectory
+from firmware_sim.autopilot.trajectory import PathLimits, PathSegment, SmoothTrajectory
 
 PAUSE_US = 100_000
 """Pause after which the trajectory restarts at the vehicle [µs]."""
@@ -28,7 +28,7 @@ class Travel:
     def __init__(self, value: Callable[[str], float]) -> None:
         """Store the look-up for PX4 parameters."""
         self._value = value
-        self._trajectory = Trajectory()
+        self._trajectory = SmoothTrajectory()
         self._time_us: int | None = None
         self._yaw = 0.0
         """Heading setpoint [rad]."""
@@ -52,7 +52,7 @@ class Travel:
         self,
         state: Vector,
         time_us: int,
-        leg: Leg,
+        leg: PathSegment,
         *,
         yaw: float = math.nan,
         limits: PathLimits | None = None,

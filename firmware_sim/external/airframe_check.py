@@ -31,7 +31,7 @@ _ARDUPILOT_QUAD_X: Mapping[int, Corner] = dict(enumerate(CORNERS, start=1))
 
 
 @dataclass(frozen=True)
-class Airframe:
+class RequiredAirframe:
     """Required configuration of one kind of firmware."""
 
     firmware: str
@@ -53,12 +53,12 @@ class Airframe:
         return [*self.also_read, *self.frame, *self.settings]
 
 
-def px4_airframe(vehicle: VehicleProfile, output: str) -> Airframe:
+def px4_airframe(vehicle: VehicleProfile, output: str) -> RequiredAirframe:
     """Return a quad by PX4's control allocation, or raise FirmwareMissingError."""
     px4 = vehicle.px4
     if px4 is None:
         raise _no_table("px4")
-    return Airframe(
+    return RequiredAirframe(
         "PX4",
         px4.motors,
         frame={
@@ -104,13 +104,13 @@ def _px4_problem(motors: Sequence[Corner], output: str, held: Mapping[str, Value
     return None
 
 
-def ardupilot_airframe(vehicle: VehicleProfile) -> Airframe:
+def ardupilot_airframe(vehicle: VehicleProfile) -> RequiredAirframe:
     """Return a quad by ArduCopter's frame class, type and outputs; else FirmwareMissingError."""
     copter = vehicle.ardupilot
     if copter is None:
         raise _no_table("ardupilot")
     kind = {"FRAME_CLASS": copter.frame_class, "FRAME_TYPE": copter.frame_type}
-    return Airframe(
+    return RequiredAirframe(
         "ArduPilot",
         copter.motors,
         frame={

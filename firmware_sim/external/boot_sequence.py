@@ -8,14 +8,14 @@ from contextlib import suppress
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.profiles.vehicle import CORNERS
-from firmware_sim.autopilot.autopilot_state import Message, Severity
-from firmware_sim.autopilot.commander import Flight
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
+from firmware_sim.autopilot.commander import CommanderState
 from firmware_sim.external.airframe_check import GROUND_LOSS, differences
 from firmware_sim.external.launcher import Launcher
-from firmware_sim.external.observer import Observer
+from firmware_sim.external.observer import FirmwareObserver
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.flight_log.log_folder import ULOG_SUFFIX
-from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
+from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.simulation import EpisodeSetup
@@ -41,7 +41,7 @@ class ExternalFlightController:
 
     internals = None
 
-    def __init__(self, launcher: Launcher, observer: Observer) -> None:
+    def __init__(self, launcher: Launcher, observer: FirmwareObserver) -> None:
         """Start or await the firmware, see `Launcher.launch`; `observer` watches its MAVLink."""
         self._bridge = bridge = launcher.launch()
         self._observer = observer
@@ -52,16 +52,16 @@ class ExternalFlightController:
         self.use_truth = bridge.use_truth
 
     @property
-    def on_message(self) -> Callable[[Message], None] | None:
+    def on_message(self) -> Callable[[OperatorText], None] | None:
         """Callback for every operator text; None = no callback."""
         return self._observer.on_message
 
     @on_message.setter
-    def on_message(self, call: Callable[[Message], None] | None) -> None:
+    def on_message(self, call: Callable[[OperatorText], None] | None) -> None:
         self._observer.on_message = call
 
     @property
-    def flight(self) -> Flight:
+    def flight(self) -> CommanderState:
         """Phase and mode from the heartbeat, with the armed state from the faster bridge."""
         return self._observer.flight(armed=self._bridge.armed)
 
@@ -98,7 +98,7 @@ class ExternalFlightStack:
     def __init__(
         self,
         launcher: Launcher,
-        observer: Observer,
+        observer: FirmwareObserver,
         timeout_s: float,
         *,
         on_close: Callable[[], None] = lambda: None,
@@ -147,7 +147,7 @@ class ExternalFlightStack:
         self._observer.restart()
         return ExternalFlightController(self._launcher, self._observer)
 
-    def connect(self, tick: Callable[[], int], truth: Callable[[], Truth]) -> None:
+    def connect(self, tick: Callable[[], int], truth: Callable[[], TrueState]) -> None:
         """Run the boot sequence on the ground until the frame is checked and arming is possible.
 
         `tick` flies a tick and returns its simulated time [µs].
@@ -218,7 +218,7 @@ class ExternalFlightStack:
 
     def _say(self, text: str) -> None:
         if self._observer.on_message is not None:
-            self._observer.on_message(Message(Severity.WARNING, text))
+            self._observer.on_message(OperatorText(Severity.WARNING, text))
 
 
 def _some(items: Sequence[str]) -> str:

@@ -18,7 +18,7 @@ from firmware_sim.external.ardupilot.program import Links, find_arducopter
 from firmware_sim.external.ardupilot.sitl import ArdupilotBridge
 from firmware_sim.external.boot_sequence import ExternalFlightStack
 from firmware_sim.external.launcher import Launcher
-from firmware_sim.external.observer import Observer
+from firmware_sim.external.observer import FirmwareObserver
 from firmware_sim.external.process import WorkingFolders
 from firmware_sim.external.px4 import program as px4_program
 from firmware_sim.external.px4.board_link import BoardLink
@@ -45,7 +45,7 @@ class Wanted:
 def real_firmware(wanted: Wanted) -> ExternalFlightStack:
     """Bind the ports of real firmware and return it, not yet started. Raises UsageError."""
     launcher, endpoint = _PARTS[wanted.aircraft.firmware](wanted)
-    observer = Observer(endpoint, "observer", wanted.vehicle.told_origin)
+    observer = FirmwareObserver(endpoint, "observer", wanted.vehicle.told_origin)
     return ExternalFlightStack(launcher, observer, wanted.aircraft.real.firmware_timeout)
 
 

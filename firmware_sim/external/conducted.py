@@ -16,7 +16,7 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import GREATEST_INSTANCE, Aircraft
 from firmware_sim.external.boot_sequence import ExternalFlightStack
 from firmware_sim.external.compose import Wanted, px4_parts
-from firmware_sim.external.observer import Observer
+from firmware_sim.external.observer import FirmwareObserver
 from firmware_sim.external.px4.onboard_link import OnboardLink
 from firmware_sim.external.px4.program import check_free, find_px4
 from firmware_sim.external.px4.sitl import Px4Bridge
@@ -104,7 +104,7 @@ def _instance(wanted: Wanted, instance: int) -> ConductedPx4:
         raise
     stack = ExternalFlightStack(
         launcher,
-        Observer(endpoint, "observer", wanted.vehicle.told_origin),
+        FirmwareObserver(endpoint, "observer", wanted.vehicle.told_origin),
         wanted.aircraft.real.firmware_timeout,
         on_close=link.close,
         look_every_us=LOOK_US,

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Protocol
 
 from airl_mav.core.log_file import PARTIAL_SUFFIX
-from firmware_sim.external.airframe_check import Airframe
+from firmware_sim.external.airframe_check import RequiredAirframe
 from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.flight_log.log_folder import ULOG_SUFFIX
-from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
+from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
 
 
 def no_process() -> None:
@@ -48,7 +48,7 @@ class Bridge(Protocol):
             FirmwareMissingError: The firmware is connected, but cannot be flown.
         """
 
-    def use_truth(self, truth: Callable[[], Truth]) -> None:
+    def use_truth(self, truth: Callable[[], TrueState]) -> None:
         """Set the source of the true state."""
 
     def close(self) -> None:
@@ -60,7 +60,7 @@ class Launcher:
 
     def __init__(
         self,
-        airframe: Airframe,
+        airframe: RequiredAirframe,
         bridge: Callable[[], Bridge],
         timeout_s: float,
         *,

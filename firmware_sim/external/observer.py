@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
-from firmware_sim.autopilot.commander import Flight, Phase
+from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Severity
+from firmware_sim.autopilot.commander import CommanderState, FlightPhase
 from firmware_sim.autopilot.mode_numbers import custom_mode
 from firmware_sim.external.parameter_client import ParameterClient
 from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect, message_id
@@ -42,7 +42,7 @@ _IN_AIR = (
 
 def flight_of(
     autopilot: int, custom_mode: int, landed_state: int, *, armed: bool, ready: bool
-) -> Flight:
+) -> CommanderState:
     """Return phase and mode from HEARTBEAT and EXTENDED_SYS_STATE; `ready` = ready to arm."""
     if autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
         mode = _ARDUCOPTER_MODES.get(custom_mode, Mode.POSITION)
@@ -52,10 +52,10 @@ def flight_of(
     else:
         mode = _PX4_MODES.get(custom_mode, Mode.POSITION)
     if not armed:
-        phase = Phase.STANDBY if ready else Phase.BOOT
+        phase = FlightPhase.STANDBY if ready else FlightPhase.BOOT
     else:
-        phase = Phase.AIR if landed_state in _IN_AIR else Phase.GROUND
-    return Flight(phase=phase, mode=mode, intended=mode, after_disarm=mode)
+        phase = FlightPhase.AIR if landed_state in _IN_AIR else FlightPhase.GROUND
+    return CommanderState(phase=phase, mode=mode, intended=mode, after_disarm=mode)
 
 
 SYSTEM_ID = 254
@@ -101,7 +101,7 @@ def _origin_message(origin: Geodetic, system_id: int) -> Any:
 _PREARM = dialect.MAV_SYS_STATUS_PREARM_CHECK
 
 
-class Observer:
+class FirmwareObserver:
     """Link to external firmware. Non-blocking; no received message raises."""
 
     def __init__(self, endpoint: Endpoint, name: str, origin: Geodetic | None = None) -> None:
@@ -113,7 +113,7 @@ class Observer:
         self._encoder = Encoder(SYSTEM_ID, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
         self._tlog: TlogWriter | None = None
         self._rx = self._tx = self._ignored = 0
-        self.on_message: Callable[[Message], None] | None = None
+        self.on_message: Callable[[OperatorText], None] | None = None
         """Callback for every operator text; None = no callback."""
         self.restart()
 
@@ -149,11 +149,11 @@ class Observer:
         """True if ready to arm and sending a position, which flying ArduPilot requires."""
         return self._ready and "LOCAL_POSITION_NED" in self._came
 
-    def flight(self, *, armed: bool) -> Flight:
+    def flight(self, *, armed: bool) -> CommanderState:
         """Return phase and mode; `armed` = the motors may turn."""
         beat = self._heard
         if beat is None:
-            return Flight()
+            return CommanderState()
         return flight_of(
             beat.autopilot, beat.custom_mode, self._landed, armed=armed, ready=self._ready
         )
@@ -265,7 +265,7 @@ class Observer:
             return
         self.last_text = self._text
         if self.on_message is not None:
-            self.on_message(Message(Severity(min(int(message.severity), 7)), self._text))
+            self.on_message(OperatorText(Severity(min(int(message.severity), 7)), self._text))
 
     def _command(self, number: int, *parameters: float) -> None:
         """Send a COMMAND_LONG to the firmware, if its heartbeat was received."""

@@ -12,7 +12,7 @@ from airl_mav.core.streams import Stream, stream
 from airl_mav.faults.kinds import Part
 from airl_mav.faults.model import FOREVER_US, Fault, active, next_change_us
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.commander import Flight, Phase
+from firmware_sim.autopilot.commander import CommanderState, FlightPhase
 
 PHASE_OF_MODE: Mapping[Mode, str] = {
     Mode.TAKEOFF: "climb",
@@ -46,11 +46,11 @@ class Acted(NamedTuple):
     to_us: int
 
 
-def phase_of(flight: Flight) -> str | None:
+def phase_of(flight: CommanderState) -> str | None:
     """Return the flight phase by the name used in faults; None = no fault starts in it."""
-    if flight.phase is Phase.AIR:
+    if flight.phase is FlightPhase.AIR:
         return PHASE_OF_MODE.get(flight.mode)
-    return None if flight.phase is Phase.BOOT else "ground"
+    return None if flight.phase is FlightPhase.BOOT else "ground"
 
 
 class FaultTimeline:
@@ -84,7 +84,7 @@ class FaultTimeline:
         """Call `listener` whenever a fault begins or ends."""
         self._listeners.append(listener)
 
-    def update(self, time_us: int, flight: Flight) -> None:
+    def update(self, time_us: int, flight: CommanderState) -> None:
         """Begin and end faults at simulated `time_us` [µs], for this flight phase and mode."""
         phase, since_us = phase_of(flight), time_us - self._start_us
         self._now_us = time_us

@@ -11,22 +11,27 @@ from typing import Any
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.autopilot_state import AutopilotState, Estimate, Message, Setpoint
+from firmware_sim.autopilot.autopilot_state import (
+    AutopilotState,
+    OperatorText,
+    Setpoint,
+    StateEstimate,
+)
 from firmware_sim.autopilot.port import ParameterStore
 from firmware_sim.autopilot.snapshot import setpoint_of
 from firmware_sim.engine.kinematics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.engine.record import Record
 from firmware_sim.flight_log.topics import SENSOR_COMBINED, TOPICS, Moment, sensor_combined
 from firmware_sim.flight_log.ulog import UlogWriter, Values
-from firmware_sim.interfaces import BatterySample, Truth
+from firmware_sim.interfaces import BatterySample, TrueState
 
 
-def truth_of(tick: Any) -> Truth:
+def truth_of(tick: Any) -> TrueState:
     """Return the true state of a tick of an aircraft (`engine.record.TRUE_TICK`)."""
     row = tick["motion"].copy()
     power_w, charge = float(tick["power_w"]), float(tick["charge"])
     parts = row[POSITION], row[VELOCITY], row[QUATERNION], row[RATES]
-    return Truth(int(tick["time_us"]), *parts, power_w, charge)
+    return TrueState(int(tick["time_us"]), *parts, power_w, charge)
 
 
 class FlownState:
@@ -47,9 +52,9 @@ class FlownState:
         return int(self._tick["time_us"])
 
     @property
-    def estimate(self) -> Estimate:
+    def estimate(self) -> StateEstimate:
         row: Vector = self._tick["state"].copy()
-        return Estimate(
+        return StateEstimate(
             self.time_us,
             row[es.P : es.V],
             row[es.V : es.Q],
@@ -152,7 +157,7 @@ class FlightLog:
                 self._log(moment, time_us)
         self._truth = truths[-1].copy()
 
-    def text(self, message: Message, time_us: int) -> None:
+    def text(self, message: OperatorText, time_us: int) -> None:
         """Log an operator text."""
         self.writer.text(time_us, message.severity, message.text)
 

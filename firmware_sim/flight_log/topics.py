@@ -22,7 +22,7 @@ from firmware_sim.autopilot.optical_flow import (
     LEAST_HEIGHT_M,
 )
 from firmware_sim.flight_log.ulog import Topic, Values
-from firmware_sim.interfaces import PoseFrame, Truth, VelocityFrame
+from firmware_sim.interfaces import PoseFrame, TrueState, VelocityFrame
 
 ON_CHANGE_US = 500 * US_PER_MS
 """Maximum interval of topics that are logged on change [µs]."""
@@ -54,7 +54,7 @@ class Moment(NamedTuple):
     """State of a vehicle and its simulator after a tick."""
 
     state: AutopilotState
-    truth: Truth
+    truth: TrueState
     unix_us: int
     """Calendar time [µs since 1970]."""
 

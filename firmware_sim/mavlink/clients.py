@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Geodetic
 from airl_mav.core.signing import Signing
-from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.mavlink.codec import Decoder, TextEncoder, WireMessage, dialect, is_signed
 from firmware_sim.mavlink.endpoint import Peer, Sender, SharedEndpoint
 from firmware_sim.mavlink.event_buffer import EventSender
@@ -63,7 +63,7 @@ class Client:
     components: set[tuple[int, int]] = field(default_factory=set)
     """System and component ids of all senders seen through this client."""
 
-    def wakes(self, now_us: int, texts: Sequence[Message]) -> bool:
+    def wakes(self, now_us: int, texts: Sequence[OperatorText]) -> bool:
         """Return True if anything may be due for this client at simulated time [µs]."""
         events = self.events
         return bool(

@@ -3,7 +3,7 @@
 pymavlink provides only the generated dialect (`dialect`): message classes, constants and the
 decoder of one whole frame. Framing is implemented here. On reception, pymavlink's parser waits for
 the full payload that a damaged header announces, and discards it. For streams, creating and packing
-a message object takes several times as long as `Layout` and `Encoder.frame`.
+a message object takes several times as long as `WireLayout` and `Encoder.frame`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from pymavlink.generator import mavcrc
 
-from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.mavlink.dialect import load
 
 if TYPE_CHECKING:
@@ -32,10 +32,10 @@ __all__ = [
     "SYSTEM_ID",
     "Decoder",
     "Encoder",
-    "Layout",
     "Reader",
     "TextEncoder",
     "Values",
+    "WireLayout",
     "WireMessage",
     "dialect",
     "is_signed",
@@ -118,7 +118,7 @@ def param_value(name: str, raw: bytes, kind: int, count: int, index: int) -> byt
     return _PARAM_VALUE.pack(raw, count, index, name.encode("ascii"), kind)
 
 
-class Layout:
+class WireLayout:
     """Wire layout of one message, from pymavlink's message class."""
 
     def __init__(self, kind: type[WireMessage]) -> None:
@@ -157,9 +157,9 @@ def trimmed(payload: bytes) -> bytes:
 
 
 @functools.cache
-def layout(name: str) -> Layout:
+def layout(name: str) -> WireLayout:
     """Return the layout of a message such as "ATTITUDE". Raises AttributeError when unknown."""
-    return Layout(dialect.mavlink_map[message_id(name)])
+    return WireLayout(dialect.mavlink_map[message_id(name)])
 
 
 def _x25(data: bytes) -> int:
@@ -207,7 +207,7 @@ class Encoder:
         self.sequence = (self.sequence + 1) & 0xFF
         return frame
 
-    def frame(self, layout: Layout, payload: bytes) -> bytes:
+    def frame(self, layout: WireLayout, payload: bytes) -> bytes:
         """Return a frame for a payload of this layout, identical to the result of `pack`."""
         seq = self.sequence
         self.sequence = (seq + 1) & 0xFF
@@ -358,7 +358,7 @@ class TextEncoder:
         """Number long texts from the id after `last_id`."""
         self._id = last_id
 
-    def encode(self, message: Message) -> list[WireMessage]:
+    def encode(self, message: OperatorText) -> list[WireMessage]:
         """Return the messages of one text, in order.
 
         A text of up to 50 characters is one message with id 0. A longer text is split into chunks

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.events.definition import Event
+from firmware_sim.autopilot.events.definition import MavlinkEvent
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.streams.units import boot_ms
 
@@ -33,7 +33,7 @@ class SentEvent(NamedTuple):
 
     sequence: int
     time_us: int
-    event: Event
+    event: MavlinkEvent
 
 
 class EventBuffer:
@@ -48,7 +48,7 @@ class EventBuffer:
         """Return the number of stored events."""
         return len(self._kept)
 
-    def add(self, event: Event, time_us: int) -> None:
+    def add(self, event: MavlinkEvent, time_us: int) -> None:
         """Add an event that occurred at simulated `time_us` [µs]."""
         self.latest = (self.latest + 1) % NUMBERS
         self._kept.append(SentEvent(self.latest, time_us, event))

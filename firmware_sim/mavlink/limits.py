@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
-from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 
 FRAMES_PER_S = 2_000
 """Sustained frame rate of one client [1/s]: eight times the rate of a setpoint per tick."""
@@ -131,9 +131,9 @@ class Complaints:
         """Restart the intervals, because simulated time may restart. Keeps reported counts."""
         self._told = {key: (-EVERY_US, count) for key, (_, count) in self._told.items()}
 
-    def due(self, name: str, refused: int, dropped: int, now_us: int) -> list[Message]:
+    def due(self, name: str, refused: int, dropped: int, now_us: int) -> list[OperatorText]:
         """Return the warnings due on a link at `now_us` [µs] about rejected and dropped data."""
-        texts: list[Message] = []
+        texts: list[OperatorText] = []
         for kind, count, problem in (
             ("refused", refused, "frames refused: bad signature"),
             ("dropped", dropped, "datagrams dropped: flood or full"),
@@ -141,5 +141,5 @@ class Complaints:
             told_us, told = self._told.get((name, kind), (-EVERY_US, 0))
             if count > told and now_us - told_us >= EVERY_US:
                 self._told[name, kind] = now_us, count
-                texts.append(Message(Severity.WARNING, f"{name}: {count - told} {problem}"))
+                texts.append(OperatorText(Severity.WARNING, f"{name}: {count - told} {problem}"))
         return texts

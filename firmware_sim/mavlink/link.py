@@ -14,8 +14,8 @@ from firmware_sim.mavlink.codec import (
     SYSTEM_ID,
     Decoder,
     Encoder,
-    Layout,
     Values,
+    WireLayout,
     WireMessage,
     layout,
     trimmed,
@@ -316,7 +316,7 @@ class Link:
             return None
 
 
-def _payload(shape: Layout, values: Values | None) -> bytes | None:
+def _payload(shape: WireLayout, values: Values | None) -> bytes | None:
     """Return the payload; empty if a value is out of range, None without values."""
     if values is None:
         return None

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 
 from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.autopilot.port import AutopilotPort
-from firmware_sim.interfaces import Truth
+from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import SYSTEM_ID, Values, WireMessage
 from firmware_sim.mavlink.streams import Builder, information, sensors
 from firmware_sim.mavlink.streams.pose import hil_state_quaternion
@@ -29,7 +29,7 @@ class OwnStreams:
         """Start without an autopilot: the builders return None."""
         self.vibration = VibrationMeter()
         self._port: AutopilotPort | None = None
-        self._truth: Callable[[], Truth] | None = None
+        self._truth: Callable[[], TrueState] | None = None
         self._system_id = SYSTEM_ID
         self.builders: Mapping[str, Builder] = {
             "VIBRATION": lambda state: self.vibration.message(state),
@@ -41,7 +41,7 @@ class OwnStreams:
         }
 
     def attach(
-        self, port: AutopilotPort, truth: Callable[[], Truth] | None, system_id: int
+        self, port: AutopilotPort, truth: Callable[[], TrueState] | None, system_id: int
     ) -> None:
         """Attach another autopilot, with its vehicle's true state; None = unavailable."""
         self._port, self._truth, self._system_id = port, truth, system_id

@@ -10,8 +10,8 @@ from firmware_sim.autopilot.autopilot_state import (
     WITH_STICKS,
     Arming,
     CommanderStatus,
-    Message,
     Mode,
+    OperatorText,
     Severity,
 )
 from firmware_sim.autopilot.events.command_events import AUTO_MODE_UNSUPPORTED
@@ -26,28 +26,28 @@ from firmware_sim.autopilot.mode_numbers import (
 from firmware_sim.mavlink.codec import dialect
 
 _CRITICAL = Severity.CRITICAL
-_UNSUPPORTED = Message.of(_CRITICAL, AUTO_MODE_UNSUPPORTED)
+_UNSUPPORTED = OperatorText.of(_CRITICAL, AUTO_MODE_UNSUPPORTED)
 
 
-def _unavailable(name: str, mode: NavigationMode, main: int, sub: int) -> Message:
+def _unavailable(name: str, mode: NavigationMode, main: int, sub: int) -> OperatorText:
     """Return PX4's rejection of a known but unavailable mode."""
     number = sub << 24 | main << 16
     text = f"Switching to {name} is currently not available"
-    return Message.of(_CRITICAL, MODE_NOT_AVAILABLE, number, mode, text=text)
+    return OperatorText.of(_CRITICAL, MODE_NOT_AVAILABLE, number, mode, text=text)
 
 
 # Modes that clients can request, by main mode; in AUTO and POSCTL by sub mode. Messages stand for
 # modes that a real PX4 knows by name but never makes available.
-_MAIN_MODES: dict[int, Mode | Message] = {
+_MAIN_MODES: dict[int, Mode | OperatorText] = {
     main: mode
     for mode, (main, sub) in MAIN_SUB.items()
     if main not in (MAIN_AUTO, MAIN_TERMINATION) and sub == 0
 }
-_POSITION_MODES: dict[int, Mode | Message] = {
+_POSITION_MODES: dict[int, Mode | OperatorText] = {
     **{sub: mode for mode, (main, sub) in MAIN_SUB.items() if main == MAIN_POSCTL},
     2: _unavailable("Position Slow", NavigationMode.POSITION_SLOW, MAIN_POSCTL, 2),
 }
-_AUTO_MODES: dict[int, Mode | Message] = {
+_AUTO_MODES: dict[int, Mode | OperatorText] = {
     **{
         sub: mode
         for mode, (main, sub) in MAIN_SUB.items()
@@ -89,7 +89,7 @@ def system_status(status: CommanderStatus, *, can_arm: bool) -> int:
     return int(dialect.MAV_STATE_STANDBY if standby else dialect.MAV_STATE_UNINIT)
 
 
-def requested_mode(base: int, main: int, sub: int) -> Mode | Message | None:
+def requested_mode(base: int, main: int, sub: int) -> Mode | OperatorText | None:
     """Return the mode requested by DO_SET_MODE, given parameters 1 to 3.
 
     The parameters are MAV_MODE_FLAG bits, main mode and sub mode. A message is PX4's explanation of
@@ -104,7 +104,7 @@ def requested_mode(base: int, main: int, sub: int) -> Mode | Message | None:
     return _MAIN_MODES.get(main)
 
 
-def _from_base_mode(base: int) -> Mode | Message | None:
+def _from_base_mode(base: int) -> Mode | OperatorText | None:
     """Return the mode that PX4 derives from the bits of clients without custom modes."""
     if base & dialect.MAV_MODE_FLAG_AUTO_ENABLED:
         return _AUTO_MODES[4]

@@ -11,10 +11,10 @@ from itertools import chain
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.signing import Signing, StoredSigning
-from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.engine.record import Record
-from firmware_sim.interfaces import Truth
+from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.clients import Client, Clients, Senders
 from firmware_sim.mavlink.codec import COMPONENT_ID, REPLY_IDS, SYSTEM_ID, TextEncoder, WireMessage
 from firmware_sim.mavlink.endpoint import Peer, Sender
@@ -102,7 +102,7 @@ class MavlinkServer:
         self._forget_us = 0
         self._system_id = SYSTEM_ID
         self._streams, self._context = OwnStreams(), TickContext()
-        self._texts: list[Message] = []
+        self._texts: list[OperatorText] = []
         self._announced = Allowance(TEXTS_PER_S, TEXTS_BURST)
         self._answers_apart = any(config.separate_replies for config in links)
         """True if replies must not change the telemetry, which includes events."""
@@ -131,7 +131,7 @@ class MavlinkServer:
         if port is not None:
             self.attach(port)
 
-    def attach(self, port: AutopilotPort, truth: Callable[[], Truth] | None = None) -> None:
+    def attach(self, port: AutopilotPort, truth: Callable[[], TrueState] | None = None) -> None:
         """Replace the autopilot between two episodes; `truth` returns the true state for clients.
 
         Keeps clients and the rates they have set. Drops running parameter lists and messages for
@@ -201,7 +201,7 @@ class MavlinkServer:
             flown = flown_of(port.state())
             after_us = now_us - flown["time_us"].item(0)
         self._streams.vibration.update(flown)
-        texts: list[Message] = port.take_messages()
+        texts: list[OperatorText] = port.take_messages()
         if texts:
             texts = list(dict.fromkeys(texts))  # once per tick, like `_announce`
         for event in port.take_events():
@@ -225,7 +225,7 @@ class MavlinkServer:
         due: Sequence[tuple[Client, list[str]]],
         flown: Record,
         after_us: int,
-        texts: Sequence[Message],
+        texts: Sequence[OperatorText],
     ) -> None:
         """Send texts, events and due streams to clients.
 
@@ -409,7 +409,7 @@ class MavlinkServer:
             _tell(self._all(), text)
         self._texts.clear()
 
-    def _announce(self, text: Message) -> None:
+    def _announce(self, text: OperatorText) -> None:
         """Queue a text once per tick, so that a repeating client cannot flood the others."""
         if text in self._texts or len(self._texts) >= TEXTS_PER_TICK:
             return
@@ -430,7 +430,7 @@ class MavlinkServer:
         return chain.from_iterable(self._links)
 
 
-def _stream_news(client: Client, texts: Iterable[Message], now_us: int) -> None:
+def _stream_news(client: Client, texts: Iterable[OperatorText], now_us: int) -> None:
     """Add texts and the client's missing events to its telemetry."""
     for text in texts:
         for chunk in client.texts.encode(text):
@@ -440,7 +440,7 @@ def _stream_news(client: Client, texts: Iterable[Message], now_us: int) -> None:
             client.link.stream(message)
 
 
-def _tell(clients: Iterable[Client], text: Message) -> None:
+def _tell(clients: Iterable[Client], text: OperatorText) -> None:
     for client in clients:
         for chunk in client.reply_texts.encode(text):
             client.link.send(chunk)

@@ -31,7 +31,7 @@ class Touch(NamedTuple):
 NOTHING = Touch(frozenset(), frozenset())
 
 
-class Body(Protocol):
+class PlantBody(Protocol):
     """Rigid body with the vehicle's mass, inertia and collision box, in an arena."""
 
     @property

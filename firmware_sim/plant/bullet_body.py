@@ -31,7 +31,7 @@ from airl_mav.core.frames import (
     quat_wxyz_to_xyzw,
 )
 from airl_mav.core.kernels import kernel
-from airl_mav.profiles.vehicle import Body as BodyProfile
+from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotation import Quat, Vec
 from firmware_sim.engine.kinematics import (
@@ -71,7 +71,7 @@ with silenced_output():
     import pybullet
     from pybullet_utils.bullet_client import BulletClient
 
-__all__ = ["NO_CLIENT", "BulletBody", "World", "connect", "pybullet"]
+__all__ = ["NO_CLIENT", "BulletBody", "BulletWorld", "connect", "pybullet"]
 
 NO_CLIENT = -1
 """Number of a closed client; every call with it raises pybullet.error."""
@@ -208,7 +208,7 @@ class WorldState(NamedTuple):
     """Moving obstacles; None = the arena has none."""
 
 
-class World:
+class BulletWorld:
     """pybullet world with floor, hills, walls and obstacles. ENU inside, NED outside."""
 
     def __init__(
@@ -337,7 +337,7 @@ class BulletBody:
         """Place the body at rest on the floor at the start, facing north; see `bodies.new_body`."""
         self._made_of = arena, body, airframe, tick_s
         diagonal_m = math.hypot(body.width_m, body.width_m, body.height_m)
-        self.world = World(arena, 0.5 * diagonal_m, tick_s)
+        self.world = BulletWorld(arena, 0.5 * diagonal_m, tick_s)
         self._tick_s = tick_s
         self.number = self._build(body, airframe)
         """Number of the body in pybullet."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
-from airl_mav.profiles.vehicle import Body as BodyProfile
+from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
 from airl_mav.vehicle.airframe import Airframe, airframe_of
 from airl_mav.vehicle.rigid_body import accelerate, drift
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
@@ -34,7 +34,7 @@ _FIRST = FLOOR_ID + 1
 """Number of the first wall or obstacle."""
 
 
-class State(NamedTuple):
+class ContactState(NamedTuple):
     """Contacts stored between ticks; updated in place."""
 
     kept: Vector  # points on the floor
@@ -53,7 +53,7 @@ def _find_contacts(
     close: float,
     moving_us: int,
     solids: Solids,
-    state: State,
+    state: ContactState,
 ) -> int:
     """Find the vehicle's contacts; return the number of contacts in `state.rows`."""
     count = 0
@@ -106,7 +106,7 @@ def advance(
     obstacle_speed: float,
     tick_s: float,
     solids: Solids,
-    state: State,
+    state: ContactState,
     row: Vector,
 ) -> int:
     """Move the vehicle by one tick.
@@ -161,7 +161,7 @@ class KernelBody:
         self._airframe = np.array(airframe)
         self._tick_s = tick_s
         self._obstacle_speed = greatest_speed(self._solids)
-        self._state = State(
+        self._state = ContactState(
             np.zeros((KEPT, 7)),
             np.zeros(1, np.int64),
             np.full(1, -math.inf),

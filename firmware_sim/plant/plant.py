@@ -11,7 +11,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_HZ, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.streams import sensors_and_gusts
-from airl_mav.profiles.vehicle import Body as BodyProfile
+from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, PlantName
 from airl_mav.vehicle.airframe import Airframe
@@ -41,8 +41,8 @@ from firmware_sim.engine.ticks import (
     rest_record,
     stretch,
 )
-from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, Truth
-from firmware_sim.plant.body import FLOOR, Body, Touch
+from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, TrueState
+from firmware_sim.plant.body import FLOOR, PlantBody, Touch
 from firmware_sim.plant.contacts.box import BREAKING_SHARE
 from firmware_sim.plant.optical_flow import PlantOpticalFlow
 from firmware_sim.plant.rangefinder import PlantRangefinder
@@ -52,7 +52,7 @@ from firmware_sim.plant.solids import Room
 
 def new_body(
     name: PlantName, arena: Arena | None, body: BodyProfile, airframe: Airframe, tick_s: float
-) -> Body:
+) -> PlantBody:
     """Return a vehicle's body at rest on the floor at the start, facing north.
 
     Args:
@@ -162,7 +162,7 @@ class Plant:
         self.rotor_lag = lag(airframe, tick_s)
         """Fraction of a rotor speed error that remains after a tick."""
         pack, power_w = pack_row(profile.battery), standing_power_w(0.0, airframe, model)
-        self.body: Body = new_body(asked.plant, arena, profile.body, airframe, tick_s)
+        self.body: PlantBody = new_body(asked.plant, arena, profile.body, airframe, tick_s)
         """Vehicle body among the bodies of the arena."""
         self._room = Room(arena, profile.body)
         for name, value in (
@@ -416,10 +416,10 @@ class Plant:
                 sample = sample._replace(flow=flow.read(self.motion, self._elapsed_us))
         return sample
 
-    def truth(self) -> Truth:
+    def truth(self) -> TrueState:
         """Return the true state."""
         row = self.motion.copy()
-        return Truth(
+        return TrueState(
             self.time_us,
             row[POSITION],
             row[VELOCITY],

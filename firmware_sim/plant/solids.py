@@ -13,7 +13,7 @@ from airl_mav.arena.ground import TOP, Relief, no_relief
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
-from airl_mav.profiles.vehicle import Body
+from airl_mav.profiles.vehicle import BodyProfile
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.engine.kinematics import quaternion
 from firmware_sim.plant.body import walls_of
@@ -135,7 +135,7 @@ def room_among(solids: Solids, p: Vec, radius: float) -> float:
 class Room:
     """Distances from a vehicle's collision box to the bodies of an arena."""
 
-    def __init__(self, arena: Arena | None, body: Body) -> None:
+    def __init__(self, arena: Arena | None, body: BodyProfile) -> None:
         """Store the solids of an arena (None = an endless floor) and the collision box."""
         self._solids, _ = solids_of(arena)
         relief = self._solids.relief

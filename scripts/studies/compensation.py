@@ -30,7 +30,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.files import replace_file
 from airl_mav.core.provenance import provenance
 from airl_mav.envs.evaluation import EpisodeResult, fly_seeds
-from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.fleet import FlightStatus
 from airl_mav.experiments.gym_flier import navigation_of, pilots_of
 from airl_mav.flight.paired import relative_difference
 from airl_mav.flight.statistics import wilson
@@ -155,14 +155,14 @@ def fly(scenario: Scenario, case: Case) -> dict[int, EpisodeResult]:
 
 def cells(flown: dict[int, EpisodeResult], reference: dict[int, EpisodeResult]) -> tuple[str, ...]:
     """Return success, flight time against the reference, and pairs, as text."""
-    reached = [flight.verdict == Verdict.SUCCESS for flight in flown.values()]
+    reached = [flight.verdict == FlightStatus.SUCCESS for flight in flown.values()]
     rate = rate_with_interval(wilson(sum(reached), len(reached)))
     if flown is reference:
         return rate, NONE, NONE
     both = [
         seed
         for seed, flight in flown.items()
-        if flight.verdict == reference[seed].verdict == Verdict.SUCCESS
+        if flight.verdict == reference[seed].verdict == FlightStatus.SUCCESS
     ]
     longer = relative_difference(
         [reference[seed].flight_time_s for seed in both],

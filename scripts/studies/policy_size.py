@@ -38,7 +38,7 @@ from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import OnnxRuntime, outputs_of
-from airl_mav.policy.template import Size, build_template, template_size
+from airl_mav.policy.template import NetworkSize, build_template, template_size
 from airl_mav.profiles.loading import load_profile
 from airl_mav.report.heatmap import Field as Cell
 from airl_mav.report.heatmap import HeatMap, draw_heat_map
@@ -163,7 +163,7 @@ def study(options: StudyOptions, config: StudyConfig, console: Console) -> None:
 # --- one network
 
 
-def size_of(config: StudyConfig, layers: int, filters: int) -> Size:
+def size_of(config: StudyConfig, layers: int, filters: int) -> NetworkSize:
     seen = config.observation
     outputs = outputs_of(config.actions)
     return template_size(layers, filters, seen.height_px, seen.width_px, outputs)
@@ -263,7 +263,7 @@ def told(t: Timed) -> str:
 
 
 def fit(timed: list[Timed], key: str) -> Fit | None:
-    sizes = {(t.layers, t.filters): Size(t.parameters, t.macs) for t in timed}
+    sizes = {(t.layers, t.filters): NetworkSize(t.parameters, t.macs) for t in timed}
     return fit_times(sizes, {(t.layers, t.filters): getattr(t, key) for t in timed})
 
 

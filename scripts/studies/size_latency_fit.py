@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.policy.template import Size
+from airl_mav.policy.template import NetworkSize
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ class Fit:
     """Share of neighbour pairs on the grid in which the larger network is slower."""
 
 
-def fit_times(sizes: Mapping[Grid, Size], times_ms: Mapping[Grid, float]) -> Fit | None:
+def fit_times(sizes: Mapping[Grid, NetworkSize], times_ms: Mapping[Grid, float]) -> Fit | None:
     """Fit times [ms] over the sizes of the same networks; None with fewer than four."""
     cells = sorted(times_ms)
     if len(cells) < 4:

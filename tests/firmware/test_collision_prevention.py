@@ -19,7 +19,7 @@ from firmware_sim.autopilot.modes.collision_prevention import (
     ObstacleMap,
 )
 from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.autopilot.requests import Obstacles
+from firmware_sim.autopilot.requests import ObstacleBins
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig
 
@@ -34,9 +34,9 @@ def obstacles(
     in_world: bool = True,
     farthest_cm: int = 2000,
     time_us: int = BEGAN_US,
-) -> Obstacles:
+) -> ObstacleBins:
     distances = tuple(distance_cm(i) for i in range(BINS))
-    return Obstacles(distances, increment_deg, offset_deg, 100, farthest_cm, in_world, time_us)
+    return ObstacleBins(distances, increment_deg, offset_deg, 100, farthest_cm, in_world, time_us)
 
 
 def prevention(**parameters: float) -> CollisionPrevention:
@@ -185,8 +185,8 @@ def test_obstacle_distance_is_read() -> None:
     rig.bench.tick()
     body, world = rig.autopilot.obstacles
     distances = tuple(range(100, 172))
-    assert body == Obstacles(distances, 2.5, -90.0, 20, 900, False, now_us)
-    assert world == Obstacles(distances, 5.0, -90.0, 20, 900, True, now_us)
+    assert body == ObstacleBins(distances, 2.5, -90.0, 20, 900, False, now_us)
+    assert world == ObstacleBins(distances, 5.0, -90.0, 20, 900, True, now_us)
     assert rig.client.received("STATUSTEXT") == []
 
 
@@ -212,7 +212,7 @@ class Wall:
                 else 2001
                 for i in range(BINS)
             ]
-            rig.ap.see_obstacles(Obstacles(tuple(ahead), 5.0, 0.0, 20, 2000, True, now_us))
+            rig.ap.see_obstacles(ObstacleBins(tuple(ahead), 5.0, 0.0, 20, 2000, True, now_us))
 
 
 def towards_a_wall(**parameters: float) -> Wall:

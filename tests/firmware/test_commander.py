@@ -13,13 +13,18 @@ from firmware_sim.autopilot.commander import (
     READINESS,
     TABLE,
     Ask,
-    Event,
-    Flight,
-    Phase,
+    CommanderEvent,
+    CommanderState,
+    FlightPhase,
     transition,
 )
 
-BOOT, STANDBY, GROUND, AIR = Phase.BOOT, Phase.STANDBY, Phase.GROUND, Phase.AIR
+BOOT, STANDBY, GROUND, AIR = (
+    FlightPhase.BOOT,
+    FlightPhase.STANDBY,
+    FlightPhase.GROUND,
+    FlightPhase.AIR,
+)
 OK, NO = Result.ACCEPTED, Result.TEMPORARILY_REJECTED
 
 SAME = "same"
@@ -35,18 +40,21 @@ NOT_LANDED = (Severity.CRITICAL, "Disarming denied: not landed")
 CUT = (Severity.INFO, "Disarmed by failsafe")
 LOCKED = (Severity.INFO, "Disarmed by lockdown")
 
-EVENTS: list[Ask | Event] = [*Event, *(Ask(*each) for each in product(Mode, (True, False)))]
+EVENTS: list[Ask | CommanderEvent] = [
+    *CommanderEvent,
+    *(Ask(*each) for each in product(Mode, (True, False))),
+]
 
 
 # (event, phase) -> next phase, mode, failsafe after (None = as before), answer, text
-Expected = tuple[Phase, "Mode | str", "bool | None", Result, "tuple[Severity, str] | None"]
+Expected = tuple[FlightPhase, "Mode | str", "bool | None", Result, "tuple[Severity, str] | None"]
 
 
-def quiet(phase: Phase) -> Expected:
+def quiet(phase: FlightPhase) -> Expected:
     return (phase, SAME, None, OK, None)
 
 
-def asked(phase: Phase, mode: Mode, text: tuple[Severity, str] | None = None) -> Expected:
+def asked(phase: FlightPhase, mode: Mode, text: tuple[Severity, str] | None = None) -> Expected:
     return (phase, mode, False, OK, text)
 
 
@@ -58,24 +66,24 @@ def unavailable(mode: Mode) -> tuple[Severity, str]:
     return (Severity.CRITICAL, f"Switching to {MODE_NAMES[mode]} is currently not available")
 
 
-EXPECTED: dict[tuple[Ask | Event, Phase], Expected] = {
+EXPECTED: dict[tuple[Ask | CommanderEvent, FlightPhase], Expected] = {
     # Everything that is not listed below changes nothing and says nothing.
-    **{(event, phase): quiet(phase) for event, phase in product(EVENTS, Phase)},
+    **{(event, phase): quiet(phase) for event, phase in product(EVENTS, FlightPhase)},
     # Armable once the estimator has converged, and no longer when it loses it; never in flight.
-    (Event.READY, BOOT): (STANDBY, SAME, None, OK, None),
-    (Event.NOT_READY, STANDBY): (BOOT, SAME, None, OK, None),
+    (CommanderEvent.READY, BOOT): (STANDBY, SAME, None, OK, None),
+    (CommanderEvent.NOT_READY, STANDBY): (BOOT, SAME, None, OK, None),
     # Arming. Where a check fails it is refused, with these words.
-    (Event.ARM, BOOT): (BOOT, SAME, None, NO, NO_ARM),
-    (Event.ARM, STANDBY): (GROUND, SAME, None, OK, ARMED),
-    (Event.ARM_UNREADY, BOOT): (BOOT, SAME, None, NO, NO_ARM),
-    (Event.ARM_UNREADY, STANDBY): (STANDBY, SAME, None, NO, NO_ARM),
+    (CommanderEvent.ARM, BOOT): (BOOT, SAME, None, NO, NO_ARM),
+    (CommanderEvent.ARM, STANDBY): (GROUND, SAME, None, OK, ARMED),
+    (CommanderEvent.ARM_UNREADY, BOOT): (BOOT, SAME, None, NO, NO_ARM),
+    (CommanderEvent.ARM_UNREADY, STANDBY): (STANDBY, SAME, None, NO, NO_ARM),
     # Disarming in the air needs force.
-    (Event.DISARM, GROUND): disarmed(DISARMED),
-    (Event.DISARM, AIR): (AIR, SAME, None, NO, NOT_LANDED),
-    (Event.KILL, GROUND): disarmed(DISARMED),
-    (Event.KILL, AIR): disarmed(DISARMED),
+    (CommanderEvent.DISARM, GROUND): disarmed(DISARMED),
+    (CommanderEvent.DISARM, AIR): (AIR, SAME, None, NO, NOT_LANDED),
+    (CommanderEvent.KILL, GROUND): disarmed(DISARMED),
+    (CommanderEvent.KILL, AIR): disarmed(DISARMED),
     # Modes may be chosen at any time, a take-off on the ground too.
-    **{(Ask(m), p): asked(p, m) for m, p in product(Mode, Phase)},
+    **{(Ask(m), p): asked(p, m) for m, p in product(Mode, FlightPhase)},
     # A mode that lacks what it needs (offboard: a setpoint): on the ground disarmed yes, else no.
     **{(Ask(m, available=False), p): asked(p, m) for m, p in product(Mode, (BOOT, STANDBY))},
     **{
@@ -83,26 +91,26 @@ EXPECTED: dict[tuple[Ask | Event, Phase], Expected] = {
         for m, p in product(Mode, (GROUND, AIR))
     },
     # The flight itself.
-    (Event.LIFTED, GROUND): (AIR, SAME, None, OK, (Severity.INFO, "Takeoff detected")),
-    (Event.LANDED, AIR): (GROUND, SAME, None, OK, (Severity.INFO, "Landing detected")),
-    (Event.MODE_DONE, AIR): asked(AIR, Mode.HOLD),
-    (Event.DISARM_TIMEOUT, GROUND): disarmed(
+    (CommanderEvent.LIFTED, GROUND): (AIR, SAME, None, OK, (Severity.INFO, "Takeoff detected")),
+    (CommanderEvent.LANDED, AIR): (GROUND, SAME, None, OK, (Severity.INFO, "Landing detected")),
+    (CommanderEvent.MODE_DONE, AIR): asked(AIR, Mode.HOLD),
+    (CommanderEvent.DISARM_TIMEOUT, GROUND): disarmed(
         (Severity.INFO, "Disarmed by auto preflight disarming")
     ),
-    (Event.LANDED_TIMEOUT, GROUND): disarmed((Severity.INFO, "Disarmed by landing")),
+    (CommanderEvent.LANDED_TIMEOUT, GROUND): disarmed((Severity.INFO, "Disarmed by landing")),
     # Motors that failsafes stop.
-    (Event.LOCKDOWN_TIMEOUT, GROUND): disarmed(LOCKED),
-    (Event.LOCKDOWN_TIMEOUT, AIR): disarmed(LOCKED),
-    (Event.FAILSAFE_DISARM, GROUND): disarmed(CUT),
-    (Event.FAILSAFE_DISARM, AIR): disarmed(CUT),
+    (CommanderEvent.LOCKDOWN_TIMEOUT, GROUND): disarmed(LOCKED),
+    (CommanderEvent.LOCKDOWN_TIMEOUT, AIR): disarmed(LOCKED),
+    (CommanderEvent.FAILSAFE_DISARM, GROUND): disarmed(CUT),
+    (CommanderEvent.FAILSAFE_DISARM, AIR): disarmed(CUT),
     # Disarmed there is nothing to terminate.
     (Ask(Mode.TERMINATION), BOOT): (BOOT, SAME, None, Result.DENIED, None),
     (Ask(Mode.TERMINATION), STANDBY): (STANDBY, SAME, None, Result.DENIED, None),
 }
 
 FLIGHTS = [
-    Flight(phase, mode, intended, after, failsafe)
-    for phase in Phase
+    CommanderState(phase, mode, intended, after, failsafe)
+    for phase in FlightPhase
     for mode, intended, failsafe in (
         (Mode.HOLD, Mode.HOLD, False),
         (Mode.OFFBOARD, Mode.OFFBOARD, False),
@@ -114,11 +122,11 @@ FLIGHTS = [
 
 def test_every_event_has_a_row_for_every_phase() -> None:
     assert set(TABLE) == set(EVENTS)
-    assert all(len(rows) == len(Phase) for rows in TABLE.values())
+    assert all(len(rows) == len(FlightPhase) for rows in TABLE.values())
 
 
 @pytest.mark.parametrize("event", EVENTS, ids=str)
-def test_every_cell(event: Ask | Event) -> None:
+def test_every_cell(event: Ask | CommanderEvent) -> None:
     for flight in FLIGHTS:
         phase, mode, failsafe, result, text = EXPECTED[event, flight.phase]
         step = transition(flight, event)
@@ -135,7 +143,7 @@ def test_every_cell(event: Ask | Event) -> None:
 
 
 @pytest.mark.parametrize("event", EVENTS, ids=str)
-def test_a_refusal_changes_nothing(event: Ask | Event) -> None:
+def test_a_refusal_changes_nothing(event: Ask | CommanderEvent) -> None:
     for flight in FLIGHTS:
         step = transition(flight, event)
         if step.result is not OK:
@@ -144,9 +152,9 @@ def test_a_refusal_changes_nothing(event: Ask | Event) -> None:
                 assert step.text is not None, "a refusal says why"
 
 
-@pytest.mark.parametrize("phase", Phase)
-def test_nobody_leaves_a_termination(phase: Phase) -> None:
-    flight = Flight(phase, Mode.TERMINATION, Mode.TERMINATION, Mode.TERMINATION)
+@pytest.mark.parametrize("phase", FlightPhase)
+def test_nobody_leaves_a_termination(phase: FlightPhase) -> None:
+    flight = CommanderState(phase, Mode.TERMINATION, Mode.TERMINATION, Mode.TERMINATION)
     for event in EVENTS:
         step = transition(flight, event)
         assert step.flight.mode is Mode.TERMINATION
@@ -157,9 +165,9 @@ def test_nobody_leaves_a_termination(phase: Phase) -> None:
 
 @pytest.mark.parametrize("flight", FLIGHTS, ids=str)
 @pytest.mark.parametrize("healthy", [False, True])
-def test_readiness_is_told_wherever_it_counts(flight: Flight, healthy: bool) -> None:
+def test_readiness_is_told_wherever_it_counts(flight: CommanderState, healthy: bool) -> None:
     told = READINESS[flight.phase][healthy]
-    every_tick = transition(flight, Event.READY if healthy else Event.NOT_READY)
+    every_tick = transition(flight, CommanderEvent.READY if healthy else CommanderEvent.NOT_READY)
     if told is None:
         assert (every_tick.flight, every_tick.text) == (flight, None)
     else:
@@ -176,22 +184,26 @@ PASSING = {
 
 
 @given(st.lists(st.sampled_from(EVENTS), max_size=60))
-def test_invariants(events: list[Ask | Event]) -> None:
-    flight = Flight()
+def test_invariants(events: list[Ask | CommanderEvent]) -> None:
+    flight = CommanderState()
     lasting = Mode.HOLD
     for event in events:
         step = transition(flight, event)
         before, flight = flight, step.flight
         # Only ready vehicles arm, and only on request.
         if before.phase < GROUND <= flight.phase:
-            assert (event, before.phase) == (Event.ARM, STANDBY)
+            assert (event, before.phase) == (CommanderEvent.ARM, STANDBY)
             assert flight.phase is GROUND
         # The air is entered from the ground and left by landing or by cutting the motors.
         if before.phase is not AIR and flight.phase is AIR:
-            assert (event, before.phase) == (Event.LIFTED, GROUND)
+            assert (event, before.phase) == (CommanderEvent.LIFTED, GROUND)
         if before.phase is AIR and flight.phase is not AIR:
-            cut = {Event.KILL, Event.FAILSAFE_DISARM, Event.LOCKDOWN_TIMEOUT}
-            assert event in (cut if flight.phase is STANDBY else {Event.LANDED})
+            cut = {
+                CommanderEvent.KILL,
+                CommanderEvent.FAILSAFE_DISARM,
+                CommanderEvent.LOCKDOWN_TIMEOUT,
+            }
+            assert event in (cut if flight.phase is STANDBY else {CommanderEvent.LANDED})
         # The table itself raises no failsafe.
         assert not flight.failsafe
         assert flight.mode is flight.intended
@@ -204,14 +216,14 @@ def test_invariants(events: list[Ask | Event]) -> None:
             assert (step.result is OK) is granted
             if granted and event.mode not in PASSING:
                 lasting = event.mode
-        elif event is Event.MODE_DONE and before.phase is AIR:
+        elif event is CommanderEvent.MODE_DONE and before.phase is AIR:
             lasting = lasting if before.mode is Mode.TERMINATION else Mode.HOLD
         assert flight.after_disarm is lasting
         if before.phase >= GROUND > flight.phase:
             assert flight.mode is lasting
         # On the ground, or not armed, disarming always works; killing does everywhere.
         if flight.phase is not AIR:
-            disarm = transition(flight, Event.DISARM)
+            disarm = transition(flight, CommanderEvent.DISARM)
             assert disarm.result is OK
             assert disarm.flight.phase < GROUND
-        assert transition(flight, Event.KILL).flight.phase < GROUND
+        assert transition(flight, CommanderEvent.KILL).flight.phase < GROUND

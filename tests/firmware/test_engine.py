@@ -19,7 +19,7 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Setpoint
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.failsafes.watch import Watch
 from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK, Record
 from firmware_sim.mavlink.codec import message_id
@@ -70,7 +70,7 @@ def flown(simulation: Simulation, fly: Callable[[Simulation, int], None]) -> tup
             fly(simulation, at_us + STEP_US)
             truths.append(simulation.truths.copy())
             logs.append(simulation.flown.copy())
-    assert autopilot.flight.phase is Phase.STANDBY
+    assert autopilot.flight.phase is FlightPhase.STANDBY
     return np.concatenate(truths), np.concatenate(logs)
 
 

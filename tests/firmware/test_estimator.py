@@ -31,7 +31,7 @@ from airl_mav.core.frames import (
     quat_wxyz_to_xyzw,
 )
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.autopilot_state import Estimate
+from firmware_sim.autopilot.autopilot_state import StateEstimate
 from firmware_sim.autopilot.error_state import GATE, N_STATES
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.parameter_store import Parameters
@@ -121,7 +121,7 @@ def unbiased(seconds: float, **changes: Any) -> Flight:
 def test_biases_are_found() -> None:
     accel_bias, gyro_bias = np.array([0.08, -0.05, 0.06]), np.array([0.004, -0.006, 0.005])
     estimator = Estimator(VALUE)
-    estimate: Estimate | None = None
+    estimate: StateEstimate | None = None
     early = np.zeros(3)
     for sample, *_ in Flight(60.0, accel_bias, gyro_bias).samples():
         estimator.step(sample)
@@ -149,7 +149,7 @@ def test_perfect_sensors_give_the_truth(heading: float) -> None:
 # --- bad data
 
 
-def run(estimator: Estimator, samples: Iterator[SensorSample]) -> list[Estimate]:
+def run(estimator: Estimator, samples: Iterator[SensorSample]) -> list[StateEstimate]:
     estimates = []
     for sample in samples:
         estimator.step(sample)
@@ -169,7 +169,7 @@ def altered(
 
 
 @cache
-def undisturbed() -> tuple[list[SensorSample], list[Estimate]]:
+def undisturbed() -> tuple[list[SensorSample], list[StateEstimate]]:
     """Return the sensor samples of a flight, and the estimates."""
     samples = [sample for sample, *_ in unbiased(16.0).samples()]
     return samples, run(Estimator(VALUE), iter(samples))

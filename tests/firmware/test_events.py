@@ -18,12 +18,12 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
+from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events
 from firmware_sim.autopilot.events.definition import (
     FORMATS,
-    Event,
     Level,
+    MavlinkEvent,
     sub_id,
 )
 from firmware_sim.autopilot.events.enumerations import (
@@ -33,8 +33,8 @@ from firmware_sim.autopilot.events.enumerations import (
     ModeGroup,
 )
 from firmware_sim.autopilot.events.health_report import ALL_MODES, HealthReport, health_report
-from firmware_sim.autopilot.failsafes.actions import Action as FailsafeAction
-from firmware_sim.autopilot.failsafes.actions import Cause
+from firmware_sim.autopilot.failsafes.actions import FailsafeAction as FailsafeAction
+from firmware_sim.autopilot.failsafes.actions import FailsafeReason
 from firmware_sim.autopilot.failsafes.announcement import announcement
 from firmware_sim.autopilot.failsafes.conditions import NEEDS, Conditions, Need
 from firmware_sim.autopilot.manual_control import Source, Sticks
@@ -61,7 +61,7 @@ def metadata() -> dict[str, Any]:
     return component
 
 
-def read(event: Event) -> tuple[str, list[Any]]:
+def read(event: MavlinkEvent) -> tuple[str, list[Any]]:
     """Return an event's message and arguments, decoded by the file as a ground station does."""
     component = metadata()
     for group in component["event_groups"].values():
@@ -167,37 +167,37 @@ def test_levels_are_two_halves_of_a_byte() -> None:
         (
             FailsafeAction.HOLD,
             FailsafeAction.RETURN,
-            Cause.GCS_LOSS,
+            FailsafeReason.GCS_LOSS,
             "GCS connection loss: switching to Return in 5 seconds",
         ),
         (
             FailsafeAction.HOLD,
             FailsafeAction.LAND,
-            Cause.GENERIC,
+            FailsafeReason.GENERIC,
             "Failsafe activated: switching to Land in 5 seconds",
         ),
         (
             FailsafeAction.WARN,
             FailsafeAction.NONE,
-            Cause.BATTERY_LOW,
+            FailsafeReason.BATTERY_LOW,
             "Low battery level, return advised",
         ),
         (
             FailsafeAction.DESCEND,
             FailsafeAction.NONE,
-            Cause.GENERIC,
+            FailsafeReason.GENERIC,
             "Failsafe activated: Autopilot disengaged, switching to Descend",
         ),
         (
             FailsafeAction.RETURN,
             FailsafeAction.NONE,
-            Cause.BATTERY_CRITICAL,
+            FailsafeReason.BATTERY_CRITICAL,
             "Critical battery level: switching to Return",
         ),
     ],
 )
 def test_a_failsafes_event_names_its_cause_and_what_follows(
-    action: FailsafeAction, delayed: FailsafeAction, cause: Cause, expected: str
+    action: FailsafeAction, delayed: FailsafeAction, cause: FailsafeReason, expected: str
 ) -> None:
     told = announcement(action, delayed, cause, Mode.OFFBOARD, 5 * US_PER_S)
     assert told.event is not None
@@ -291,7 +291,7 @@ def say(rig: Rig, *texts: str) -> None:
     """Let the autopilot say texts that are events, too; a tick later they are sent."""
     for text in texts:
         event = flight_events.ARMED_BY.event(ArmingReason.COMMAND_EXTERNAL)
-        rig.autopilot.messages.append(Message(Severity.INFO, text, event))
+        rig.autopilot.messages.append(OperatorText(Severity.INFO, text, event))
         rig.autopilot.events.append(event)
     rig.bench.tick()
 
@@ -479,7 +479,7 @@ def test_what_services_refuse_is_an_event(refused: Any, text: str | None, words:
     assert said == 2 * f"{text or words}\t"
     (event, same) = [m for m in heard if m.get_type() == "EVENT"]
     assert event.id == same.id
-    assert read(Event(event.id, event.log_levels, bytes(event.arguments)))[0] == words
+    assert read(MavlinkEvent(event.id, event.log_levels, bytes(event.arguments)))[0] == words
 
 
 def test_nobody_arms_while_a_radio_is_calibrated() -> None:

@@ -29,7 +29,7 @@ from firmware_sim.external.ardupilot.sitl import (
     state_line,
 )
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, Truth
+from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, TrueState
 from tests.support.ardupilot_copter import GUIDED, LAND
 from tests.support.ardupilot_peer import ArdupilotPeer
 from tests.support.ardupilot_stage import bridged
@@ -51,9 +51,9 @@ def sample(
     return SensorSample(time_us, np.array(accel, float), np.array(gyro, float), 20.0, battery)
 
 
-def truth(position: Any = (1.5, -2.25, -3.0), velocity: Any = (0.5, 1e-9, -2e5)) -> Truth:
+def truth(position: Any = (1.5, -2.25, -3.0), velocity: Any = (0.5, 1e-9, -2e5)) -> TrueState:
     attitude = np.array([0.5, -0.5, 0.5, 0.5])
-    return Truth(
+    return TrueState(
         0, np.array(position, float), np.array(velocity, float), attitude, np.zeros(3), 300.0, 1.0
     )
 

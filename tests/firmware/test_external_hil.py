@@ -14,14 +14,14 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.core.frames import HOME, Geodetic
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.external.px4 import hil_messages as hil
-from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample, Truth
-from firmware_sim.mavlink.codec import Encoder, Layout, Values
+from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample, TrueState
+from firmware_sim.mavlink.codec import Encoder, Values, WireLayout
 from firmware_sim.mavlink.streams.pose import hil_state_quaternion
 
 BATTERY = BatterySample(16.0, 10.0, 100.0, 0.9)
 
 
-def decoded(layout: Layout, values: Values) -> Any:
+def decoded(layout: WireLayout, values: Values) -> Any:
     """Return the message that pymavlink finds in the frame."""
     frame = Encoder().frame(layout, layout.payload(values))
     (message,) = dialect.MAVLink(None).parse_buffer(frame)
@@ -116,7 +116,7 @@ def test_what_does_not_fit_is_clamped() -> None:
 
 def test_the_true_state() -> None:
     half = math.sqrt(0.5)
-    truth = Truth(
+    truth = TrueState(
         1,
         np.array([0.0, 0.0, -10.0]),
         np.array([1.0, -2.0, 0.25]),
@@ -135,7 +135,7 @@ def test_the_true_state() -> None:
 
 
 def test_a_metre_north_and_east_on_the_globe() -> None:
-    truth = Truth(
+    truth = TrueState(
         1, np.array([1.0, 1.0, 0.0]), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3), 0.0, 1.0
     )
     message = decoded(hil.STATE, hil_state_quaternion(truth, 1))

@@ -16,12 +16,12 @@ from mavsdk.plugins.telemetry import Telemetry
 
 from airl_mav.core.clock import SimClock, WallClock
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.external.airframe_check import HITL_OUTPUT, px4_airframe
 from firmware_sim.external.boot_sequence import ExternalFlightController, ExternalFlightStack
 from firmware_sim.external.launcher import Launcher
-from firmware_sim.external.observer import Observer
+from firmware_sim.external.observer import FirmwareObserver
 from firmware_sim.external.px4 import hitl
 from firmware_sim.external.px4.board_link import BoardLink
 from firmware_sim.external.px4.hitl import HitlBridge
@@ -61,7 +61,7 @@ class Flight:
         self.router = Router(ends.by_name(), WallClock())
         bridge = partial(HitlBridge, BoardLink(self.router, peer.device, 921_600))
         self.launcher = Launcher(px4_airframe(quad(), HITL_OUTPUT), bridge, PATIENCE_S)
-        self.observer = Observer(self.router, "observer")
+        self.observer = FirmwareObserver(self.router, "observer")
         self.texts: list[str] = []
         self.simulation = self.boot()
 
@@ -114,7 +114,7 @@ def test_take_off_and_hover(flight: Flight, peer: HitlPeer) -> None:
         in_background(flight, action.arm, "it arms")
         in_background(flight, action.takeoff, "it takes off")
         flight.until(lambda: flight.firmware.flight.mode is Mode.HOLD and flight.height > 2.0, "up")
-        assert flight.firmware.flight.phase is Phase.AIR
+        assert flight.firmware.flight.phase is FlightPhase.AIR
         heights = []
         for _ in range(500):
             flight.tick()

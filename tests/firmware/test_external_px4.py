@@ -16,8 +16,8 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
-from firmware_sim.autopilot.autopilot_state import Message
-from firmware_sim.autopilot.commander import Flight
+from firmware_sim.autopilot.autopilot_state import OperatorText
+from firmware_sim.autopilot.commander import CommanderState
 from firmware_sim.external.process import FirmwareProcess
 from firmware_sim.external.px4.program import find_px4
 from firmware_sim.external.px4.sitl import EPOCH_US, Px4Bridge
@@ -40,9 +40,9 @@ def fine() -> None:
 class Flown:
     """A bridge as a flight controller. Implements `FlightController`."""
 
-    on_message: Callable[[Message], None] | None = None
+    on_message: Callable[[OperatorText], None] | None = None
     internals = None
-    flight = Flight()
+    flight = CommanderState()
 
     def __init__(self, bridge: Px4Bridge) -> None:
         self.bridge = bridge

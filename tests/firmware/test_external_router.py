@@ -16,8 +16,8 @@ from airl_mav.core.clock import SimClock, WallClock
 from firmware_sim.external.transport.router import (
     BURST_BYTES,
     SIMULATOR_IDS,
-    Budget,
     Router,
+    TokenBucket,
 )
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
@@ -210,7 +210,7 @@ def test_clients_cannot_flood_the_line() -> None:
 
 def test_a_budget_saves_no_more_than_a_burst() -> None:
     clock = SimClock()
-    budget = Budget(1_000, clock)
+    budget = TokenBucket(1_000, clock)
     clock.advance(10**9)
     assert budget.take(BURST_BYTES)
     assert not budget.take(1)

@@ -10,7 +10,7 @@ import pytest
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Mode, Result, Severity, Wire
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.failsafes.supervisor import LOOK_US
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
@@ -41,7 +41,7 @@ def until_said(rig: Rig, text: str, limit_s: float) -> float:
 
 
 def until_disarmed(rig: Rig, limit_s: float) -> float:
-    return rig.until(lambda: rig.ap.flight.phase is Phase.STANDBY, limit_s)
+    return rig.until(lambda: rig.ap.flight.phase is FlightPhase.STANDBY, limit_s)
 
 
 def highest_until_disarmed(rig: Rig, limit_s: float) -> float:
@@ -50,7 +50,7 @@ def highest_until_disarmed(rig: Rig, limit_s: float) -> float:
 
     def disarmed() -> bool:
         heights.append(rig.height)
-        return rig.ap.flight.phase is Phase.STANDBY
+        return rig.ap.flight.phase is FlightPhase.STANDBY
 
     rig.until(disarmed, limit_s)
     return max(heights)
@@ -149,15 +149,18 @@ def test_loss_hold_holds() -> None:
         rig.run(12.0, lambda: far.append(float(np.linalg.norm(rig.truth.position - here))))
         assert max(far) < 0.5
         assert rig.mode is Mode.HOLD
-        assert rig.ap.flight.phase is Phase.AIR
+        assert rig.ap.flight.phase is FlightPhase.AIR
 
 
 @pytest.mark.parametrize(
     ("action", "phase", "text"),
-    [(6, Phase.AIR, "Disarmed by lockdown"), (7, Phase.STANDBY, "Disarmed by failsafe")],
+    [
+        (6, FlightPhase.AIR, "Disarmed by lockdown"),
+        (7, FlightPhase.STANDBY, "Disarmed by failsafe"),
+    ],
     ids=["terminate", "disarm"],
 )
-def test_loss_terminate_and_disarm_fall(action: int, phase: Phase, text: str) -> None:
+def test_loss_terminate_and_disarm_fall(action: int, phase: FlightPhase, text: str) -> None:
     with flight(SEED, parameters={"COM_OBL_RC_ACT": action}) as rig:
         assert LOSS_S[0] <= lose_offboard(rig) <= LOSS_S[1]
         assert rig.ap.flight.phase is phase
@@ -171,7 +174,7 @@ def test_loss_terminate_and_disarm_fall(action: int, phase: Phase, text: str) ->
         # Setpoints that come back start no motor.
         rig.stream(NORTHWARD)
         rig.run(5.0)
-        assert rig.ap.flight.phase is Phase.STANDBY
+        assert rig.ap.flight.phase is FlightPhase.STANDBY
         assert count(rig, text) == 1
         assert rig.ap.state().motors == (0.0, 0.0, 0.0, 0.0)
 
@@ -265,9 +268,9 @@ def test_disarms_after_landing(wait_s: float) -> None:
         rig.ap.set_mode(Mode.LAND)
         until_said(rig, "Landing detected", 20.0)
         landed = rig.ap.flight.phase
-        assert landed is Phase.GROUND
+        assert landed is FlightPhase.GROUND
         assert until_said(rig, "Disarmed by landing", 10.0) == pytest.approx(wait_s, abs=0.02)
-        assert rig.ap.flight.phase is Phase.STANDBY
+        assert rig.ap.flight.phase is FlightPhase.STANDBY
         assert rig.mode is Mode.HOLD
 
 
@@ -277,7 +280,7 @@ def test_disarms_without_take_off(wait_s: float) -> None:
         rig.arm()
         text = "Disarmed by auto preflight disarming"
         assert until_said(rig, text, 15.0) == pytest.approx(wait_s, abs=0.02)
-        assert rig.ap.flight.phase is Phase.STANDBY
+        assert rig.ap.flight.phase is FlightPhase.STANDBY
         assert count(rig, text) == 1
 
 
@@ -285,13 +288,13 @@ def test_disarming_times_can_be_switched_off() -> None:
     with flight(SEED, parameters={"COM_DISARM_LAND": -1.0, "COM_DISARM_PRFLT": -1.0}) as rig:
         rig.arm()
         rig.run(12.0)  # Two seconds more than it would take.
-        assert rig.ap.flight.phase is Phase.GROUND
+        assert rig.ap.flight.phase is FlightPhase.GROUND
         rig.ap.takeoff(2.5)
         rig.until(lambda: rig.mode is Mode.HOLD, 20.0)
         rig.ap.set_mode(Mode.LAND)
         until_said(rig, "Landing detected", 20.0)
         rig.run(4.0)
-        assert rig.ap.flight.phase is Phase.GROUND
+        assert rig.ap.flight.phase is FlightPhase.GROUND
 
 
 def test_disarm_in_the_air_is_refused() -> None:
@@ -300,7 +303,7 @@ def test_disarm_in_the_air_is_refused() -> None:
         assert rig.ap.disarm(force=False) is Result.TEMPORARILY_REJECTED
         assert count(rig, "Disarming denied: not landed") == 1
         rig.run(2.0)
-        assert rig.ap.flight.phase is Phase.AIR
+        assert rig.ap.flight.phase is FlightPhase.AIR
         assert rig.height > 2.0
 
 
@@ -322,7 +325,7 @@ def test_kill_in_the_air_cuts_the_motors() -> None:
         assert not commands[-1].armed
         assert rig.until(lambda: bool(rig.sim.plant.collisions), 2.0) < 1.2
         rig.run(1.0)
-        assert rig.ap.flight.phase is Phase.STANDBY
+        assert rig.ap.flight.phase is FlightPhase.STANDBY
 
 
 # --- battery
@@ -532,7 +535,7 @@ def test_take_off_while_disarmed_stays() -> None:
         assert rig.ap.takeoff(2.5) is Result.ACCEPTED
         rig.run(6.0)
         assert rig.height < 0.001
-        assert rig.ap.flight.phase is Phase.STANDBY
+        assert rig.ap.flight.phase is FlightPhase.STANDBY
 
 
 def test_landing_from_eight_metres() -> None:

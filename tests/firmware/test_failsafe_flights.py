@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from firmware_sim.autopilot.autopilot_state import Mode, Result
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from tests.support.flight_rig import Rig, flight, velocity_setpoint
 
@@ -61,7 +61,7 @@ def touch_down(rig: Rig, limit_s: float) -> float:
         nonlocal fastest
         if 0.0 < rig.height < 0.5:
             fastest = max(fastest, float(rig.truth.velocity[2]))
-        return rig.ap.flight.phase <= Phase.STANDBY
+        return rig.ap.flight.phase <= FlightPhase.STANDBY
 
     rig.until(ended, limit_s)
     return fastest
@@ -193,7 +193,7 @@ def test_a_stuck_gyro_terminates() -> None:
         rig.tick()
         assert rig.ap.state().motors == (0.0, 0.0, 0.0, 0.0)
         # Lockdown needs no estimate, only stopped motors.
-        rig.until(lambda: rig.ap.flight.phase <= Phase.STANDBY, 6.0)
+        rig.until(lambda: rig.ap.flight.phase <= FlightPhase.STANDBY, 6.0)
         assert said(rig, "Disarmed by lockdown") == 1
 
 
@@ -225,7 +225,7 @@ def test_termination_is_for_good() -> None:
         rig.tick()
         assert rig.ap.state().motors == (0.0, 0.0, 0.0, 0.0)
         assert rig.ap.set_mode(Mode.HOLD) is Result.TEMPORARILY_REJECTED
-        stopped = rig.until(lambda: rig.ap.flight.phase is not Phase.AIR, 6.0)
+        stopped = rig.until(lambda: rig.ap.flight.phase is not FlightPhase.AIR, 6.0)
         assert stopped == pytest.approx(5.0, abs=0.02)
         assert said(rig, "Disarmed by lockdown") == 1
         assert rig.ap.arm(force=True) is Result.TEMPORARILY_REJECTED
@@ -264,7 +264,7 @@ def test_without_any_sensor_it_never_gets_ready_nor_grows() -> None:
         tamper = Tamper(rig)
         tamper.change = without_gps
         rig.run(25.0)
-        assert rig.ap.flight.phase is Phase.BOOT
+        assert rig.ap.flight.phase is FlightPhase.BOOT
         assert rig.ap.record["rest_count"].max() <= 2600
         assert rig.ap.arm(force=False) is Result.TEMPORARILY_REJECTED
         assert said(rig, "Preflight Fail: ekf2 missing data") == 1

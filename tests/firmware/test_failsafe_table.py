@@ -15,21 +15,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.failsafes.actions import Action
+from firmware_sim.autopilot.failsafes.actions import FailsafeAction
 from firmware_sim.autopilot.failsafes.conditions import (
     NEEDS,
     BatteryWarning,
     Conditions,
+    FailsafeSettings,
     FenceBreach,
-    Settings,
     can_run,
 )
 from firmware_sim.autopilot.failsafes.framework import (
     NO_INTERVENTION,
+    FailsafeInput,
+    FailsafeResult,
     FailsafeState,
     Intervention,
-    Outcome,
-    Vehicle,
     update,
 )
 from firmware_sim.autopilot.failsafes.table import (
@@ -56,10 +56,10 @@ LONG_ARMED_US = 60 * S
 class Machine:
     """Steps the failsafes and keeps their state."""
 
-    def __init__(self, mode: Mode = Mode.HOLD, options: Settings | None = None) -> None:
+    def __init__(self, mode: Mode = Mode.HOLD, options: FailsafeSettings | None = None) -> None:
         self.state = FailsafeState()
         self.mode, self.armed, self.time_us = mode, True, 1 * S
-        self.options = options or Settings()
+        self.options = options or FailsafeSettings()
         self.conditions = FINE
         self.mission_finished = False
         self.texts: list[str] = []
@@ -67,26 +67,26 @@ class Machine:
 
     def step(
         self, elapsed_us: int = 10 * MS, asked: Intervention = NO_INTERVENTION, **changes: Any
-    ) -> Outcome:
+    ) -> FailsafeResult:
         """Let time pass, change what is wrong, and update; return the outcome."""
         self.time_us += elapsed_us
         self.conditions = self.conditions._replace(**changes)
-        vehicle = Vehicle(self.armed, self.mode, self.mission_finished)
+        vehicle = FailsafeInput(self.armed, self.mode, self.mission_finished)
         self.last = update(self.state, self.time_us, vehicle, self.conditions, self.options, asked)
         self.state, self.mode = self.last.state, self.last.intended
         if self.last.text is not None:
             self.texts.append(self.last.text.text)
         return self.last
 
-    def action(self) -> Action:
+    def action(self) -> FailsafeAction:
         return self.state.action
 
 
 def flying(mode: Mode = Mode.HOLD, **options: float) -> Machine:
     """Return the failsafes of a vehicle that has been armed for a while."""
-    machine = Machine(mode, Settings(**options))  # type: ignore[arg-type]  # by name
+    machine = Machine(mode, FailsafeSettings(**options))  # type: ignore[arg-type]  # by name
     machine.step(LONG_ARMED_US)
-    assert machine.action() is Action.NONE
+    assert machine.action() is FailsafeAction.NONE
     return machine
 
 
@@ -95,74 +95,74 @@ def flying(mode: Mode = Mode.HOLD, **options: float) -> Machine:
 
 def test_manual_control_lost_holds_then_returns() -> None:
     m = flying(Mode.POSITION, nav_rcl_act=2)
-    assert m.step(manual_control_signal_lost=True).state.action is Action.HOLD
+    assert m.step(manual_control_signal_lost=True).state.action is FailsafeAction.HOLD
     assert m.texts == ["Failsafe activated: entering Hold for 5 seconds"]
-    assert m.last.delayed is Action.RETURN
+    assert m.last.delayed is FailsafeAction.RETURN
     assert m.last.mode is Mode.HOLD
     m.step(4900 * MS)
-    assert m.action() is Action.HOLD
+    assert m.action() is FailsafeAction.HOLD
     m.step(200 * MS)
-    assert m.action() is Action.RETURN
+    assert m.action() is FailsafeAction.RETURN
     assert m.texts[-1] == "Failsafe activated"
     # The signal is back: the return continues until the user chooses a mode.
     m.step(manual_control_signal_lost=False)
-    assert m.action() is Action.RETURN
+    assert m.action() is FailsafeAction.RETURN
     m.mode = Mode.ALTITUDE
     assert m.step().mode is Mode.ALTITUDE
-    assert m.action() is Action.NONE
+    assert m.action() is FailsafeAction.NONE
 
 
 def test_the_worse_of_two_is_taken_and_the_other_after_it() -> None:
     m = flying(Mode.POSITION, nav_rcl_act=2, nav_dll_act=3)
     m.step(manual_control_signal_lost=True)
     m.step(6 * S)
-    assert m.action() is Action.RETURN
+    assert m.action() is FailsafeAction.RETURN
     m.step(gcs_connection_lost=True)
-    assert m.action() is Action.LAND, "no second wait: it is in a failsafe already"
+    assert m.action() is FailsafeAction.LAND, "no second wait: it is in a failsafe already"
     m.mode = Mode.HOLD
     m.step(gcs_connection_lost=False)
-    assert m.action() is Action.WARN, "the user flies on; the pilot's link is still lost"
+    assert m.action() is FailsafeAction.WARN, "the user flies on; the pilot's link is still lost"
 
 
 def test_the_user_takes_over_with_the_sticks_only_after_the_wait() -> None:
     m = flying(Mode.MISSION)
     m.step(mission_failure=True)
-    assert m.action() is Action.HOLD
+    assert m.action() is FailsafeAction.HOLD
     m.step(3 * S, Intervention(sticks_moved=True))
-    assert m.action() is Action.HOLD
+    assert m.action() is FailsafeAction.HOLD
     m.step(3 * S)
-    assert m.action() is Action.RETURN
+    assert m.action() is FailsafeAction.RETURN
     m.step(10 * MS, Intervention(sticks_moved=True))
-    assert (m.action(), m.mode, m.state.taken_over) == (Action.WARN, Mode.POSITION, True)
+    assert (m.action(), m.mode, m.state.taken_over) == (FailsafeAction.WARN, Mode.POSITION, True)
     m.step()
-    assert m.action() is Action.NONE
+    assert m.action() is FailsafeAction.NONE
     assert not m.state.taken_over
 
 
 def test_a_mode_ends_the_wait_but_not_one_asked_before() -> None:
     m = flying(Mode.POSITION, nav_rcl_act=2)
     m.step(10 * MS, Intervention(mode_chosen=True), manual_control_signal_lost=True)
-    assert m.action() is Action.HOLD, "asked for at the moment of the loss: no takeover"
+    assert m.action() is FailsafeAction.HOLD, "asked for at the moment of the loss: no takeover"
     m.step(1 * S, Intervention(mode_chosen=True))
-    assert (m.action(), m.state.taken_over) == (Action.WARN, True)
+    assert (m.action(), m.state.taken_over) == (FailsafeAction.WARN, True)
     m.step(60 * S)
-    assert m.action() is Action.WARN
+    assert m.action() is FailsafeAction.WARN
 
 
 def test_a_fence_is_escaped_by_mode_not_by_sticks_and_termination_by_nothing() -> None:
     m = flying(Mode.POSITION, gf_action=2)
     m.step(geofence=FenceBreach(distance=True))
-    assert m.action() is Action.HOLD
+    assert m.action() is FailsafeAction.HOLD
     m.step(10 * MS, Intervention(sticks_moved=True))
-    assert m.action() is Action.HOLD
+    assert m.action() is FailsafeAction.HOLD
     m.step(10 * MS, Intervention(mode_chosen=True))
-    assert m.action() is Action.WARN
+    assert m.action() is FailsafeAction.WARN
     m = flying(Mode.POSITION, gf_action=4)
     m.step(geofence=FenceBreach(custom=True))
-    assert m.action() is Action.TERMINATE
+    assert m.action() is FailsafeAction.TERMINATE
     m.armed, m.mode = False, Mode.HOLD
     m.step(10 * S, Intervention(mode_chosen=True, sticks_moved=True), geofence=FenceBreach())
-    assert m.action() is Action.TERMINATE
+    assert m.action() is FailsafeAction.TERMINATE
     assert m.last.mode is Mode.TERMINATION
 
 
@@ -170,7 +170,7 @@ def test_already_returning_or_landing_it_only_warns() -> None:
     for mode in (Mode.RETURN, Mode.LAND, Mode.PRECISION_LAND):
         m = flying(mode, nav_rcl_act=2)
         m.step(manual_control_signal_lost=True)
-        assert (m.action(), m.last.mode) == (Action.WARN, mode)
+        assert (m.action(), m.last.mode) == (FailsafeAction.WARN, mode)
 
 
 def test_a_condition_that_flaps_acts_in_the_end() -> None:
@@ -179,54 +179,54 @@ def test_a_condition_that_flaps_acts_in_the_end() -> None:
     for _ in range(3):
         m.step(mission_failure=True)
         m.step(1 * S)
-        assert m.action() is Action.HOLD
+        assert m.action() is FailsafeAction.HOLD
         m.step(mission_failure=False)
         m.step(500 * MS)
-        assert m.action() is Action.HOLD
+        assert m.action() is FailsafeAction.HOLD
     m.step(1 * S)
-    assert m.action() is Action.NONE
+    assert m.action() is FailsafeAction.NONE
     m.step(mission_failure=True)
     assert m.texts[-1] == "Failsafe activated: entering Hold for 3 seconds"
     m.step(3500 * MS)
-    assert m.action() is Action.RETURN
+    assert m.action() is FailsafeAction.RETURN
 
 
 def test_the_battery_acts_only_when_worse_than_at_arming() -> None:
-    m = Machine(Mode.HOLD, Settings(com_low_bat_act=3))
+    m = Machine(Mode.HOLD, FailsafeSettings(com_low_bat_act=3))
     m.armed = False
     m.step(battery_warning=BatteryWarning.CRITICAL)
     m.armed = True
     m.step()
     m.step(LONG_ARMED_US)
-    assert m.action() is Action.WARN
+    assert m.action() is FailsafeAction.WARN
     m.step(battery_warning=BatteryWarning.EMERGENCY)
     m.step(6 * S)
-    assert m.action() is Action.LAND
+    assert m.action() is FailsafeAction.LAND
 
 
 def test_manual_control_that_was_missing_at_arming_is_optional() -> None:
-    m = Machine(Mode.HOLD, Settings(nav_rcl_act=2))
+    m = Machine(Mode.HOLD, FailsafeSettings(nav_rcl_act=2))
     m.armed = False
     m.step(manual_control_signal_lost=True)
     m.armed = True
     m.step(LONG_ARMED_US)
-    assert m.action() is Action.NONE
+    assert m.action() is FailsafeAction.NONE
     m.step(manual_control_signal_lost=False)
     m.step(manual_control_signal_lost=True)
-    assert m.action() is Action.HOLD, "once it was there, its loss counts"
+    assert m.action() is FailsafeAction.HOLD, "once it was there, its loss counts"
 
 
 @pytest.mark.parametrize(
     ("after_s", "breaker", "expected"),
     [
-        (3.9, 121212, Action.DISARM),
-        (3.9, 0, Action.DISARM),
-        (4.1, 121212, Action.WARN),
-        (4.1, 0, Action.TERMINATE),
+        (3.9, 121212, FailsafeAction.DISARM),
+        (3.9, 0, FailsafeAction.DISARM),
+        (4.1, 121212, FailsafeAction.WARN),
+        (4.1, 0, FailsafeAction.TERMINATE),
     ],
 )
-def test_attitude_failure(after_s: float, breaker: int, expected: Action) -> None:
-    m = Machine(Mode.TAKEOFF, Settings(cbrk_flightterm=breaker))
+def test_attitude_failure(after_s: float, breaker: int, expected: FailsafeAction) -> None:
+    m = Machine(Mode.TAKEOFF, FailsafeSettings(cbrk_flightterm=breaker))
     m.step(round(after_s * S), fd_critical_failure=True)
     assert m.action() is expected
 
@@ -234,18 +234,18 @@ def test_attitude_failure(after_s: float, breaker: int, expected: Action) -> Non
 def test_an_orbit_that_a_failsafe_ended_is_not_resumed() -> None:
     m = flying(Mode.ORBIT, com_fail_act_t=0.0)
     m.step(flight_time_limit_exceeded=True)
-    assert m.action() is Action.RETURN
+    assert m.action() is FailsafeAction.RETURN
     m.step(flight_time_limit_exceeded=False)
-    assert (m.action(), m.mode) == (Action.NONE, Mode.HOLD)
+    assert (m.action(), m.mode) == (FailsafeAction.NONE, Mode.HOLD)
 
 
 def test_offboard_lost_and_regained() -> None:
     m = flying(Mode.OFFBOARD, com_obl_rc_act=3)
     m.step(offboard_control_signal_lost=True)
-    assert (m.action(), m.last.mode, m.mode) == (Action.RETURN, Mode.RETURN, Mode.OFFBOARD)
+    assert (m.action(), m.last.mode, m.mode) == (FailsafeAction.RETURN, Mode.RETURN, Mode.OFFBOARD)
     assert m.texts == ["Failsafe activated"], "no wait in Hold for a mode that cannot fly on"
     m.step(offboard_control_signal_lost=False)
-    assert (m.action(), m.last.mode) == (Action.NONE, Mode.OFFBOARD)
+    assert (m.action(), m.last.mode) == (FailsafeAction.NONE, Mode.OFFBOARD)
 
 
 # --- every pair
@@ -258,7 +258,7 @@ def test_every_trigger_has_a_row_and_every_value_of_its_parameter_an_answer() ->
         if row.parameter is None:
             assert set(row.answers) == {0}
         else:
-            assert row.parameter.lower() in Settings._fields
+            assert row.parameter.lower() in FailsafeSettings._fields
 
 
 def test_every_mode_needs_something_known() -> None:
@@ -274,17 +274,17 @@ SINGLES = [(name,) for name in Conditions._fields]
 PAIRS = [(a, b) for a, b in product(Conditions._fields, repeat=2) if a < b]
 
 
-def with_every_action(value: int) -> Settings:
+def with_every_action(value: int) -> FailsafeSettings:
     """Return settings in which every parameter that chooses an action has this value."""
-    return Settings(
+    return FailsafeSettings(
         *(
             value if isinstance(default, int) and "act" in name else default
-            for name, default in Settings._field_defaults.items()
+            for name, default in FailsafeSettings._field_defaults.items()
         )
     )
 
 
-def assert_flown(mode: Mode, options: Settings, names: tuple[str, ...]) -> None:
+def assert_flown(mode: Mode, options: FailsafeSettings, names: tuple[str, ...]) -> None:
     """Apply conditions; the modes chosen at once and after the wait can be flown."""
     m = Machine(mode, options)
     for elapsed_us in (LONG_ARMED_US, 6 * S):
@@ -293,10 +293,10 @@ def assert_flown(mode: Mode, options: Settings, names: tuple[str, ...]) -> None:
         where = f"{names} in {mode.name} with {options}: {action.name}"
         if action in MODE_OF_ACTION:
             assert flown is MODE_OF_ACTION[action], where
-            assert action is Action.TERMINATE or can_run(flown, m.conditions), where
+            assert action is FailsafeAction.TERMINATE or can_run(flown, m.conditions), where
         else:
             assert flown is m.mode, where
-            assert action is Action.DISARM or can_run(flown, m.conditions), where
+            assert action is FailsafeAction.DISARM or can_run(flown, m.conditions), where
 
 
 @pytest.mark.parametrize("mode", Mode)
@@ -309,7 +309,7 @@ def test_every_condition_in_every_mode_has_an_outcome_that_can_be_flown(mode: Mo
 @pytest.mark.parametrize("mode", Mode)
 def test_every_pair_of_conditions_has_an_outcome_that_can_be_flown(mode: Mode) -> None:
     for names in PAIRS:
-        assert_flown(mode, Settings(), names)
+        assert_flown(mode, FailsafeSettings(), names)
 
 
 def test_the_chain_of_fallbacks() -> None:
@@ -325,14 +325,17 @@ def test_the_chain_of_fallbacks() -> None:
         lost[name] = True
         conditions = FINE._replace(**lost)
         ends.append(
-            (possible(Action.FALLBACK_POSITION, conditions), possible(Action.HOLD, conditions))
+            (
+                possible(FailsafeAction.FALLBACK_POSITION, conditions),
+                possible(FailsafeAction.HOLD, conditions),
+            )
         )
     assert ends == [
-        (Action.FALLBACK_POSITION, Action.LAND),
-        (Action.FALLBACK_POSITION, Action.LAND),
-        (Action.FALLBACK_ALTITUDE, Action.DESCEND),
-        (Action.FALLBACK_STABILIZED, Action.DESCEND),
-        (Action.TERMINATE, Action.TERMINATE),
+        (FailsafeAction.FALLBACK_POSITION, FailsafeAction.LAND),
+        (FailsafeAction.FALLBACK_POSITION, FailsafeAction.LAND),
+        (FailsafeAction.FALLBACK_ALTITUDE, FailsafeAction.DESCEND),
+        (FailsafeAction.FALLBACK_STABILIZED, FailsafeAction.DESCEND),
+        (FailsafeAction.TERMINATE, FailsafeAction.TERMINATE),
     ]
 
 
@@ -343,23 +346,32 @@ class Known(NamedTuple):
     """Inputs of the independent rules."""
 
     c: Conditions
-    p: Settings
+    p: FailsafeSettings
     mode: Mode
 
 
 _LINK = [
-    Action.NONE,
-    Action.HOLD,
-    Action.RETURN,
-    Action.LAND,
+    FailsafeAction.NONE,
+    FailsafeAction.HOLD,
+    FailsafeAction.RETURN,
+    FailsafeAction.LAND,
     None,
-    Action.TERMINATE,
-    Action.DISARM,
+    FailsafeAction.TERMINATE,
+    FailsafeAction.DISARM,
 ]
-_LIMIT = [Action.NONE, Action.WARN, Action.HOLD, Action.RETURN, Action.TERMINATE, Action.LAND]
+_LIMIT = [
+    FailsafeAction.NONE,
+    FailsafeAction.WARN,
+    FailsafeAction.HOLD,
+    FailsafeAction.RETURN,
+    FailsafeAction.TERMINATE,
+    FailsafeAction.LAND,
+]
 
 
-def _pick(actions: list[Action | None], value: int, otherwise: Action) -> Action:
+def _pick(
+    actions: list[FailsafeAction | None], value: int, otherwise: FailsafeAction
+) -> FailsafeAction:
     found = actions[value] if 0 <= value < len(actions) else None
     return otherwise if found is None else found
 
@@ -370,45 +382,48 @@ def _excepted(k: Known) -> bool:
     return bool(k.p.com_rcl_except & bit)
 
 
-def _low_battery(k: Known) -> Action:
+def _low_battery(k: Known) -> FailsafeAction:
     if k.c.battery_warning is BatteryWarning.NONE:
-        return Action.NONE
+        return FailsafeAction.NONE
     if k.c.battery_warning is BatteryWarning.LOW or k.p.com_low_bat_act not in (1, 2, 3):
-        return Action.WARN
+        return FailsafeAction.WARN
     if k.p.com_low_bat_act == 2:
-        return Action.LAND
+        return FailsafeAction.LAND
     empty = k.c.battery_warning is BatteryWarning.EMERGENCY
-    return Action.LAND if empty and k.p.com_low_bat_act == 3 else Action.RETURN
+    return FailsafeAction.LAND if empty and k.p.com_low_bat_act == 3 else FailsafeAction.RETURN
 
 
-def _unflyable(k: Known) -> Action:
+def _unflyable(k: Known) -> FailsafeAction:
     """Return the action for a mode that cannot continue."""
-    mode, action = k.mode, Action.NONE
+    mode, action = k.mode, FailsafeAction.NONE
     if mode is Mode.OFFBOARD and k.c.offboard_control_signal_lost:
         losses = [
-            (Action.FALLBACK_POSITION, Mode.POSITION),
-            (Action.FALLBACK_ALTITUDE, Mode.ALTITUDE),
-            (Action.FALLBACK_STABILIZED, Mode.STABILIZED),
-            (Action.RETURN, Mode.RETURN),
-            (Action.LAND, Mode.LAND),
-            (Action.HOLD, Mode.HOLD),
-            (Action.TERMINATE, Mode.TERMINATION),
+            (FailsafeAction.FALLBACK_POSITION, Mode.POSITION),
+            (FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+            (FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
+            (FailsafeAction.RETURN, Mode.RETURN),
+            (FailsafeAction.LAND, Mode.LAND),
+            (FailsafeAction.HOLD, Mode.HOLD),
+            (FailsafeAction.TERMINATE, Mode.TERMINATION),
         ]
         if k.p.com_obl_rc_act == 7:
-            return Action.DISARM
+            return FailsafeAction.DISARM
         action, mode = losses[k.p.com_obl_rc_act]
     steps = {
         0: [
-            (Mode.POSITION, Action.FALLBACK_ALTITUDE, Mode.ALTITUDE),
-            (Mode.ALTITUDE, Action.FALLBACK_STABILIZED, Mode.STABILIZED),
+            (Mode.POSITION, FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+            (Mode.ALTITUDE, FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
         ],
-        1: [(Mode.POSITION, Action.LAND, Mode.LAND), (Mode.LAND, Action.DESCEND, Mode.DESCEND)],
+        1: [
+            (Mode.POSITION, FailsafeAction.LAND, Mode.LAND),
+            (Mode.LAND, FailsafeAction.DESCEND, Mode.DESCEND),
+        ],
     }[k.p.com_posctl_navl]
     if mode is Mode.POSITION or k.p.com_posctl_navl == 0:
         for at, then, into in steps:
             if mode is at and not _flies(at, k.c):
                 action, mode = then, into
-    return action if _flies(mode, k.c) else Action.RETURN
+    return action if _flies(mode, k.c) else FailsafeAction.RETURN
 
 
 def _flies(mode: Mode, c: Conditions) -> bool:
@@ -437,89 +452,104 @@ def _flies(mode: Mode, c: Conditions) -> bool:
     }[mode]
 
 
-RULES: list[Callable[[Known], Action]] = [
+RULES: list[Callable[[Known], FailsafeAction]] = [
     lambda k: (
-        _pick(_LINK, k.p.nav_rcl_act, Action.NONE)
+        _pick(_LINK, k.p.nav_rcl_act, FailsafeAction.NONE)
         if k.c.manual_control_signal_lost and k.p.com_rc_in_mode != 4 and not _excepted(k)
-        else Action.NONE
+        else FailsafeAction.NONE
     ),
     lambda k: (
-        _pick(_LINK, k.p.nav_dll_act, Action.NONE)
+        _pick(_LINK, k.p.nav_dll_act, FailsafeAction.NONE)
         if k.c.gcs_connection_lost and k.mode not in (Mode.LAND, Mode.PRECISION_LAND)
-        else Action.NONE
+        else FailsafeAction.NONE
     ),
-    lambda k: Action.RETURN if k.mode is Mode.MISSION and k.c.mission_failure else Action.NONE,
     lambda k: (
-        _pick(list(_LIMIT), k.p.com_wind_max_act, Action.WARN)
+        FailsafeAction.RETURN
+        if k.mode is Mode.MISSION and k.c.mission_failure
+        else FailsafeAction.NONE
+    ),
+    lambda k: (
+        _pick(list(_LIMIT), k.p.com_wind_max_act, FailsafeAction.WARN)
         if k.c.wind_limit_exceeded
-        else Action.NONE
+        else FailsafeAction.NONE
     ),
-    lambda k: Action.RETURN if k.c.flight_time_limit_exceeded else Action.NONE,
+    lambda k: FailsafeAction.RETURN if k.c.flight_time_limit_exceeded else FailsafeAction.NONE,
     lambda k: (
-        _pick(list(_LIMIT), k.p.com_pos_low_act, Action.WARN)
+        _pick(list(_LIMIT), k.p.com_pos_low_act, FailsafeAction.WARN)
         if k.c.local_position_accuracy_low and k.mode in (Mode.HOLD, Mode.MISSION)
-        else Action.NONE
+        else FailsafeAction.NONE
     ),
     lambda k: (
-        (Action.LAND if k.mode in (Mode.TAKEOFF, Mode.RETURN) else Action.HOLD)
+        (FailsafeAction.LAND if k.mode in (Mode.TAKEOFF, Mode.RETURN) else FailsafeAction.HOLD)
         if k.c.navigator_failure
-        else Action.NONE
+        else FailsafeAction.NONE
     ),
     lambda k: (
-        _pick(list(_LIMIT), k.p.gf_action, Action.WARN)
+        _pick(list(_LIMIT), k.p.gf_action, FailsafeAction.WARN)
         if k.c.geofence != FenceBreach()
-        else Action.NONE
+        else FailsafeAction.NONE
     ),
     lambda k: (
-        {1: Action.WARN, 3: Action.RETURN}.get(k.p.com_fltt_low_act, Action.NONE)
+        {1: FailsafeAction.WARN, 3: FailsafeAction.RETURN}.get(
+            k.p.com_fltt_low_act, FailsafeAction.NONE
+        )
         if k.c.battery_low_remaining_time
-        else Action.NONE
+        else FailsafeAction.NONE
     ),
-    lambda k: Action.WARN if k.c.battery_unhealthy else Action.NONE,
+    lambda k: FailsafeAction.WARN if k.c.battery_unhealthy else FailsafeAction.NONE,
     _low_battery,
     lambda k: (
-        (Action.WARN if k.p.cbrk_flightterm == 121212 else Action.TERMINATE)
+        (FailsafeAction.WARN if k.p.cbrk_flightterm == 121212 else FailsafeAction.TERMINATE)
         if k.c.fd_critical_failure
-        else Action.NONE
+        else FailsafeAction.NONE
     ),
     lambda k: (
-        {0: Action.WARN, 1: Action.RETURN, 2: Action.LAND}.get(k.p.com_imb_prop_act, Action.NONE)
-        if k.c.fd_imbalanced_prop
-        else Action.NONE
-    ),
-    lambda k: (
-        {1: Action.HOLD, 2: Action.LAND, 3: Action.RETURN, 4: Action.TERMINATE}.get(
-            k.p.com_act_fail_act, Action.WARN
+        {0: FailsafeAction.WARN, 1: FailsafeAction.RETURN, 2: FailsafeAction.LAND}.get(
+            k.p.com_imb_prop_act, FailsafeAction.NONE
         )
+        if k.c.fd_imbalanced_prop
+        else FailsafeAction.NONE
+    ),
+    lambda k: (
+        {
+            1: FailsafeAction.HOLD,
+            2: FailsafeAction.LAND,
+            3: FailsafeAction.RETURN,
+            4: FailsafeAction.TERMINATE,
+        }.get(k.p.com_act_fail_act, FailsafeAction.WARN)
         if k.c.fd_motor_failure
-        else Action.NONE
+        else FailsafeAction.NONE
     ),
     _unflyable,
 ]
 
 _CHAIN = [
-    (Action.FALLBACK_POSITION, Mode.POSITION),
-    (Action.FALLBACK_ALTITUDE, Mode.ALTITUDE),
-    (Action.FALLBACK_STABILIZED, Mode.STABILIZED),
-    (Action.HOLD, Mode.HOLD),
-    (Action.RETURN, Mode.RETURN),
-    (Action.LAND, Mode.LAND),
-    (Action.DESCEND, Mode.DESCEND),
+    (FailsafeAction.FALLBACK_POSITION, Mode.POSITION),
+    (FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+    (FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
+    (FailsafeAction.HOLD, Mode.HOLD),
+    (FailsafeAction.RETURN, Mode.RETURN),
+    (FailsafeAction.LAND, Mode.LAND),
+    (FailsafeAction.DESCEND, Mode.DESCEND),
 ]
 
 
-def second_opinion(k: Known) -> Action:
+def second_opinion(k: Known) -> FailsafeAction:
     """Return the final action: the worst that applies, after its necessary fallbacks."""
     worst = max(rule(k) for rule in RULES)
-    if Action.WARN < worst < Action.DISARM:
+    if FailsafeAction.WARN < worst < FailsafeAction.DISARM:
         worst = next(
-            (a for a, mode in _CHAIN if a >= worst and _flies(mode, k.c)), Action.TERMINATE
+            (a for a, mode in _CHAIN if a >= worst and _flies(mode, k.c)), FailsafeAction.TERMINATE
         )
-    if k.mode in (Mode.LAND, Mode.RETURN) and worst is Action.RETURN and _flies(k.mode, k.c):
-        return Action.WARN
-    needless = worst in (Action.RETURN, Action.LAND)
+    if (
+        k.mode in (Mode.LAND, Mode.RETURN)
+        and worst is FailsafeAction.RETURN
+        and _flies(k.mode, k.c)
+    ):
+        return FailsafeAction.WARN
+    needless = worst in (FailsafeAction.RETURN, FailsafeAction.LAND)
     if k.mode is Mode.PRECISION_LAND and needless and _flies(k.mode, k.c):
-        return Action.WARN
+        return FailsafeAction.WARN
     return worst
 
 
@@ -534,7 +564,7 @@ CONDITIONS = st.builds(
     geofence=st.sampled_from([FenceBreach(), FenceBreach(), FenceBreach(distance=True)]),
 )
 OPTIONS = st.builds(
-    Settings,
+    FailsafeSettings,
     com_act_fail_act=st.integers(0, 4),
     com_fltt_low_act=st.integers(0, 3),
     com_imb_prop_act=st.integers(-1, 2),
@@ -558,7 +588,7 @@ OPTIONS = st.builds(
 @settings(max_examples=600)
 @given(CONDITIONS, OPTIONS, st.sampled_from(Mode))
 def test_what_flies_in_the_end_is_what_the_rules_say(
-    conditions: Conditions, options: Settings, mode: Mode
+    conditions: Conditions, options: FailsafeSettings, mode: Mode
 ) -> None:
     machine = Machine(mode, options)
     machine.step(LONG_ARMED_US)
@@ -570,7 +600,7 @@ def test_what_flies_in_the_end_is_what_the_rules_say(
 
 @given(CONDITIONS, OPTIONS, st.sampled_from(Mode), st.integers(1, 5_900))
 def test_the_wait_only_ever_holds(
-    conditions: Conditions, options: Settings, mode: Mode, later_ms: int
+    conditions: Conditions, options: FailsafeSettings, mode: Mode, later_ms: int
 ) -> None:
     """Until COM_FAIL_ACT_T is over, the vehicle holds, or does at once what ends it."""
     machine = Machine(mode, options)
@@ -580,29 +610,31 @@ def test_the_wait_only_ever_holds(
     machine.step(later_ms * MS)
     final = second_opinion(Known(conditions, options, mode))
     # As in PX4: landing or returning continues until a return turns out impossible.
-    on_the_way = {Action.WARN} if mode in (Mode.LAND, Mode.RETURN, Mode.PRECISION_LAND) else set()
-    assert machine.action() in {final, Action.HOLD, *on_the_way}
+    on_the_way = (
+        {FailsafeAction.WARN} if mode in (Mode.LAND, Mode.RETURN, Mode.PRECISION_LAND) else set()
+    )
+    assert machine.action() in {final, FailsafeAction.HOLD, *on_the_way}
     if machine.action() is not final:
         assert later_ms < 5_000
         assert _flies(Mode.HOLD, conditions)
-        assert final not in (Action.DISARM, Action.TERMINATE)
+        assert final not in (FailsafeAction.DISARM, FailsafeAction.TERMINATE)
 
 
 @given(CONDITIONS, OPTIONS, st.sampled_from(Mode))
 def test_disarmed_nothing_acts_and_nothing_is_said(
-    conditions: Conditions, options: Settings, mode: Mode
+    conditions: Conditions, options: FailsafeSettings, mode: Mode
 ) -> None:
     machine = Machine(mode, options)
     machine.armed = False
     machine.conditions = conditions
     machine.step()
-    assert machine.action() is Action.NONE
+    assert machine.action() is FailsafeAction.NONE
     assert machine.texts == []
 
 
 @given(CONDITIONS, OPTIONS, st.sampled_from(Mode))
 def test_answers_are_none_for_a_vehicle_that_lacks_nothing(
-    conditions: Conditions, options: Settings, mode: Mode
+    conditions: Conditions, options: FailsafeSettings, mode: Mode
 ) -> None:
     assert answers(Situation(0, FINE, options, mode)) == []
     found = answers(Situation(0, conditions, options, mode))

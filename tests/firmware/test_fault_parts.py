@@ -16,8 +16,8 @@ from airl_mav.core.frames import HOME, geodetic_to_local
 from airl_mav.faults.model import Fault
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
-from firmware_sim.autopilot.autopilot_state import Message
-from firmware_sim.autopilot.commander import Flight
+from firmware_sim.autopilot.autopilot_state import OperatorText
+from firmware_sim.autopilot.commander import CommanderState
 from firmware_sim.faults.link import FailingEndpoint
 from firmware_sim.faults.timeline import FaultTimeline
 from firmware_sim.interfaces import ActuatorControls, SensorSample
@@ -34,8 +34,8 @@ class Witness:
     internals = None
 
     def __init__(self, motor: float = 0.0) -> None:
-        self.on_message: Callable[[Message], None] | None = None
-        self.flight = Flight()
+        self.on_message: Callable[[OperatorText], None] | None = None
+        self.flight = CommanderState()
         self.samples: list[SensorSample] = []
         self.motors = (motor, motor, motor, motor)
 
@@ -203,10 +203,10 @@ def test_a_gust_pushes_and_ends() -> None:
 
 def test_an_injected_fault_acts_from_now_on_until_it_is_cleared() -> None:
     timeline = FaultTimeline((), 1, 0)
-    timeline.update(5_000_000, Flight())
+    timeline.update(5_000_000, CommanderState())
     timeline.inject(Fault.model_validate("gps off"))
     assert [each.fault.part for each in timeline.acting("gps")] == ["gps"]
-    timeline.update(7_000_000, Flight())
+    timeline.update(7_000_000, CommanderState())
     timeline.clear("gps")
     assert timeline.acting("gps") == []
     assert [(a.fault, a.from_us, a.to_us) for a in timeline.acted(9_000_000)] == [
@@ -229,7 +229,7 @@ def link_of(*faults: str, conducted: bool = False) -> tuple[FailingEndpoint, Any
 
     def at(time_us: int) -> None:
         clock.sleep_until(time_us)
-        timeline.update(time_us, Flight())
+        timeline.update(time_us, CommanderState())
 
     return endpoint, inner, at
 

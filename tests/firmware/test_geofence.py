@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.autopilot_state import Message, Mode, Result
+from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Result
 from firmware_sim.autopilot.navigation.fence import (
     PERIOD_US,
     Circle,
@@ -21,10 +21,10 @@ from firmware_sim.autopilot.navigation.fence import (
     areas,
     braking_distance,
 )
-from firmware_sim.autopilot.navigation.flown_item import Situation
-from firmware_sim.autopilot.navigation.plan import Kind, NavCommand, PlanItem, Plans
+from firmware_sim.autopilot.navigation.flown_item import ExecutorState
+from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand, PlanItem, Plans
 from firmware_sim.autopilot.navigation.way_home import destination
-from firmware_sim.autopilot.requests import Place, Reposition
+from firmware_sim.autopilot.requests import PositionYaw, Reposition
 from tests.support.flight_rig import Rig, velocity_setpoint
 from tests.support.mission_kit import DEFAULTS, ORIGIN, at, place
 
@@ -108,11 +108,11 @@ class Watch:
         self.values = {**DEFAULTS, **parameters}
         self.plans, self.texts = Plans(), list[str]()
         self.monitor = FenceMonitor(self.plans, self.values.__getitem__, self._say)
-        self.now = Situation(0, (0.0, 0.0, -10.0), 0.0, landed, ORIGIN, ORIGIN)
+        self.now = ExecutorState(0, (0.0, 0.0, -10.0), 0.0, landed, ORIGIN, ORIGIN)
         if items:
-            self.plans.store(Kind.FENCE, items, 1)
+            self.plans.store(MissionType.FENCE, items, 1)
 
-    def _say(self, message: Message) -> None:
+    def _say(self, message: OperatorText) -> None:
         self.texts.append(message.text)
 
     def at(
@@ -248,8 +248,8 @@ def test_no_place_outside_is_taken_to_hold_at() -> None:
     """PX4: the vehicle holds and reports why; a fence that only warns has no effect."""
     limits = {"GF_MAX_HOR_DIST": 20.0, "GF_MAX_VER_DIST": 15.0, "GF_ACTION": 3}
     rig = Rig(seed=2, parameters=limits)
-    outside = Reposition(Place((40.0, 0.0, -5.0), math.nan))
-    nowhere = Place((math.nan, math.nan, -40.0), math.nan)
+    outside = Reposition(PositionYaw((40.0, 0.0, -5.0), math.nan))
+    nowhere = PositionYaw((math.nan, math.nan, -40.0), math.nan)
     assert rig.ap.set_mode(Mode.HOLD, outside) is Result.ACCEPTED  # disarmed it means nothing
     rig.take_off(5.0)
     assert math.isnan(rig.said("outside geofence"))
@@ -262,7 +262,7 @@ def test_no_place_outside_is_taken_to_hold_at() -> None:
         rig.run(2.0)
         assert np.linalg.norm(rig.truth.position[:2]) < 0.5
         assert rig.height == pytest.approx(5.0, abs=0.5)
-    rig.ap.set_mode(Mode.HOLD, Reposition(Place((10.0, 0.0, -5.0), math.nan)))
+    rig.ap.set_mode(Mode.HOLD, Reposition(PositionYaw((10.0, 0.0, -5.0), math.nan)))
     rig.run(2.0)
     assert rig.truth.position[0] > 1.0
     rig.ap.parameters.set("GF_ACTION", 1)
@@ -294,9 +294,9 @@ def test_return_goes_to_the_nearest_place(
     kind: int, here: tuple[float, float], expected: tuple[float, float]
 ) -> None:
     plans = Plans()
-    plans.store(Kind.MISSION, (at(20, 0, 10), LAND), 1)
+    plans.store(MissionType.MISSION, (at(20, 0, 10), LAND), 1)
     rally = (at(4, 0, 0, N.RALLY_POINT), at(100, 0, 3, N.RALLY_POINT))  # the first is home's
-    plans.store(Kind.RALLY, rally, 1)
+    plans.store(MissionType.RALLY, rally, 1)
     found = destination(plans, ORIGIN, place(*here, 20.0), kind)
     wanted = place(*expected)
     assert found.place[:2] == pytest.approx(wanted[:2], abs=1e-9)
@@ -310,6 +310,6 @@ def test_return_goes_home_where_there_is_nothing_else() -> None:
         found = destination(Plans(), ORIGIN, Geodetic(47.0, 8.0, 500.0), kind)
         assert found == (ORIGIN, False)
     plans = Plans()
-    plans.store(Kind.MISSION, (LAND,), 1)
+    plans.store(MissionType.MISSION, (LAND,), 1)
     invalid = destination(plans, ORIGIN, place(0, 80), 1, valid=False)
     assert invalid == (ORIGIN, False)

@@ -20,7 +20,7 @@ from airl_mav.envs.arenas import NOTHING, touches
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from firmware_sim.interfaces import ActuatorControls
-from firmware_sim.plant.bullet_body import World
+from firmware_sim.plant.bullet_body import BulletWorld
 from firmware_sim.plant.contacts.box import BREAKING_SHARE, MOST, ROW
 from firmware_sim.plant.contacts.ground import near_ground, touch_ground
 from firmware_sim.plant.plant import Plant
@@ -124,7 +124,7 @@ def test_the_kernel_s_box_touches_hills_where_their_surface_says() -> None:
 
 def test_pybullet_s_box_touches_hills_where_their_surface_says() -> None:
     arena, rng = hills(), np.random.default_rng(1)
-    world = World(arena, RADIUS)
+    world = BulletWorld(arena, RADIUS)
     client = world.client
     shape = client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=HALF.tolist())
     box = client.createMultiBody(1.0, shape)
@@ -238,7 +238,7 @@ def test_on_the_level_ground_around_the_start_it_moves_as_without_hills() -> Non
 def test_a_rangefinder_sees_hills_as_pybullet_s_rays_do() -> None:
     arena, rng = hills(), np.random.default_rng(3)
     finder = PlantRangefinder(QUIET, arena, rng, 1.0)
-    world = World(arena, RADIUS)
+    world = BulletWorld(arena, RADIUS)
     offset = np.array([QUIET.forward_m, QUIET.right_m, QUIET.down_m])
     for north, east in places(6, 40):
         turn = attitude(rng, 0.2)

@@ -17,7 +17,7 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.hover_start import HoverStart
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
@@ -58,7 +58,7 @@ def test_the_vehicle_hovers_at_the_altitude_as_after_a_take_off(make: Make, vehi
     simulation = begun(make(vehicle))
     internals = simulation.autopilot.internals
     assert internals is not None
-    assert (internals.flight.phase, internals.flight.mode) == (Phase.AIR, Mode.HOLD)
+    assert (internals.flight.phase, internals.flight.mode) == (FlightPhase.AIR, Mode.HOLD)
     assert not internals.flight.failsafe
     state, truth = internals.state(), simulation.truth
     assert -truth.position[2] == pytest.approx(ALTITUDE_M, abs=2 * TAKEOFF_REACHED_M)
@@ -111,5 +111,5 @@ def test_a_vehicle_that_refuses_to_arm_stays_on_the_ground_and_says_why(make: Ma
     assert not HoverStart(ALTITUDE_M).fly(simulation)
     internals = simulation.autopilot.internals
     assert internals is not None
-    assert internals.flight.phase is Phase.STANDBY
+    assert internals.flight.phase is FlightPhase.STANDBY
     assert any("battery" in message.text.lower() for message in internals.take_messages())

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from firmware_sim.autopilot.autopilot_state import Arming, Mode, Result
 from firmware_sim.autopilot.mode_numbers import custom_mode
-from firmware_sim.autopilot.navigation.plan import Kind
+from firmware_sim.autopilot.navigation.plan import MissionType
 from tests.support.kinematic_autopilot import ORIGIN
 from tests.support.mavlink_clients import RawClient, Rig, text_of
 from tests.support.mission_kit import at
@@ -188,7 +188,7 @@ def test_set_home(rig: Rig) -> None:
 def test_missions_are_started_and_places_looked_at(rig: Rig) -> None:
     assert rig.command(300, 0)[0] == DENIED  # none is stored
     assert rig.command(189)[0] == Result.CANCELLED
-    rig.autopilot.plans.store(Kind.MISSION, (at(0, 0, 5), at(0, 0, 0, 21)), 1)
+    rig.autopilot.plans.store(MissionType.MISSION, (at(0, 0, 5), at(0, 0, 0, 21)), 1)
     assert rig.command(300, 0)[0] == ACCEPTED
     assert rig.command(300, math.nan)[0] == DENIED
     assert rig.command(189)[0] == ACCEPTED

@@ -26,8 +26,8 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import HOME
-from firmware_sim.autopilot.autopilot_state import Arming, Message, Mode, Setpoint, Severity
-from firmware_sim.interfaces import Truth
+from firmware_sim.autopilot.autopilot_state import Arming, Mode, OperatorText, Setpoint, Severity
+from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from tests.support.kinematic_autopilot import DEFAULT_PARAMETERS, ORIGIN, KinematicAutopilot
 from tests.support.mavlink_clients import (
@@ -320,7 +320,7 @@ def test_long_texts_arrive_whole() -> None:
     with mavsdk_over_memory() as (companion, pacer):
         telemetry = ready(companion)
         with pacer.lock:
-            pacer.bench.autopilot.messages.append(Message(Severity.ERROR, text))
+            pacer.bench.autopilot.messages.append(OperatorText(Severity.ERROR, text))
         wait_for(lambda: telemetry.status_text().text == text)
 
 
@@ -341,7 +341,7 @@ def test_the_true_state_is_there_for_who_asks() -> None:
         telemetry = companion.plugin(Telemetry)
         still = np.zeros(3)
         with pacer.lock:
-            truth = Truth(0, np.array([0.0, 0.0, -30.0]), still, np.eye(4)[0], still, 0.0, 1.0)
+            truth = TrueState(0, np.array([0.0, 0.0, -30.0]), still, np.eye(4)[0], still, 0.0, 1.0)
             pacer.bench.server.attach(pacer.bench.autopilot, lambda: truth)
         assert math.isnan(telemetry.ground_truth().latitude_deg)
         telemetry.set_rate_ground_truth(20.0)

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from airl_mav.core.frames import local_to_geodetic, quat_from_euler, quat_to_euler, quat_yaw
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Mode, Setpoint
 from firmware_sim.interfaces import BatterySample
-from firmware_sim.mavlink.codec import SYSTEM_ID, Encoder, Layout, Values, dialect, layout
+from firmware_sim.mavlink.codec import SYSTEM_ID, Encoder, Values, WireLayout, dialect, layout
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import Link, Payloads, onboard_link
 from firmware_sim.mavlink.streams import BUILDERS, SILENT, units
@@ -69,7 +69,7 @@ def pymavlinks(kind: Any, values: Values, seq: int = 0) -> bytes:
 
 
 def ours(kind: Any, values: Values) -> bytes:
-    shape = Layout(kind)
+    shape = WireLayout(kind)
     return Encoder().frame(shape, shape.payload(values))
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local
 from firmware_sim.autopilot.manual_control import Sticks
-from firmware_sim.interfaces import Truth
+from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.streams.status import CAPABILITIES, manual_control
 from tests.support.kinematic_autopilot import KinematicAutopilot
@@ -169,7 +169,7 @@ def requested(rig: Rig, name: str) -> Any:
 def test_the_true_state_is_sent_to_who_asks_and_to_nobody_else() -> None:
     rig = Rig()
     assert rig.command(512, dialect.MAVLINK_MSG_ID_HIL_STATE_QUATERNION)[0] == DENIED  # no plant
-    truth = Truth(
+    truth = TrueState(
         rig.autopilot.time_us,
         np.array([100.0, -50.0, -20.0]),
         np.array([1.0, -2.0, 400.0]),

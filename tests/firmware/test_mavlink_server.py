@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Message, Severity
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, OperatorText, Severity
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import onboard_link
@@ -31,7 +31,7 @@ def test_a_new_autopilot_takes_over_the_links(rig: Rig) -> None:
     rig.command(511, dialect.MAVLINK_MSG_ID_ATTITUDE, 20_000)
     rig.client.send(dialect.MAVLink_param_request_list_message(1, 1))
     rig.bench.tick()
-    rig.autopilot.messages.append(Message(Severity.INFO, "from the old flight"))
+    rig.autopilot.messages.append(OperatorText(Severity.INFO, "from the old flight"))
     rig.set_local(3527, frame=7, vx=1.0)
     rig.bench.server.receive(rig.autopilot.time_us)  # leaves a text that was not sent
     rig.set_local(3527, vx=1.0)  # arrives too late for the old, must not reach the new
@@ -178,7 +178,7 @@ def telemetry(*, separate_replies: bool, seed: int | None) -> TwoLanes:
         server.receive(autopilot.time_us)
         autopilot.step()
         if tick % 100 == 50:
-            autopilot.messages.append(Message(Severity.INFO, "x" * tick))
+            autopilot.messages.append(OperatorText(Severity.INFO, "x" * tick))
         server.send(autopilot.time_us)
     return endpoint
 

@@ -10,7 +10,7 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import TICK_US
-from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.mavlink.codec import TextEncoder
 from tests.support.mavlink_clients import CLIENT_IDS, Rig
 
@@ -85,8 +85,8 @@ def test_only_ground_stations_heartbeats_count(rig: Rig) -> None:
 def test_long_texts_come_in_chunks(length: int) -> None:
     text = "".join(chr(ord("a") + i % 26) for i in range(length))
     encoder = TextEncoder()
-    first = encoder.encode(Message(Severity.ERROR, text))
-    second = encoder.encode(Message(Severity.ERROR, text))
+    first = encoder.encode(OperatorText(Severity.ERROR, text))
+    second = encoder.encode(OperatorText(Severity.ERROR, text))
     parser = dialect.MAVLink(None)
     received = [parser.parse_buffer(m.pack(dialect.MAVLink(None, 1, 1)))[0] for m in first]
     assert {m.severity for m in received} == {3}
@@ -105,10 +105,10 @@ def test_long_texts_come_in_chunks(length: int) -> None:
 def test_text_ids_are_never_zero() -> None:
     encoder = TextEncoder()
     encoder._id = 65_534
-    ids = [encoder.encode(Message(Severity.INFO, "x" * 60))[0].id for _ in range(3)]
+    ids = [encoder.encode(OperatorText(Severity.INFO, "x" * 60))[0].id for _ in range(3)]
     assert ids == [65_535, 1, 2]
 
 
 def test_texts_beyond_ascii_stay_readable() -> None:
-    (message,) = TextEncoder().encode(Message(Severity.INFO, "80 µs"))
+    (message,) = TextEncoder().encode(OperatorText(Severity.INFO, "80 µs"))
     assert message.text == "80 ?s"

@@ -7,7 +7,7 @@ import random
 
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.autopilot.navigation.plan import Frame, Kind, NavCommand, PlanItem
+from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand, PlanFrame, PlanItem
 from firmware_sim.mavlink.services.mission_items import belongs, parse
 from tests.support.mission_kit import FakeFlight
 
@@ -23,7 +23,7 @@ def absurd_item(rng: random.Random) -> PlanItem | None:
         1,
         1,
         0,
-        rng.choice((Frame.GLOBAL, Frame.MISSION, Frame.GLOBAL_RELATIVE_ALT)),
+        rng.choice((PlanFrame.GLOBAL, PlanFrame.MISSION, PlanFrame.GLOBAL_RELATIVE_ALT)),
         rng.choice(tuple(NavCommand)),
         0,
         int(rng.random() < 0.9),
@@ -33,7 +33,7 @@ def absurd_item(rng: random.Random) -> PlanItem | None:
         rng.choice(VALUES),
     )
     item = parse(message)
-    return item if isinstance(item, PlanItem) and belongs(item, Kind.MISSION) else None
+    return item if isinstance(item, PlanItem) and belongs(item, MissionType.MISSION) else None
 
 
 def test_what_is_flown_to_is_always_a_place() -> None:

@@ -7,7 +7,13 @@ import math
 import pytest
 
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.navigation.plan import Frame, Kind, NavCommand, PlanItem, TripletKind
+from firmware_sim.autopilot.navigation.plan import (
+    MissionType,
+    NavCommand,
+    PlanFrame,
+    PlanItem,
+    TripletKind,
+)
 from tests.support.mission_kit import NAN, ORIGIN, FakeFlight, at, do, place
 
 N = NavCommand
@@ -184,10 +190,10 @@ def test_set_current_and_a_new_mission_are_flown_at_once() -> None:
     flight.be()
     assert target(flight) == (60.0, 0.0, -10.0)
     assert flight.executor.triplet.previous is None
-    flight.plans.store(Kind.MISSION, (at(0, 50, 10), at(0, 0, 10)), 2, 0)
+    flight.plans.store(MissionType.MISSION, (at(0, 50, 10), at(0, 0, 10)), 2, 0)
     flight.be()
     assert target(flight) == (0.0, 50.0, -10.0)
-    flight.plans.clear(Kind.MISSION)
+    flight.plans.clear(MissionType.MISSION)
     flight.be()
     assert flight.texts[-1] == "No valid mission available, loitering"
     assert flight.executor.finished
@@ -240,7 +246,7 @@ def test_loiter_unlimited_and_no_autocontinue_stay() -> None:
 
 
 def test_altitudes_above_sea_and_home_that_moves() -> None:
-    sea = at(20, 0, ORIGIN.altitude_m + 15.0, frame=Frame.GLOBAL_INT)
+    sea = at(20, 0, ORIGIN.altitude_m + 15.0, frame=PlanFrame.GLOBAL_INT)
     assert target(flying(sea, at(0, 0, 10))) == (0.0, 0.0, -15.0)  # the climb to it
     flight = flying(at(20, 0, 10), at(40, 0, 10))
     home = flight.now.home
@@ -261,7 +267,7 @@ def test_an_altitude_that_is_no_number_is_the_present_one(up: float) -> None:
 def test_region_of_interest(mount_turns: float) -> None:
     looked_at = place(0.0, 50.0)
     roi = PlanItem(
-        N.DO_SET_ROI_LOCATION, Frame.GLOBAL_INT, (0, 0, 0, 0), *looked_at[:2], looked_at[2]
+        N.DO_SET_ROI_LOCATION, PlanFrame.GLOBAL_INT, (0, 0, 0, 0), *looked_at[:2], looked_at[2]
     )
     flight = flying(
         roi, at(0, 0, 10), at(0, -30, 10), do(N.DO_SET_ROI_NONE), at(0, 0, 10),

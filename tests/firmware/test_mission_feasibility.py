@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from firmware_sim.autopilot.navigation.feasibility import check
-from firmware_sim.autopilot.navigation.plan import Frame, NavCommand, PlanItem
+from firmware_sim.autopilot.navigation.plan import NavCommand, PlanFrame, PlanItem
 from tests.support.mission_kit import DEFAULTS, ORIGIN, at, do
 
 N = NavCommand
@@ -35,7 +35,7 @@ def test_a_sound_mission() -> None:
         ((LAND, WAYPOINT), "Mission rejected: starts with landing"),
         ((WAYPOINT, TAKEOFF), "Mission rejected: takeoff not first waypoint item"),
         (
-            (at(0, 0, 489.0, N.TAKEOFF, frame=Frame.GLOBAL_INT),),
+            (at(0, 0, 489.0, N.TAKEOFF, frame=PlanFrame.GLOBAL_INT),),
             "Mission rejected: Takeoff altitude below home altitude!",
         ),
         (

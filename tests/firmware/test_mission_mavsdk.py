@@ -7,7 +7,7 @@ import math
 import pytest
 from mavsdk.plugins import geofence, mission, mission_raw
 
-from firmware_sim.autopilot.navigation.plan import Kind
+from firmware_sim.autopilot.navigation.plan import MissionType
 from tests.support.mavlink_clients import mavsdk_over_memory
 from tests.support.mavsdk_items import LATITUDE, LONGITUDE, raw_item, waypoint
 
@@ -63,4 +63,4 @@ def test_mission_mission_raw_and_geofence() -> None:
         assert [item.command for item in full.download_geofence()] == [5001] * 4 + [5004]
         fence.clear_geofence()
         with pacer.lock:
-            assert plans.stored(Kind.FENCE).items == ()
+            assert plans.stored(MissionType.FENCE).items == ()

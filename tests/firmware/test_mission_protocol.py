@@ -10,7 +10,7 @@ import pytest
 from pymavlink import mavwp
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.autopilot.navigation.plan import Kind
+from firmware_sim.autopilot.navigation.plan import MissionType
 from tests.support.mavlink_clients import CLIENT_IDS, RawClient, Rig, text_of
 
 HOME = (473_977_430, 85_455_940)
@@ -146,14 +146,14 @@ def test_lists_are_separate_and_cleared_one_by_one_or_all(rig: Rig, kind: int) -
     plans = rig.autopilot.plans
     for each, command in ((0, 16), (1, 5003), (2, 5100)):
         assert upload(rig, [item_int(0, each, command=command, param1=30.0)], each) == 0
-    assert [len(plans.stored(k).items) for k in Kind] == [1, 1, 1]
-    assert len({plans.stored(k).identity for k in Kind}) == 3
+    assert [len(plans.stored(k).items) for k in MissionType] == [1, 1, 1]
+    assert len({plans.stored(k).identity for k in MissionType}) == 3
     (ack,) = replies(rig.exchange(dialect.MAVLink_mission_clear_all_message(1, 0, kind)))[:1]
     assert (ack.type, ack.mission_type) == (0, kind)
-    assert [len(plans.stored(k).items) for k in Kind] == [int(k != kind) for k in range(3)]
+    assert [len(plans.stored(k).items) for k in MissionType] == [int(k != kind) for k in range(3)]
     assert download(rig, kind) == []
     rig.exchange(dialect.MAVLink_mission_clear_all_message(1, 190, 255))
-    assert [plans.stored(k).identity for k in Kind] == [0, 0, 0]
+    assert [plans.stored(k).identity for k in MissionType] == [0, 0, 0]
 
 
 def test_a_count_of_zero_clears(rig: Rig) -> None:

@@ -23,7 +23,7 @@ from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.autopilot.optical_flow import STUCK, OpticalFlow, flow_by_errors
+from firmware_sim.autopilot.optical_flow import STUCK, OpticalFlowFusion, flow_by_errors
 from firmware_sim.crash_detector import TOUCHDOWN_M_S
 from firmware_sim.engine.kinematics import WIDTH
 from firmware_sim.external.px4 import hil_messages as hil
@@ -182,7 +182,7 @@ def flown_by_flow(**changes: float) -> Rig:
     return rig
 
 
-def flow_of(rig: Rig) -> OpticalFlow:
+def flow_of(rig: Rig) -> OpticalFlowFusion:
     found = rig.ap.estimator.flow
     assert found is not None
     return found

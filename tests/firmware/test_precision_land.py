@@ -8,8 +8,8 @@ import pytest
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Mode, Result
-from firmware_sim.autopilot.commander import Phase
-from firmware_sim.autopilot.navigation.plan import Kind, NavCommand
+from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand
 from firmware_sim.autopilot.requests import LandingTarget
 from firmware_sim.mavlink.codec import dialect
 from tests.support import mavlink_clients
@@ -37,7 +37,7 @@ class Beacon:
 
     def until_landed(self, limit_s: float = 60.0) -> None:
         for _ in range(round(limit_s * 10)):
-            if self.rig.ap.flight.phase < Phase.AIR:
+            if self.rig.ap.flight.phase < FlightPhase.AIR:
                 return
             self.run(0.1)
         raise AssertionError(f"not landed: {self.rig.texts}")
@@ -61,7 +61,7 @@ def test_it_lands_on_the_target_and_follows_it() -> None:
     beacon.place = (5.5, -3.0, 0.0)
     beacon.until_landed()
     assert beacon.missed_m < 0.3
-    rig.until(lambda: rig.ap.flight.phase < Phase.GROUND, 5.0)
+    rig.until(lambda: rig.ap.flight.phase < FlightPhase.GROUND, 5.0)
     assert rig.mode is Mode.HOLD
     rig.close()
 
@@ -74,7 +74,7 @@ def test_without_a_target_it_climbs_to_search_and_then_lands() -> None:
     assert rig.height == pytest.approx(4.0, abs=0.7)
     rig.run(7.0)
     assert rig.height > 8.5
-    rig.until(lambda: rig.ap.flight.phase < Phase.AIR, 40.0)
+    rig.until(lambda: rig.ap.flight.phase < FlightPhase.AIR, 40.0)
     assert math.hypot(*rig.truth.position[:2]) < 1.0
     rig.close()
 
@@ -112,7 +112,7 @@ def test_a_target_that_is_lost_on_the_way_down_is_searched_for() -> None:
         if rig.height < 4.0:
             break
     beacon.lit = False  # a second time it is not searched for
-    rig.until(lambda: rig.ap.flight.phase < Phase.AIR, 20.0)
+    rig.until(lambda: rig.ap.flight.phase < FlightPhase.AIR, 20.0)
     rig.close()
 
 
@@ -121,7 +121,7 @@ def test_a_missions_landing_asks_for_it(precision: int, on_target: bool) -> None
     rig = Rig()
     rig.take_off(5.0, settle_s=0.0)
     landing = at(0, 8, 0, _N.LAND, 0.0, precision)
-    rig.ap.plans.store(Kind.MISSION, (at(0, 0, 5, _N.TAKEOFF), landing), 1, 1)
+    rig.ap.plans.store(MissionType.MISSION, (at(0, 0, 5, _N.TAKEOFF), landing), 1, 1)
     beacon = Beacon(rig, 1.5, 8.0)
     beacon.run(0.3)
     rig.ap.set_mode(Mode.MISSION)
@@ -137,7 +137,7 @@ def test_an_opportunistic_landing_does_not_search() -> None:
     rig.ap.set_mode(Mode.RETURN)
     rig.until(lambda: math.isfinite(rig.said("RTL: land at destination")), 20.0)
     highest = rig.height
-    rig.until(lambda: rig.ap.flight.phase < Phase.AIR, 30.0)
+    rig.until(lambda: rig.ap.flight.phase < FlightPhase.AIR, 30.0)
     assert highest < 6.0
     rig.close()
 

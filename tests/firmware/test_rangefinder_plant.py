@@ -43,10 +43,10 @@ def arena_of(name: str, seed: int = 3) -> Arena:
 @pytest.mark.parametrize("name", ["static-obstacles", "dynamic-obstacles"])
 def test_rays_are_pybullet_s(name: str) -> None:
     pybullet = pytest.importorskip("pybullet")
-    from firmware_sim.plant.bullet_body import World
+    from firmware_sim.plant.bullet_body import BulletWorld
 
     arena = arena_of(name)
-    world = World(arena, 0.3)
+    world = BulletWorld(arena, 0.3)
     profile = Rangefinder(
         **{**QUIET.model_dump(), "forward_m": 0.3, "right_m": -0.2, "down_m": 0.1}
     )

@@ -26,10 +26,10 @@ from airl_mav.scenario.aircraft import Aircraft, RealFirmware
 from airl_mav.scenario.checks import check_firmware
 from airl_mav.scenario.model import LevelName
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.external.airframe_check import (
     SITL_OUTPUT,
-    Airframe,
+    RequiredAirframe,
     ardupilot_airframe,
     differences,
     px4_airframe,
@@ -37,7 +37,7 @@ from firmware_sim.external.airframe_check import (
 from firmware_sim.external.ardupilot.program import PARAMETERS, Links, find_arducopter
 from firmware_sim.external.ardupilot.program import start as start_arducopter
 from firmware_sim.external.launcher import Bridge, Launcher
-from firmware_sim.external.observer import Observer, flight_of
+from firmware_sim.external.observer import FirmwareObserver, flight_of
 from firmware_sim.external.parameter_client import ParameterClient, same
 from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
 from firmware_sim.external.programs import how_to_start, load_timeout_s
@@ -137,7 +137,7 @@ def px4_set_right(vehicle: VehicleProfile) -> dict[str, int | float]:
     return held | {"MPC_THR_HOVER": 0.5, "THR_MDL_FAC": 0.0}
 
 
-def px4(vehicle: VehicleProfile) -> Airframe:
+def px4(vehicle: VehicleProfile) -> RequiredAirframe:
     return px4_airframe(vehicle, "PWM_MAIN_FUNC{}")
 
 
@@ -189,7 +189,7 @@ def test_a_wrong_px4_frame_is_told(change: dict[str, int | float], words: str) -
     assert re.search(words, problem), problem
 
 
-def ardupilot(vehicle: VehicleProfile) -> Airframe:
+def ardupilot(vehicle: VehicleProfile) -> RequiredAirframe:
     return ardupilot_airframe(vehicle)
 
 
@@ -283,7 +283,7 @@ class Far:
 
     def __init__(self, origin: Geodetic | None = None) -> None:
         self.endpoint = MemoryEndpoint()
-        self.observer = Observer(self.endpoint, "observer", origin)
+        self.observer = FirmwareObserver(self.endpoint, "observer", origin)
         self.mav = dialect.MAVLink(None, 1, 1)
         self.said: list[tuple[int, str]] = []
         self.observer.on_message = lambda m: self.said.append((int(m.severity), m.text))
@@ -311,7 +311,7 @@ def test_texts_in_pieces_are_put_together() -> None:
 def test_it_hears_mode_phase_and_readiness() -> None:
     far = Far()
     observer = far.observer
-    assert observer.flight(armed=False).phase is Phase.BOOT
+    assert observer.flight(armed=False).phase is FlightPhase.BOOT
     far.hear(heartbeat(PX4_ID, 6 << 16, 145))
     assert observer.heard
     assert not observer.ready
@@ -321,11 +321,11 @@ def test_it_hears_mode_phase_and_readiness() -> None:
     assert not observer.ready  # it does not know where it is
     far.hear(dialect.MAVLink_local_position_ned_message(0, *([0.0] * 6)))
     assert observer.ready
-    assert observer.flight(armed=False).phase is Phase.STANDBY
-    assert observer.flight(armed=True).phase is Phase.GROUND
+    assert observer.flight(armed=False).phase is FlightPhase.STANDBY
+    assert observer.flight(armed=True).phase is FlightPhase.GROUND
     far.hear(dialect.MAVLink_extended_sys_state_message(0, dialect.MAV_LANDED_STATE_IN_AIR))
     flight = observer.flight(armed=True)
-    assert (flight.phase, flight.mode) == (Phase.AIR, Mode.OFFBOARD)
+    assert (flight.phase, flight.mode) == (FlightPhase.AIR, Mode.OFFBOARD)
     observer.restart()
     assert not observer.heard
     assert not observer.ready
@@ -395,7 +395,7 @@ def test_firmware_without_gps_is_told_its_origin_once_it_knows_where_it_is() -> 
 )
 def test_modes_of_both_families(kind: int, custom: int, landed: int, mode: Mode) -> None:
     flight = flight_of(kind, custom, landed, armed=True, ready=True)
-    assert (flight.mode, flight.phase) == (mode, Phase.AIR)
+    assert (flight.mode, flight.phase) == (mode, FlightPhase.AIR)
 
 
 # --- parameters as files

@@ -14,7 +14,7 @@ from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.faults.model import Fault
-from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile
@@ -22,7 +22,7 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import HAS_PYBULLET, Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.hover_start import HoverStart
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.flight_rig import velocity_setpoint
@@ -104,7 +104,7 @@ def test_contacts_are_restored(held: ExitStack, plant: str) -> None:
         simulation.tick()
     snapshot = simulation.snapshot()
     went_on = flown(simulation, land=True)
-    assert simulation.autopilot.flight.phase < Phase.AIR
+    assert simulation.autopilot.flight.phase < FlightPhase.AIR
     assert flown(held.enter_context(closing(snapshot.restore())), land=True) == went_on
 
 
@@ -133,7 +133,7 @@ def test_a_snapshot_changes_nothing_and_keeps_the_time(held: ExitStack) -> None:
 
 
 def test_a_linked_flight_has_no_snapshot() -> None:
-    with Stage() as stage:
+    with LockstepStage() as stage:
         stage.firmware.load(EpisodeSetup(load_vehicle("quad"), None, 1), None, 0)
         assert stage.firmware.simulation is not None
         with pytest.raises(ValueError, match="without links and logs"):

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from firmware_sim.autopilot.trajectory import (
     Axis,
-    Leg,
     PathLimits,
-    Trajectory,
+    PathSegment,
+    SmoothTrajectory,
     braking_speed,
     synchronise,
 )
@@ -28,7 +28,7 @@ ROUNDING = 1.005
 SPEEDS = st.floats(-10.0, 10.0)
 
 
-def fly(path: Trajectory, leg: Leg, seconds: float) -> np.ndarray:
+def fly(path: SmoothTrajectory, leg: PathSegment, seconds: float) -> np.ndarray:
     """Follow a trajectory exactly; return (n, 9) positions, velocities and accelerations."""
     rows = []
     for _ in range(round(seconds / TICK_S)):
@@ -102,8 +102,8 @@ def test_the_braking_speed_can_be_braked(
     "target", [(12.0, 6.0, -10.0), (0.5, 0.0, -3.0), (-30.0, 5.0, 4.0), (0.0, 0.0, -12.0)]
 )
 def test_a_target_is_reached_within_all_limits(target: tuple[float, float, float]) -> None:
-    path = Trajectory()
-    rows = fly(path, Leg(target), 25.0)
+    path = SmoothTrajectory()
+    rows = fly(path, PathSegment(target), 25.0)
     assert path.position == pytest.approx(target, abs=0.02)
     assert np.abs(rows[-1, 3:]).max() < 0.02
     assert np.hypot(rows[:, 3], rows[:, 4]).max() <= LIMITS.cruise_m_s * ROUNDING
@@ -118,30 +118,30 @@ def test_a_target_is_reached_within_all_limits(target: tuple[float, float, float
 
 def test_a_long_leg_is_cruised() -> None:
     """Most of 100 m is flown at 5 m/s: PX4 takes 100 / 5 plus acceleration and braking."""
-    path = Trajectory()
-    rows = fly(path, Leg((100.0, 0.0, 0.0)), 30.0)
+    path = SmoothTrajectory()
+    rows = fly(path, PathSegment((100.0, 0.0, 0.0)), 30.0)
     assert np.median(rows[:, 3]) == pytest.approx(5.0, abs=0.01)
     arrived = float(np.argmax(rows[:, 0] > 99.0)) * TICK_S
     assert 22.0 < arrived < 25.0
 
 
 def test_a_corner_is_rounded_without_a_stop() -> None:
-    path = Trajectory()
+    path = SmoothTrajectory()
     corner, end = (30.0, 0.0, 0.0), (30.0, 30.0, 0.0)
     slowest = math.inf
     for _ in range(round(12.0 / TICK_S)):
-        path.advance(path.position, Leg(corner, (0.0, 0.0, 0.0), end), LIMITS, TICK_S)
+        path.advance(path.position, PathSegment(corner, (0.0, 0.0, 0.0), end), LIMITS, TICK_S)
         if path.position[0] > 1.0:
             slowest = min(slowest, path.velocity[0])
         if math.dist(path.position, corner) < LIMITS.acceptance_m:
             break
     assert 1.0 < slowest < 3.0
-    fly(path, Leg(end, corner), 15.0)
+    fly(path, PathSegment(end, corner), 15.0)
     assert path.position == pytest.approx(end, abs=0.05)
 
 
 def test_the_trajectory_waits_for_a_vehicle_that_is_held_back() -> None:
-    path = Trajectory()
+    path = SmoothTrajectory()
     for _ in range(2000):
-        path.advance((0.0, 0.0, 0.0), Leg((50.0, 0.0, 0.0)), LIMITS, TICK_S)
+        path.advance((0.0, 0.0, 0.0), PathSegment((50.0, 0.0, 0.0)), LIMITS, TICK_S)
     assert path.position[0] <= LIMITS.error_m

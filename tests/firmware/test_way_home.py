@@ -7,8 +7,8 @@ import math
 import pytest
 
 from firmware_sim.autopilot.autopilot_state import Mode, Result
-from firmware_sim.autopilot.commander import Phase
-from firmware_sim.autopilot.navigation.plan import Kind, NavCommand, PlanItem, Plans
+from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand, PlanItem, Plans
 from firmware_sim.autopilot.navigation.way_home import along_mission, landing_start, onwards
 from tests.support.flight_rig import Rig
 from tests.support.mission_kit import ORIGIN, at, do, place
@@ -22,7 +22,7 @@ LANDING = (do(_N.DO_LAND_START), at(-10, 20, 9), at(-10, 0, 0, _N.LAND))
 
 def plans(*items: PlanItem, current: int = 0) -> Plans:
     stored = Plans()
-    stored.store(Kind.MISSION, items, 1, current)
+    stored.store(MissionType.MISSION, items, 1, current)
     return stored
 
 
@@ -82,7 +82,7 @@ def test_jumps_that_are_left_are_taken_and_endless_ones_end() -> None:
 def flown_mission(rig: Rig, *items: PlanItem, current: int = 0) -> None:
     """Take off and fly a mission from an item on."""
     rig.take_off(6.0, settle_s=0.0)
-    rig.ap.plans.store(Kind.MISSION, items, 1, current)
+    rig.ap.plans.store(MissionType.MISSION, items, 1, current)
     rig.run(0.3)
     assert rig.ap.set_mode(Mode.MISSION) is Result.ACCEPTED
 
@@ -111,9 +111,9 @@ def test_a_return_goes_back_the_way_it_came() -> None:
     there = rig.ap.state().destination
     assert there is not None and there[:2] == pytest.approx((20.0, 20.0), abs=0.5)
     assert max(distances(rig, 22.0, (20.0, 20.0), (20.0, 0.0))) < 3.0
-    rig.until(lambda: rig.ap.flight.phase < Phase.AIR, 60.0)
+    rig.until(lambda: rig.ap.flight.phase < FlightPhase.AIR, 60.0)
     assert rig.truth.position[:2] == pytest.approx([0.0, 0.0], abs=1.0)
-    rig.until(lambda: rig.ap.flight.phase < Phase.GROUND, 5.0)
+    rig.until(lambda: rig.ap.flight.phase < FlightPhase.GROUND, 5.0)
     rig.close()
 
 
@@ -128,7 +128,7 @@ def test_a_return_flies_on_to_the_missions_landing() -> None:
     rig.ap.set_mode(Mode.HOLD)
     rig.run(1.0)
     rig.ap.set_mode(Mode.RETURN)
-    rig.until(lambda: rig.ap.flight.phase < Phase.AIR, 60.0)
+    rig.until(lambda: rig.ap.flight.phase < FlightPhase.AIR, 60.0)
     assert rig.truth.position[:2] == pytest.approx([0.0, 15.0], abs=1.0)
     rig.close()
 
@@ -148,7 +148,7 @@ def test_the_missions_landing_is_flown_from_its_beginning() -> None:
     rig = Rig(parameters={"RTL_TYPE": 1, "RTL_RETURN_ALT": 12.0, "RTL_CONE_ANG": 0})
     landing = (do(_N.DO_LAND_START), at(20, 20, 10), at(20, 0, 0, _N.LAND))
     rig.take_off(6.0, settle_s=0.0)
-    rig.ap.plans.store(Kind.MISSION, (TAKE_OFF, *landing), 1, 0)
+    rig.ap.plans.store(MissionType.MISSION, (TAKE_OFF, *landing), 1, 0)
     rig.run(0.3)
     rig.ap.set_mode(Mode.RETURN)
     rig.run(0.2)
@@ -156,6 +156,6 @@ def test_the_missions_landing_is_flown_from_its_beginning() -> None:
     rig.until(lambda: rig.height > 11.0, 20.0)
     assert math.hypot(*rig.truth.position[:2]) < 2.0
     assert distances(rig, 20.0, (20.0, 20.0))[0] < 3.0
-    rig.until(lambda: rig.ap.flight.phase < Phase.AIR, 60.0)
+    rig.until(lambda: rig.ap.flight.phase < FlightPhase.AIR, 60.0)
     assert rig.truth.position[:2] == pytest.approx([20.0, 0.0], abs=1.0)
     rig.close()

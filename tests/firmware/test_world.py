@@ -18,7 +18,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.interfaces import ActuatorControls
-from firmware_sim.plant.bullet_body import World, facing
+from firmware_sim.plant.bullet_body import BulletWorld, facing
 from firmware_sim.plant.plant import REST_SPEED_M_S, Plant
 from tests.support.flight_rig import quad
 
@@ -180,7 +180,7 @@ def test_near_the_vehicle_every_moving_obstacle_is_where_the_arena_says(name: st
     spec = load_profile("arenas", name, ArenaSpec)
     place = generate(spec, 4, name=name, vehicle_width_m=BODY.width_m)
     radius = 0.5 * math.hypot(BODY.width_m, BODY.width_m, BODY.height_m)
-    world, rng = World(place, radius), np.random.default_rng(8)
+    world, rng = BulletWorld(place, radius), np.random.default_rng(8)
     bodies = [n for n, what in world.names.items() if what.startswith("moving")]
     first = place.n_static
     half = place.obstacles.half_size[first:]

@@ -15,7 +15,7 @@ from airl_mav.core.frames import quat_wxyz_to_xyzw, quat_yaw
 from airl_mav.experiments.fault_matrix import fly_fault
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.emergency_yaw import EXPLAINED, EmergencyYaw, turn_to
 from firmware_sim.autopilot.yaw_estimator import WEIGHT, YAW, YawEstimator
 from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
@@ -48,7 +48,7 @@ def ticks() -> list[Tick]:
         def listen(sample: Any) -> Any:
             fix = None if sample.gps is None else sample.gps.velocity_ned
             yaw = quat_yaw(rig.truth.quaternion)
-            flying = rig.ap.flight.phase is Phase.AIR
+            flying = rig.ap.flight.phase is FlightPhase.AIR
             seen.append(Tick(sample.gyro, sample.accel, fix, flying, yaw))
             return step(sample)
 
@@ -329,7 +329,7 @@ def test_a_compass_that_is_wrong_from_the_start_is_survived(bias: str) -> None:
         assert rig.said("Compass needs calibration - Land now!") > 0.0
         assert rig.truth.velocity[0] > 1.5
         rig.ap.set_mode(Mode.LAND)
-        rig.until(lambda: rig.ap.flight.phase is Phase.STANDBY, 30.0)
+        rig.until(lambda: rig.ap.flight.phase is FlightPhase.STANDBY, 30.0)
         assert max(hit.speed_m_s for hit in rig.sim.plant.collisions) < 1.0
 
 

@@ -34,7 +34,7 @@ from airl_mav.experiments.run import Run, load_run
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import Setup
 from airl_mav.latency.stamps import STAMPS
-from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.report.comparison.runs import compare_folders
 from airl_mav.report.recorded_flight import episode_of
 from airl_mav.report.recording_folder import take_in
@@ -69,7 +69,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     run = run_of(asked, prepare(asked))
     setup = EpisodeSetup(scenario.vehicle, arena, SEED)
     results: list[MissionResult] = []
-    with Stage(transport_us=TRANSPORT_US) as stage:
+    with LockstepStage(transport_us=TRANSPORT_US) as stage:
         # Its thread would live by the wall clock, which this flight does not.
         recorder = open_recorder(folder, run, stage.link, stage.clock, goal)
 

@@ -20,27 +20,27 @@ from airl_mav.conformance.checklist import (
     CheckDefinition,
     CheckFailedError,
     Checklist,
-    Line,
+    CheckOutcome,
     NotApplicableError,
-    Outcome,
     Transcript,
+    TranscriptLine,
     require,
 )
 from airl_mav.conformance.mavlink_names import version_name
 from airl_mav.conformance.reference import StoredStep, Tolerance, deviations, load_reference
-from airl_mav.conformance.result import ConformanceResult, Settings
+from airl_mav.conformance.result import ConformanceResult, ConformanceSettings
 from airl_mav.conformance.steps import (
     BEFORE_S,
     MANOEUVRES,
     STEP_NAMES,
     MeasuredStep,
-    Step,
+    SetpointStep,
     StepResponse,
     measure,
     plan,
     step_response,
 )
-from airl_mav.conformance.telemetry import Motion, Telemetry
+from airl_mav.conformance.telemetry import EstimatedMotion, TelemetryBuffer
 from airl_mav.conformance.vehicle_clock import Method, VehicleClock
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
@@ -139,7 +139,7 @@ def test_median_of_flights() -> None:
     one = StepResponse(0.1, 0.2, 0.3, 0.4, 5.0, 0.01, 1.0)
     other = StepResponse(0.2, 0.2, 0.3, 0.6, 7.0, -0.03, float("nan"))
     third = StepResponse(0.0, 0.1, 0.4, 0.5, 9.0, 0.00, 2.0)
-    step = Step("north-2", "north", 0.0, 2.0)
+    step = SetpointStep("north-2", "north", 0.0, 2.0)
     median = MeasuredStep(step, [one, other, third]).median
     assert median[:6] == pytest.approx((0.1, 0.2, 0.3, 0.5, 7.0, 0.0))
     assert math.isnan(median.settle_s)
@@ -149,11 +149,13 @@ def test_median_of_flights() -> None:
 # --- steps read from telemetry
 
 
-def a_motion(seconds: float, velocity: np.ndarray, yaw: np.ndarray, rate: np.ndarray) -> Motion:
+def a_motion(
+    seconds: float, velocity: np.ndarray, yaw: np.ndarray, rate: np.ndarray
+) -> EstimatedMotion:
     """Telemetry at 100 Hz; velocity (n, 3), yaw and rate (n,)."""
     times = 100.0 + np.arange(0.0, seconds, 0.01)
     position = np.column_stack([times, np.zeros((len(times), 3)), velocity])
-    return Motion(position, np.column_stack([times, yaw, rate]))
+    return EstimatedMotion(position, np.column_stack([times, yaw, rate]))
 
 
 def test_forward_is_along_the_heading_before_the_step() -> None:
@@ -163,7 +165,7 @@ def test_forward_is_along_the_heading_before_the_step() -> None:
     yaw = math.radians(120.0)
     velocity = np.column_stack([speed * math.cos(yaw), speed * math.sin(yaw), np.zeros(n)])
     motion = a_motion(6.0, velocity, np.full(n, yaw), np.zeros(n))
-    found = measure(Step("forward-2", "forward", 0.0, 2.0), motion, 100.0 + BEFORE_S)
+    found = measure(SetpointStep("forward-2", "forward", 0.0, 2.0), motion, 100.0 + BEFORE_S)
     assert found.rise_s == pytest.approx(0.3 * math.log(9.0), abs=0.011)
     assert found.t50_s == pytest.approx(0.1 + 0.3 * math.log(2.0), abs=0.011)
     assert found.error == pytest.approx(0.0, abs=1e-6)
@@ -176,7 +178,7 @@ def test_heading_steps_in_degrees_across_any_wrap(target: float) -> None:
     yaw = np.radians(target * share)
     wrapped = (yaw + math.pi) % (2.0 * math.pi) - math.pi
     motion = a_motion(6.0, np.zeros((n, 3)), wrapped, np.zeros(n))
-    found = measure(Step("yaw-90", "heading", 0.0, target), motion, 100.0 + BEFORE_S)
+    found = measure(SetpointStep("yaw-90", "heading", 0.0, target), motion, 100.0 + BEFORE_S)
     assert found.overshoot_percent == pytest.approx(16.3, abs=0.3)
 
 
@@ -185,7 +187,10 @@ def test_down_and_heading_rate_are_read_from_their_columns() -> None:
     share = first_order(np.arange(n) * 0.01 - BEFORE_S, 0.0, 0.2)
     velocity = np.column_stack([np.zeros(n), np.zeros(n), -2.0 * share])
     motion = a_motion(6.0, velocity, np.zeros(n), np.radians(30.0) * share)
-    for step in (Step("up-2", "down", 0.0, -2.0), Step("yawspeed-30", "heading rate", 0.0, 30.0)):
+    for step in (
+        SetpointStep("up-2", "down", 0.0, -2.0),
+        SetpointStep("yawspeed-30", "heading rate", 0.0, 30.0),
+    ):
         found = measure(step, motion, 100.0 + BEFORE_S)
         assert found.rise_s == pytest.approx(0.2 * math.log(9.0), abs=0.011)
 
@@ -281,13 +286,15 @@ def test_overshoot_that_is_missing_is_a_miss() -> None:
 # --- checks and transcript
 
 
-def a_checklist() -> tuple[Checklist, list[Line]]:
-    shown: list[Line] = []
+def a_checklist() -> tuple[Checklist, list[TranscriptLine]]:
+    shown: list[TranscriptLine] = []
     return Checklist(Transcript(SimClock(), shown.append)), shown
 
 
 def a_result(checklist: Checklist, **found: Any) -> ConformanceResult:
-    settings = Settings("udpin://127.0.0.1:14540", "auto", 1.0, 10.0, STEP_NAMES, 1, False, 30.0)
+    settings = ConformanceSettings(
+        "udpin://127.0.0.1:14540", "auto", 1.0, 10.0, STEP_NAMES, 1, False, 30.0
+    )
     return ConformanceResult(settings, checklist.checks, **found)
 
 
@@ -308,9 +315,9 @@ def test_checks_and_what_they_find() -> None:
     assert not a_result(checklist).passed
     outcomes = [(check.name, check.outcome, check.finding) for check in checklist.checks]
     assert outcomes == [
-        ("first", Outcome.PASSED, "quick"),
-        ("second", Outcome.NOT_APPLICABLE, "no rangefinder"),
-        ("third", Outcome.FAILED, "too slow"),
+        ("first", CheckOutcome.PASSED, "quick"),
+        ("second", CheckOutcome.NOT_APPLICABLE, "no rangefinder"),
+        ("third", CheckOutcome.FAILED, "too slow"),
     ]
     assert [line.text for line in shown][-1] == "third: fail: too slow"
 
@@ -325,7 +332,7 @@ def test_what_ends_a_flight_is_noted_and_goes_on(error: BaseException) -> None:
     with pytest.raises(type(error)):
         checklist.perform("flight", breaks)
     (check,) = checklist.checks
-    assert check.outcome is Outcome.FAILED
+    assert check.outcome is CheckOutcome.FAILED
     assert check.finding == (str(error) or "interrupted")
 
 
@@ -372,7 +379,7 @@ def test_verdict(found: dict[str, Any], verdict: str) -> None:
 
 
 def test_repeated_lines_are_counted() -> None:
-    shown: list[Line] = []
+    shown: list[TranscriptLine] = []
     transcript = Transcript(SimClock(2_500_000), shown.append)
     for text in ("a", "b", "b", "b", "c"):
         transcript.add("heard", text)
@@ -442,9 +449,9 @@ class Message:
         self.fields_json = json.dumps(fields)
 
 
-def a_telemetry() -> tuple[Telemetry, list[str]]:
+def a_telemetry() -> tuple[TelemetryBuffer, list[str]]:
     shown: list[str] = []
-    return Telemetry(Transcript(SimClock(), lambda line: shown.append(line.text))), shown
+    return TelemetryBuffer(Transcript(SimClock(), lambda line: shown.append(line.text))), shown
 
 
 def a_text(text: str, number: int = 0, part: int = 0) -> Message:
@@ -496,7 +503,7 @@ def test_motion_by_the_vehicles_clock() -> None:
 class Vehicle:
     """Answers, or not."""
 
-    def __init__(self, telemetry: Telemetry, *methods: Method) -> None:
+    def __init__(self, telemetry: TelemetryBuffer, *methods: Method) -> None:
         self.telemetry, self.methods = telemetry, methods
         self.clock = VehicleClock(telemetry, self.send, speed=0.0)
 

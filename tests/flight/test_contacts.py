@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.commander import Flight, Phase
+from firmware_sim.autopilot.commander import CommanderState, FlightPhase
 from firmware_sim.crash_detector import is_crash
 from firmware_sim.plant.body import FLOOR
 from firmware_sim.plant.plant import Collision
@@ -15,26 +15,26 @@ from firmware_sim.plant.plant import Collision
     ("what", "speed_m_s", "phase", "mode", "crash"),
     [
         # Coming down, by command, by return and by the offboard-loss failsafe.
-        (FLOOR, 0.75, Phase.AIR, Mode.LAND, False),
-        (FLOOR, 1.5, Phase.AIR, Mode.RETURN, False),
-        (FLOOR, 0.9, Phase.AIR, Mode.POSITION, False),
+        (FLOOR, 0.75, FlightPhase.AIR, Mode.LAND, False),
+        (FLOOR, 1.5, FlightPhase.AIR, Mode.RETURN, False),
+        (FLOOR, 0.9, FlightPhase.AIR, Mode.POSITION, False),
         # A hop at take-off.
-        (FLOOR, 0.3, Phase.AIR, Mode.TAKEOFF, False),
-        (FLOOR, 0.3, Phase.GROUND, Mode.TAKEOFF, False),
+        (FLOOR, 0.3, FlightPhase.AIR, Mode.TAKEOFF, False),
+        (FLOOR, 0.3, FlightPhase.GROUND, Mode.TAKEOFF, False),
         # Standing and sliding.
-        (FLOOR, 0.5, Phase.STANDBY, Mode.HOLD, False),
-        (FLOOR, 5.0, Phase.GROUND, Mode.OFFBOARD, False),
+        (FLOOR, 0.5, FlightPhase.STANDBY, Mode.HOLD, False),
+        (FLOOR, 5.0, FlightPhase.GROUND, Mode.OFFBOARD, False),
         # Falling out of the sky.
-        (FLOOR, 6.0, Phase.AIR, Mode.LAND, True),
-        (FLOOR, 6.0, Phase.AIR, Mode.POSITION, True),
+        (FLOOR, 6.0, FlightPhase.AIR, Mode.LAND, True),
+        (FLOOR, 6.0, FlightPhase.AIR, Mode.POSITION, True),
         # A policy has no business on the floor.
-        (FLOOR, 0.2, Phase.AIR, Mode.OFFBOARD, True),
-        (FLOOR, 0.2, Phase.AIR, Mode.HOLD, True),
+        (FLOOR, 0.2, FlightPhase.AIR, Mode.OFFBOARD, True),
+        (FLOOR, 0.2, FlightPhase.AIR, Mode.HOLD, True),
         # Any other contact, at any speed.
-        ("wall north", 0.01, Phase.AIR, Mode.LAND, True),
-        ("box 3", 0.01, Phase.GROUND, Mode.TAKEOFF, True),
-        ("box 3", 2.0, Phase.STANDBY, Mode.HOLD, True),
+        ("wall north", 0.01, FlightPhase.AIR, Mode.LAND, True),
+        ("box 3", 0.01, FlightPhase.GROUND, Mode.TAKEOFF, True),
+        ("box 3", 2.0, FlightPhase.STANDBY, Mode.HOLD, True),
     ],
 )
-def test_contact(what: str, speed_m_s: float, phase: Phase, mode: Mode, crash: bool) -> None:
-    assert is_crash(Collision(0, what, speed_m_s), Flight(phase=phase, mode=mode)) is crash
+def test_contact(what: str, speed_m_s: float, phase: FlightPhase, mode: Mode, crash: bool) -> None:
+    assert is_crash(Collision(0, what, speed_m_s), CommanderState(phase=phase, mode=mode)) is crash

@@ -18,7 +18,7 @@ from airl_mav.faults.model import Fault
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.lockstep.flight import fly
-from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.episode import faults_of
 from airl_mav.rehearsal.run_folder import load
@@ -92,7 +92,7 @@ def test_mavsdk_s_failure_plugin_makes_sensors_fail() -> None:
     """Match PX4 SITL: supported failures succeed, others fail; SYS_FAILURE_EN is required."""
     answers: list[str] = []
 
-    def program(stage: Stage) -> None:
+    def program(stage: LockstepStage) -> None:
         stage.clock.sleep_until(3 * US_PER_S)
         failure, param = Failure(stage.link._system), Param(stage.link._system)
         try:
@@ -112,7 +112,7 @@ def test_mavsdk_s_failure_plugin_makes_sensors_fail() -> None:
             failure.destroy()
             param.destroy()
 
-    with Stage() as stage:
+    with LockstepStage() as stage:
         setup = EpisodeSetup(load_vehicle("quad"), None, 1)
         simulation = stage.run(setup, lambda: program(stage))
         acted = faults_of(simulation.arrays())

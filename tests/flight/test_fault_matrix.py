@@ -12,8 +12,8 @@ from airl_mav.cli import faults
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.experiments import fault_matrix
 from airl_mav.experiments.fault_matrix import (
-    Cell,
     FaultFlight,
+    MatrixCell,
     cell_text,
     fly_fault,
     fly_matrix,
@@ -79,7 +79,7 @@ def flight(end: End, touchdown_m_s: float | None = None) -> FaultFlight:
 def test_six_phases_are_whole_in_a_terminal_of_eighty_columns() -> None:
     cases = ["wind gust 6,0,0m/s for 4s", "accel bias 0.5,0.5,0.5m/s2", "motor1 off"]
     ends = (*[flight("landed", 0.7)] * 19, flight("crashed"))
-    cells = [Cell(fault, phase, ends) for fault in cases for phase in MATRIX_PHASES]
+    cells = [MatrixCell(fault, phase, ends) for fault in cases for phase in MATRIX_PHASES]
     console = Console(record=True, width=80)
     print_table(faults.table_of(cases, MATRIX_PHASES, cells), console, wrap=True)
     text = console.export_text()
@@ -93,9 +93,9 @@ def test_six_phases_are_whole_in_a_terminal_of_eighty_columns() -> None:
 
 
 def test_a_cell_counts_its_ends_and_marks_what_is_not_documented() -> None:
-    good = Cell("baro off", "hold", (flight("landed", 0.7), flight("landed", 0.9)))
+    good = MatrixCell("baro off", "hold", (flight("landed", 0.7), flight("landed", 0.9)))
     assert cell_text(good) == "2 landed (0.9 m/s)"
-    bad = Cell("baro off", "climb", (flight("landed", 0.7), flight("broken")))
+    bad = MatrixCell("baro off", "climb", (flight("landed", 0.7), flight("broken")))
     assert cell_text(bad) == "1 landed (0.7 m/s), 1 broken !"
     assert markdown([good, bad]).splitlines() == [
         "| fault | hold | climb |",
@@ -103,8 +103,8 @@ def test_a_cell_counts_its_ends_and_marks_what_is_not_documented() -> None:
         "| `baro off` | 2 landed (0.9 m/s) | 1 landed (0.7 m/s), 1 broken ! |",
     ]
     # On the ground a fault may also keep the vehicle from arming.
-    assert not Cell("baro off", "ground", (flight("not armed"),)).unexpected
-    assert Cell("baro off", "hold", (flight("not armed"),)).unexpected
+    assert not MatrixCell("baro off", "ground", (flight("not armed"),)).unexpected
+    assert MatrixCell("baro off", "hold", (flight("not armed"),)).unexpected
 
 
 @pytest.mark.nightly  # Nor of any other jobs: test_executors.py, test_campaign.py.

@@ -9,7 +9,7 @@ import pytest
 
 from airl_mav.core.frames import geodetic_to_local, quat_yaw
 from firmware_sim.autopilot.autopilot_state import Arming, Mode, Result, Setpoint
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.streams.status import heartbeat
 from tests.support.flight_rig import NAN, Rig, flight, quad, velocity_setpoint
@@ -23,7 +23,7 @@ def away(rig: Rig, north: float = 0.0, east: float = 0.0) -> float:
 
 
 def disarmed(rig: Rig) -> bool:
-    return rig.ap.flight.phase < Phase.GROUND
+    return rig.ap.flight.phase < FlightPhase.GROUND
 
 
 def test_loss_on_the_ground_starts_no_flight() -> None:
@@ -79,7 +79,7 @@ def test_taking_off_right_after_landing() -> None:
     with flight(0) as rig:
         rig.take_off(1.5, settle_s=1.0)
         rig.ap.set_mode(Mode.LAND)
-        rig.until(lambda: rig.ap.flight.phase is Phase.GROUND, 20.0)
+        rig.until(lambda: rig.ap.flight.phase is FlightPhase.GROUND, 20.0)
         rig.run(1.0)
         rig.ap.takeoff(1.5)
         rig.until(lambda: rig.mode is Mode.HOLD, 12.0)
@@ -151,7 +151,7 @@ def test_home_follows_a_vehicle_that_has_landed_elsewhere() -> None:
         rig.run(2.0)
         begun = rig.ap.state().home
         rig.ap.set_mode(Mode.LAND)
-        rig.until(lambda: rig.ap.flight.phase is Phase.GROUND, 30.0)
+        rig.until(lambda: rig.ap.flight.phase is FlightPhase.GROUND, 30.0)
         assert rig.ap.state().home == begun
         rig.until(lambda: disarmed(rig), 5.0)
         home, origin = rig.ap.state().home, rig.ap.state().origin

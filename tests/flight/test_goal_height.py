@@ -11,7 +11,7 @@ import tomli_w
 
 from airl_mav.arena.gates import openings_of
 from airl_mav.envs.evaluation import LearnedPilots, SinglePilots, fly_seeds
-from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
 from airl_mav.flight.judge import Outcome
@@ -102,7 +102,7 @@ def test_it_climbs_to_the_goal_at_both_levels(arena: Path) -> None:
     navigation = Navigation(environment, 1)
     pilots = SinglePilots(Climbing, 5.0)
     ((_, twin),) = fly_seeds(navigation, pilots, [SEED])
-    assert twin.verdict == Verdict.SUCCESS
+    assert twin.verdict == FlightStatus.SUCCESS
     navigated_s = (record.ended_us - (record.navigation_us or 0)) / 1e6
     assert twin.flight_time_s == pytest.approx(navigated_s, rel=0.1)
 
@@ -137,6 +137,6 @@ def test_the_shipped_policy_flies_through_the_gates_at_both_levels() -> None:
     assert isinstance(policy, LearnedPolicy)
     pilots = LearnedPilots(policy, np.random.default_rng)
     ((_, twin),) = fly_seeds(Navigation(environment, 1), pilots, [seed])
-    assert twin.verdict == Verdict.SUCCESS
+    assert twin.verdict == FlightStatus.SUCCESS
     navigated_s = (flown.record.ended_us - (flown.record.navigation_us or 0)) / 1e6
     assert twin.flight_time_s == pytest.approx(navigated_s, rel=0.1)

@@ -14,7 +14,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.gym_env import RehearsalEnv
-from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.rehearsal.episode_setup import episode_setup
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.model import Scenario
@@ -61,7 +61,7 @@ def test_mavsdk_sees_a_vehicle_in_the_air() -> None:
         seen["height"] = telemetry.position().relative_altitude_m
         seen["home"] = telemetry.home().latitude_deg
 
-    with Stage() as stage:
+    with LockstepStage() as stage:
         stage.run(episode_setup(scenario, scenario.arena_of(SEED), SEED), look)
     assert seen["status"].armed
     assert seen["status"].mode == "hold"
@@ -79,7 +79,7 @@ def test_a_companion_does_not_fly_a_vehicle_on_the_ground() -> None:
         policy, goal = scenario.fresh_policy(SEED), scenario.arena_of(SEED).goal_point
         results.append(fly_as_companion(stage, policy, goal, start="hover"))
 
-    with Stage() as stage:
+    with LockstepStage() as stage:
         simulation = stage.run(episode_setup(scenario, scenario.arena_of(SEED), SEED), program)
         assert simulation.truth.position[2] > -0.1
     assert results[0].reason == "not in the air after 5 s"

@@ -9,7 +9,7 @@ import pytest
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.flight import fly
-from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import FlownEpisode
@@ -17,7 +17,7 @@ from airl_mav.scenario.piloting import TRANSPORT_US
 from companion.mission import MissionResult
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.lockstep_kit import demo_scenario, fly_as_companion
 
@@ -53,7 +53,7 @@ def test_who_takes_over_has_the_vehicle(mode: Mode, breaks: bool) -> None:
     modes: list[tuple[Mode, int]] = []
     """Flown modes, each with its start [µs]."""
 
-    with Stage(transport_us=TRANSPORT_US) as stage:
+    with LockstepStage(transport_us=TRANSPORT_US) as stage:
 
         def break_after_a_long_thought() -> None:
             now_us = stage.clock.time_us()
@@ -84,7 +84,7 @@ def test_who_takes_over_has_the_vehicle(mode: Mode, breaks: bool) -> None:
             stage.firmware.step()
         assert simulation.recorder is not None
         accepted_us = simulation.recorder.setpoints.arrays()["accepted_us"]
-        assert simulation.autopilot.flight.phase is Phase.AIR
+        assert simulation.autopilot.flight.phase is FlightPhase.AIR
     (result,) = results
     assert result.reason == ("policy failed: ZeroDivisionError: " if breaks else "taken over")
     assert result.notes[-1].startswith("taken over: the mode is ")

@@ -27,7 +27,7 @@ from airl_mav.lockstep.digest import LANES
 from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.frames import newest
 from airl_mav.lockstep.inbound import REPEAT_US, Inbound
-from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.lockstep.threaded import ThreadPartner
 from airl_mav.lockstep.turns import Handle, LockstepError, Turn
 from airl_mav.policy.actions import Action
@@ -283,19 +283,19 @@ class Still:
         return still(observation)
 
 
-def airborne(stage: Stage) -> None:
+def airborne(stage: LockstepStage) -> None:
     stop = stage.abandon
     stage.link.arm(20.0, stop)
     stage.link.takeoff(2.5, 30.0, stop)
     stage.link.enter_offboard()
 
 
-def companion_dies(stage: Stage) -> None:
+def companion_dies(stage: LockstepStage) -> None:
     airborne(stage)
     stage.link.send_setpoint(BodyVelocity(1.0, 0.0, 0.0, 0.3))
 
 
-def policy_hangs(stage: Stage) -> None:
+def policy_hangs(stage: LockstepStage) -> None:
     result = fly_mission(
         *(stage.link, stage.camera, Still(), (500.0, 0.0), stage.clock),
         *(stage.abandon, stage.abandon, lambda _: None),
@@ -310,18 +310,18 @@ def policy_hangs(stage: Stage) -> None:
     assert len(result.notes) == 2
 
 
-def fly_on(stage: Stage, seconds: float) -> None:
+def fly_on(stage: LockstepStage, seconds: float) -> None:
     """Fly on for a while when the companion's program has ended."""
     until_us = stage.conductor.clock.time_us() + int(seconds * US_PER_S)
     while stage.conductor.clock.time_us() < until_us:
         stage.firmware.step()
 
 
-def nobody_takes_off(stage: Stage) -> None:
+def nobody_takes_off(stage: LockstepStage) -> None:
     stage.link.arm(20.0, stage.abandon)
 
 
-def battery_runs_low(stage: Stage) -> None:
+def battery_runs_low(stage: LockstepStage) -> None:
     airborne(stage)
     for _ in range(120):
         stage.link.send_setpoint(BodyVelocity(0.5, 0.0, 0.0, 0.0))
@@ -341,7 +341,7 @@ FAILSAFES = [
 )
 def test_failsafes_come_at_the_same_tick_at_every_speed(
     scenario: ResolvedScenario,
-    program: Callable[[Stage], None],
+    program: Callable[[LockstepStage], None],
     word: str,
     capacity_mah: float | None,
 ) -> None:
@@ -353,7 +353,7 @@ def test_failsafes_come_at_the_same_tick_at_every_speed(
 
     def events(speed: float | None) -> list[tuple[int, str]]:
         found: list[tuple[int, str]] = []
-        with Stage(speed=speed) as stage:
+        with LockstepStage(speed=speed) as stage:
             firmware, now_us = stage.firmware, stage.conductor.clock.time_us
             firmware.on_message = lambda message: found.append((now_us(), message.text))
             stage.run(setup, lambda: program(stage))
@@ -369,7 +369,7 @@ def test_offboard_loss_comes_one_second_after_the_last_setpoint() -> None:
     """COM_OF_LOSS_T; MAVSDK's repeated setpoints end with its process."""
     told: list[int] = []
     setup = EpisodeSetup(load_vehicle("quad"), None, 1)
-    with Stage() as stage:
+    with LockstepStage() as stage:
         now_us = stage.conductor.clock.time_us
         stage.firmware.on_message = lambda message: (
             told.append(now_us()) if "Failsafe" in message.text else None
@@ -390,7 +390,10 @@ def test_a_broken_companion_is_told() -> None:
         raise ZeroDivisionError("nothing to share")
 
     setup = EpisodeSetup(load_vehicle("quad"), None, 1)
-    with Stage() as stage, pytest.raises(LockstepError, match="ZeroDivisionError: nothing to"):
+    with (
+        LockstepStage() as stage,
+        pytest.raises(LockstepError, match="ZeroDivisionError: nothing to"),
+    ):
         stage.run(setup, broken)
 
 
@@ -399,14 +402,14 @@ def test_bad_input_stays_bad_input() -> None:
         raise UsageError("--policy p: camera is not the one")
 
     setup = EpisodeSetup(load_vehicle("quad"), None, 1)
-    with Stage() as stage, pytest.raises(UsageError, match="camera is not the one"):
+    with LockstepStage() as stage, pytest.raises(UsageError, match="camera is not the one"):
         stage.run(setup, refused)
 
 
 def test_a_hanging_companion_is_told() -> None:
     setup = EpisodeSetup(load_vehicle("quad"), None, 1)
     told = "the companion hangs: its turn did not end in 1 s"
-    with Stage(patience_s=1.0) as stage, pytest.raises(LockstepError, match=told):
+    with LockstepStage(patience_s=1.0) as stage, pytest.raises(LockstepError, match=told):
         stage.run(setup, lambda: time.sleep(3.0))
 
 

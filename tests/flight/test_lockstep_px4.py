@@ -21,7 +21,7 @@ from airl_mav.experiments.fly import rehearse
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.link import ConductedVehicle, builtin_vehicle
-from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.lockstep.vehicle_end import VehicleEnd, acknowledged
 from airl_mav.profiles.vehicle import load_vehicle
@@ -81,7 +81,7 @@ def test_simulated_time_goes_on_while_a_command_is_answered() -> None:
     """The companion waits inside MAVSDK; it takes off, flies and comes down all the same."""
     end, vehicle = late(3)
     flown_us: list[int] = []
-    with Stage(vehicle=vehicle) as stage:
+    with LockstepStage(vehicle=vehicle) as stage:
 
         def program() -> None:
             link, stop = stage.link, threading.Event()
@@ -101,7 +101,7 @@ def test_an_answer_that_never_comes_ends_the_flight(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("airl_mav.lockstep.threaded.LONGEST_ANSWER_US", US_PER_S // 10)
     _, vehicle = late(10_000)
     with (
-        Stage(vehicle=vehicle) as stage,
+        LockstepStage(vehicle=vehicle) as stage,
         pytest.raises(FirmwareLostError, match=r"did not answer command \d+"),
     ):
         stage.run(EpisodeSetup(load_vehicle("quad"), None, 1), lambda: None)

@@ -23,7 +23,7 @@ from airl_mav.lockstep.turns import LockstepError, Turn
 from airl_mav.lockstep.wire import Wire
 from airl_mav.rehearsal.supervisor import Order
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
-from companion.tokens import Phase, TurnBack, TurnGiven
+from companion.tokens import PhaseToken, TurnBack, TurnGiven
 from firmware_sim.firmware import FrameServer
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.mavlink.endpoint import UdpEndpoint
@@ -43,10 +43,10 @@ from tests.support.ports import LOOPBACK
         (TurnBack(4, 600_000, 12), "D4 600000 12"),
         (TurnBack(4, 600_000, 12, "stop"), "D4 600000 12 stop"),
         (TurnBack(4, ended=True), "D4 end"),
-        (Phase(4, "taking off"), "P4 taking off"),
+        (PhaseToken(4, "taking off"), "P4 taking off"),
     ],
 )
-def test_words_are_read_as_written(words: TurnGiven | TurnBack | Phase, text: str) -> None:
+def test_words_are_read_as_written(words: TurnGiven | TurnBack | PhaseToken, text: str) -> None:
     assert words.text() == text
     assert type(words).parse(text) == words
 
@@ -76,7 +76,7 @@ def test_longest_words_fit_a_status_text() -> None:
 def test_other_texts_are_no_words(text: str) -> None:
     assert TurnGiven.parse(text) is None
     assert TurnBack.parse(text) is None
-    assert Phase.parse(text) is None
+    assert PhaseToken.parse(text) is None
 
 
 # --- the vehicle's end of a turn

@@ -9,7 +9,7 @@ import pytest
 
 from airl_mav.core.frames import quat_yaw
 from firmware_sim.autopilot.autopilot_state import Mode, Result
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.requests import FollowedTarget, OrbitRequest
 from tests.support.flight_rig import NAN, Rig, flight, velocity_setpoint
@@ -39,9 +39,9 @@ def test_position_from_take_off_to_landing() -> None:
         assert ask(rig, Mode.POSITION) is Result.ACCEPTED
         assert rig.ap.arm(force=False) is Result.ACCEPTED
         fly(rig, Sticks(0.0, 0.0, -1.0, 0.0), 1.0)
-        assert rig.ap.flight.phase < Phase.AIR
+        assert rig.ap.flight.phase < FlightPhase.AIR
         fly(rig, Sticks(0.0, 0.0, 1.0, 0.0), 7.0)
-        assert rig.ap.flight.phase is Phase.AIR
+        assert rig.ap.flight.phase is FlightPhase.AIR
         assert rig.truth.velocity[2] == pytest.approx(-1.5, abs=0.6), (
             "MPC_TKO_SPEED near the ground"
         )
@@ -72,7 +72,7 @@ def test_position_from_take_off_to_landing() -> None:
 
         fly(rig, CENTRED, 2.0)
         fly(rig, Sticks(0.0, 0.0, -1.0, 0.0), 25.0)
-        assert rig.ap.flight.phase < Phase.AIR
+        assert rig.ap.flight.phase < FlightPhase.AIR
         assert rig.said("Landing detected") > 0.0
 
 

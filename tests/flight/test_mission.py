@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from firmware_sim.autopilot.autopilot_state import Mode, Result
-from firmware_sim.autopilot.navigation.plan import Kind, NavCommand, PlanItem
+from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand, PlanItem
 from tests.support.flight_rig import Rig, flight
 from tests.support.mission_kit import at, do
 
@@ -36,7 +36,7 @@ def test_a_mission_with_a_jump_a_pause_and_hold_at_its_end() -> None:
             do(N.DO_JUMP, 1, 1),
             item(rig, 0, 10, 4),
         )
-        plans.store(Kind.MISSION, items, 1, 0)
+        plans.store(MissionType.MISSION, items, 1, 0)
         assert rig.ap.set_mode(Mode.MISSION) is Result.ACCEPTED
         assert rig.ap.arm(force=False) is Result.ACCEPTED
 
@@ -70,7 +70,7 @@ def test_land_ends_it_on_the_ground() -> None:
     with flight() as rig:
         rig.boot()
         rig.ap.plans.store(
-            Kind.MISSION,
+            MissionType.MISSION,
             (item(rig, 0, 0, 2, N.TAKEOFF), item(rig, 6, 0, 0, N.LAND)),
             1,
             0,

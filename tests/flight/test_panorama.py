@@ -15,7 +15,7 @@ from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.colour_images import lens_of
 from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.evaluation import SinglePilots, fly_seeds
-from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
 from airl_mav.lockstep.flight import fly
@@ -114,4 +114,4 @@ def test_the_twin_flies_it_too(*, compensate: bool) -> None:
     navigation = Navigation(spec_of(None, spec), 1)
     assert navigation.observation.projection == "cylindrical"
     ((_, flown),) = fly_seeds(navigation, SinglePilots(GreedyPolicy, 5.0), [SEED])
-    assert flown.verdict == Verdict.SUCCESS
+    assert flown.verdict == FlightStatus.SUCCESS

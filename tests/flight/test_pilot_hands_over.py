@@ -16,7 +16,7 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.scenario.model import PilotSettings
@@ -24,7 +24,7 @@ from airl_mav.scenario.piloting import TRANSPORT_US
 from companion.mission import MissionResult
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Result
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.lockstep_kit import demo_scenario, fly_as_companion
 from tests.support.ports import LOOPBACK, choose_ports
@@ -80,7 +80,7 @@ def fly_with(
     phases: list[str] = []
     refused: list[Result] = []
     stop = threading.Event()
-    with Stage(transport_us=TRANSPORT_US) as stage:
+    with LockstepStage(transport_us=TRANSPORT_US) as stage:
 
         def look_on(simulation: Simulation) -> None:
             autopilot = simulation.autopilot
@@ -115,11 +115,11 @@ def fly_with(
 def take_off_and_hand_over(autopilot: BuiltinAutopilot, now_s: float) -> Result | None:
     """Take off when it can be armed; switch to Offboard once it holds."""
     flight = autopilot.flight
-    if flight.phase is Phase.STANDBY:
+    if flight.phase is FlightPhase.STANDBY:
         if now_s > 8.0 or autopilot.arm(force=False) is not Result.ACCEPTED:
             return None
         return autopilot.takeoff(2.5)
-    if flight.phase is Phase.AIR and flight.mode is Mode.HOLD and now_s < 20.0:
+    if flight.phase is FlightPhase.AIR and flight.mode is Mode.HOLD and now_s < 20.0:
         return autopilot.set_mode(Mode.OFFBOARD)
     return None
 
@@ -148,7 +148,7 @@ def test_the_goal_is_reached_and_the_pilot_has_it_back_in_hold() -> None:
     assert flight.result.reason == "goal reached"
     assert flight.phases == ["waiting for offboard", "navigating", "handing back", "done"]
     assert flight.modes[-3:] == [Mode.HOLD, Mode.OFFBOARD, Mode.HOLD]
-    assert flight.autopilot.flight.phase is Phase.AIR, "it never lands"
+    assert flight.autopilot.flight.phase is FlightPhase.AIR, "it never lands"
     north, east, _ = flight.autopilot.state().estimate.position
     assert math.hypot(north - AHEAD_M, east) < PilotSettings.goal_radius_m + 0.5
     assert not flight.refused, "zero setpoints were there before the switch"
@@ -168,12 +168,12 @@ def test_a_policy_that_fails_leaves_the_vehicle_in_hold() -> None:
     flight = fly_with(Once(), act=fail)
     assert flight.result.reason.startswith("policy failed: ZeroDivisionError")
     assert flight.modes[-2:] == [Mode.OFFBOARD, Mode.HOLD]
-    assert flight.autopilot.flight.phase is Phase.AIR
+    assert flight.autopilot.flight.phase is FlightPhase.AIR
 
 
 def test_on_the_ground_nothing_begins() -> None:
     def switch(autopilot: BuiltinAutopilot, now_s: float) -> Result | None:
-        if autopilot.flight.phase is Phase.STANDBY and now_s < 8.0:
+        if autopilot.flight.phase is FlightPhase.STANDBY and now_s < 8.0:
             autopilot.arm(force=False)
             autopilot.set_mode(Mode.OFFBOARD)
         return None
@@ -191,7 +191,7 @@ def test_after_the_wait_was_ended_no_switch_is_taken() -> None:
 
     def late(autopilot: BuiltinAutopilot, now_s: float) -> Result | None:
         if now_s < stop_at_s:
-            if autopilot.flight.phase is Phase.STANDBY:
+            if autopilot.flight.phase is FlightPhase.STANDBY:
                 autopilot.arm(force=False)
                 autopilot.takeoff(2.5)
             return None

@@ -32,7 +32,7 @@ from airl_mav.rehearsal.channel import (
     Loaded,
     LoadEpisode,
     LogLost,
-    Progress,
+    PhaseEntered,
     Ready,
     Saved,
     State,
@@ -75,7 +75,7 @@ def at(seconds: float, north: float = 0.0, **more: Any) -> Item:
 
 
 def phase(name: str, seconds: float) -> Item:
-    return COMPANION, Progress(phase=name, time_us=START_US + round(seconds * 1e6))
+    return COMPANION, PhaseEntered(phase=name, time_us=START_US + round(seconds * 1e6))
 
 
 WARNED: Item = (

@@ -35,7 +35,7 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.cameras.by_name import open_named_camera
-from companion.ground_check import Finding, check_on_ground
+from companion.ground_check import CheckResult, check_on_ground
 from companion.program import prepare
 from firmware_sim.plant.camera_server import SimulatedCamera
 from tests.support.command_line import airl
@@ -264,7 +264,9 @@ def left(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run" / "policy"
 
 
-def checked(folder: Path, policy: Path, camera: str, monkeypatch: pytest.MonkeyPatch) -> Finding:
+def checked(
+    folder: Path, policy: Path, camera: str, monkeypatch: pytest.MonkeyPatch
+) -> CheckResult:
     """Return what `airl-companion --check` says of a driver of the user's."""
     monkeypatch.setattr("companion.ground_check.LOOK_S", 0.1)
     (folder / "mine.py").write_text(OWN)

@@ -9,8 +9,8 @@ import pytest
 
 from airl_mav.core.frames import quat_yaw
 from firmware_sim.autopilot.autopilot_state import Mode, Result
-from firmware_sim.autopilot.commander import Phase
-from firmware_sim.autopilot.requests import Place, Reposition
+from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.requests import PositionYaw, Reposition
 from tests.support.flight_rig import NAN, Rig, flight
 
 
@@ -35,19 +35,19 @@ def test_going_to_places_and_back_home() -> None:
     """The legs of a long flight on PX4: 12 m at its cruise speed, back at 2 m/s (measured 2.12)."""
     with flight(0, parameters={"RTL_RETURN_ALT": 12.0}) as rig:
         rig.take_off(8.0, settle_s=1.0)
-        fast = go(rig, Reposition(Place((12.0, 6.0, -10.0), math.radians(90.0))), 9.0)
+        fast = go(rig, Reposition(PositionYaw((12.0, 6.0, -10.0), math.radians(90.0))), 9.0)
         assert 4.0 < fast < 5.2
         assert rig.truth.position == pytest.approx([12.0, 6.0, -10.0], abs=0.3)
         assert quat_yaw(rig.truth.quaternion) == pytest.approx(math.radians(90.0), abs=0.05)
         rig.ap.change_speed(2.0)
-        slow = go(rig, Reposition(Place((NAN, 12.0, NAN), NAN)), 1.0)
+        slow = go(rig, Reposition(PositionYaw((NAN, 12.0, NAN), NAN)), 1.0)
         assert slow < 0.3, "half a place is none: the vehicle stays"
-        slow = go(rig, Reposition(Place((22.0, 6.0, NAN), NAN)), 7.0)
+        slow = go(rig, Reposition(PositionYaw((22.0, 6.0, NAN), NAN)), 7.0)
         assert slow == pytest.approx(2.1, abs=0.1)
         assert rig.height == pytest.approx(10.0, abs=0.3)
         assert abs(quat_yaw(rig.truth.quaternion)) < 0.1, "it looks ahead, to the north"
         rig.ap.set_mode(Mode.RETURN)
-        rig.until(lambda: rig.ap.flight.phase < Phase.GROUND, 60.0)
+        rig.until(lambda: rig.ap.flight.phase < FlightPhase.GROUND, 60.0)
         assert np.hypot(*rig.truth.position[:2]) < 0.5
         assert rig.said("RTL: start return at 502 m (12 m above destination)") > 0.0
         assert rig.said("RTL: land at destination") > rig.said("RTL: start return")
@@ -70,7 +70,7 @@ def test_a_return_waits_at_its_descend_altitude() -> None:
         assert highest < 6.5
         assert rig.height == pytest.approx(4.0, abs=0.5)
         assert math.isnan(rig.said("RTL: land"))
-        rig.until(lambda: rig.ap.flight.phase < Phase.AIR, 25.0)
+        rig.until(lambda: rig.ap.flight.phase < FlightPhase.AIR, 25.0)
         assert rig.said("RTL: land at destination") > 0.0
 
 
@@ -80,7 +80,7 @@ def test_a_take_off_below_the_ground_stays_there() -> None:
         rig.ap.takeoff(-5.0)
         assert rig.said("Already higher than takeoff altitude") > 0.0
         rig.run(3.0)
-        assert rig.ap.flight.phase is Phase.GROUND
+        assert rig.ap.flight.phase is FlightPhase.GROUND
         assert rig.height < 0.01
 
 

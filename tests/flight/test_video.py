@@ -25,7 +25,7 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
-from companion.video import GIMBAL_PORT, RtpVideo, Watcher, picture_of, picture_size
+from companion.video import GIMBAL_PORT, RtpVideo, VideoReceiver, picture_of, picture_size
 from companion.video_program import ShownCamera, show_video
 from firmware_sim.mavlink.link import gimbal_link
 from firmware_sim.mavlink.udp_links import DEVICE_PORTS
@@ -153,7 +153,7 @@ def test_a_further_camera_is_shown_by_its_name(tmp_path: Path) -> None:
                 frames += 1
 
         said: list[str] = []
-        watcher = Watcher("127.0.0.1", port)
+        watcher = VideoReceiver("127.0.0.1", port)
 
         def show() -> None:
             camera = ShownCamera(server.endpoint, "quad-rig", vehicle, "down")
@@ -202,7 +202,7 @@ def test_a_link_that_carries_nothing_ends_no_video() -> None:
         ending.start()
         sent = show_video(
             ShownCamera(server.endpoint, "quad", load_vehicle("quad")),
-            Watcher("255.255.255.255", port),
+            VideoReceiver("255.255.255.255", port),
             None,
             WallClock(),
             stop,

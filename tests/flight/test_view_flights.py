@@ -20,7 +20,15 @@ from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.view.ends import ViewEnds
 from airl_mav.view.feed import Ends
-from airl_mav.view.messages import Decided, Episode, Flight, Phase, Picture, Steering, Vehicle
+from airl_mav.view.messages import (
+    CameraImage,
+    Decided,
+    Episode,
+    Flight,
+    PhaseStart,
+    Steering,
+    VehicleState,
+)
 from airl_mav.view.shown import Shown
 from tests.support.browser import CHROMIUM, Page, browser
 from tests.support.lockstep_kit import SEED, demo_scenario
@@ -80,7 +88,7 @@ def test_a_watched_flight_is_the_same_bit_by_bit() -> None:
         wait_until(lambda: watchers.shown.decisions > 4, "decisions")
     assert watched == alone
     assert watched.sha256 is not None
-    assert {Episode, Vehicle, Picture, Decided} <= watchers.kinds
+    assert {Episode, VehicleState, CameraImage, Decided} <= watchers.kinds
     shown = watchers.shown
     # The drawn path is the flown path: down at the goal, over the whole way.
     assert shown.to_goal_m is not None
@@ -128,7 +136,7 @@ def test_two_processes_show_their_flight_and_obey(tmp_path: Path) -> None:
             rehearsal.run()
         wait_until(lambda: watchers.shown.phase == "done", "the end")
         observer.close()
-    assert {Flight, Phase, Episode, Vehicle, Picture, Decided} <= watchers.kinds
+    assert {Flight, PhaseStart, Episode, VehicleState, CameraImage, Decided} <= watchers.kinds
     (record,) = load(folder.path).episodes
     assert BY_HAND in record.invalid
     assert not any("flown again" in note for note in record.notes)

@@ -25,7 +25,7 @@ from airl_mav.envs.decision import (
     take,
 )
 from airl_mav.envs.faults import delays_of
-from airl_mav.envs.fleet import ROWS, Verdict, new_fleet
+from airl_mav.envs.fleet import ROWS, FlightStatus, new_fleet
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.rewards import Step, reward_of
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
@@ -185,7 +185,7 @@ def test_an_expired_command_is_a_hover_by_velocity() -> None:
     for _ in range(3):
         navigation.fly(np.tile(HOVER, (2, 1)))
         most = max(most, float(tilts(navigation).max()))
-    assert navigation.fleet.verdict.tolist() == [Verdict.FLYING] * 2
+    assert navigation.fleet.verdict.tolist() == [FlightStatus.FLYING] * 2
     assert most < 0.3
 
 
@@ -272,7 +272,9 @@ def test_the_reward_without_haste_by_hand() -> None:
     now = now._replace(goal_distance_m=before.goal_distance_m - 0.1 * fast)
     found = reward_of("paced")(Step(before, now, commands, 0.5))
     np.testing.assert_allclose(found, [0.3 * 0.2 - 0.008, 0.3 * 0.4 * 2 / 3 - 0.008, -0.008])
-    ended = now._replace(verdict=np.array([Verdict.SUCCESS, Verdict.COLLISION, now.verdict[2]]))
+    ended = now._replace(
+        verdict=np.array([FlightStatus.SUCCESS, FlightStatus.COLLISION, now.verdict[2]])
+    )
     np.testing.assert_allclose(
         reward_of("paced")(Step(before, ended, commands, 0.5)) - found, [4.0, -4.0, 0.0]
     )

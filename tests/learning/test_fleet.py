@@ -27,7 +27,15 @@ from airl_mav.envs.arenas import (
     put_arena,
     touches,
 )
-from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict, hover, new_fleet, vehicle_of
+from airl_mav.envs.fleet import (
+    Fleet,
+    FleetConstants,
+    FlightStatus,
+    Rules,
+    hover,
+    new_fleet,
+    vehicle_of,
+)
 from airl_mav.envs.flight import REPEAT_US, advance
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.profiles.arena import ArenaSpec
@@ -146,7 +154,7 @@ def test_battery_runs_empty_when_the_plant_s_does() -> None:
     setpoint = np.array([4.0, 0.0, 0.0, 0.3])
     command(fleet, 0, setpoint)
     fly(fleet, arenas, 10_000)
-    assert fleet.verdict[0] == Verdict.BATTERY
+    assert fleet.verdict[0] == FlightStatus.BATTERY
     assert fleet.battery[0] == 0.0
     pilot.fly(setpoint, int(fleet.time_us[0]) // TICK_US - 1)
     assert 0.0 < pilot.plant.truth().battery_remaining < 1e-5
@@ -156,10 +164,10 @@ def test_battery_runs_empty_when_the_plant_s_does() -> None:
 
 
 OUTCOMES = {
-    Outcome.SUCCESS: Verdict.SUCCESS,
-    Outcome.COLLISION: Verdict.COLLISION,
-    Outcome.BATTERY: Verdict.BATTERY,
-    Outcome.TIMEOUT: Verdict.TIMEOUT,
+    Outcome.SUCCESS: FlightStatus.SUCCESS,
+    Outcome.COLLISION: FlightStatus.COLLISION,
+    Outcome.BATTERY: FlightStatus.BATTERY,
+    Outcome.TIMEOUT: FlightStatus.TIMEOUT,
 }
 
 
@@ -213,10 +221,10 @@ def test_verdicts_are_the_referee_s_to_the_tick() -> None:
         assert fleet.time_us[i] == referee.verdict.time_us
         assert str(fleet.touched[i]) == (hits[i] or str(NOTHING))
     assert set(fleet.verdict) == {
-        Verdict.SUCCESS,
-        Verdict.COLLISION,
-        Verdict.BATTERY,
-        Verdict.TIMEOUT,
+        FlightStatus.SUCCESS,
+        FlightStatus.COLLISION,
+        FlightStatus.BATTERY,
+        FlightStatus.TIMEOUT,
     }
 
 
@@ -229,7 +237,7 @@ def test_goal_comes_before_a_collision_in_the_same_tick() -> None:
     fleet.battery[1] = 1e-12
     fly(fleet, batch_of([goal, dataclasses.replace(OPEN, goal=np.array([50.0, 0.0]))]), 1,
         Rules(3.0, TICK_US))  # fmt: skip
-    assert list(fleet.verdict) == [Verdict.SUCCESS, Verdict.COLLISION]
+    assert list(fleet.verdict) == [FlightStatus.SUCCESS, FlightStatus.COLLISION]
     assert list(fleet.touched) == [FLOOR, FLOOR]
 
 
@@ -321,7 +329,7 @@ def test_contact_ends_a_flight_and_names_what_was_hit() -> None:
         command(fleet, i, np.array(setpoint))
     fly(fleet, arenas, 6000)
     assert list(fleet.touched) == [WALL, FLOOR]
-    assert list(fleet.verdict) == [Verdict.COLLISION] * 2
+    assert list(fleet.verdict) == [FlightStatus.COLLISION] * 2
     stopped = fleet.position.copy()
     fly(fleet, arenas, 100)
     assert np.array_equal(stopped, fleet.position)
@@ -407,7 +415,7 @@ def test_nothing_is_touched_within_the_clearance() -> None:
 
 
 def test_vehicle_radius_covers_the_collision_box_s_width() -> None:
-    assert isinstance(VEHICLE, Vehicle)
+    assert isinstance(VEHICLE, FleetConstants)
     assert pytest.approx(0.5 * QUAD.body.width_m) == VEHICLE.radius
 
 

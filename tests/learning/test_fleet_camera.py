@@ -16,8 +16,8 @@ from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.cameras import Eye, render_images
-from airl_mav.envs.colour_images import Lens, lens_of
-from airl_mav.envs.fleet import Seen
+from airl_mav.envs.colour_images import LensConstants, lens_of
+from airl_mav.envs.fleet import FramePoses
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
@@ -38,7 +38,7 @@ def worlds(request: pytest.FixtureRequest) -> list[Arena]:
     return [generate(spec, seed, name="view", vehicle_width_m=0.55) for seed in range(N)]
 
 
-def scattered(rng: np.random.Generator) -> Seen:
+def scattered(rng: np.random.Generator) -> FramePoses:
     """Vehicles anywhere in the room, tilted, at any time."""
     fleet = at_rest(N)
     fleet.position[:] = rng.uniform([-20, -20, -4.5], [20, 20, -0.5], (N, 3))
@@ -50,7 +50,7 @@ def scattered(rng: np.random.Generator) -> Seen:
 
 
 def expected(
-    world: Arena, fleet: Seen, i: int, range_m: float, camera: Intrinsics = CAMERA
+    world: Arena, fleet: FramePoses, i: int, range_m: float, camera: Intrinsics = CAMERA
 ) -> np.ndarray:
     pose = camera_pose(fleet.position[i], fleet.quaternion[i], MOUNT)
     centers = world.centers_at(int(fleet.time_us[i]))
@@ -131,9 +131,9 @@ def test_depth_beyond_16_bits_is_clipped() -> None:
     arenas.bounds[0] = [-100.0, 100.0, -100.0, 100.0, 50.0, 0.0]
     fleet.position[0] = [0.0, 0.0, -20.0]
     out = np.zeros((1, 9, 9), np.uint16)
-    eye = Eye(Mount((10.0, 0.0, 0.0), 0.0), Lens(40.0, 4.0, 4.0, 200.0), out, None)
+    eye = Eye(Mount((10.0, 0.0, 0.0), 0.0), LensConstants(40.0, 4.0, 4.0, 200.0), out, None)
     render_images(fleet, arenas, np.ones(1, np.bool_), eye)
     assert np.all(out == 65_535)
-    eye = Eye(Mount((40.0, 0.0, 0.0), 0.0), Lens(40.0, 4.0, 4.0, 200.0), out, None)
+    eye = Eye(Mount((40.0, 0.0, 0.0), 0.0), LensConstants(40.0, 4.0, 4.0, 200.0), out, None)
     render_images(fleet, arenas, np.ones(1, np.bool_), eye)
     assert out[0, 4, 4] == 60_000

@@ -19,7 +19,7 @@ from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.colour_images import ColourImages, Looks, lens_of
-from airl_mav.envs.fleet import Seen
+from airl_mav.envs.fleet import FramePoses
 from airl_mav.envs.meshes import MeshesSeen
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
@@ -65,7 +65,7 @@ def seen_of(worlds: list[Arena]) -> MeshesSeen:
     return seen
 
 
-def scattered(n: int) -> Seen:
+def scattered(n: int) -> FramePoses:
     rng = np.random.default_rng(4)
     fleet = at_rest(n)
     fleet.position[:] = rng.uniform([0, -15, -4.0], [30, 15, -0.5], (n, 3))

@@ -20,10 +20,10 @@ from airl_mav.envs.arenas import batch_of, put_arena, relief_of, with_room
 from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.colour_images import ColourImages, Looks, lens_of
 from airl_mav.envs.experts import Expert
-from airl_mav.envs.fleet import Seen, Verdict
+from airl_mav.envs.fleet import FlightStatus, FramePoses
 from airl_mav.envs.meshes import MeshesSeen
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.planner import OVER_M, Body, map_of
+from airl_mav.envs.planner import OVER_M, PlannerBody, map_of
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.action_sets import commands
 from airl_mav.profiles.arena import ArenaSpec
@@ -50,7 +50,7 @@ def worlds() -> list[Arena]:
     ]
 
 
-def scattered(n: int, seed: int) -> Seen:
+def scattered(n: int, seed: int) -> FramePoses:
     rng = np.random.default_rng(seed)
     fleet = at_rest(n)
     fleet.position[:] = rng.uniform([0, -14, -6.0], [30, 14, -0.5], (n, 3))
@@ -60,7 +60,7 @@ def scattered(n: int, seed: int) -> Seen:
     return fleet
 
 
-def images(worlds: list[Arena], seen: MeshesSeen, fleet: Seen) -> np.ndarray:
+def images(worlds: list[Arena], seen: MeshesSeen, fleet: FramePoses) -> np.ndarray:
     n = len(worlds)
     out = np.zeros((n, CAMERA.height, CAMERA.width), np.uint16)
     lens = lens_of(CAMERA, RANGE_M)
@@ -68,7 +68,7 @@ def images(worlds: list[Arena], seen: MeshesSeen, fleet: Seen) -> np.ndarray:
     return out
 
 
-def own(world: Arena, fleet: Seen, i: int) -> np.ndarray:
+def own(world: Arena, fleet: FramePoses, i: int) -> np.ndarray:
     pose = camera_pose(fleet.position[i], fleet.quaternion[i], MOUNT)
     return depth_to_z16(render(world, world.centers_at(0), CAMERA, RANGE_M, *pose))
 
@@ -141,7 +141,7 @@ def test_on_the_planner_s_map_ground_at_the_height_of_the_flight_is_in_the_way(
     # Without obstacles: against the nearest of many points that are high.
     o = worlds[0].obstacles
     none = replace(o, shape=o.shape[:0], center=o.center[:0], half_size=o.half_size[:0])
-    body = Body(0.275, 0.1, 2.5, 4.0, 3.0)
+    body = PlannerBody(0.275, 0.1, 2.5, 4.0, 3.0)
     for world in worlds[:3]:
         bare = replace(world, obstacles=replace(none, yaw=o.yaw[:0]), statics=None)
         assert bare.ground is not None
@@ -186,12 +186,12 @@ def test_the_planner_reaches_its_goals_among_hills() -> None:
     expert = Expert("planner", navigation)
     navigation.begin(range(len(seeds)), seeds)
     expert.begin(range(len(seeds)))
-    while (navigation.fleet.verdict == Verdict.FLYING).any():
+    while (navigation.fleet.verdict == FlightStatus.FLYING).any():
         navigation.fly(commands(spec.action_spec, expert.decide()))
-        for i in np.flatnonzero(navigation.fleet.verdict == Verdict.FLYING):
+        for i in np.flatnonzero(navigation.fleet.verdict == FlightStatus.FLYING):
             arena = navigation.arenas[i]
             assert arena is not None
             assert arena.ground is not None
             north, east, down = navigation.fleet.position[i].tolist()
             assert -down > arena.ground.height_at(north, east)
-    assert (navigation.fleet.verdict == Verdict.SUCCESS).all()
+    assert (navigation.fleet.verdict == FlightStatus.SUCCESS).all()

@@ -10,7 +10,7 @@ import pytest
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.evaluation import fly_seeds, success_rate
 from airl_mav.envs.experts import Expert
-from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.single import NavigationEnv
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
@@ -114,7 +114,7 @@ def test_the_twin_judges_as_the_referee(
                 1.0,
             )
         )
-        succeeded = navigation.flights().verdict[0] == Verdict.SUCCESS
+        succeeded = navigation.flights().verdict[0] == FlightStatus.SUCCESS
         assert succeeded is np.bool_(verdict is not None)
         if succeeded:
             assert verdict is not None

@@ -20,7 +20,7 @@ from airl_mav.envs.evaluation import (
 )
 from airl_mav.envs.experts import Expert, choices
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.planner import Body, map_of
+from airl_mav.envs.planner import PlannerBody, map_of
 from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import ExpertName, spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
@@ -90,7 +90,7 @@ def test_the_map_is_the_way_around() -> None:
     """Without obstacles the time to go is the distance; behind one it is longer, never inside."""
     free = Navigation(spec_of(None, SMALL | {"arena": "open-field"}), 1)
     free.begin([0], [3])
-    arenas, body = free.whole_truth().arenas, Body(0.3, 0.1, 2.5, 5.0, 3.0)
+    arenas, body = free.whole_truth().arenas, PlannerBody(0.3, 0.1, 2.5, 5.0, 3.0)
     known = map_of(arenas, 0, body)
     rows, columns = np.indices(known.gap.shape)
     north, east = known.north + rows * known.cell, known.east + columns * known.cell

@@ -16,7 +16,7 @@ from airl_mav.control.gains import Gains
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, batch_of
-from airl_mav.envs.fleet import LANES, Fleet, Rules, Verdict, hover, new_fleet, vehicle_of
+from airl_mav.envs.fleet import LANES, Fleet, FlightStatus, Rules, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import NAN3, REPEAT_US, advance
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import Spread
@@ -215,7 +215,7 @@ def test_neither_order_nor_company_matters(arena: str) -> None:
 def test_who_has_landed_is_left_alone() -> None:
     n = LANES + 1
     fleet, arenas = fleet_of(n, np.random.default_rng(3)), arenas_of(n, "no-obstacles")
-    fleet.verdict[2] = Verdict.COLLISION
+    fleet.verdict[2] = FlightStatus.COLLISION
     before = [array[2].copy() for array in fleet]
     advance(fleet, arenas, np.full(n, 30), VEHICLE, RULES, None)
     assert (np.delete(fleet.time_us, 2) == 30 * TICK_US).all()

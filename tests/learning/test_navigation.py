@@ -19,7 +19,7 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.draws import BLOCK, DelayDraws
-from airl_mav.envs.fleet import Fleet, Rules, Verdict, hover, new_fleet, vehicle_of
+from airl_mav.envs.fleet import Fleet, FlightStatus, Rules, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
@@ -162,7 +162,7 @@ def test_setpoints_change_at_the_very_tick(
         assert np.array_equal(truth.quaternion, hand.fleet.quaternion)
         assert flights.energy_j[0] == pytest.approx(hand.fleet.energy[0], rel=1e-12)
         assert flights.distance_m[0] == pytest.approx(hand.fleet.distance[0], rel=1e-12)
-        assert flights.verdict[0] == Verdict.FLYING
+        assert flights.verdict[0] == FlightStatus.FLYING
 
 
 def test_hovering_after_the_hold_costs_way_and_persisting_does_not() -> None:
@@ -526,7 +526,7 @@ def test_an_ended_flight_stays_as_it_ended() -> None:
     for _ in range(5):
         navigation.fly(np.array([[2.0, 0.0, 0.0]]))
     flights, where = navigation.flights(), navigation.truth().position
-    assert flights.verdict[0] == Verdict.TIMEOUT
+    assert flights.verdict[0] == FlightStatus.TIMEOUT
     assert flights.time_s[0] == 1.2
     navigation.fly(np.array([[2.0, 0.0, 0.0]]))
     assert np.array_equal(navigation.truth().position, where)

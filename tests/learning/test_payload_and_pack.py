@@ -10,7 +10,7 @@ import pytest
 
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.envs.arenas import batch_of
-from airl_mav.envs.fleet import Fleet, Rules, Verdict, hover, new_fleet, vehicle_of
+from airl_mav.envs.fleet import Fleet, FlightStatus, Rules, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
 from airl_mav.profiles.conditions import Payload
 from airl_mav.profiles.loaded import loaded
@@ -98,7 +98,7 @@ def in_the_twin(profile: VehicleProfile) -> Measured:
     fly(2500)
     power = fleet.energy[0] / 10.0
     fly(100_000)
-    assert fleet.verdict[0] == Verdict.BATTERY
+    assert fleet.verdict[0] == FlightStatus.BATTERY
     return climb, float(power), float(fleet.time_us[0]) / 1e6
 
 
@@ -117,7 +117,7 @@ def test_500_g_more_climb_slower_take_more_and_last_shorter(
 def test_a_computer_of_5000_w_empties_the_pack() -> None:
     fleet, fly = twin(QUAD, computer_w=5000.0)
     fly(20_000)
-    assert fleet.verdict[0] == Verdict.BATTERY
+    assert fleet.verdict[0] == FlightStatus.BATTERY
     # More than the pack can give, E²/4R: the current is P over half the open-circuit voltage, whose
     # mean is 15.4 V.
     lasted_s = fleet.time_us[0] / 1e6
@@ -125,7 +125,7 @@ def test_a_computer_of_5000_w_empties_the_pack() -> None:
     assert lasted_s == pytest.approx(5.2 * 3600 * 15.4 / (2 * power), rel=0.01)
     spared, fly = twin(QUAD)
     fly(int(fleet.time_us[0]) // TICK_US)
-    assert spared.verdict[0] == Verdict.FLYING
+    assert spared.verdict[0] == FlightStatus.FLYING
     assert fleet.energy[0] == pytest.approx(spared.energy[0], rel=1e-3)  # of the airframe alone
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from airl_mav.envs.fleet import Flights, Verdict
+from airl_mav.envs.fleet import FlightArrays, FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.rewards import Step, costs, reward_of
 from airl_mav.envs.spec import Costs, EnvironmentSpec
@@ -16,13 +16,13 @@ NEARER, AWAY, GOAL, CRASH, FAST, STILL = range(6)
 HOLD_S = 0.5
 
 
-def flights(distance_m: list[float], speed_m_s: list[float], **verdicts: int) -> Flights:
+def flights(distance_m: list[float], speed_m_s: list[float], **verdicts: int) -> FlightArrays:
     """Return flights in progress, except for vehicles with a verdict, given by its name."""
     n = len(distance_m)
-    verdict = np.full(n, Verdict.FLYING, np.int64)
+    verdict = np.full(n, FlightStatus.FLYING, np.int64)
     for name, i in verdicts.items():
-        verdict[i] = Verdict[name]
-    return Flights(
+        verdict[i] = FlightStatus[name]
+    return FlightArrays(
         verdict=verdict,
         time_s=np.zeros(n),
         distance_m=np.zeros(n),
@@ -34,7 +34,9 @@ def flights(distance_m: list[float], speed_m_s: list[float], **verdicts: int) ->
     )
 
 
-def rewards(name: str, before: Flights, now: Flights, hold_s: float) -> NDArray[np.float64]:
+def rewards(
+    name: str, before: FlightArrays, now: FlightArrays, hold_s: float
+) -> NDArray[np.float64]:
     return reward_of(name)(Step(before, now, np.zeros((len(now.verdict), 3)), hold_s))
 
 
@@ -138,7 +140,7 @@ def test_a_failure_costs_what_it_is_said_to() -> None:
     """A collision and an empty battery; not the goal, not the end of time."""
     before, now = flights([9.0] * 5, [0.0] * 5), flights([8.0] * 5, [1.0] * 5)
     ends = ("FLYING", "SUCCESS", "COLLISION", "BATTERY", "TIMEOUT")
-    now.verdict[:] = [Verdict[name] for name in ends]
+    now.verdict[:] = [FlightStatus[name] for name in ends]
     still = np.zeros((5, 3))
     found = costs(Costs(failure=2.5), still, Step(before, now, still, HOLD_S))
     assert found.tolist() == [0.0, 0.0, 2.5, 2.5, 0.0]

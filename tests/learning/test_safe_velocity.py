@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from airl_mav.core.errors import FieldError
 from airl_mav.envs import stopping
-from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.roofline import noticed_m
 from airl_mav.envs.spec import spec_of
@@ -180,8 +180,8 @@ def test_the_whole_loop_with_its_camera_stops_in_time() -> None:
             commands[:, 0] = np.where(stopped, 0.0, speeds)
             navigation.fly(commands)
         verdict = navigation.flights().verdict
-        assert (stopped | (verdict == Verdict.SUCCESS)).all()
-        return int((verdict == Verdict.COLLISION).sum())
+        assert (stopped | (verdict == FlightStatus.SUCCESS)).all()
+        return int((verdict == FlightStatus.COLLISION).sum())
 
     assert touched(safe) == 0
     assert touched(1.15 * safe) > 0

@@ -23,7 +23,7 @@ from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import OnnxRuntime
-from airl_mav.policy.template import Size, build_template, template_size
+from airl_mav.policy.template import NetworkSize, build_template, template_size
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import list_profiles
 from airl_mav.report.document import write_document
@@ -72,7 +72,7 @@ def test_shipped_sweeps_load_and_the_papers_has_its_image() -> None:
         assert load_sweep(name).description
     config = load_sweep("paper")
     best = next(t for t in trials(config) if t.network == "5x32" and "static" in t.arena)
-    assert size_of(config, best) == Size(40_412_761, 1_505_055_712)
+    assert size_of(config, best) == NetworkSize(40_412_761, 1_505_055_712)
     training = training_of(config, best)
     assert training.environment.arena == "static-obstacles"
     assert (training.network.layers, training.network.filters, training.seed) == (5, 32, 1)

@@ -18,7 +18,7 @@ from airl_mav.cli import sweep as sweep_command
 from airl_mav.core.errors import EXIT_INTERRUPTED
 from airl_mav.experiments.process_executor import open_executor
 from airl_mav.policy.card import read_card
-from airl_mav.policy.template import Size
+from airl_mav.policy.template import NetworkSize
 from airl_mav.sweep.config import load_sweep
 from airl_mav.sweep.store import SweepFolder
 from airl_mav.sweep.trial import size_of, trials
@@ -120,7 +120,7 @@ def test_a_sweep_trains_judges_and_tells_all(undisturbed: Path) -> None:
         assert sum(result["outcomes"].values()) == result["episodes"] == 20
         policy = undisturbed / "out" / trial.name / "policy"
         card = read_card(policy)
-        assert Size(card.parameters, card.macs) == size_of(config, trial)
+        assert NetworkSize(card.parameters, card.macs) == size_of(config, trial)
         assert card.training.seed == trial.seed
         # Files needed only for resuming are deleted.
         assert not (policy.parent / "checkpoints").exists()

@@ -14,7 +14,7 @@ from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.envs.evaluation import EpisodeResult, SinglePilots, fly_seeds
-from airl_mav.envs.fleet import Fleet, Verdict
+from airl_mav.envs.fleet import Fleet, FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import Delay, EnvironmentSpec, EpisodeRules
 from airl_mav.envs.trace import Trace
@@ -103,7 +103,7 @@ class TickByTick(Trace):
 
     def _add(self, fleet: Fleet, power_w: float) -> None:
         state = fleet.position[0].copy(), fleet.velocity[0].copy(), fleet.quaternion[0].copy()
-        ended = bool(fleet.verdict[0] != Verdict.FLYING)
+        ended = bool(fleet.verdict[0] != FlightStatus.FLYING)
         time_us = int(fleet.time_us[0])
         record_tick(self.recorder, time_us, *state, power_w, keep=ended)
         self.poses[time_us] = state[0], state[2]
@@ -221,6 +221,6 @@ def test_setpoints_are_what_was_commanded() -> None:
     navigation = Navigation(spec("no-obstacles", episode=rules), 1, trace=trace)
     ((slot, flown),) = fly_seeds(navigation, SinglePilots(Circle, 5.0), [1])
     setpoints = trace.latency(slot)["setpoint"]
-    assert flown.verdict is Verdict.TIMEOUT
+    assert flown.verdict is FlightStatus.TIMEOUT
     assert setpoints.dtype == np.float32
     assert np.all(setpoints[:, [0, 1, 3]] == np.array([1.0, -0.5, 0.25], np.float32))

@@ -21,20 +21,20 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.training import run
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.store import TrainingProgress
-from airl_mav.training.watched import Reflight, Taped, WatchedTraining
+from airl_mav.training.watched import EpisodeReplay, Taped, WatchedTraining
 from airl_mav.view.ends import ViewEnds
 from airl_mav.view.feed import Ends
 from airl_mav.view.messages import (
+    CameraImage,
     Decided,
     Episode,
     Flight,
-    Phase,
-    Picture,
+    PhaseStart,
     Said,
     Steering,
     Told,
     Trained,
-    Vehicle,
+    VehicleState,
 )
 from airl_mav.view.shown import Shown
 from tests.support.browser import CHROMIUM, browser
@@ -120,7 +120,7 @@ def test_a_watched_training_learns_the_same(tmp_path: Path) -> None:
     assert len(alone) >= 2
     assert weights(tmp_path / "watched") == alone
     kinds = {type(message) for message in watchers.told}
-    assert {Flight, Episode, Phase, Vehicle, Picture, Decided, Trained} <= kinds
+    assert {Flight, Episode, PhaseStart, VehicleState, CameraImage, Decided, Trained} <= kinds
     trained = watchers.shown.trained
     assert trained is not None
     assert 0 < trained.steps <= config.steps
@@ -168,7 +168,7 @@ def test_what_is_shown_is_what_was_flown(decisions: str) -> None:
         _, _, done, infos = env.step(rng.integers(0, 4, 6))
         if done[0]:
             ends.append(infos[0])
-    refly = Reflight(spec)
+    refly = EpisodeReplay(spec)
     for tape, info in zip(taping.done, ends, strict=True):
         moments = list(refly.moments(tape, 7_000_000))
         times = [moment.time_us for moment in moments]
@@ -183,7 +183,7 @@ def test_what_is_shown_is_what_was_flown(decisions: str) -> None:
         assert sum(isinstance(message, Decided) for message in told) == episode["l"]
         last = [message for message in told if isinstance(message, Trained)][-1]
         assert last.returned == pytest.approx(episode["r"], abs=1e-5)
-        vehicle = [message for message in told if isinstance(message, Vehicle)][-1]
+        vehicle = [message for message in told if isinstance(message, VehicleState)][-1]
         assert vehicle.time_us == 7_000_000 + fleet.time_us[0]
         assert vehicle.position == tuple(fleet.position[0])
         # The network's image at the end, of bytes, as depths.

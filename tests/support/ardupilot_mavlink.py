@@ -12,7 +12,7 @@ from airl_mav.core.signing import Signing
 from firmware_sim.autopilot.autopilot_state import (
     AutopilotState,
     Landed,
-    Message,
+    OperatorText,
     Result,
     Setpoint,
     Severity,
@@ -22,7 +22,7 @@ from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.event_buffer import EventBuffer
 from firmware_sim.mavlink.link import Link, LinkConfig
 from firmware_sim.mavlink.services import commands, handle
-from firmware_sim.mavlink.services.context import Command, Context, for_vehicle, sender
+from firmware_sim.mavlink.services.context import Context, VehicleCommand, for_vehicle, sender
 from firmware_sim.mavlink.streams import BUILDERS, Builder, status
 from firmware_sim.mavlink.telemetry import PARTS, TickContext, flown_of
 from tests.support.ardupilot_copter import LAND, STABILIZE, Copter
@@ -100,7 +100,7 @@ class Manners:
 
     def _say(self, severity: int, text: str) -> None:
         for link in self._links:
-            for chunk in self._texts.encode(Message(Severity(severity), text)):
+            for chunk in self._texts.encode(OperatorText(Severity(severity), text)):
                 link.send(chunk)
 
     def _beat(self) -> None:
@@ -170,7 +170,9 @@ class Manners:
             dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
         ):
             a, b, c, d, e, f, g = params
-            result = commands.ACTIONS[number](Command(number, (a, b, c, d, e, f, g)), context)
+            result = commands.ACTIONS[number](
+                VehicleCommand(number, (a, b, c, d, e, f, g)), context
+            )
             assert result is not None
             return result
         return Result.UNSUPPORTED

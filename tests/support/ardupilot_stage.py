@@ -10,8 +10,8 @@ from typing import Any
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Message
-from firmware_sim.autopilot.commander import Flight
+from firmware_sim.autopilot.autopilot_state import OperatorText
+from firmware_sim.autopilot.commander import CommanderState
 from firmware_sim.external.ardupilot.sitl import ArdupilotBridge
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.ardupilot_peer import ArdupilotPeer
@@ -22,13 +22,13 @@ from tests.support.ports import free_ports
 class BridgeOnly:
     """A flight controller that is nothing but its bridge. Implements `FlightController`."""
 
-    on_message: Callable[[Message], None] | None = None
+    on_message: Callable[[OperatorText], None] | None = None
     internals = None
 
     def __init__(self, bridge: ArdupilotBridge) -> None:
         self.rate_hz = bridge.rate_hz
         self.step, self.use_truth, self.close = bridge.step, bridge.use_truth, bridge.close
-        self.flight = Flight()
+        self.flight = CommanderState()
 
 
 class Stage:

@@ -19,7 +19,7 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint
-from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
+from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 SETPOINT_US = 50_000
@@ -85,7 +85,7 @@ class Rig:
         return self.sim.time_us / US_PER_S
 
     @property
-    def truth(self) -> Truth:
+    def truth(self) -> TrueState:
         return self.sim.truth
 
     @property

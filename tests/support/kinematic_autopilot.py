@@ -21,25 +21,25 @@ from firmware_sim.autopilot.autopilot_state import (
     Arming,
     Clearance,
     CommanderStatus,
-    Estimate,
     FenceStatus,
     Health,
     Landed,
-    Message,
     MissionProgress,
     Mode,
+    OperatorText,
     OrbitStatus,
     Result,
     Setpoint,
     Severity,
+    StateEstimate,
     Vector,
     Wire,
 )
-from firmware_sim.autopilot.events.definition import Event
+from firmware_sim.autopilot.events.definition import MavlinkEvent
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs, ParameterValue
-from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Obstacles, Request
+from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, ModeRequest, ObstacleBins
 from firmware_sim.autopilot.snapshot import progress
 from firmware_sim.interfaces import (
     BatterySample,
@@ -73,7 +73,7 @@ class KnownState(NamedTuple):
     """Implements `AutopilotState` by plain values."""
 
     time_us: int
-    estimate: Estimate
+    estimate: StateEstimate
     status: CommanderStatus
     setpoint: Setpoint
     attitude_setpoint: Vector
@@ -189,21 +189,21 @@ class KinematicAutopilot:
         self.odometry: list[Odometry] = []
         self.distances: list[DistanceReading] = []
         self.flows: list[FlowReading] = []
-        self.obstacles: list[Obstacles] = []
+        self.obstacles: list[ObstacleBins] = []
         self.gcs_heartbeats: list[int] = []
         self.takeoffs: list[float | None] = []
         self.takeoff_place: tuple[float, float] | None = None
         self.commands: list[str] = []
         self.looked_at: Geodetic | None = None
-        self.requests: list[Request | None] = []
+        self.requests: list[ModeRequest | None] = []
         self.sticks: list[tuple[Sticks, Source, int]] = []
         self.landing_targets: list[LandingTarget] = []
         self.followed: list[FollowedTarget] = []
         self.attitudes: list[tuple[AttitudeDemand | RateDemand, int]] = []
         self.wires: list[Wire] = []
         self.refusals: list[tuple[str, int]] = []
-        self.messages: list[Message] = []
-        self.events: list[Event] = []
+        self.messages: list[OperatorText] = []
+        self.events: list[MavlinkEvent] = []
         self.offboard_loss_us = US_PER_S
         self.frozen = False
         """Only time passes: lets a test read what it has set."""
@@ -215,11 +215,11 @@ class KinematicAutopilot:
     def sample(self) -> SensorSample:
         return SensorSample(self.time_us, self.accel, self.gyro, 25.31, self.battery)
 
-    def take_messages(self) -> list[Message]:
+    def take_messages(self) -> list[OperatorText]:
         taken, self.messages = self.messages, []
         return taken
 
-    def take_events(self) -> list[Event]:
+    def take_events(self) -> list[MavlinkEvent]:
         taken, self.events = self.events, []
         return taken
 
@@ -264,7 +264,7 @@ class KinematicAutopilot:
         self.commands.append(f"speed {speed_m_s}")
 
     def set_mode(
-        self, mode: Mode, request: Request | None = None, *, commanded: bool = False
+        self, mode: Mode, request: ModeRequest | None = None, *, commanded: bool = False
     ) -> Result:
         self.requests.append(request)
         self.commands.append(f"mode {mode.name}")
@@ -309,7 +309,7 @@ class KinematicAutopilot:
     def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
         self.sticks.append((sticks, source, time_us))
 
-    def see_obstacles(self, obstacles: Obstacles) -> None:
+    def see_obstacles(self, obstacles: ObstacleBins) -> None:
         self.obstacles.append(obstacles)
 
     def see(self, odometry: Odometry) -> None:
@@ -336,7 +336,7 @@ class KinematicAutopilot:
 
     def state(self) -> KnownState:
         zero = np.zeros(3)
-        estimate = Estimate(
+        estimate = StateEstimate(
             time_us=self.time_us,
             position=self.position,
             velocity=self.velocity,
@@ -448,4 +448,4 @@ class KinematicAutopilot:
         return self.time_us - self.setpoints[-1][1]
 
     def _say(self, severity: Severity, text: str) -> None:
-        self.messages.append(Message(severity, text))
+        self.messages.append(OperatorText(severity, text))

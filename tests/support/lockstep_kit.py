@@ -10,7 +10,7 @@ from typing import Any
 from airl_mav.core.frames import Goal
 from airl_mav.latency.samplers import FixedSampler
 from airl_mav.lockstep.flight import fly
-from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.policy.actions import Policy
 from airl_mav.rehearsal.progress import Observer
 from airl_mav.scenario.model import LimitSettings, PilotSettings, Scenario, WatchdogSettings
@@ -18,7 +18,7 @@ from airl_mav.scenario.piloting import NATIVE_T2_US
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.mission import MissionResult, Start, fly_mission
-from companion.pilot import Decided
+from companion.pilot import SentDecision
 
 SEED = 11
 """A short flight: two seconds to the goal."""
@@ -44,16 +44,16 @@ def demo_scenario(**changes: Any) -> ResolvedScenario:
 
 
 def fly_as_companion(
-    stage: Stage,
+    stage: LockstepStage,
     policy: Policy,
     goal: Goal,
     *,
     stop: threading.Event | None = None,
     phase: Callable[[str], None] = lambda _: None,
     start: Start = "arm",
-    decided: Callable[[Decided], None] | None = None,
+    decided: Callable[[SentDecision], None] | None = None,
 ) -> MissionResult:
-    """Fly a mission on a stage with default settings; called by `Stage.run`.
+    """Fly a mission on a stage with default settings; called by `LockstepStage.run`.
 
     `stop` ends it early; `phase` receives its phases, and `decided` its decisions.
     """

@@ -10,11 +10,17 @@ import numpy as np
 from airl_mav.core.frames import Geodetic, local_to_geodetic
 from airl_mav.profiles.parameters import SPECS
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.navigation.executor import PERIOD_US, MissionExecutor
-from firmware_sim.autopilot.navigation.feasibility import Verdict, check
-from firmware_sim.autopilot.navigation.flown_item import Situation
-from firmware_sim.autopilot.navigation.plan import Frame, Kind, NavCommand, PlanItem, Plans
+from firmware_sim.autopilot.navigation.feasibility import FeasibilityResult, check
+from firmware_sim.autopilot.navigation.flown_item import ExecutorState
+from firmware_sim.autopilot.navigation.plan import (
+    MissionType,
+    NavCommand,
+    PlanFrame,
+    PlanItem,
+    Plans,
+)
 
 NAN = math.nan
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
@@ -32,7 +38,7 @@ def at(
     up: float,
     command: int = NavCommand.WAYPOINT,
     *params: float,
-    frame: int = Frame.GLOBAL_RELATIVE_ALT_INT,
+    frame: int = PlanFrame.GLOBAL_RELATIVE_ALT_INT,
     autocontinue: bool = True,
     origin: Geodetic = ORIGIN,
 ) -> PlanItem:
@@ -54,7 +60,7 @@ def at(
 def do(command: int, *params: float, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> PlanItem:
     """Return an item without a place."""
     first, second, third, fourth = (*params, *(0.0, 0.0, 0.0, 0.0)[len(params) :])
-    return PlanItem(command, Frame.MISSION, (first, second, third, fourth), x, y, z)
+    return PlanItem(command, PlanFrame.MISSION, (first, second, third, fourth), x, y, z)
 
 
 class FakeFlight:
@@ -66,12 +72,12 @@ class FakeFlight:
         self.texts: list[str] = []
         self.homes: list[Geodetic | None] = []
         self.returned = False
-        self.now = Situation(0, (0.0, 0.0, 0.0), 0.0, True, ORIGIN, ORIGIN)
+        self.now = ExecutorState(0, (0.0, 0.0, 0.0), 0.0, True, ORIGIN, ORIGIN)
         self.executor = MissionExecutor(self.plans, self.values.__getitem__, self, self._check)
         if items:
-            self.plans.store(Kind.MISSION, items, 1, 0)
+            self.plans.store(MissionType.MISSION, items, 1, 0)
 
-    def _check(self, now: Situation) -> Verdict:
+    def _check(self, now: ExecutorState) -> FeasibilityResult:
         return check(
             self.plans.mission,
             now.home,
@@ -82,7 +88,7 @@ class FakeFlight:
 
     # --- the crew
 
-    def say(self, message: Message) -> None:
+    def say(self, message: OperatorText) -> None:
         self.texts.append(message.text)
 
     def set_home(self, place: Geodetic | None) -> None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from airl_mav.envs.fleet import Seen, new_fleet
+from airl_mav.envs.fleet import FramePoses, new_fleet
 
 
-def at_rest(n: int) -> Seen:
+def at_rest(n: int) -> FramePoses:
     """Return n vehicles in the origin, as kernels that render take those of an environment."""
     fleet = new_fleet(n)
-    return Seen(*(getattr(fleet, name) for name in Seen._fields))
+    return FramePoses(*(getattr(fleet, name) for name in FramePoses._fields))

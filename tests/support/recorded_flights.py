@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.policy.observation import Kinematics
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.episode import part_of
@@ -112,7 +112,7 @@ def fly_recorded(
     run = run_of(alone, prepare(alone))
     setup = EpisodeSetup(vehicle or scenario.vehicle, arena, seed, asked)
     reasons: list[str] = []
-    with Stage(transport_us=TRANSPORT_US, faults=asked.faults) as stage:
+    with LockstepStage(transport_us=TRANSPORT_US, faults=asked.faults) as stage:
         heard = HeardLink(stage.link)
         recorder = open_recorder(folder, run, heard, stage.clock, goal)
         phases: list[str] = []

@@ -21,7 +21,7 @@ from airl_mav.policy.observation import Kinematics
 from companion.black_box import BlackBoxRecorder
 from companion.camera import ReceivedFrame
 from companion.interfaces import BatteryState, BodyVelocity, VehicleStatus
-from companion.pilot import Decided
+from companion.pilot import SentDecision
 
 LENS = Intrinsics.from_fov(64, 48, 1.0)
 PERIOD_US = 20 * US_PER_MS
@@ -59,7 +59,7 @@ def main(path: Path) -> None:
         seen = ReceivedFrame(Frame(number, now_us, depth, LENS), now_us)
         times = now_us, now_us, now_us, now_us + PERIOD_US, now_us
         command = BodyVelocity(1.0, 0.0, 0.0, 0.0)
-        recorder.decided(Decided(seen, link.kinematics(), command, *times, None, depth))
+        recorder.decided(SentDecision(seen, link.kinematics(), command, *times, None, depth))
         sys.stdout.write(f"{now_us}\n")
         sys.stdout.flush()
         clock.sleep_until(now_us + PERIOD_US)

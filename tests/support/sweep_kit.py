@@ -8,7 +8,7 @@ from pathlib import Path
 from airl_mav.flight.judge import Outcome
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.sweep.config import SweepConfig
-from airl_mav.sweep.trial import Trained, Trial, TrialResult, size_of
+from airl_mav.sweep.trial import TrainedTrial, Trial, TrialResult, size_of
 
 TINY = (profiles_dir() / "sweeps" / "tiny.toml").read_text(encoding="utf-8")
 
@@ -27,7 +27,7 @@ def fake_results(
     for trial, count in zip(trials, successes, strict=True):
         size = size_of(config, trial)
         outcomes = {Outcome.SUCCESS: count, Outcome.COLLISION: episodes - count}
-        trained = Trained(config.training.steps, config.training.steps, 0.5, 60.0)
+        trained = TrainedTrial(config.training.steps, config.training.steps, 0.5, 60.0)
         results.append(
             TrialResult(
                 trial=trial,

@@ -25,7 +25,7 @@ from airl_mav.envs.arenas import NOTHING, WALL, touches
 from airl_mav.profiles.appearance import MATERIALS
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from firmware_sim.plant.bullet_body import World
+from firmware_sim.plant.bullet_body import BulletWorld
 
 WIDTH_M = 1.0
 SEEDS = range(6)
@@ -217,7 +217,7 @@ def test_depth_is_what_pybullet_s_rays_measure(seed: int) -> None:
     arena, rng = park(seed), np.random.default_rng(seed)
     statics = arena.statics
     assert statics is not None
-    world, k = World(arena, 1.0), Intrinsics(64, 48, 60.0, 31.5, 23.5)
+    world, k = BulletWorld(arena, 1.0), Intrinsics(64, 48, 60.0, 31.5, 23.5)
     numbers = {name: body for body, name in world.names.items()}
     first = min(numbers[arena.name_of(i)] for i in range(arena.n_static))
     u, v = np.meshgrid(np.arange(k.width), np.arange(k.height))
@@ -256,7 +256,7 @@ def test_depth_is_what_pybullet_s_rays_measure(seed: int) -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_vehicle_touches_what_pybullet_says_it_touches(seed: int) -> None:
     arena, rng = park(seed), np.random.default_rng(seed)
-    o, world, radius = arena.obstacles, World(arena, 1.0), 0.25
+    o, world, radius = arena.obstacles, BulletWorld(arena, 1.0), 0.25
     client = world.number
     disc = pybullet.createCollisionShape(
         pybullet.GEOM_CYLINDER, radius=radius, height=2 * HALF_HEIGHT_M, physicsClientId=client

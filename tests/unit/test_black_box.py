@@ -43,7 +43,7 @@ from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.black_box import BlackBoxRecorder
 from companion.camera import ReceivedFrame
 from companion.interfaces import BodyVelocity
-from companion.pilot import Decided
+from companion.pilot import SentDecision
 from companion.program import prepare, run_of
 from tests.support.full_disk import largest_file
 from tests.support.processes import running, wait_until
@@ -299,7 +299,9 @@ def test_images_of_further_cameras_have_topics_of_their_own(tmp_path: Path) -> N
     now_us = clock.time_us()
     seen, state = ReceivedFrame(frame, now_us), Straight(clock).kinematics()
     times = (now_us, now_us, now_us, now_us, now_us)
-    recorder.decided(Decided(seen, state, BodyVelocity(1.0, 0.0, 0.0, 0.0), *times, None, depth))
+    recorder.decided(
+        SentDecision(seen, state, BodyVelocity(1.0, 0.0, 0.0, 0.0), *times, None, depth)
+    )
     recorder.end("goal reached", ())
     with path.open("rb") as file:
         read = make_reader(file, validate_crcs=True).iter_messages()

@@ -24,7 +24,7 @@ from airl_mav.rehearsal.channel import (
     ChildChannel,
     Event,
     FinishEpisode,
-    Progress,
+    PhaseEntered,
     Ready,
     Request,
     Shutdown,
@@ -203,7 +203,7 @@ def test_events_of_many_threads_do_not_mix() -> None:
 
     def send(who: int) -> None:
         for _ in range(50):
-            end.send(Progress(phase=text, time_us=who))
+            end.send(PhaseEntered(phase=text, time_us=who))
 
     threads = [threading.Thread(target=send, args=(who,)) for who in range(4)]
     for thread in threads:
@@ -213,7 +213,9 @@ def test_events_of_many_threads_do_not_mix() -> None:
     for thread in threads:
         thread.join()
     outgoing.close()
-    assert sorted(e.time_us for e in found if isinstance(e, Progress)) == sorted([0, 1, 2, 3] * 50)
+    assert sorted(e.time_us for e in found if isinstance(e, PhaseEntered)) == sorted(
+        [0, 1, 2, 3] * 50
+    )
 
 
 def test_sending_to_a_harness_that_is_gone_is_no_error() -> None:
@@ -249,10 +251,10 @@ def test_child_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         assert events.get(timeout=60.0) == ("c", Ready())
         child.send(FinishEpisode())
-        assert events.get(timeout=60.0) == ("c", Progress(phase="finish", time_us=0))
+        assert events.get(timeout=60.0) == ("c", PhaseEntered(phase="finish", time_us=0))
     finally:
         child.stop()
-    assert events.get(timeout=10.0) == ("c", Progress(phase="gone", time_us=1))
+    assert events.get(timeout=10.0) == ("c", PhaseEntered(phase="gone", time_us=1))
     assert events.get(timeout=10.0) == ("c", Exited(7))
     assert child.log_tail() == "banner of a library\nprinted"
     child.send(FinishEpisode())  # To a dead child: no error.

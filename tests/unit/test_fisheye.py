@@ -23,7 +23,7 @@ from airl_mav.policy.greedy import near_points
 from airl_mav.policy.observation import Kinematics, observe
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
 from airl_mav.policy.scans import rays_of
-from airl_mav.prediction.reprojection import CameraPose, Reprojector, Sight
+from airl_mav.prediction.reprojection import CameraPose, PosedImage, Reprojector
 from airl_mav.profiles.appearance import DEFAULT
 from airl_mav.profiles.distortion import UNDISTORTED, Distortion
 from airl_mav.profiles.vehicle import load_vehicle
@@ -137,7 +137,7 @@ def test_an_image_from_elsewhere_is_that_of_the_camera_there(distortion: Distort
         depth_to_z16(render(scene, centers, k, camera.range_m, *pose))
         for pose in ((HERE, LEVEL), (there, turned))
     )
-    sight = Sight(first, CameraPose(HERE, quat_to_matrix(LEVEL)))
+    sight = PosedImage(first, CameraPose(HERE, quat_to_matrix(LEVEL)))
     found = Reprojector(camera, k).image([sight], CameraPose(there, quat_to_matrix(turned)))
     both = (found > 0) & (wanted > 0)
     off_m = np.abs(found[both].astype(float) - wanted[both]) / 1e3

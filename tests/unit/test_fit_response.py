@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from airl_mav.conformance.reference import StoredStep
-from airl_mav.conformance.result import ConformanceResult, Settings
+from airl_mav.conformance.result import ConformanceResult, ConformanceSettings
 from airl_mav.conformance.steps import (
     MANOEUVRES,
     MeasuredStep,
-    Step,
+    SetpointStep,
     StepName,
     StepResponse,
     step_response,
@@ -37,7 +37,7 @@ QUAD = load_vehicle("quad")
 STEPS = {leg.step.name: leg.step for legs in MANOEUVRES for leg in legs if leg.step is not None}
 
 
-def flown(step: Step, dead_s: float, lag_s: float) -> StepResponse:
+def flown(step: SetpointStep, dead_s: float, lag_s: float) -> StepResponse:
     """Return the figures of a first-order lag with dead time, sampled at 500 Hz."""
     times_s = np.arange(-0.5, 6.0, 0.002)
     done = 1.0 - np.exp(-np.maximum(times_s - dead_s, 0.0) / lag_s)
@@ -57,7 +57,7 @@ def steps_of(dead_s: float, lag_s: float, turn_lag_s: float) -> dict[StepName, M
 
 def result(tmp_path: Path, steps: Mapping[StepName, MeasuredStep]) -> str:
     """Write what `airl conformance --out` writes."""
-    settings = Settings("udpin://127.0.0.1:14540", "auto", 1.0, 10.0, (), 1, True, 10.0)
+    settings = ConformanceSettings("udpin://127.0.0.1:14540", "auto", 1.0, 10.0, (), 1, True, 10.0)
     path = tmp_path / "steps.json"
     ConformanceResult(settings, steps=dict(steps)).write(path)
     return str(path)

@@ -16,7 +16,7 @@ from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
 from companion.camera import ReceivedFrame
-from companion.ground_check import DECISIONS, Finding, check_on_ground, time_decisions
+from companion.ground_check import DECISIONS, CheckResult, check_on_ground, time_decisions
 from companion.program import prepare
 from tests.support.ports import LOOPBACK, free_ports
 
@@ -45,7 +45,7 @@ class Dead(Mine):
 """
 
 
-def found_with(folder: Path, camera: str, **asked: Any) -> list[Finding]:
+def found_with(folder: Path, camera: str, **asked: Any) -> list[CheckResult]:
     """Look at a camera where no flight controller is."""
     (folder / "mine.py").write_text(OWN)
     (udp,), _ = free_ports(1, 0)

@@ -9,12 +9,12 @@ from scipy import stats
 from scipy.optimize import brentq
 
 from airl_mav.latency.samplers import FixedSampler, LatencySampler, ReplaySampler, build_sampler
-from airl_mav.profiles.computer import Latency
+from airl_mav.profiles.computer import LatencyDistribution
 
 N = 20_000
 
 
-def draws(latency: Latency, seed: int = 5, n: int = N) -> np.ndarray:
+def draws(latency: LatencyDistribution, seed: int = 5, n: int = N) -> np.ndarray:
     sampler: LatencySampler = build_sampler(latency, np.random.default_rng(seed))
     return np.array([sampler.sample_us() for _ in range(n)])
 
@@ -31,7 +31,9 @@ def scipy_lognormal_us(mean_ms: float, std_ms: float, min_ms: float) -> Any:
     ("mean_ms", "std_ms", "min_ms"), [(396.0, 19.8, 0.0), (10.0, 8.0, 0.0), (12.0, 3.0, 9.0)]
 )
 def test_lognormal_is_scipys(mean_ms: float, std_ms: float, min_ms: float) -> None:
-    latency = Latency(distribution="lognormal", mean_ms=mean_ms, std_ms=std_ms, min_ms=min_ms)
+    latency = LatencyDistribution(
+        distribution="lognormal", mean_ms=mean_ms, std_ms=std_ms, min_ms=min_ms
+    )
     values = draws(latency)
     expected = scipy_lognormal_us(mean_ms, std_ms, min_ms)
     assert expected.mean() == pytest.approx(1e3 * mean_ms)
@@ -42,7 +44,9 @@ def test_lognormal_is_scipys(mean_ms: float, std_ms: float, min_ms: float) -> No
 
 
 def test_truncated_normal_is_scipys() -> None:
-    latency = Latency(distribution="normal-truncated", mean_ms=10.0, std_ms=4.0, min_ms=8.0)
+    latency = LatencyDistribution(
+        distribution="normal-truncated", mean_ms=10.0, std_ms=4.0, min_ms=8.0
+    )
     expected = stats.truncnorm((8.0 - 10.0) / 4.0, np.inf, loc=10e3, scale=4e3)
     values = draws(latency)
     assert stats.kstest(values, expected.cdf).pvalue > 0.01
@@ -50,7 +54,7 @@ def test_truncated_normal_is_scipys() -> None:
 
 
 def test_samples_come_back_with_their_own_frequencies() -> None:
-    latency = Latency(distribution="samples", samples_ms=(1.0, 2.5, 2.5, 7.125))
+    latency = LatencyDistribution(distribution="samples", samples_ms=(1.0, 2.5, 2.5, 7.125))
     values, counts = np.unique(draws(latency), return_counts=True)
     assert values.tolist() == [1_000, 2_500, 7_125]
     assert stats.chisquare(counts, N * np.array([0.25, 0.5, 0.25])).pvalue > 0.01
@@ -59,31 +63,33 @@ def test_samples_come_back_with_their_own_frequencies() -> None:
 @pytest.mark.parametrize(
     "latency",
     [
-        Latency(distribution="fixed", mean_ms=150.0),
-        Latency(distribution="lognormal", mean_ms=150.0, std_ms=0.0),
-        Latency(distribution="normal-truncated", mean_ms=150.0, std_ms=0.0),
+        LatencyDistribution(distribution="fixed", mean_ms=150.0),
+        LatencyDistribution(distribution="lognormal", mean_ms=150.0, std_ms=0.0),
+        LatencyDistribution(distribution="normal-truncated", mean_ms=150.0, std_ms=0.0),
     ],
 )
-def test_no_spread_is_a_constant(latency: Latency) -> None:
+def test_no_spread_is_a_constant(latency: LatencyDistribution) -> None:
     assert set(draws(latency, n=20).tolist()) == {150_000}
 
 
 @pytest.mark.parametrize("distribution", ["lognormal", "normal-truncated"])
 def test_the_seed_decides(distribution: str) -> None:
-    latency = Latency.model_validate({"distribution": distribution, "mean_ms": 40.0, "std_ms": 5.0})
+    latency = LatencyDistribution.model_validate(
+        {"distribution": distribution, "mean_ms": 40.0, "std_ms": 5.0}
+    )
     assert np.array_equal(draws(latency, 1, 50), draws(latency, 1, 50))
     assert not np.array_equal(draws(latency, 1, 50), draws(latency, 2, 50))
 
 
 def test_latencies_are_plain_integers() -> None:
     sampler = build_sampler(
-        Latency(distribution="samples", samples_ms=(1.0,)), np.random.default_rng(0)
+        LatencyDistribution(distribution="samples", samples_ms=(1.0,)), np.random.default_rng(0)
     )
     assert type(sampler.sample_us()) is int
 
 
 def test_a_sample_file_nobody_read_is_an_error() -> None:
-    latency = Latency(distribution="samples", samples_file="laps.txt")
+    latency = LatencyDistribution(distribution="samples", samples_file="laps.txt")
     with pytest.raises(ValueError, match=r"laps\.txt not read"):
         build_sampler(latency, np.random.default_rng(0))
 

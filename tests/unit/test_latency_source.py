@@ -11,7 +11,7 @@ import scipy.stats
 from airl_mav.core.errors import UsageError
 from airl_mav.latency.samplers import ReplaySampler, latency_generator
 from airl_mav.latency.source import longest_ms, parse_latency, select_injection
-from airl_mav.profiles.computer import Latency, load_computer
+from airl_mav.profiles.computer import LatencyDistribution, load_computer
 
 
 @pytest.mark.parametrize(
@@ -20,14 +20,14 @@ from airl_mav.profiles.computer import Latency, load_computer
 )
 def test_a_fixed_latency(text: str, mean_ms: float) -> None:
     injection = parse_latency(text)
-    assert injection.latency == Latency(distribution="fixed", mean_ms=mean_ms)
+    assert injection.latency == LatencyDistribution(distribution="fixed", mean_ms=mean_ms)
     assert injection.origin == "injected"
     assert f"{mean_ms:g} ms" in injection.label
 
 
 def test_a_distribution_by_its_moments() -> None:
     injection = parse_latency("lognormal:396ms,20ms,0.3s")
-    assert injection.latency == Latency(
+    assert injection.latency == LatencyDistribution(
         distribution="lognormal", mean_ms=396.0, std_ms=20.0, min_ms=300.0
     )
     sampler = injection.sampler(np.random.default_rng(1))
@@ -110,11 +110,15 @@ def test_replay_keeps_histogram_and_autocorrelation() -> None:
 
 
 def test_the_longest_latency() -> None:
-    assert longest_ms(Latency(distribution="fixed", mean_ms=40.0)) == 40.0
-    assert longest_ms(Latency(distribution="samples", samples_ms=(3.0, 9.0, 4.0))) == 9.0
-    normal = Latency(distribution="normal-truncated", mean_ms=40.0, std_ms=2.0)
+    assert longest_ms(LatencyDistribution(distribution="fixed", mean_ms=40.0)) == 40.0
+    assert (
+        longest_ms(LatencyDistribution(distribution="samples", samples_ms=(3.0, 9.0, 4.0))) == 9.0
+    )
+    normal = LatencyDistribution(distribution="normal-truncated", mean_ms=40.0, std_ms=2.0)
     assert longest_ms(normal) == pytest.approx(scipy.stats.norm.ppf(0.999, 40.0, 2.0))
-    lognormal = Latency(distribution="lognormal", mean_ms=396.0, std_ms=60.0, min_ms=200.0)
+    lognormal = LatencyDistribution(
+        distribution="lognormal", mean_ms=396.0, std_ms=60.0, min_ms=200.0
+    )
     shape = np.sqrt(np.log1p((60.0 / 196.0) ** 2))
     scale = 196.0 / np.exp(0.5 * shape**2)
     expected = scipy.stats.lognorm.ppf(0.999, shape, loc=200.0, scale=scale)

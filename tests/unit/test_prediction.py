@@ -17,9 +17,9 @@ from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.policy.observation import Kinematics
-from airl_mav.prediction.compensator import LINK_US, Compensator, Motion, flown_on, leaning
+from airl_mav.prediction.compensator import LINK_US, Compensator, MotionBatch, flown_on, leaning
 from airl_mav.prediction.memory import REMEMBERED, ExpectedLatency
-from airl_mav.prediction.reprojection import CameraPose, Reprojector, Sight
+from airl_mav.prediction.reprojection import CameraPose, PosedImage, Reprojector
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import Response, load_vehicle
@@ -53,13 +53,13 @@ def integrated(
     return np.asarray(found.y[:, -1])
 
 
-def flat(motion: Motion) -> np.ndarray:
+def flat(motion: MotionBatch) -> np.ndarray:
     """Return motions as rows (n, 8)."""
     return np.column_stack(motion)
 
 
-def motion_of(rows: np.ndarray) -> Motion:
-    return Motion(rows[:, :3], rows[:, 3:6], rows[:, 6], rows[:, 7])
+def motion_of(rows: np.ndarray) -> MotionBatch:
+    return MotionBatch(rows[:, :3], rows[:, 3:6], rows[:, 6], rows[:, 7])
 
 
 COMMANDS = np.array(
@@ -140,13 +140,13 @@ def sight(
     heading: float,
     pitch: float = 0.0,
     lens: Intrinsics = LENS,
-) -> Sight:
+) -> PosedImage:
     """Return the view of a level or slightly lowered camera 2.5 m above the ground."""
     position = np.array([north, east, -2.5])
     quaternion = quat_from_euler(0.0, pitch, heading)
     centers = arena.centers_at(0)
     depth = render(arena, centers, lens, RANGE_M, position, quaternion)
-    return Sight(depth_to_z16(depth), CameraPose(position, quat_to_matrix(quaternion)))
+    return PosedImage(depth_to_z16(depth), CameraPose(position, quat_to_matrix(quaternion)))
 
 
 REPROJECTOR = Reprojector(QUAD.camera, LENS)
@@ -161,14 +161,14 @@ def test_from_where_it_was_taken_an_image_is_as_it_is() -> None:
     assert np.array_equal(REPROJECTOR.image([seen], seen.pose), seen.depth_mm)
 
 
-def shown_by(seen: Sight, pose: CameraPose) -> np.ndarray:
+def shown_by(seen: PosedImage, pose: CameraPose) -> np.ndarray:
     """Return the pixels of a view that depend on the depths of an image.
 
     Compares two walls in the image's frame, near and far.
     """
     views = []
     for depth_mm in (1000, 9000):
-        wall = Sight(np.full_like(seen.depth_mm, depth_mm), seen.pose)
+        wall = PosedImage(np.full_like(seen.depth_mm, depth_mm), seen.pose)
         views.append(REPROJECTOR.image([wall], pose))
     return views[0] != views[1]
 
@@ -241,7 +241,7 @@ def test_the_newest_image_decides_and_older_ones_fill_what_it_did_not_see() -> N
     assert np.array_equal(both[~seen], other[~seen])
     assert 0.2 < seen.mean() < 0.8
     # Nearer depths of an older image do not occlude the newest.
-    stale = Sight(np.full_like(newest.depth_mm, 500), newest.pose)
+    stale = PosedImage(np.full_like(newest.depth_mm, 500), newest.pose)
     assert np.array_equal(REPROJECTOR.image([newest, stale], newest.pose), newest.depth_mm)
 
 

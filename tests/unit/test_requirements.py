@@ -15,7 +15,7 @@ from airl_mav.flight.requirements import (
     find,
     parse_requirement,
 )
-from airl_mav.flight.sequential import Decision
+from airl_mav.flight.sequential import RequirementDecision
 from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate, Estimate, wilson
 
 QUALITY = Aggregate(
@@ -84,23 +84,23 @@ def test_what_is_refused(text: str, hint: str) -> None:
     ("text", "decision"),
     [
         # Wilson's interval of 87 in 100: 79.0 to 92.2 %.
-        ("success >= 95 %", Decision.NOT_MET),
-        ("success >= 93 %", Decision.NOT_MET),
-        ("success >= 90 %", Decision.UNDECIDED),
-        ("success >= 80 %", Decision.UNDECIDED),
-        ("success >= 75 %", Decision.MET),
-        ("success <= 95 %", Decision.MET),
-        ("flight_time <= 8.5 s", Decision.MET),
-        ("flight_time <= 8.4 s", Decision.UNDECIDED),
-        ("flight_time <= 7.4 s", Decision.NOT_MET),
-        ("energy <= 3.6 kJ", Decision.MET),
-        ("flight_time gap <= 10 %", Decision.NOT_MET),
-        ("flight_time gap <= 50 %", Decision.MET),
-        ("success gap >= -10 points", Decision.UNDECIDED),
-        ("distance gap <= 10 %", Decision.UNDECIDED),
+        ("success >= 95 %", RequirementDecision.NOT_MET),
+        ("success >= 93 %", RequirementDecision.NOT_MET),
+        ("success >= 90 %", RequirementDecision.UNDECIDED),
+        ("success >= 80 %", RequirementDecision.UNDECIDED),
+        ("success >= 75 %", RequirementDecision.MET),
+        ("success <= 95 %", RequirementDecision.MET),
+        ("flight_time <= 8.5 s", RequirementDecision.MET),
+        ("flight_time <= 8.4 s", RequirementDecision.UNDECIDED),
+        ("flight_time <= 7.4 s", RequirementDecision.NOT_MET),
+        ("energy <= 3.6 kJ", RequirementDecision.MET),
+        ("flight_time gap <= 10 %", RequirementDecision.NOT_MET),
+        ("flight_time gap <= 50 %", RequirementDecision.MET),
+        ("success gap >= -10 points", RequirementDecision.UNDECIDED),
+        ("distance gap <= 10 %", RequirementDecision.UNDECIDED),
     ],
 )
-def test_it_is_decided_on_the_interval(text: str, decision: Decision) -> None:
+def test_it_is_decided_on_the_interval(text: str, decision: RequirementDecision) -> None:
     finding = find(parse_requirement(text), QUALITY, AGAINST)
     assert finding.decision is decision
     assert finding.sentence().startswith(decision.value)
@@ -111,12 +111,12 @@ def test_so_many_more_flights_of_that_rate_decide(rate: float) -> None:
     requirement = parse_requirement("success >= 95 %")
     quality = replace(QUALITY, success_rate=wilson(round(40 * rate), 40))
     finding = find(requirement, quality, None)
-    assert finding.decision is Decision.UNDECIDED
+    assert finding.decision is RequirementDecision.UNDECIDED
     assert finding.more_flights is not None
     n = 40 + finding.more_flights
     value = round(40 * rate) / 40
     later = replace(QUALITY, success_rate=wilson(round(value * n), n))
-    assert find(requirement, later, None).decision is not Decision.UNDECIDED
+    assert find(requirement, later, None).decision is not RequirementDecision.UNDECIDED
 
 
 def test_means_need_as_many_as_shrinks_their_interval() -> None:
@@ -128,14 +128,14 @@ def test_means_need_as_many_as_shrinks_their_interval() -> None:
 def test_at_the_threshold_no_number_would_tell() -> None:
     quality = replace(QUALITY, success_rate=wilson(95, 100))
     finding = find(parse_requirement("success >= 95 %"), quality, None)
-    assert (finding.decision, finding.more_flights) == (Decision.UNDECIDED, None)
+    assert (finding.decision, finding.more_flights) == (RequirementDecision.UNDECIDED, None)
     assert "no number of flights in reach" in finding.sentence()
 
 
 def test_nothing_flown_decides_nothing() -> None:
     quality = replace(QUALITY, success_rate=NO_ESTIMATE)
     finding = find(parse_requirement("success >= 95 %"), quality, None)
-    assert finding.decision is Decision.UNDECIDED
+    assert finding.decision is RequirementDecision.UNDECIDED
     assert "no flight" in finding.sentence()
 
 
@@ -154,5 +154,5 @@ def test_every_measure_is_a_figure_of_runs_and_of_pairs() -> None:
 def test_late_decisions_are_judged_as_a_share() -> None:
     quality = replace(QUALITY, deadline_misses=Estimate(0.02, 0.015, 0.03, 100))
     finding = find(parse_requirement("deadline_misses <= 1 %"), quality, None)
-    assert finding.decision is Decision.NOT_MET
+    assert finding.decision is RequirementDecision.NOT_MET
     assert finding.sentence().endswith("(2.0 % [1.5, 3.0], n = 100)")

@@ -72,10 +72,10 @@ def test_what_keeps_pace_with_the_wall_clock_runs_soon_after_it_was_woken() -> N
 
 
 def test_a_view_gives_way() -> None:
-    from airl_mav.view.ends import Request
+    from airl_mav.view.ends import ViewSettings
     from airl_mav.view.viewer import Viewer
 
-    request = Request(run="t", port=None, paced=False, speed=None, steerable=False,
+    request = ViewSettings(run="t", port=None, paced=False, speed=None, steerable=False,
                       compensable=False, compensated=False)  # fmt: skip
     viewer = Viewer(request)
     try:

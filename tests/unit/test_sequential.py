@@ -16,9 +16,9 @@ from scipy import stats
 from airl_mav.flight.sequential import (
     ALPHA,
     LOOKS,
-    Decision,
-    Look,
+    InterimAnalysis,
     RateTest,
+    RequirementDecision,
     error_spent,
     plan_looks,
 )
@@ -32,21 +32,21 @@ def flown(n: int, failures: int) -> list[bool]:
     return [bool(value) for value in np.diff(ends) == 0]
 
 
-def campaigns(rate: float, threshold: float) -> dict[Decision, float]:
+def campaigns(rate: float, threshold: float) -> dict[RequirementDecision, float]:
     """Simulate campaigns of at most 500 flights; return how large a share ends how."""
     rng = np.random.default_rng(7)
     left: NDArray[np.int64] = np.zeros(CAMPAIGNS, np.int64)
-    ends = dict.fromkeys(Decision, 0.0)
+    ends = dict.fromkeys(RequirementDecision, 0.0)
     before = 0
     for look in plan_looks(threshold):
         if look.flights > FLIGHTS:
             break
         left = left + rng.binomial(look.flights - before, 1.0 - rate, left.size)
         before = look.flights
-        ends[Decision.MET] += np.sum(left <= look.few) / CAMPAIGNS
-        ends[Decision.NOT_MET] += np.sum(left >= look.many) / CAMPAIGNS
+        ends[RequirementDecision.MET] += np.sum(left <= look.few) / CAMPAIGNS
+        ends[RequirementDecision.NOT_MET] += np.sum(left >= look.many) / CAMPAIGNS
         left = left[(left > look.few) & (left < look.many)]
-    ends[Decision.UNDECIDED] = left.size / CAMPAIGNS
+    ends[RequirementDecision.UNDECIDED] = left.size / CAMPAIGNS
     return ends
 
 
@@ -54,10 +54,10 @@ def campaigns(rate: float, threshold: float) -> dict[Decision, float]:
 def test_at_the_threshold_hardly_a_campaign_is_judged_falsely(threshold: float) -> None:
     ends = campaigns(threshold, threshold)
     # "meets" is true there, but just below it would not be.
-    assert ends[Decision.NOT_MET] <= 0.5 * ALPHA
-    assert ends[Decision.MET] <= 0.5 * ALPHA
+    assert ends[RequirementDecision.NOT_MET] <= 0.5 * ALPHA
+    assert ends[RequirementDecision.MET] <= 0.5 * ALPHA
     # As much of the error is used as counts of flights permit: no flights are wasted.
-    assert ends[Decision.NOT_MET] + ends[Decision.MET] > 0.5 * ALPHA
+    assert ends[RequirementDecision.NOT_MET] + ends[RequirementDecision.MET] > 0.5 * ALPHA
 
 
 def test_a_plain_interval_looked_at_as_often_would_be_false_far_more_often() -> None:
@@ -69,14 +69,14 @@ def test_a_plain_interval_looked_at_as_often_would_be_false_far_more_often() -> 
 
 
 def ends_by_brute_force(
-    looks: Sequence[Look], failure_rate: float, decision: Decision
+    looks: Sequence[InterimAnalysis], failure_rate: float, decision: RequirementDecision
 ) -> list[float]:
     """Return the probability that each look decides so: every sequence of flights, one by one."""
     found = [0.0] * len(looks)
     for failed in itertools.product((0, 1), repeat=looks[-1].flights):
         for k, look in enumerate(looks):
             first = look.decide(sum(failed[: look.flights]))
-            if first is not Decision.UNDECIDED:
+            if first is not RequirementDecision.UNDECIDED:
                 if first is decision:
                     failures = sum(failed)
                     found[k] += failure_rate**failures * (1.0 - failure_rate) ** (
@@ -95,11 +95,14 @@ def test_the_error_is_what_all_sequences_of_flights_add_up_to() -> None:
 
     looks = list(plan_looks(threshold, numbers, spent))
     assert any(look.few >= 0 for look in looks)
-    for decision, change in ((Decision.MET, (1, 0)), (Decision.NOT_MET, (0, -1))):
+    for decision, change in (
+        (RequirementDecision.MET, (1, 0)),
+        (RequirementDecision.NOT_MET, (0, -1)),
+    ):
         ends = np.cumsum(ends_by_brute_force(looks, 1.0 - threshold, decision))
         for k, look in enumerate(looks):
             assert ends[k] <= spent(look.flights) + 1e-12
-            wider = Look(look.flights, look.few + change[0], look.many + change[1])
+            wider = InterimAnalysis(look.flights, look.few + change[0], look.many + change[1])
             more = ends_by_brute_force([*looks[:k], wider], 1.0 - threshold, decision)
             assert sum(more) > spent(look.flights)
 
@@ -123,7 +126,7 @@ def test_the_error_that_may_be_spent_grows_and_has_an_end() -> None:
 
 @pytest.mark.parametrize("threshold", [0.8, 0.9, 0.95])
 def test_what_is_far_from_the_threshold_is_soon_decided(threshold: float) -> None:
-    assert campaigns(threshold - 0.15, threshold)[Decision.NOT_MET] > 0.99
+    assert campaigns(threshold - 0.15, threshold)[RequirementDecision.NOT_MET] > 0.99
     needed = RateTest(threshold).flights_needed(threshold - 0.15)
     assert needed is not None
     assert needed <= 100
@@ -131,13 +134,13 @@ def test_what_is_far_from_the_threshold_is_soon_decided(threshold: float) -> Non
 
 def test_the_first_look_that_decides_is_the_verdict() -> None:
     test = RateTest(0.95)
-    assert test.decide([False] * 20) is Decision.NOT_MET
+    assert test.decide([False] * 20) is RequirementDecision.NOT_MET
     # Flights for another requirement do not revoke the verdict.
-    assert test.decide([False] * 20 + [True] * 980) is Decision.NOT_MET
-    assert test.decide([True] * 1000) is Decision.MET
+    assert test.decide([False] * 20 + [True] * 980) is RequirementDecision.NOT_MET
+    assert test.decide([True] * 1000) is RequirementDecision.MET
     # Only the planned looks count: nineteen failures have not been looked at.
-    assert test.decide([False] * 19) is Decision.UNDECIDED
-    assert test.decide([]) is Decision.UNDECIDED
+    assert test.decide([False] * 19) is RequirementDecision.UNDECIDED
+    assert test.decide([]) is RequirementDecision.UNDECIDED
 
 
 @pytest.mark.parametrize("rate", [0.6, 0.87, 0.93, 0.97, 1.0])
@@ -146,9 +149,9 @@ def test_so_many_flights_of_that_rate_decide(rate: float) -> None:
     needed = test.flights_needed(rate)
     assert needed is not None
     before = max([look for look in LOOKS if look < needed], default=0)
-    expected = Decision.MET if rate > 0.95 else Decision.NOT_MET
+    expected = RequirementDecision.MET if rate > 0.95 else RequirementDecision.NOT_MET
     assert test.decide(flown(needed, round((1.0 - rate) * needed))) is expected
-    assert test.decide(flown(before, round((1.0 - rate) * before))) is Decision.UNDECIDED
+    assert test.decide(flown(before, round((1.0 - rate) * before))) is RequirementDecision.UNDECIDED
     # Only looks after the flights already flown count.
     later = test.flights_needed(rate, needed)
     assert later is not None

@@ -10,7 +10,7 @@ import pytest
 from airl_mav.core.clock import SimClock
 from airl_mav.core.machine import MachineState, throttled_since
 from airl_mav.profiling.request import ProfileRequest
-from airl_mav.profiling.soak import Reading, Soak, soak
+from airl_mav.profiling.soak import MachineReading, Soak, soak
 
 
 @dataclass
@@ -30,13 +30,13 @@ class Computer:
         self.clock.advance(took_us if start_us < self.warm_us else took_us * 3 // 2)
         return start_us, self.clock.time_us()
 
-    def read(self) -> Reading:
+    def read(self) -> MachineReading:
         now_us = self.clock.time_us()
         self.clock.advance(300)  # Looking takes time, which no decision is charged with.
         if not self.tells:
-            return Reading(None, None, None)
+            return MachineReading(None, None, None)
         warm = now_us > self.warm_us
-        return Reading(1200.0 if warm else 1500.0, 40.0 + now_us / 10e6, 6.0)
+        return MachineReading(1200.0 if warm else 1500.0, 40.0 + now_us / 10e6, 6.0)
 
     def state(self) -> MachineState:
         warm = self.clock.time_us() > self.warm_us

@@ -35,14 +35,14 @@ from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.view.feed import QUEUED, Asked, Ends, Feed
 from airl_mav.view.messages import (
+    CameraImage,
     Decided,
     Episode,
     Flight,
-    Picture,
     Said,
     Steering,
-    Vehicle,
     VehicleShape,
+    VehicleState,
     from_parts,
     to_parts,
 )
@@ -78,8 +78,8 @@ def episode(arena: Arena | None = None, vehicle: str = "quad") -> Episode:
     return Episode(seed=3, started_us=START_US, arena=arena or some_arena(), **known)
 
 
-def vehicle(seconds: float, north: float = 0.0, mode: str = "offboard") -> Vehicle:
-    return Vehicle(
+def vehicle(seconds: float, north: float = 0.0, mode: str = "offboard") -> VehicleState:
+    return VehicleState(
         time_us=START_US + round(1e6 * seconds),
         position=(north, 1.0, -2.5),
         velocity=(3.0, 0.0, 0.0),
@@ -156,7 +156,7 @@ def test_an_arena_is_the_same_on_the_other_side() -> None:
 
 
 def test_an_image_travels_with_its_message() -> None:
-    read = from_parts(to_parts(Picture(captured_us=5, shape=(3, 4)), DEPTH_MM))
+    read = from_parts(to_parts(CameraImage(captured_us=5, shape=(3, 4)), DEPTH_MM))
     assert read is not None
     np.testing.assert_array_equal(read[1], DEPTH_MM)
 
@@ -167,9 +167,9 @@ def test_an_image_travels_with_its_message() -> None:
         [],
         [b"nonsense"],
         [b'{"kind": "vehicle"}'],
-        to_parts(Picture(captured_us=5, shape=(3, 4))),
-        to_parts(Picture(captured_us=5, shape=(4, 4)), DEPTH_MM),
-        to_parts(Picture(captured_us=5, shape=(0, 4)), DEPTH_MM[:0]),
+        to_parts(CameraImage(captured_us=5, shape=(3, 4))),
+        to_parts(CameraImage(captured_us=5, shape=(4, 4)), DEPTH_MM),
+        to_parts(CameraImage(captured_us=5, shape=(0, 4)), DEPTH_MM[:0]),
     ],
 )
 def test_what_is_no_message_is_passed_over(parts: list[bytes]) -> None:
@@ -182,7 +182,7 @@ def test_a_view_that_is_gone_holds_nobody_up(ends: Ends) -> None:
     (first,) = ends.take(10.0)
     assert first == (Flight(index=0, seed=1, goal=(1.0, 2.0)), None)
     for _ in range(100 * QUEUED):  # Without a receiver, messages beyond the queue are dropped.
-        feed.send(Picture(captured_us=5, shape=(3, 4)), DEPTH_MM)
+        feed.send(CameraImage(captured_us=5, shape=(3, 4)), DEPTH_MM)
     feed.close()
 
 
@@ -483,7 +483,7 @@ def test_an_image_of_all_sides_hangs_unrolled_above_the_vehicle() -> None:
         scene, shown = FlightScene(server), Shown()
         shown.take(episode(vehicle="quad-panorama"), None)
         shown.take(vehicle(0.0), None)
-        shown.take(Picture(captured_us=5, shape=(3, 4)), DEPTH_MM)
+        shown.take(CameraImage(captured_us=5, shape=(3, 4)), DEPTH_MM)
         scene.draw(shown, picture=True)
         drawn = server.scene.get_handle_by_name("/flight/vehicle/camera")
         assert drawn.image.shape[:2] != (1, 1)
@@ -508,7 +508,7 @@ def test_the_scene_holds_arena_vehicle_and_trail() -> None:
         for step in range(2 * CHUNK + 50):
             shown.take(vehicle(0.04 * step, north=0.1 * step), None)
         shown.take(decided(2.0, t2_ms=150.0), DEPTH_MM)
-        shown.take(Picture(captured_us=5, shape=(3, 4)), DEPTH_MM)
+        shown.take(CameraImage(captured_us=5, shape=(3, 4)), DEPTH_MM)
         scene.draw(shown, picture=True)
         last = 0.1 * (2 * CHUNK + 49)
         np.testing.assert_allclose(node("/vehicle").position, (last, 1.0, -2.5))

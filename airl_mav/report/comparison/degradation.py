@@ -20,13 +20,13 @@ from airl_mav.report.comparison.documents import comparison_document
 from airl_mav.report.comparison.model import Comparison, Contrast, ContrastEntry, RunEntry
 from airl_mav.report.comparison.tables import common_rules, contrasts_table, plain_facts, signed
 from airl_mav.report.document import Document, Section
-from airl_mav.report.measures import DISTANCE, ENERGY, FLIGHT_TIME, MEASURES, Measure
+from airl_mav.report.measures import DISTANCE, ENERGY, FLIGHT_TIME, MEASURES, QualityMeasure
 from airl_mav.report.table import Column, TableView, ms
-from airl_mav.report.theme import Picture
+from airl_mav.report.theme import FigureImage
 
 
 @dataclass(frozen=True)
-class Series:
+class FigureLine:
     """Line of a figure."""
 
     name: str
@@ -38,9 +38,9 @@ def curves_picture(
     name: str,
     title: str,
     labels: tuple[str, str],
-    series: Sequence[Series],
+    series: Sequence[FigureLine],
     paper: Sequence[tuple[float, float]] = (),
-) -> theme.Picture:
+) -> theme.FigureImage:
     """Draw series with their known intervals and the paper's points over a common axis."""
     figure = theme.new_figure(4.2, 3.0 + 0.2 * (len(series) + bool(paper)))
     ax: Axes = figure.subplots()
@@ -132,7 +132,7 @@ def _success_trend(steps: Sequence[Contrast]) -> str:
     return "never rises"
 
 
-def _monotone(measure: Measure, steps: Sequence[Contrast]) -> str:
+def _monotone(measure: QualityMeasure, steps: Sequence[Contrast]) -> str:
     changes = [(step.entry.title, measure.change(step.paired).difference) for step in steps]
     known = [(title, d) for title, d in changes if d.value is not None and d.n >= FEWEST]
     if not known:
@@ -202,11 +202,11 @@ def _published_losses(number: int) -> tuple[float, ...]:
     return gap.flight_time_percent, gap.distance_percent, gap.energy_percent
 
 
-def curve_pictures(comparison: Comparison) -> list[Picture]:
+def curve_pictures(comparison: Comparison) -> list[FigureImage]:
     """Draw success rate and losses of time, distance and energy over the mean t2."""
     at_ms = {run.name: (run.stages["t2"].mean or 0.0) / US_PER_MS for run in comparison.runs}
     success = [
-        Series(
+        FigureLine(
             policy,
             [
                 (at_ms[run.name], run.quality.success_rate.scaled(100.0))
@@ -219,7 +219,7 @@ def curve_pictures(comparison: Comparison) -> list[Picture]:
     pictures = [curves_picture("degradation-success", "success rate", (axis, "%"), success)]
     for number, measure in enumerate(LOSSES):
         losses = [
-            Series(
+            FigureLine(
                 policy,
                 [
                     (at_ms[comparison.group(policy)[0].name], Estimate(0.0, None, None, 0)),

@@ -21,7 +21,7 @@ from airl_mav.report.arenas import arena_of
 from airl_mav.report.comparison.build import samples_of, tests_of
 from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast
 from airl_mav.report.comparison.tables import contrast_head, published_change
-from airl_mav.report.flights_above import Panel, path_points
+from airl_mav.report.flights_above import RunFlights, path_points
 from airl_mav.report.measures import COMPUTER_ENERGY, DISTANCE, ENERGY, MEASURES, rate_digits
 from airl_mav.report.run_figures import LONG_TAIL, OUTCOME_MARKERS
 from airl_mav.report.table import NONE, OUTCOME_LABELS
@@ -46,7 +46,7 @@ def contrast_pictures(
     contrasts: Sequence[Contrast],
     *,
     medians: bool = False,
-) -> list[theme.Picture]:
+) -> list[theme.FigureImage]:
     """Draw contrasts with intervals and published values, one picture per measure."""
     names = [contrast_head(comparison, each) for each in contrasts]
     pictures = []
@@ -113,7 +113,7 @@ def _finish_rows(ax: Axes, names: Sequence[str], ends: Sequence[float]) -> None:
 # --- latency
 
 
-def latency_pictures(comparison: Comparison, runs: Runs) -> list[theme.Picture]:
+def latency_pictures(comparison: Comparison, runs: Runs) -> list[theme.FigureImage]:
     """Draw the cumulative distributions of all runs, one picture per stage with samples."""
     pooled = {name: samples_of(run) for name, run in runs.items()}
     pictures = []
@@ -163,7 +163,7 @@ def cumulated(samples: Samples) -> tuple[NDArray[np.float64], NDArray[np.float64
 # --- energy
 
 
-def energy_picture(comparison: Comparison) -> theme.Picture:
+def energy_picture(comparison: Comparison) -> theme.FigureImage:
     """Draw the mean energy of a successful flight, split into airframe and computer."""
     runs = [run for run in comparison.runs if run.quality.energy_j.value is not None]
     figure = theme.new_figure(6.4, 1.3 + 0.55 * len(runs))
@@ -208,7 +208,7 @@ def energy_picture(comparison: Comparison) -> theme.Picture:
 
 def flight_panels(
     compared: Sequence[ComparedRun], runs: Runs, most: int | None = None
-) -> list[Panel]:
+) -> list[RunFlights]:
     """Return map panels with the first `most` flights of each run; None = all flights."""
     panels = []
     for figures in compared:
@@ -225,13 +225,13 @@ def flight_panels(
             told = f"{path.value:.1f} m" if path.value is not None else NONE
             detail = f"{success} of {rate.n:,} reached the goal, mean {DISTANCE.title} {told}"
         arena = arena_of(run, tests[0])
-        panels.append(Panel(figures.heading, detail, tests, run.trajectories, arena))
+        panels.append(RunFlights(figures.heading, detail, tests, run.trajectories, arena))
     return panels
 
 
 def seed_picture(
     name: str, compared: Sequence[ComparedRun], runs: Runs, seed: int
-) -> theme.Picture:
+) -> theme.FigureImage:
     """Draw a map of several runs' flights of a seed."""
     figure = theme.new_figure(4.2, 4.6)
     ax: Axes = figure.subplots()

@@ -13,7 +13,7 @@ from airl_mav.report.comparison.model import ComparedRun, Comparison, RunEntry
 from airl_mav.report.comparison.tables import plain_facts
 from airl_mav.report.document import Document, Section
 from airl_mav.report.heatmap import Field, HeatMap, heat_picture
-from airl_mav.report.measures import MEASURES, SUCCESS_RATE, Measure
+from airl_mav.report.measures import MEASURES, SUCCESS_RATE, QualityMeasure
 from airl_mav.report.table import NONE, Column, TableView
 
 
@@ -45,7 +45,7 @@ def matrix_tables(runs: Sequence[ComparedRun]) -> list[TableView]:
     return views
 
 
-def _cell(run: ComparedRun | None, measure: Measure) -> str:
+def _cell(run: ComparedRun | None, measure: QualityMeasure) -> str:
     if run is None:
         return NONE
     text = measure.with_interval(run.quality)
@@ -57,7 +57,7 @@ def trained_here(run: ComparedRun) -> bool:
     return run.entry.group == run.entry.trained_in
 
 
-def _notes(runs: Sequence[ComparedRun], measure: Measure) -> tuple[str, ...]:
+def _notes(runs: Sequence[ComparedRun], measure: QualityMeasure) -> tuple[str, ...]:
     if measure is not SUCCESS_RATE:
         return ("Means over the flights that reached the goal, 95 % bootstrap intervals.",)
     notes = ["Of all flights; 95 % intervals after Wilson. The same seeds in every cell."]

@@ -15,7 +15,7 @@ from airl_mav.report.measures import (
     CONDUCT,
     FEW_FLIGHTS,
     MEASURES,
-    Measure,
+    QualityMeasure,
     count_successes,
     interval_of,
     with_interval,
@@ -40,7 +40,7 @@ _PUBLISHED = {
 _NARROW = "Bootstrap intervals of fewer than {} {} are too narrow."
 
 
-def published_value(run: ComparedRun, measure: Measure) -> float | None:
+def published_value(run: ComparedRun, measure: QualityMeasure) -> float | None:
     """Return the published value of a measure in the displayed unit."""
     if run.published is None or measure.key not in _PUBLISHED:
         return None
@@ -48,7 +48,7 @@ def published_value(run: ComparedRun, measure: Measure) -> float | None:
     return value
 
 
-def published_change(contrast: Contrast, measure: Measure) -> float | None:
+def published_change(contrast: Contrast, measure: QualityMeasure) -> float | None:
     """Return the published difference of a measure."""
     if contrast.published is None or measure.key not in _PUBLISHED:
         return None
@@ -83,7 +83,7 @@ def runs_table(
     *,
     title: str = "Quality of flight",
     head: str = "run",
-    measures: Sequence[Measure] = (*MEASURES, COMPUTER_ENERGY),
+    measures: Sequence[QualityMeasure] = (*MEASURES, COMPUTER_ENERGY),
 ) -> table.TableView:
     """Return the results of each run, one per row."""
     columns = (
@@ -177,7 +177,7 @@ def stages_table(runs: Sequence[ComparedRun]) -> table.TableView:
 
 
 def contrast_table(
-    comparison: Comparison, contrast: Contrast, measures: Sequence[Measure] = MEASURES
+    comparison: Comparison, contrast: Contrast, measures: Sequence[QualityMeasure] = MEASURES
 ) -> table.TableView:
     """Return a contrast with one row per measure."""
     target, reference = comparison.pair(contrast)
@@ -214,7 +214,7 @@ def contrast_table(
 
 
 def _contrast_row(
-    contrast: Contrast, measure: Measure, reference: ComparedRun, target: ComparedRun
+    contrast: Contrast, measure: QualityMeasure, reference: ComparedRun, target: ComparedRun
 ) -> tuple[str, ...]:
     change = measure.change(contrast.paired)
     d = change.difference

@@ -167,7 +167,7 @@ def velocity_scene(
 
 
 def vehicle_scene(
-    shape: VehicleShape, frame: str, look: style.Look, at: messages.Timestamp
+    shape: VehicleShape, frame: str, look: style.FlightColours, at: messages.Timestamp
 ) -> messages.SceneUpdate:
     """Return a vehicle built from primitives that move with its frame."""
     forward, right = shape.arm_forward_m, shape.arm_right_m

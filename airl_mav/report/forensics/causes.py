@@ -39,7 +39,7 @@ _THING = re.compile(r"hit (?:(?:static|moving)-)?([a-z]+(?:-[a-z]+)*(?:[- ](\d+)
 
 
 @dataclass(frozen=True)
-class Collision:
+class CollisionAnalysis:
     """Analysis of a collision."""
 
     what: str
@@ -88,7 +88,7 @@ def hit_number(reason: str, arena: Arena | None) -> int | None:
     return number if number < len(arena.obstacles) else None
 
 
-def examine_collision(flight: evidence.Evidence) -> Collision | None:
+def examine_collision(flight: evidence.Evidence) -> CollisionAnalysis | None:
     """Return the analysis of a collision; None without a collision or a recording."""
     record, path, stamps, arena = flight.record, flight.path, flight.stamps, flight.arena
     if record.outcome is not Outcome.COLLISION or not len(path):
@@ -126,7 +126,7 @@ def examine_collision(flight: evidence.Evidence) -> Collision | None:
                 seen = tuple((v.share or 0.0) >= SEEN_SHARE for v in views)
             elif "wall" in record.reason:
                 view = view_wall(path, frame_us, hit_us, arena)
-    return Collision(
+    return CollisionAnalysis(
         what=record.reason.removeprefix("hit ").removesuffix(" during the take-off"),
         speed_m_s=float(np.linalg.norm(velocity)),
         off_heading_rad=bearing(quaternion, velocity) if math.hypot(*velocity[:2]) > 0.2 else 0.0,
@@ -179,7 +179,7 @@ def _slow(record: EpisodeRecord, usual: evidence.UsualFlight) -> bool:
     return slow or excess + 1.0 > (1.0 + SLOW_EXCESS) * usual.path_ratio
 
 
-def _cause_of_collision(flight: evidence.Evidence, crash: Collision) -> evidence.Cause:
+def _cause_of_collision(flight: evidence.Evidence, crash: CollisionAnalysis) -> evidence.Cause:
     if flight.record.navigation_us is None or flight.record.reason.endswith("take-off"):
         return evidence.Cause("hit during the take-off", (f"At {crash.speed_m_s:.1f} m/s.",))
     if crash.before_s is None or crash.blind_m is None:
@@ -219,7 +219,9 @@ def _cause_of_collision(flight: evidence.Evidence, crash: Collision) -> evidence
     return evidence.Cause(kind, tuple(sentences))
 
 
-def _seen(crash: Collision, view: ObstacleView, braking_m: Callable[[float], float] | None) -> str:
+def _seen(
+    crash: CollisionAnalysis, view: ObstacleView, braking_m: Callable[[float], float] | None
+) -> str:
     """Return the cause for a visible obstacle, by the time to act and the distance to stop."""
     if crash.lag_m is None or crash.lag_s is None or crash.before_s is None:
         return "seen and flown into"
@@ -232,7 +234,7 @@ def _seen(crash: Collision, view: ObstacleView, braking_m: Callable[[float], flo
     return "seen and flown into" if stops else "seen too late to stop"
 
 
-def _where(crash: Collision, camera: PolicyCamera | None) -> str:
+def _where(crash: CollisionAnalysis, camera: PolicyCamera | None) -> str:
     """Return a sentence on the obstacle's position in the last effective frame."""
     view = crash.view
     if view is None or camera is None:

@@ -132,7 +132,7 @@ class ReplayedFlight:
         x, y, z = position.tolist()
         vx, vy, vz = velocity.tolist()
         q0, q1, q2, q3 = quaternion.tolist()
-        shown.vehicle = messages.Vehicle(
+        shown.vehicle = messages.VehicleState(
             time_us=time_us,
             position=(x, y, z),
             velocity=(vx, vy, vz),

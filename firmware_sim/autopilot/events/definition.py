@@ -58,7 +58,7 @@ class Argument(NamedTuple):
     name: str
 
 
-class Event(NamedTuple):
+class MavlinkEvent(NamedTuple):
     """Event instance in wire format."""
 
     number: int
@@ -88,7 +88,7 @@ class Definition(NamedTuple):
         """MAVLink id of the event."""
         return _AUTOPILOT << 24 | sub_id(self.name)
 
-    def event(self, *values: float, level: Level | None = None) -> Event:
+    def event(self, *values: float, level: Level | None = None) -> MavlinkEvent:
         """Return an event of this type; `level` overrides its levels.
 
         Values outside the range of an argument are clipped, so that a home 3e38 m high causes no
@@ -99,7 +99,7 @@ class Definition(NamedTuple):
         formats = [_format(argument.kind) for argument in self.arguments]
         fitted = [_fitted(value, of) for value, of in zip(values, formats, strict=False)]
         packed = struct.pack("<" + "".join(formats), *fitted, *values[len(formats) :])
-        return Event(self.number, internal << 4 | external, packed)
+        return MavlinkEvent(self.number, internal << 4 | external, packed)
 
 
 def sub_id(name: str) -> int:

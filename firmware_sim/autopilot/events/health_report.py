@@ -13,11 +13,11 @@ from typing import NamedTuple
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.events.check_events import ARMING_SUMMARY, HEALTH_SUMMARY
-from firmware_sim.autopilot.events.definition import Event, Level
+from firmware_sim.autopilot.events.definition import Level, MavlinkEvent
 from firmware_sim.autopilot.events.enumerations import Component
 from firmware_sim.autopilot.failsafes.conditions import NEEDS, Need, lacking
 from firmware_sim.autopilot.mode_numbers import STATE_BITS
-from firmware_sim.autopilot.prearm import CHECKS, Check
+from firmware_sim.autopilot.prearm import CHECKS, PrearmCheck
 from firmware_sim.autopilot.readiness import SUPPLY_CHECK_OFF, Readiness
 
 ALL_MODES = 0xFFFFFFFF
@@ -39,7 +39,7 @@ class HealthReport(NamedTuple):
     """Bits of the modes that permit arming."""
     can_run: int
     """Bits of the modes available in flight."""
-    checks: tuple[Event, ...]
+    checks: tuple[MavlinkEvent, ...]
     """Events of the failing checks."""
     arming_error: int = 0
     """Bits of `Component`, like the four fields below."""
@@ -48,7 +48,7 @@ class HealthReport(NamedTuple):
     health_error: int = 0
     health_warning: int = 0
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[MavlinkEvent, ...]:
         """Return the events of the report in order."""
         whole = 0
         return (
@@ -64,7 +64,7 @@ class HealthReport(NamedTuple):
 def health_report(readiness: Readiness) -> HealthReport:
     """Return the findings of the checks for all modes."""
     in_modes = {mode: readiness._replace(mode=mode) for mode in Mode}
-    told: list[Event] = []
+    told: list[MavlinkEvent] = []
     blocked = arming_error = arming_warning = health_error = health_warning = 0
     for check in CHECKS:
         modes = _blocked_modes(check, readiness, in_modes)
@@ -96,7 +96,7 @@ def health_report(readiness: Readiness) -> HealthReport:
 
 
 def _blocked_modes(
-    check: Check, readiness: Readiness, in_modes: dict[Mode, Readiness]
+    check: PrearmCheck, readiness: Readiness, in_modes: dict[Mode, Readiness]
 ) -> int | None:
     """Return the modes in which a check prevents arming; None = passed."""
     if check.of_present_mode and not check.fails(readiness):
@@ -146,7 +146,7 @@ def _present(r: Readiness) -> int:
 class HealthReporter:
     """Sender of health reports, on change and on demand."""
 
-    def __init__(self, tell: Callable[[Event], None]) -> None:
+    def __init__(self, tell: Callable[[MavlinkEvent], None]) -> None:
         """Store the callback that sends an event."""
         self._tell = tell
         self._seen: Readiness | None = None

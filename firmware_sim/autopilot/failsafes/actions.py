@@ -9,7 +9,7 @@ from enum import Enum, IntEnum, auto
 from typing import NamedTuple
 
 
-class Action(IntEnum):
+class FailsafeAction(IntEnum):
     """Action of a failsafe. The highest of several takes effect."""
 
     NONE = 0
@@ -49,7 +49,7 @@ class Takeover(IntEnum):
     NEVER = 3
 
 
-class Cause(Enum):
+class FailsafeReason(Enum):
     """Cause in operator texts."""
 
     GENERIC = auto()
@@ -64,7 +64,7 @@ class Cause(Enum):
 class Options(NamedTuple):
     """Response of a failsafe to its condition."""
 
-    action: Action
+    action: FailsafeAction
     clear: Clear = Clear.WITH_CONDITION
     takeover: Takeover = Takeover.AUTO
-    cause: Cause = Cause.GENERIC
+    cause: FailsafeReason = FailsafeReason.GENERIC

@@ -15,7 +15,7 @@ LONGEST_S = 1e6
 """Limit of every value, so that times in microseconds do not overflow [s]."""
 
 
-class Settings(NamedTuple):
+class FailsafeSettings(NamedTuple):
     """Failsafe parameters: the field name in capitals; defaults are PX4's.
 
     PX4's simulated airframe sets COM_LOW_BAT_ACT to 3 and COM_RC_IN_MODE to 1.
@@ -40,7 +40,7 @@ class Settings(NamedTuple):
     nav_rcl_act: int = 2
 
     @classmethod
-    def read(cls, value: Callable[[str], float]) -> Settings:
+    def read(cls, value: Callable[[str], float]) -> FailsafeSettings:
         """Read the parameters with a look-up by PX4 name, clipped to `LONGEST_S`."""
         defaults = cls._field_defaults.values()
         return cls(

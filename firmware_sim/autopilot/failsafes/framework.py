@@ -10,13 +10,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Message, Mode
-from firmware_sim.autopilot.failsafes.actions import Action, Cause, Clear, Options, Takeover
+from firmware_sim.autopilot.autopilot_state import Mode, OperatorText
+from firmware_sim.autopilot.failsafes.actions import (
+    Clear,
+    FailsafeAction,
+    FailsafeReason,
+    Options,
+    Takeover,
+)
 from firmware_sim.autopilot.failsafes.announcement import announcement
 from firmware_sim.autopilot.failsafes.conditions import (
     BatteryWarning,
     Conditions,
-    Settings,
+    FailsafeSettings,
     can_run,
 )
 from firmware_sim.autopilot.failsafes.table import (
@@ -29,7 +35,7 @@ from firmware_sim.autopilot.failsafes.table import (
 )
 
 
-class Vehicle(NamedTuple):
+class FailsafeInput(NamedTuple):
     """Flight state used by the failsafes."""
 
     armed: bool
@@ -62,7 +68,7 @@ class FailsafeState(NamedTuple):
     """State of the failsafe framework."""
 
     held: tuple[Held, ...] = ()
-    action: Action = Action.NONE
+    action: FailsafeAction = FailsafeAction.NONE
     """Active action."""
     taken_over: bool = False
     """The user continues to fly despite the failsafe."""
@@ -81,10 +87,10 @@ class FailsafeState(NamedTuple):
     @property
     def active(self) -> bool:
         """True if a failsafe determines the mode."""
-        return self.action > Action.WARN
+        return self.action > FailsafeAction.WARN
 
 
-class Outcome(NamedTuple):
+class FailsafeResult(NamedTuple):
     """Result of an update."""
 
     state: FailsafeState
@@ -92,31 +98,31 @@ class Outcome(NamedTuple):
     """Active mode."""
     intended: Mode
     """Mode intended by the user; the sticks may have changed it."""
-    text: Message | None
+    text: OperatorText | None
     """New message for the operator; None = no change."""
-    delayed: Action = Action.NONE
+    delayed: FailsafeAction = FailsafeAction.NONE
     """Action after the delay in Hold."""
-    cause: Cause = Cause.GENERIC
+    cause: FailsafeReason = FailsafeReason.GENERIC
 
 
 class _Choice(NamedTuple):
     """Selected action with its attributes."""
 
-    action: Action
+    action: FailsafeAction
     intended: Mode
-    delayed: Action = Action.NONE
-    cause: Cause = Cause.GENERIC
+    delayed: FailsafeAction = FailsafeAction.NONE
+    cause: FailsafeReason = FailsafeReason.GENERIC
     taken_over: bool = False
 
 
 def update(
     state: FailsafeState,
     time_us: int,
-    vehicle: Vehicle,
+    vehicle: FailsafeInput,
     conditions: Conditions,
-    settings: Settings,
+    settings: FailsafeSettings,
     intervention: Intervention = NO_INTERVENTION,
-) -> Outcome:
+) -> FailsafeResult:
     """Return the active mode and action.
 
     Args:
@@ -137,12 +143,12 @@ def update(
     if chosen or state.taken_over:
         state = state._replace(held=_released(state.held))
     state, warned = _hold(state, time_us, vehicle, conditions, settings)
-    if state.action > Action.HOLD or state.taken_over or not can_run(Mode.HOLD, conditions):
+    if state.action > FailsafeAction.HOLD or state.taken_over or not can_run(Mode.HOLD, conditions):
         state = state._replace(delay_us=0)
     intervention = intervention._replace(mode_chosen=chosen)
     choice = _select(state, vehicle, conditions, settings, intervention)
     text = None
-    if choice.action > state.action or (choice.action is not Action.NONE and warned):
+    if choice.action > state.action or (choice.action is not FailsafeAction.NONE and warned):
         text = announcement(
             choice.action, choice.delayed, choice.cause, vehicle.intended, state.delay_us
         )
@@ -158,11 +164,15 @@ def update(
         start_delay_us=_start_delay(state, settings, elapsed_us, choice.delayed),
     )
     mode = mode_of(choice.action, intended)
-    return Outcome(state, mode, intended, text, choice.delayed, choice.cause)
+    return FailsafeResult(state, mode, intended, text, choice.delayed, choice.cause)
 
 
 def _begin(
-    state: FailsafeState, time_us: int, elapsed_us: int, vehicle: Vehicle, conditions: Conditions
+    state: FailsafeState,
+    time_us: int,
+    elapsed_us: int,
+    vehicle: FailsafeInput,
+    conditions: Conditions,
 ) -> FailsafeState:
     """Advance the delays, and store the failures present at arming."""
     state = state._replace(delay_us=max(0, state.delay_us - elapsed_us))
@@ -189,9 +199,9 @@ def _released(held: tuple[Held, ...]) -> tuple[Held, ...]:
 def _hold(
     state: FailsafeState,
     time_us: int,
-    vehicle: Vehicle,
+    vehicle: FailsafeInput,
     conditions: Conditions,
-    settings: Settings,
+    settings: FailsafeSettings,
 ) -> tuple[FailsafeState, bool]:
     """Add new failures, drop cleared ones; return also whether a warning is new."""
     situation = Situation(
@@ -218,28 +228,28 @@ def _hold(
     delay_us = state.delay_us
     for trigger, options in failing.items():
         if options.takeover is Takeover.AUTO:
-            if waits and options.action is not Action.WARN and delay_us == 0:
+            if waits and options.action is not FailsafeAction.WARN and delay_us == 0:
                 delay_us = _next_delay(state, settings)
             takeover = Takeover.ALWAYS if waits else Takeover.MODE_SWITCH
             options = options._replace(takeover=takeover)
         held.append(Held(trigger, options, True))
-        warned = warned or options.action is Action.WARN
-        if options.action >= Action.HOLD:
+        warned = warned or options.action is FailsafeAction.WARN
+        if options.action >= FailsafeAction.HOLD:
             state = state._replace(taken_over=False)
     return state._replace(held=tuple(held), delay_us=delay_us), warned
 
 
-def _next_delay(state: FailsafeState, settings: Settings) -> int:
+def _next_delay(state: FailsafeState, settings: FailsafeSettings) -> int:
     full_us = round(settings.com_fail_act_t * US_PER_S)
     return full_us if state.start_delay_us is None else min(full_us, state.start_delay_us)
 
 
 def _start_delay(
-    state: FailsafeState, settings: Settings, elapsed_us: int, delayed: Action
+    state: FailsafeState, settings: FailsafeSettings, elapsed_us: int, delayed: FailsafeAction
 ) -> int | None:
     """Return the duration of the next delay: an intermittent condition shortens it."""
     left = _next_delay(state, settings)
-    if delayed is not Action.NONE:
+    if delayed is not FailsafeAction.NONE:
         return max(0, left - elapsed_us)
     left += elapsed_us // 4
     return None if left >= settings.com_fail_act_t * US_PER_S else left
@@ -247,59 +257,63 @@ def _start_delay(
 
 def _select(
     state: FailsafeState,
-    vehicle: Vehicle,
+    vehicle: FailsafeInput,
     conditions: Conditions,
-    settings: Settings,
+    settings: FailsafeSettings,
     intervention: Intervention,
 ) -> _Choice:
-    if state.action is Action.TERMINATE:
-        return _Choice(Action.TERMINATE, vehicle.intended)
+    if state.action is FailsafeAction.TERMINATE:
+        return _Choice(FailsafeAction.TERMINATE, vehicle.intended)
     if not vehicle.armed:
-        return _Choice(Action.NONE, vehicle.intended)
-    worst = Options(Action.NONE, takeover=Takeover.ALWAYS)
+        return _Choice(FailsafeAction.NONE, vehicle.intended)
+    worst = Options(FailsafeAction.NONE, takeover=Takeover.ALWAYS)
     strictest = Takeover.ALWAYS
     for item in state.held:
         strictest = max(strictest, item.options.takeover)
         if item.options.action > worst.action:
             worst = item.options
     action, cause, intended = worst.action, worst.cause, vehicle.intended
-    delayed = Action.NONE
+    delayed = FailsafeAction.NONE
     if (
         state.delay_us > 0
         and not state.taken_over
         and strictest <= Takeover.MODE_SWITCH
-        and action not in (Action.DISARM, Action.TERMINATE, Action.HOLD)
+        and action not in (FailsafeAction.DISARM, FailsafeAction.TERMINATE, FailsafeAction.HOLD)
     ):
-        delayed, action, strictest = action, Action.HOLD, Takeover.MODE_SWITCH
+        delayed, action, strictest = action, FailsafeAction.HOLD, Takeover.MODE_SWITCH
     # A mode switch in the update that starts the action does not end the action.
     by_mode = intervention.mode_chosen and state.action is action
     wanted = state.taken_over or by_mode
     if strictest is Takeover.ALWAYS:
         wanted = wanted or intervention.sticks_moved
     taken_over = False
-    if Action.HOLD <= action <= Action.DESCEND and strictest < Takeover.AUTO and wanted:
+    if (
+        FailsafeAction.HOLD <= action <= FailsafeAction.DESCEND
+        and strictest < Takeover.AUTO
+        and wanted
+    ):
         if not state.taken_over and intervention.sticks_moved:
             intended = Mode.POSITION
-        action, taken_over, delayed = Action.WARN, True, Action.NONE
+        action, taken_over, delayed = FailsafeAction.WARN, True, FailsafeAction.NONE
         action = max(action, mode_fallback(conditions, settings, intended))
     possible_now = possible(action, conditions)
     if possible_now is not action:
-        action, cause = possible_now, Cause.GENERIC
+        action, cause = possible_now, FailsafeReason.GENERIC
     if _already_on_the_way(intended, action, delayed, conditions):
-        action, delayed = Action.WARN, Action.NONE
+        action, delayed = FailsafeAction.WARN, FailsafeAction.NONE
     return _Choice(action, intended, delayed, cause, taken_over)
 
 
 def _already_on_the_way(
-    intended: Mode, action: Action, delayed: Action, conditions: Conditions
+    intended: Mode, action: FailsafeAction, delayed: FailsafeAction, conditions: Conditions
 ) -> bool:
     """Return whether Return is redundant as the vehicle already lands or returns.
 
     A precision landing also continues instead of an ordinary landing.
     """
-    needless = {Action.RETURN}
+    needless = {FailsafeAction.RETURN}
     if intended is Mode.PRECISION_LAND:
-        needless.add(Action.LAND)
+        needless.add(FailsafeAction.LAND)
     return (
         intended in (Mode.LAND, Mode.RETURN, Mode.PRECISION_LAND)
         and (action in needless or delayed in needless)

@@ -7,22 +7,22 @@ from collections.abc import Iterable, Sequence
 from airl_mav.profiles.parameters import SPEC_BY_NAME
 from firmware_sim.autopilot import prearm
 from firmware_sim.autopilot.autopilot_state import MODE_NAMES, Mode
-from firmware_sim.autopilot.failsafes.actions import Action, Clear, Options, Takeover
+from firmware_sim.autopilot.failsafes.actions import Clear, FailsafeAction, Options, Takeover
 from firmware_sim.autopilot.failsafes.conditions import NEEDS
 from firmware_sim.autopilot.failsafes.table import MODE_OF_ACTION, OFFBOARD_LOSS, TABLE, Row
 
 ACTION_NAMES = {
-    Action.NONE: "nothing",
-    Action.WARN: "warn",
-    Action.FALLBACK_POSITION: "Position",
-    Action.FALLBACK_ALTITUDE: "Altitude",
-    Action.FALLBACK_STABILIZED: "Stabilized",
-    Action.HOLD: "Hold",
-    Action.RETURN: "Return",
-    Action.LAND: "Land",
-    Action.DESCEND: "Descend",
-    Action.DISARM: "disarm",
-    Action.TERMINATE: "terminate",
+    FailsafeAction.NONE: "nothing",
+    FailsafeAction.WARN: "warn",
+    FailsafeAction.FALLBACK_POSITION: "Position",
+    FailsafeAction.FALLBACK_ALTITUDE: "Altitude",
+    FailsafeAction.FALLBACK_STABILIZED: "Stabilized",
+    FailsafeAction.HOLD: "Hold",
+    FailsafeAction.RETURN: "Return",
+    FailsafeAction.LAND: "Land",
+    FailsafeAction.DESCEND: "Descend",
+    FailsafeAction.DISARM: "disarm",
+    FailsafeAction.TERMINATE: "terminate",
 }
 
 _TAKEOVER = {
@@ -58,7 +58,7 @@ def _failsafe(row: Row) -> Sequence[str]:
     when = f"{row.when} ({related})" if related else row.when
     if shown is None:
         return row.title, when, action, "–", "–"
-    final = shown.action >= Action.DISARM
+    final = shown.action >= FailsafeAction.DISARM
     takeover = "no" if final else _TAKEOVER[shown.takeover]
     return row.title, when, action, takeover, _CLEAR[shown.clear]
 
@@ -66,11 +66,11 @@ def _failsafe(row: Row) -> Sequence[str]:
 def _shown(row: Row) -> Options | None:
     """Return the response listed with its end: the default, or the mildest active one."""
     value = 0 if row.parameter is None else int(SPEC_BY_NAME[row.parameter].default)
-    acting = [options for options in row.answers.values() if options.action > Action.WARN]
+    acting = [options for options in row.answers.values() if options.action > FailsafeAction.WARN]
     chosen = row.answers.get(value)
-    if chosen is not None and chosen.action > Action.WARN:
+    if chosen is not None and chosen.action > FailsafeAction.WARN:
         return chosen
-    returning = [options for options in acting if options.action is Action.RETURN]
+    returning = [options for options in acting if options.action is FailsafeAction.RETURN]
     return next(iter(returning or acting), None)
 
 
@@ -123,7 +123,7 @@ def checks() -> str:
     return _table(("text", "part", "told"), rows)
 
 
-def _told(check: prearm.Check) -> str:
+def _told(check: prearm.PrearmCheck) -> str:
     if check.said:
         return "by itself"
     return "by an event alone" if check.blocks is prearm.never else "when arming is refused"

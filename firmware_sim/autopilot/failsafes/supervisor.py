@@ -12,29 +12,29 @@ from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot import prearm
-from firmware_sim.autopilot.autopilot_state import Health, Message, Mode, Setpoint, Severity
-from firmware_sim.autopilot.commander import Flight, Phase
+from firmware_sim.autopilot.autopilot_state import Health, Mode, OperatorText, Setpoint, Severity
+from firmware_sim.autopilot.commander import CommanderState, FlightPhase
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import Event
+from firmware_sim.autopilot.events.definition import MavlinkEvent
 from firmware_sim.autopilot.events.health_report import REPORT_US, HealthReporter
-from firmware_sim.autopilot.failsafes.actions import Action
+from firmware_sim.autopilot.failsafes.actions import FailsafeAction
 from firmware_sim.autopilot.failsafes.conditions import (
     BatteryWarning,
     Conditions,
+    FailsafeSettings,
     Need,
-    Settings,
     lacking,
 )
 from firmware_sim.autopilot.failsafes.framework import (
     NO_INTERVENTION,
+    FailsafeInput,
     FailsafeState,
     Intervention,
-    Vehicle,
     update,
 )
 from firmware_sim.autopilot.failsafes.watch import Watch
-from firmware_sim.autopilot.prearm import Check
+from firmware_sim.autopilot.prearm import PrearmCheck
 from firmware_sim.autopilot.readiness import ArmingSettings, Readiness
 from firmware_sim.autopilot.sensor_monitor import NO_DATA_US
 from firmware_sim.interfaces import SensorSample
@@ -45,14 +45,14 @@ LOOK_US = 100_000
 CHECK_US = 100_000
 """Period of the pre-arm checks [µs] (PX4: 10 Hz)."""
 
-_GROUND = Phase.GROUND
+_GROUND = FlightPhase.GROUND
 
 
-class Decision(NamedTuple):
+class FailsafeDecision(NamedTuple):
     """Decision of the failsafes."""
 
-    flight: Flight
-    text: Message | None
+    flight: CommanderState
+    text: OperatorText | None
     disarm: bool
     """True if the motors must stop now."""
 
@@ -64,7 +64,7 @@ class Supervisor:
         self,
         value: Callable[[str], float],
         estimator: Estimator,
-        tell: Callable[[Event], None] = lambda _event: None,
+        tell: Callable[[MavlinkEvent], None] = lambda _event: None,
     ) -> None:
         """Store the look-up for PX4 parameters, the estimator and the event callback."""
         self._value = value
@@ -79,14 +79,14 @@ class Supervisor:
         """Conditions at the last check."""
         self.changes = 0
         """Number of checks with changed conditions or readiness."""
-        self.failing: tuple[Check, ...] = ()
+        self.failing: tuple[PrearmCheck, ...] = ()
         """Pre-arm checks that failed at the last check."""
         self._ready: Readiness | None = None
         """Last input of the pre-arm checks."""
         self._armable = False
         self._state = FailsafeState()
         self._decided: tuple[object, ...] = ()
-        self._told: tuple[Check, ...] | None = None
+        self._told: tuple[PrearmCheck, ...] | None = None
         """Checks reported as failing; None: reporting starts when the vehicle is ready."""
         self._told_us = 0
         self._tell = tell
@@ -96,16 +96,16 @@ class Supervisor:
         self._asked = False
         """True if a report of all failing checks is requested."""
         self._check_us = 0
-        self._checked = Phase.BOOT
+        self._checked = FlightPhase.BOOT
         """Flight phase at the last check."""
-        self._calm_flight: Flight | None = None
+        self._calm_flight: CommanderState | None = None
         """Flight state at a check without findings that stays valid; None = there were findings."""
         self.read_parameters()
 
     def read_parameters(self) -> None:
         """Read the parameters again."""
         self.watch.read_parameters()
-        self._settings = Settings.read(self._value)
+        self._settings = FailsafeSettings.read(self._value)
         self._arming = ArmingSettings.read(self._value)
         self.next_us, self._calm_flight = 0, None
 
@@ -134,7 +134,7 @@ class Supervisor:
         """True if the newest check found nothing new or unusual."""
         return self._calm_flight is not None
 
-    def is_unchanged(self, now_us: int, flight: Flight) -> bool:
+    def is_unchanged(self, now_us: int, flight: CommanderState) -> bool:
         """Return whether a check would repeat the newest result; if so, it counts as done."""
         if flight is not self._calm_flight or not self.watch.is_unchanged(now_us):
             self._calm_flight = None
@@ -142,7 +142,7 @@ class Supervisor:
         self.next_us, self._check_us = now_us + LOOK_US, now_us + CHECK_US
         return True
 
-    def look(self, sample: SensorSample, flight: Flight) -> list[Message]:
+    def look(self, sample: SensorSample, flight: CommanderState) -> list[OperatorText]:
         """Run the checks; return new messages for the operator."""
         now_us = sample.time_us
         self.next_us = now_us + LOOK_US
@@ -173,7 +173,7 @@ class Supervisor:
         if not lost:
             self._pilot_us = now_us
 
-    def readiness(self, sample: SensorSample, flight: Flight, mode: Mode) -> Readiness:
+    def readiness(self, sample: SensorSample, flight: CommanderState, mode: Mode) -> Readiness:
         """Return the input of the pre-arm checks for arming in a mode."""
         now_us, attitude = sample.time_us, self.watch.attitude
         return Readiness(
@@ -216,10 +216,10 @@ class Supervisor:
         finder = self._estimator.range
         return None if finder is None else now_us - finder.reading_us < NO_DATA_US
 
-    def _report(self, now_us: int, flight: Flight) -> list[Message]:
+    def _report(self, now_us: int, flight: CommanderState) -> list[OperatorText]:
         """Return the newly failing checks once the vehicle has been ready."""
         if self._told is None:
-            if flight.phase is Phase.BOOT:
+            if flight.phase is FlightPhase.BOOT:
                 self._asked = False
                 return []
             self._told = ()
@@ -229,14 +229,14 @@ class Supervisor:
         known = () if self._asked else self._told
         new = [check for check in self.failing if check.said and check not in known]
         self._told, self._told_us, self._asked = self.failing, now_us, False
-        return [Message(check.severity, check.text) for check in new]
+        return [OperatorText(check.severity, check.text) for check in new]
 
     # --- arming and modes
 
-    def refusals(self, sample: SensorSample, flight: Flight) -> list[Message]:
+    def refusals(self, sample: SensorSample, flight: CommanderState) -> list[OperatorText]:
         """Return the reasons against arming in the current mode; empty = armable."""
         checks = prearm.can_arm(self.readiness(sample, flight, flight.mode))
-        return [Message(Severity.CRITICAL, check.text) for check in checks]
+        return [OperatorText(Severity.CRITICAL, check.text) for check in checks]
 
     def available(self, mode: Mode) -> bool:
         """Return whether a mode's requirements are met for a user request, pilot input aside."""
@@ -245,8 +245,8 @@ class Supervisor:
     # --- deciding
 
     def decide(
-        self, time_us: int, flight: Flight, intervention: Intervention = NO_INTERVENTION
-    ) -> Decision | None:
+        self, time_us: int, flight: CommanderState, intervention: Intervention = NO_INTERVENTION
+    ) -> FailsafeDecision | None:
         """Return the failsafes' decision for a flight; None = no change."""
         state, finished = self._state, self.watch.reports.mission_finished
         armed = flight.phase >= _GROUND
@@ -258,11 +258,11 @@ class Supervisor:
         if idle and seen == self._decided and intervention == NO_INTERVENTION:
             return None
         self._decided = seen
-        vehicle = Vehicle(armed, flight.intended, finished)
+        vehicle = FailsafeInput(armed, flight.intended, finished)
         outcome = update(state, time_us, vehicle, self.conditions, self._settings, intervention)
         self._state = outcome.state
         action = outcome.state.action
         followed = replace(
             flight, mode=outcome.mode, intended=outcome.intended, failsafe=outcome.state.active
         )
-        return Decision(followed, outcome.text, action is Action.DISARM and armed)
+        return FailsafeDecision(followed, outcome.text, action is FailsafeAction.DISARM and armed)

@@ -13,59 +13,69 @@ from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.failsafes.actions import Action, Cause, Clear, Options, Takeover
+from firmware_sim.autopilot.failsafes.actions import (
+    Clear,
+    FailsafeAction,
+    FailsafeReason,
+    Options,
+    Takeover,
+)
 from firmware_sim.autopilot.failsafes.conditions import (
     FLIGHT_TERMINATION_OFF,
     NEEDS,
     BatteryWarning,
     Conditions,
+    FailsafeSettings,
     Need,
-    Settings,
     can_run,
 )
 
 MODE_OF_ACTION = {
-    Action.FALLBACK_POSITION: Mode.POSITION,
-    Action.FALLBACK_ALTITUDE: Mode.ALTITUDE,
-    Action.FALLBACK_STABILIZED: Mode.STABILIZED,
-    Action.HOLD: Mode.HOLD,
-    Action.RETURN: Mode.RETURN,
-    Action.LAND: Mode.LAND,
-    Action.DESCEND: Mode.DESCEND,
-    Action.TERMINATE: Mode.TERMINATION,
+    FailsafeAction.FALLBACK_POSITION: Mode.POSITION,
+    FailsafeAction.FALLBACK_ALTITUDE: Mode.ALTITUDE,
+    FailsafeAction.FALLBACK_STABILIZED: Mode.STABILIZED,
+    FailsafeAction.HOLD: Mode.HOLD,
+    FailsafeAction.RETURN: Mode.RETURN,
+    FailsafeAction.LAND: Mode.LAND,
+    FailsafeAction.DESCEND: Mode.DESCEND,
+    FailsafeAction.TERMINATE: Mode.TERMINATION,
 }
 """Mode of each action; other actions keep the intended mode. In ascending order: if a mode cannot
 run, the next action replaces it."""
 
-OFFBOARD_LOSS: dict[int, tuple[Action, Mode | None]] = {
-    0: (Action.FALLBACK_POSITION, Mode.POSITION),
-    1: (Action.FALLBACK_ALTITUDE, Mode.ALTITUDE),
-    2: (Action.FALLBACK_STABILIZED, Mode.STABILIZED),
-    3: (Action.RETURN, Mode.RETURN),
-    4: (Action.LAND, Mode.LAND),
-    5: (Action.HOLD, Mode.HOLD),
-    6: (Action.TERMINATE, Mode.TERMINATION),
-    7: (Action.DISARM, None),
+OFFBOARD_LOSS: dict[int, tuple[FailsafeAction, Mode | None]] = {
+    0: (FailsafeAction.FALLBACK_POSITION, Mode.POSITION),
+    1: (FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+    2: (FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
+    3: (FailsafeAction.RETURN, Mode.RETURN),
+    4: (FailsafeAction.LAND, Mode.LAND),
+    5: (FailsafeAction.HOLD, Mode.HOLD),
+    6: (FailsafeAction.TERMINATE, Mode.TERMINATION),
+    7: (FailsafeAction.DISARM, None),
 }
 """COM_OBL_RC_ACT: action, and the mode whose requirements apply from there on."""
 
 
-def mode_of(action: Action, intended: Mode) -> Mode:
+def mode_of(action: FailsafeAction, intended: Mode) -> Mode:
     """Return the action's mode, or the intended mode if the action has none."""
     return MODE_OF_ACTION.get(action, intended)
 
 
-def possible(action: Action, conditions: Conditions) -> Action:
+def possible(action: FailsafeAction, conditions: Conditions) -> FailsafeAction:
     """Return the action, or the next possible one in the chain, which ends at Terminate."""
     if action not in MODE_OF_ACTION:
         return action
     chain = (a for a in MODE_OF_ACTION if a >= action)
-    return next((a for a in chain if can_run(MODE_OF_ACTION[a], conditions)), Action.TERMINATE)
+    return next(
+        (a for a in chain if can_run(MODE_OF_ACTION[a], conditions)), FailsafeAction.TERMINATE
+    )
 
 
-def mode_fallback(conditions: Conditions, settings: Settings, intended: Mode) -> Action:
+def mode_fallback(
+    conditions: Conditions, settings: FailsafeSettings, intended: Mode
+) -> FailsafeAction:
     """Return the replacement of an intended mode that cannot run; NONE = it can."""
-    action, mode = Action.NONE, intended
+    action, mode = FailsafeAction.NONE, intended
     if conditions.offboard_control_signal_lost and NEEDS[mode] & Need.OFFBOARD_SIGNAL:
         action, next_mode = OFFBOARD_LOSS.get(settings.com_obl_rc_act, OFFBOARD_LOSS[0])
         if next_mode is None:
@@ -73,17 +83,17 @@ def mode_fallback(conditions: Conditions, settings: Settings, intended: Mode) ->
         mode = next_mode
     if settings.com_posctl_navl == 0:
         if mode is Mode.POSITION and not can_run(mode, conditions):
-            action, mode = Action.FALLBACK_ALTITUDE, Mode.ALTITUDE
+            action, mode = FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE
         if mode is Mode.ALTITUDE and not can_run(mode, conditions):
-            action, mode = Action.FALLBACK_STABILIZED, Mode.STABILIZED
+            action, mode = FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED
     elif settings.com_posctl_navl == 1 and mode is Mode.POSITION and not can_run(mode, conditions):
-        action, mode = Action.LAND, Mode.LAND
+        action, mode = FailsafeAction.LAND, Mode.LAND
         if not can_run(mode, conditions):
-            action, mode = Action.DESCEND, Mode.DESCEND
-    return action if can_run(mode, conditions) else Action.RETURN
+            action, mode = FailsafeAction.DESCEND, Mode.DESCEND
+    return action if can_run(mode, conditions) else FailsafeAction.RETURN
 
 
-NOTHING = Options(Action.NONE)
+NOTHING = Options(FailsafeAction.NONE)
 
 
 class Situation(NamedTuple):
@@ -91,7 +101,7 @@ class Situation(NamedTuple):
 
     time_us: int
     conditions: Conditions
-    settings: Settings
+    settings: FailsafeSettings
     intended: Mode
     """Mode requested by the user."""
     mission_finished: bool = False
@@ -160,15 +170,15 @@ _STICKS_OFF = 4
 _EXCEPT_MISSION, _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 1, 2, 4
 """Bits of COM_RCL_EXCEPT."""
 
-_NONE, _WARN, _HOLD = NOTHING, Options(Action.WARN), Options(Action.HOLD)
-_RETURN = Options(Action.RETURN, Clear.ON_MODE_CHANGE)
-_LAND = Options(Action.LAND, Clear.ON_MODE_CHANGE)
-_LASTING_HOLD = Options(Action.HOLD, Clear.ON_MODE_CHANGE)
-_TERMINATE = Options(Action.TERMINATE, Clear.NEVER, Takeover.NEVER)
-_DISARM = Options(Action.DISARM, takeover=Takeover.NEVER)
+_NONE, _WARN, _HOLD = NOTHING, Options(FailsafeAction.WARN), Options(FailsafeAction.HOLD)
+_RETURN = Options(FailsafeAction.RETURN, Clear.ON_MODE_CHANGE)
+_LAND = Options(FailsafeAction.LAND, Clear.ON_MODE_CHANGE)
+_LASTING_HOLD = Options(FailsafeAction.HOLD, Clear.ON_MODE_CHANGE)
+_TERMINATE = Options(FailsafeAction.TERMINATE, Clear.NEVER, Takeover.NEVER)
+_DISARM = Options(FailsafeAction.DISARM, takeover=Takeover.NEVER)
 
 
-def _caused(answers: Mapping[int, Options], cause: Cause) -> dict[int, Options]:
+def _caused(answers: Mapping[int, Options], cause: FailsafeReason) -> dict[int, Options]:
     return {value: options._replace(cause=cause) for value, options in answers.items()}
 
 
@@ -183,7 +193,14 @@ _LIMITS = {0: _NONE, 1: _WARN, 2: _ESCAPABLE_HOLD, 3: _RETURN, 4: _TERMINATE, 5:
 _POSITION_LOW = {
     value: Options(action, takeover=Takeover.MODE_SWITCH)
     for value, action in enumerate(
-        (Action.NONE, Action.WARN, Action.HOLD, Action.RETURN, Action.TERMINATE, Action.LAND)
+        (
+            FailsafeAction.NONE,
+            FailsafeAction.WARN,
+            FailsafeAction.HOLD,
+            FailsafeAction.RETURN,
+            FailsafeAction.TERMINATE,
+            FailsafeAction.LAND,
+        )
     )
 } | {4: _TERMINATE}
 
@@ -192,7 +209,7 @@ _ACTUATOR = {
     1: _HOLD,
     2: _LAND,
     3: _RETURN,
-    4: Options(Action.TERMINATE, Clear.NEVER),
+    4: Options(FailsafeAction.TERMINATE, Clear.NEVER),
 }
 
 
@@ -249,7 +266,11 @@ def _battery_action(s: Situation) -> int:
 
 
 def _battery_row(
-    trigger: Trigger, level: BatteryWarning, title: str, cause: Cause, actions: tuple[Action, ...]
+    trigger: Trigger,
+    level: BatteryWarning,
+    title: str,
+    cause: FailsafeReason,
+    actions: tuple[FailsafeAction, ...],
 ) -> Row:
     threshold = ("", "BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")[level]
     return Row(
@@ -259,13 +280,13 @@ def _battery_row(
         lambda s: s.conditions.battery_warning is level,
         {value: Options(action, cause=cause) for value, action in enumerate(actions)},
         "COM_LOW_BAT_ACT",
-        Options(Action.WARN, cause=cause),
+        Options(FailsafeAction.WARN, cause=cause),
         related=(threshold,),
         value=_battery_action,
     )
 
 
-_W, _R, _L = Action.WARN, Action.RETURN, Action.LAND
+_W, _R, _L = FailsafeAction.WARN, FailsafeAction.RETURN, FailsafeAction.LAND
 
 TABLE: tuple[Row, ...] = (
     Row(
@@ -273,7 +294,7 @@ TABLE: tuple[Row, ...] = (
         "Manual control lost",
         "no pilot's input for so long, unless there was none at arming",
         _manual_control,
-        _caused(_LINK_LOSS, Cause.MANUAL_CONTROL_LOSS),
+        _caused(_LINK_LOSS, FailsafeReason.MANUAL_CONTROL_LOSS),
         "NAV_RCL_ACT",
         related=("COM_RC_LOSS_T", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
     ),
@@ -282,7 +303,7 @@ TABLE: tuple[Row, ...] = (
         "Ground station lost",
         "no ground station's HEARTBEAT for so long; not in Land or Precision Landing",
         lambda s: s.conditions.gcs_connection_lost and s.intended not in _LANDING,
-        _caused(_LINK_LOSS, Cause.GCS_LOSS),
+        _caused(_LINK_LOSS, FailsafeReason.GCS_LOSS),
         "NAV_DLL_ACT",
         related=("COM_DL_LOSS_T",),
     ),
@@ -291,14 +312,14 @@ TABLE: tuple[Row, ...] = (
         "Mission cannot be completed",
         "the mission has become infeasible, in Mission",
         lambda s: s.intended is Mode.MISSION and s.conditions.mission_failure,
-        {0: Options(Action.RETURN)},
+        {0: Options(FailsafeAction.RETURN)},
     ),
     Row(
         Trigger.MISSION_WITHOUT_LINKS,
         "No link after the mission",
         "the mission is finished, the ground station lost and NAV_DLL_ACT 0, manual control unused",
         _links_lost_after_mission,
-        {0: Options(Action.RETURN)},
+        {0: Options(FailsafeAction.RETURN)},
         related=("NAV_DLL_ACT", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
     ),
     Row(
@@ -308,7 +329,7 @@ TABLE: tuple[Row, ...] = (
         lambda s: s.conditions.wind_limit_exceeded,
         _LIMITS,
         "COM_WIND_MAX_ACT",
-        Options(Action.WARN),
+        Options(FailsafeAction.WARN),
         related=("COM_WIND_MAX",),
     ),
     Row(
@@ -316,7 +337,7 @@ TABLE: tuple[Row, ...] = (
         "Flight time over",
         "so long since take-off",
         lambda s: s.conditions.flight_time_limit_exceeded,
-        {0: Options(Action.RETURN)},
+        {0: Options(FailsafeAction.RETURN)},
         related=("COM_FLT_TIME_MAX",),
     ),
     Row(
@@ -328,7 +349,7 @@ TABLE: tuple[Row, ...] = (
         ),
         _POSITION_LOW,
         "COM_POS_LOW_ACT",
-        Options(Action.WARN, takeover=Takeover.MODE_SWITCH),
+        Options(FailsafeAction.WARN, takeover=Takeover.MODE_SWITCH),
         related=("COM_POS_LOW_EPH",),
     ),
     Row(
@@ -352,7 +373,7 @@ TABLE: tuple[Row, ...] = (
         lambda s: any(s.conditions.geofence),
         _LIMITS,
         "GF_ACTION",
-        Options(Action.WARN),
+        Options(FailsafeAction.WARN),
         related=("GF_MAX_HOR_DIST", "GF_MAX_VER_DIST"),
     ),
     Row(
@@ -360,7 +381,7 @@ TABLE: tuple[Row, ...] = (
         "Remaining flight time low",
         "the battery lasts no longer than a return takes",
         lambda s: s.conditions.battery_low_remaining_time,
-        _caused({0: _NONE, 1: _WARN, 3: _RETURN}, Cause.FLIGHT_TIME_LOW),
+        _caused({0: _NONE, 1: _WARN, 3: _RETURN}, FailsafeReason.FLIGHT_TIME_LOW),
         "COM_FLTT_LOW_ACT",
         related=("BAT1_CAPACITY", "RTL_TIME_FACTOR", "RTL_TIME_MARGIN"),
     ),
@@ -369,7 +390,7 @@ TABLE: tuple[Row, ...] = (
         "Battery unhealthy at arming",
         "the battery reports nothing, within COM_SPOOLUP_TIME of arming",
         lambda s: s.conditions.battery_unhealthy and _spooling(s),
-        {0: Options(Action.DISARM)},
+        {0: Options(FailsafeAction.DISARM)},
     ),
     Row(
         Trigger.BATTERY_UNHEALTHY,
@@ -382,21 +403,21 @@ TABLE: tuple[Row, ...] = (
         Trigger.BATTERY_LOW,
         BatteryWarning.LOW,
         "Battery low",
-        Cause.BATTERY_LOW,
+        FailsafeReason.BATTERY_LOW,
         (_W, _W, _W, _W),
     ),
     _battery_row(
         Trigger.BATTERY_CRITICAL,
         BatteryWarning.CRITICAL,
         "Battery critical",
-        Cause.BATTERY_CRITICAL,
+        FailsafeReason.BATTERY_CRITICAL,
         (_W, _R, _L, _R),
     ),
     _battery_row(
         Trigger.BATTERY_EMERGENCY,
         BatteryWarning.EMERGENCY,
         "Battery empty",
-        Cause.BATTERY_EMERGENCY,
+        FailsafeReason.BATTERY_EMERGENCY,
         (_W, _R, _L, _L),
     ),
     Row(
@@ -404,7 +425,7 @@ TABLE: tuple[Row, ...] = (
         "Attitude failure at take-off",
         "roll or pitch out of limits, within COM_SPOOLUP_TIME + COM_LKDOWN_TKO of arming",
         lambda s: s.conditions.fd_critical_failure and _taking_off(s),
-        {0: Options(Action.DISARM)},
+        {0: Options(FailsafeAction.DISARM)},
         related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "COM_LKDOWN_TKO"),
     ),
     Row(
@@ -412,7 +433,7 @@ TABLE: tuple[Row, ...] = (
         "Attitude failure in flight, CBRK_FLIGHTTERM 0",
         "roll or pitch out of limits",
         lambda s: s.conditions.fd_critical_failure and not _taking_off(s) and _terminates(s),
-        {0: Options(Action.TERMINATE)},
+        {0: Options(FailsafeAction.TERMINATE)},
         related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "CBRK_FLIGHTTERM"),
     ),
     Row(
@@ -449,9 +470,13 @@ TABLE: tuple[Row, ...] = (
 def answers(situation: Situation) -> list[tuple[Trigger, Options]]:
     """Return the triggered failsafes with their responses in table order, without NONE."""
     found = [(row.trigger, row.options(situation)) for row in TABLE if row.occurs(situation)]
-    found = [(trigger, options) for trigger, options in found if options.action is not Action.NONE]
+    found = [
+        (trigger, options)
+        for trigger, options in found
+        if options.action is not FailsafeAction.NONE
+    ]
     fallback = mode_fallback(situation.conditions, situation.settings, situation.intended)
-    if fallback is not Action.NONE:
+    if fallback is not FailsafeAction.NONE:
         options = Options(fallback, takeover=Takeover.ALWAYS)
         found.append((Trigger.MODE_FALLBACK, options))
     return found

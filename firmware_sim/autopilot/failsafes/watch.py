@@ -13,8 +13,8 @@ from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
-from firmware_sim.autopilot.autopilot_state import Message, Setpoint, Severity
-from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.autopilot_state import OperatorText, Setpoint, Severity
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.error_state import SIGMA, Q
 from firmware_sim.autopilot.estimator import GPS_GONE_US, Estimator
 from firmware_sim.autopilot.events import flight_events as events
@@ -45,7 +45,7 @@ from firmware_sim.engine.record import (
 )
 from firmware_sim.interfaces import BatterySample, SensorSample
 
-_GROUND, _AIR = Phase.GROUND, Phase.AIR
+_GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR
 _WARNINGS = tuple(BatteryWarning)
 
 _RECENT, _ACCURACY, _SPEED_ACCURACY, _ROLL, _PITCH, _BATTERY = range(6)
@@ -214,7 +214,9 @@ class Watch:
             limits = Undercurrent(p.fd_act_mot_thr, p.fd_act_mot_c2t, p.fd_act_mot_tout)
             self.motors.take(time_us, told, outputs, limits)
 
-    def look(self, sample: SensorSample, phase: Phase) -> tuple[Conditions, list[Message]]:
+    def look(
+        self, sample: SensorSample, phase: FlightPhase
+    ) -> tuple[Conditions, list[OperatorText]]:
         """Return the current conditions and the messages for the operator."""
         seen, now_us = self._estimator.record["looked_at"][0], sample.time_us
         if self._calm is not None:
@@ -270,7 +272,7 @@ class Watch:
             and self.sensors.are_calm(now_us)
         )
 
-    def _conditions(self, sample: SensorSample, phase: Phase) -> Conditions:
+    def _conditions(self, sample: SensorSample, phase: FlightPhase) -> Conditions:
         now_us, p, reports = sample.time_us, self.settings, self.reports
         estimator = self._estimator
         armed = phase >= _GROUND
@@ -327,37 +329,37 @@ class Watch:
             fd_motor_failure=self.motors.failed,
         )
 
-    def _texts(self, conditions: Conditions, now_us: int, phase: Phase) -> list[Message]:
-        texts: list[Message] = []
+    def _texts(self, conditions: Conditions, now_us: int, phase: FlightPhase) -> list[OperatorText]:
+        texts: list[OperatorText] = []
         if self._gcs_us is not None and conditions.gcs_connection_lost is not self._gcs_lost:
             lost = self._gcs_lost = conditions.gcs_connection_lost
             text = "Connection to ground station lost" if lost else "GCS connection regained"
             event = events.GCS_LOST if lost else events.GCS_REGAINED
-            texts.append(Message(Severity.INFO, text, event.event()))
+            texts.append(OperatorText(Severity.INFO, text, event.event()))
         fused = self._estimator.fuses_gps(now_us)
         if fused is not self._gps_fused:
             self._gps_fused = fused
             if phase >= _GROUND and fused:
-                texts.append(Message.of(Severity.INFO, events.GNSS_STARTED))
+                texts.append(OperatorText.of(Severity.INFO, events.GNSS_STARTED))
             elif phase >= _GROUND:
-                texts.append(Message.of(Severity.WARNING, events.GNSS_STOPPED))
+                texts.append(OperatorText.of(Severity.WARNING, events.GNSS_STOPPED))
         seen = bool(self._estimator.vision.fused)
         if seen is not self._vision_fused:
             self._vision_fused = seen
             if phase >= _GROUND:
                 text = f"External vision fusion {'started' if seen else 'stopped'}"
-                texts.append(Message(Severity.INFO if seen else Severity.WARNING, text))
+                texts.append(OperatorText(Severity.INFO if seen else Severity.WARNING, text))
         estimator = self._estimator
         if estimator.recovery.consistency.restarts != self._restarts:
             self._restarts = estimator.recovery.consistency.restarts
             other = "GNSS" if fused else "vision"
             text = f"Estimator biases reset: IMU and {other} disagree"
-            texts.append(Message(Severity.WARNING, text))
+            texts.append(OperatorText(Severity.WARNING, text))
         if estimator.recovery.compass.given_up is not self._compass_given_up:
             given_up = self._compass_given_up = estimator.recovery.compass.given_up
             if given_up and phase >= _GROUND:
                 text = "Compass needs calibration - Land now!"
-                texts.append(Message(Severity.CRITICAL, text))
+                texts.append(OperatorText(Severity.CRITICAL, text))
         return texts
 
     def _lasts_too_short(self, sample: SensorSample, *, armed: bool) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
-from firmware_sim.autopilot.requests import Obstacles
+from firmware_sim.autopilot.requests import ObstacleBins
 from firmware_sim.autopilot.trajectory import braking_speed
 
 BINS = 72
@@ -55,7 +55,7 @@ class ObstacleMap:
         self.time_us = 0
         """Time of the newest data [µs]."""
 
-    def take(self, obstacles: Obstacles, yaw: float) -> None:
+    def take(self, obstacles: ObstacleBins, yaw: float) -> None:
         """Add reported obstacles at a heading [rad]."""
         self.time_us = max(self.time_us, obstacles.time_us)
         self.nearest_cm = min(self.nearest_cm, obstacles.nearest_cm)
@@ -101,7 +101,7 @@ class CollisionPrevention:
         """Start without data; `value` is the look-up for PX4 parameters."""
         self._value = value
         self.map = ObstacleMap()
-        self._taken: Obstacles | None = None
+        self._taken: ObstacleBins | None = None
         self._active_us: int | None = None
         """Time of activation [µs]."""
         self.gives_up = False
@@ -120,7 +120,7 @@ class CollisionPrevention:
         self,
         wanted: tuple[float, float],
         velocity: tuple[float, float],
-        obstacles: Obstacles | None,
+        obstacles: ObstacleBins | None,
         yaw: float,
         now_us: int,
     ) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from airl_mav.control.demand import Demand
 from airl_mav.core.frames import Vector, quat_yaw
 from firmware_sim.autopilot.error_state import RATES, Q
 from firmware_sim.autopilot.modes.interface import FREE, NAN, FlightContext, FlightMode
-from firmware_sim.autopilot.requests import Request
+from firmware_sim.autopilot.requests import ModeRequest
 
 
 class Descend(FlightMode):
@@ -19,7 +19,7 @@ class Descend(FlightMode):
         self._context = context
         self._yaw = 0.0
 
-    def enter(self, state: Vector, _request: Request | None, /) -> None:
+    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
         """Start with the current heading."""
         self._yaw = quat_yaw(state[Q:RATES])
 

@@ -14,8 +14,8 @@ from airl_mav.core.frames import Vector, quat_yaw
 from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.modes.hold import Hold
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
-from firmware_sim.autopilot.requests import Request
-from firmware_sim.autopilot.trajectory import Leg
+from firmware_sim.autopilot.requests import ModeRequest
+from firmware_sim.autopilot.trajectory import PathSegment
 
 LOST_US = 3 * US_PER_S
 """Target timeout [µs], after which the vehicle waits at its position."""
@@ -34,7 +34,7 @@ class Follow(FlightMode):
         """Course of the target [rad]."""
         self._following = False
 
-    def enter(self, state: Vector, _request: Request | None, /) -> None:
+    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
         """Start; until the target moves, its course is the vehicle's heading."""
         self._course, self._following = quat_yaw(state[Q:RATES]), False
         self._waiting.enter(state, None)
@@ -64,4 +64,4 @@ class Follow(FlightMode):
         here = triple(state, P)
         yaw = math.atan2(east - here[1], north - here[0])
         travel.speed_m_s = value("FLW_TGT_MAX_VEL")
-        return travel.fly(state, time_us, Leg(place, velocity=(vn, ve, 0.0)), yaw=yaw)
+        return travel.fly(state, time_us, PathSegment(place, velocity=(vn, ve, 0.0)), yaw=yaw)

@@ -18,8 +18,8 @@ from firmware_sim.autopilot.modes.interface import (
     triple,
 )
 from firmware_sim.autopilot.modes.takeoff import aim
-from firmware_sim.autopilot.requests import ClimbOn, Place, Reposition, Request
-from firmware_sim.autopilot.trajectory import Leg
+from firmware_sim.autopilot.requests import ClimbOn, ModeRequest, PositionYaw, Reposition
+from firmware_sim.autopilot.trajectory import PathSegment
 from firmware_sim.autopilot.travel import stopping_place
 from firmware_sim.engine.record import SETTLING
 
@@ -32,7 +32,7 @@ class Hold(FlightMode):
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
-        self._place = Place((0.0, 0.0, 0.0), 0.0)
+        self._place = PositionYaw((0.0, 0.0, 0.0), 0.0)
         self._braking = False
         self._travelling = False
         self._settling = False
@@ -49,7 +49,7 @@ class Hold(FlightMode):
         """Hold position, once known."""
         return None if self._braking else self._place.position
 
-    def enter(self, state: Vector, request: Request | None, /) -> None:
+    def enter(self, state: Vector, request: ModeRequest | None, /) -> None:
         """Start: finish a take-off climb, fly to a place, or brake."""
         self._settling = isinstance(request, ClimbOn)
         self._travelling = isinstance(request, Reposition)
@@ -65,7 +65,7 @@ class Hold(FlightMode):
         """Brake first, then hold the position of the stop."""
         if self._travelling:
             place = self._place
-            leg = Leg(place.position)
+            leg = PathSegment(place.position)
             return self._context.travel.fly(state, time_us, leg, yaw=place.yaw)
         if self._settling and not self._context.climb.has_ended:
             return self._settle(time_us)
@@ -93,7 +93,7 @@ class Hold(FlightMode):
             north, east = held[0], held[1]
         if math.isnan(down):
             down = now[2]
-        self._place = Place((north, east, down), place.yaw)
+        self._place = PositionYaw((north, east, down), place.yaw)
         if not math.isnan(request.speed_m_s):
             self._context.travel.speed_m_s = request.speed_m_s
 

@@ -11,12 +11,18 @@ from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, RateDeman
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector, quat_yaw
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Clearance, Message, OrbitStatus, Setpoint
+from firmware_sim.autopilot.autopilot_state import Clearance, OperatorText, OrbitStatus, Setpoint
 from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.autopilot.navigation.plan import STANDING, Triplet
-from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Obstacles, Place, Request
+from firmware_sim.autopilot.requests import (
+    FollowedTarget,
+    LandingTarget,
+    ModeRequest,
+    ObstacleBins,
+    PositionYaw,
+)
 from firmware_sim.autopilot.travel import Travel
 
 NAN = math.nan
@@ -41,7 +47,7 @@ class FlightContext:
     """Target height of a take-off above home [m]."""
     takeoff_place: tuple[float, float] | None = None
     """Target of a take-off, north and east [m]; None = vertical."""
-    say: Callable[[Message], None] = lambda _message: None
+    say: Callable[[OperatorText], None] = lambda _message: None
     """Sends a text to the operator."""
     home_yaw: float = 0.0
     """Heading at home [rad]."""
@@ -53,7 +59,7 @@ class FlightContext:
     """Newest offboard setpoint."""
     setpoints: dict[type, OffboardSetpoint] = field(default_factory=dict)
     """Newest offboard setpoint by type."""
-    return_place: Callable[[], Place | None] | None = None
+    return_place: Callable[[], PositionYaw | None] | None = None
     """Returns Return's destination, or None if it flies mission items. None = home."""
     triplet: Triplet = STANDING
     """Waypoints of Mission mode, and of Return if it flies mission items."""
@@ -69,7 +75,7 @@ class FlightContext:
     """Target of Follow."""
     landing_target: LandingTarget | None = None
     """Target of a precision landing, as last reported."""
-    obstacles: Obstacles | None = None
+    obstacles: ObstacleBins | None = None
     """Obstacles, as last reported."""
     ground: Clearance | None = None
     """Height above ground; None = not measured."""
@@ -123,7 +129,7 @@ class FlightMode(Protocol):
         """Destination of an automatic mode, local NED [m]; None in all other modes."""
         return None
 
-    def enter(self, _state: Vector, _request: Request | None, /) -> None:
+    def enter(self, _state: Vector, _request: ModeRequest | None, /) -> None:
         """Start at the current state.
 
         The request comes from the user, or from the previous mode (its `remainder`). Modes ignore
@@ -135,7 +141,7 @@ class FlightMode(Protocol):
         """Return the demand at a time [µs], which increases from call to call."""
         ...
 
-    def remainder(self, _state: Vector, /) -> Request | None:
+    def remainder(self, _state: Vector, /) -> ModeRequest | None:
         """Return a request for the next mode; None = the next mode starts without."""
         return None
 
@@ -165,12 +171,12 @@ def triple(state: Vector, start: int) -> Vec:
     return north, east, down
 
 
-def here(state: Vector) -> Place:
+def here(state: Vector) -> PositionYaw:
     """Return the current position and heading."""
-    return Place(triple(state, P), quat_yaw(state[Q:RATES]))
+    return PositionYaw(triple(state, P), quat_yaw(state[Q:RATES]))
 
 
-def over(place: Place, down_m_s: float) -> Demand:
+def over(place: PositionYaw, down_m_s: float) -> Demand:
     """Return the demand that holds a place and heading at a vertical speed NED [m/s]."""
     north, east, _ = place.position
     return Demand((north, east, NAN), (NAN, NAN, down_m_s), place.yaw, NAN)

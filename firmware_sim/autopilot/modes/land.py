@@ -18,7 +18,7 @@ from firmware_sim.autopilot.modes.interface import (
     over,
     triple,
 )
-from firmware_sim.autopilot.requests import Place, Request
+from firmware_sim.autopilot.requests import ModeRequest, PositionYaw
 
 STANDING_M_S = 0.3
 """Horizontal speed below which the descent holds a position [m/s]."""
@@ -33,7 +33,7 @@ class Land(FlightMode):
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
-        self._place = Place((0.0, 0.0, 0.0), 0.0)
+        self._place = PositionYaw((0.0, 0.0, 0.0), 0.0)
         self._stopping, self._began = False, (0.0, 0.0)
         self._is_slow = False
 
@@ -48,7 +48,7 @@ class Land(FlightMode):
         north, east = self._began
         return north, east, self._context.home[2]
 
-    def enter(self, state: Vector, _request: Request | None, /) -> None:
+    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
         """Start at the current position."""
         self._place, self._stopping = here(state), True
         self._began = self._place.position[:2]

@@ -13,8 +13,8 @@ from firmware_sim.autopilot.modes.land import landing_speed
 from firmware_sim.autopilot.modes.precision_land import PrecisionLand
 from firmware_sim.autopilot.modes.takeoff import gentle, leave_ground
 from firmware_sim.autopilot.navigation.plan import Triplet, TripletKind
-from firmware_sim.autopilot.requests import Request
-from firmware_sim.autopilot.trajectory import Leg, PathLimits
+from firmware_sim.autopilot.requests import ModeRequest
+from firmware_sim.autopilot.trajectory import PathLimits, PathSegment
 
 _TAKEOFF, _LAND, _IDLE = TripletKind.TAKEOFF, TripletKind.LAND, TripletKind.IDLE
 
@@ -44,7 +44,7 @@ class Mission(FlightMode):
         """Position of the active item."""
         return self._context.triplet.target
 
-    def enter(self, _state: Vector, _request: Request | None, /) -> None:
+    def enter(self, _state: Vector, _request: ModeRequest | None, /) -> None:
         """Start; the executor supplies the waypoints."""
         self._triplet, self._lands_precisely = None, False
 
@@ -67,7 +67,7 @@ class Mission(FlightMode):
         if triplet.kind is _LAND:
             speed = landing_speed(context.value, context.height(state), context.ground_m)
             north, east, _ = triplet.target
-            leg = Leg((north, east, math.nan), vertical_m_s=speed)
+            leg = PathSegment((north, east, math.nan), vertical_m_s=speed)
         return travel.fly(state, time_us, leg, yaw=yaw, limits=limits)
 
     def _land_precisely(self, triplet: Triplet, state: Vector, time_us: int) -> AnyDemand:
@@ -103,13 +103,13 @@ class Mission(FlightMode):
         return math.atan2(east, north) if mode == 1 else math.atan2(-east, -north)
 
 
-def _leg(triplet: Triplet, position: Vec) -> Leg:
+def _leg(triplet: Triplet, position: Vec) -> PathSegment:
     """Return the leg to fly; off its line, the vehicle returns to the line first.
 
     Source: PX4 1.16, FlightTaskAuto::_getCurrentState, _updateInternalWaypoints.
     """
     start, target = triplet.previous, triplet.target
-    direct = Leg(target, start, triplet.next)
+    direct = PathSegment(target, start, triplet.next)
     if start is None:
         return direct
     line = [b - a for a, b in zip(start, target, strict=True)]
@@ -119,10 +119,10 @@ def _leg(triplet: Triplet, position: Vec) -> Leg:
     unit = [c / length for c in line]
     along = math.fsum(u * (p - s) for u, p, s in zip(unit, position, start, strict=True))
     if along > length:
-        return Leg(target, position, triplet.next)
+        return PathSegment(target, position, triplet.next)
     if along < 0.0 and math.dist(start, position) > triplet.acceptance_m:
-        return Leg(start, position, target)
+        return PathSegment(start, position, target)
     north, east, down = (s + u * along for s, u in zip(start, unit, strict=True))
     if math.dist((north, east, down), position) > triplet.acceptance_m:
-        return Leg((north, east, down), position, target)
+        return PathSegment((north, east, down), position, target)
     return direct

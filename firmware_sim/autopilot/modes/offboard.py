@@ -24,7 +24,7 @@ from firmware_sim.autopilot.modes.interface import (
     FlightMode,
     OffboardSetpoint,
 )
-from firmware_sim.autopilot.requests import Request
+from firmware_sim.autopilot.requests import ModeRequest
 
 CLIMBS_M_S = 0.1
 """Minimum climb rate of a setpoint that lifts a standing vehicle [m/s]."""
@@ -70,7 +70,7 @@ class Offboard(FlightMode):
             return False
         return not isinstance(newest, RateDemand) or not math.isnan(newest.rates[2])
 
-    def enter(self, state: Vector, _request: Request | None, /) -> None:
+    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
         """Start the mode."""
         self._waiting.enter(state, None)
         self._kind_us = 0

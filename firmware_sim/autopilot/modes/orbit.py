@@ -12,7 +12,7 @@ from airl_mav.control.demand import AnyDemand, TrajectoryDemand
 from airl_mav.core.constants import DEG
 from airl_mav.core.frames import Vector, quat_yaw, wrap_pi
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Message, OrbitStatus, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, OrbitStatus, Severity
 from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.autopilot.modes.interface import (
@@ -22,8 +22,8 @@ from firmware_sim.autopilot.modes.interface import (
     since,
     triple,
 )
-from firmware_sim.autopilot.requests import OrbitRequest, Request
-from firmware_sim.autopilot.trajectory import Leg
+from firmware_sim.autopilot.requests import ModeRequest, OrbitRequest
+from firmware_sim.autopilot.trajectory import PathSegment
 
 LEAST_RADIUS_M = 1.0
 FASTEST_M_S = 10.0
@@ -62,7 +62,7 @@ class Orbit(FlightMode):
         """Current speed, which rises with MPC_ACC_HOR [m/s]."""
         self._time_us: int | None = None
 
-    def enter(self, state: Vector, request: Request | None, /) -> None:
+    def enter(self, state: Vector, request: ModeRequest | None, /) -> None:
         """Start, or change the active orbit."""
         if self._context.orbit is None:  # otherwise the active orbit is changed
             self._centre, self._radius, self._speed = triple(state, P), LEAST_RADIUS_M, 1.0
@@ -91,7 +91,7 @@ class Orbit(FlightMode):
                 self._centre[2],
             )
             inward = math.atan2(-outward[1], -outward[0])
-            return self._context.travel.fly(state, time_us, Leg(on_circle), yaw=inward)
+            return self._context.travel.fly(state, time_us, PathSegment(on_circle), yaw=inward)
         return self._round(outward, distance, quat_yaw(state[Q:RATES]), dt)
 
     def _round(
@@ -136,7 +136,7 @@ class Orbit(FlightMode):
             radius, clockwise = abs(request.radius_m), request.radius_m > 0.0
         speed = abs(self._speed) if math.isnan(request.speed_m_s) else request.speed_m_s
         if not LEAST_RADIUS_M <= radius <= self._context.value("MC_ORBIT_RAD_MAX"):
-            self._context.say(Message.of(Severity.CRITICAL, events.ORBIT_TOO_WIDE))
+            self._context.say(OperatorText.of(Severity.CRITICAL, events.ORBIT_TOO_WIDE))
             return
         fastest = min(FASTEST_M_S, math.sqrt(MOST_M_S2 * radius))
         speed = min(fastest, max(-fastest, speed))

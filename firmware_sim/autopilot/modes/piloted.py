@@ -24,7 +24,7 @@ from firmware_sim.autopilot.modes.stick_motion import (
     expo,
 )
 from firmware_sim.autopilot.modes.terrain_hold import Piloting, TerrainHold
-from firmware_sim.autopilot.requests import Request
+from firmware_sim.autopilot.requests import ModeRequest
 
 LIFTING_THROTTLE = 0.3
 """Minimum deflection for a take-off: PX4's 65 % of the stick's travel."""
@@ -47,7 +47,7 @@ class Piloted(FlightMode):
         sticks = self._context.sticks
         return sticks is not None and sticks.throttle > LIFTING_THROTTLE
 
-    def enter(self, state: Vector, _request: Request | None, /) -> None:
+    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
         """Start with the current motion."""
         self._vertical.restart(state.item(P + 2), state.item(V + 2))
         self._turning.restart()

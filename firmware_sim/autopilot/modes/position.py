@@ -11,7 +11,7 @@ from firmware_sim.autopilot.modes.collision_prevention import CollisionPreventio
 from firmware_sim.autopilot.modes.interface import FlightContext, triple
 from firmware_sim.autopilot.modes.piloted import Piloted
 from firmware_sim.autopilot.modes.stick_motion import AxisDemand, HorizontalStick
-from firmware_sim.autopilot.requests import Request
+from firmware_sim.autopilot.requests import ModeRequest
 
 
 class Position(Piloted):
@@ -22,7 +22,7 @@ class Position(Piloted):
         self._horizontal = HorizontalStick(context.value)
         self._prevention = CollisionPrevention(context.value)
 
-    def enter(self, state: Vector, request: Request | None, /) -> None:
+    def enter(self, state: Vector, request: ModeRequest | None, /) -> None:
         """Start with the current motion."""
         super().enter(state, request)
         north, east, _ = triple(state, V)

@@ -15,8 +15,8 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
 from firmware_sim.autopilot.modes.land import landing_speed
-from firmware_sim.autopilot.requests import LandingTarget, Request
-from firmware_sim.autopilot.trajectory import Leg
+from firmware_sim.autopilot.requests import LandingTarget, ModeRequest
+from firmware_sim.autopilot.trajectory import PathSegment
 
 PERIOD_US = 50_000
 """Period of target checks [µs]: PX4's navigator runs at 20 Hz."""
@@ -77,7 +77,7 @@ class PrecisionLand(FlightMode):
         north, east, down = self._goal
         return north, east, self._context.home[2] if self._state in _DOWNWARDS else down
 
-    def enter(self, state: Vector, _request: Request | None, /) -> None:
+    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
         """Start at the current position; search for the target if not visible."""
         self.begin(triple(state, P), required=True)
 
@@ -102,8 +102,10 @@ class PrecisionLand(FlightMode):
         if self._state in _DOWNWARDS:
             context = self._context
             speed = landing_speed(context.value, context.height(state), context.ground_m)
-            return travel.fly(state, time_us, Leg((north, east, math.nan), vertical_m_s=speed))
-        return travel.fly(state, time_us, Leg(self._goal))
+            return travel.fly(
+                state, time_us, PathSegment((north, east, math.nan), vertical_m_s=speed)
+            )
+        return travel.fly(state, time_us, PathSegment(self._goal))
 
     # --- states
 

@@ -12,7 +12,7 @@ from airl_mav.control.demand import AnyDemand
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, triple
@@ -20,8 +20,8 @@ from firmware_sim.autopilot.modes.land import landing_speed
 from firmware_sim.autopilot.modes.mission import Mission
 from firmware_sim.autopilot.modes.precision_land import PrecisionLand
 from firmware_sim.autopilot.navigation.return_path import return_height
-from firmware_sim.autopilot.requests import Place, Request
-from firmware_sim.autopilot.trajectory import Leg
+from firmware_sim.autopilot.requests import ModeRequest, PositionYaw
+from firmware_sim.autopilot.trajectory import PathSegment
 
 _REQUIRED = 2
 """RTL_PLD_MD: 1 lands on a target that is visible at once, 2 searches for the target."""
@@ -41,12 +41,12 @@ class ReturnToLaunch(FlightMode):
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
-        self._start = Place((0.0, 0.0, 0.0), 0.0)
+        self._start = PositionYaw((0.0, 0.0, 0.0), 0.0)
         self._stage = _Stage.CLIMB
         self._waiting_since_us: int | None = None
         self._down = 0.0
         """Height of the flight home, NED [m]."""
-        self._home = Place((0.0, 0.0, 0.0), 0.0)
+        self._home = PositionYaw((0.0, 0.0, 0.0), 0.0)
         self._mission = Mission(context)
         self._precision = PrecisionLand(context)
         self._precise = False
@@ -64,10 +64,10 @@ class ReturnToLaunch(FlightMode):
             return north, east, self._down
         return north, east, ground if self._stage is _Stage.LAND else self._waiting_down
 
-    def enter(self, state: Vector, _request: Request | None, /) -> None:
+    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
         """Start with the climb, if needed."""
         context = self._context
-        home = Place(context.home, context.home_yaw)
+        home = PositionYaw(context.home, context.home_yaw)
         chosen = home if context.return_place is None else context.return_place()
         self._by_mission = chosen is None
         if chosen is None:
@@ -85,7 +85,7 @@ class ReturnToLaunch(FlightMode):
         text = f"RTL: start return at {above_sea} m ({math.ceil(at)} m above destination)"
         event = events.RTL_RETURN_AT.event(above_sea, math.ceil(at))
         if context.armed:  # Disarmed, nothing is flown or reported.
-            context.say(Message(Severity.INFO, text, event))
+            context.say(OperatorText(Severity.INFO, text, event))
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Return the demand of the current stage, and advance stages."""
@@ -95,20 +95,20 @@ class ReturnToLaunch(FlightMode):
         (north, east, _), travel = self._home.position, self._context.travel
         if self._stage is _Stage.CLIMB:
             start = self._start
-            leg = Leg((start.position[0], start.position[1], self._down))
+            leg = PathSegment((start.position[0], start.position[1], self._down))
             return travel.fly(state, time_us, leg, yaw=start.yaw)
         if self._stage is _Stage.GO_HOME:
             near = self._away(state) < self._context.value("RTL_MIN_DIST")
             yaw = self._home.yaw if near else math.nan
-            return travel.fly(state, time_us, Leg((north, east, self._down)), yaw=yaw)
+            return travel.fly(state, time_us, PathSegment((north, east, self._down)), yaw=yaw)
         if self._stage is _Stage.LAND and self._precise:
             return self._precision.demand(state, time_us)
         if self._stage is _Stage.LAND:
             context = self._context
             speed = landing_speed(context.value, self._height(state), context.ground_m)
-            leg = Leg((north, east, math.nan), vertical_m_s=speed)
+            leg = PathSegment((north, east, math.nan), vertical_m_s=speed)
             return travel.fly(state, time_us, leg, yaw=self._home.yaw)
-        leg = Leg((north, east, self._waiting_down))
+        leg = PathSegment((north, east, self._waiting_down))
         return travel.fly(state, time_us, leg, yaw=self._home.yaw)
 
     @property
@@ -132,7 +132,7 @@ class ReturnToLaunch(FlightMode):
         elif self._stage is _Stage.DESCEND and abs(down - self._waiting_down) < radius:
             self._stage, self._waiting_since_us = _Stage.WAIT, time_us
             if delay < 0.0:
-                self._context.say(Message.of(Severity.INFO, events.RTL_LOITERING))
+                self._context.say(OperatorText.of(Severity.INFO, events.RTL_LOITERING))
         elif self._stage is _Stage.WAIT and self._waiting_since_us is not None:
             waited_s = (time_us - self._waiting_since_us) / US_PER_S
             if 0.0 <= delay <= waited_s:
@@ -146,7 +146,7 @@ class ReturnToLaunch(FlightMode):
         if self._precise:
             north, east, _ = self._home.position
             self._precision.begin((north, east, down), required=asked == _REQUIRED)
-        self._context.say(Message.of(Severity.INFO, events.RTL_LAND))
+        self._context.say(OperatorText.of(Severity.INFO, events.RTL_LAND))
 
     def _height(self, state: Vector) -> float:
         """Return the height above the landing place [m]."""

@@ -15,7 +15,7 @@ from airl_mav.vehicle.rotation import multiply
 from firmware_sim.autopilot.error_state import RATES, Q
 from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, since
-from firmware_sim.autopilot.requests import Request
+from firmware_sim.autopilot.requests import ModeRequest
 
 IDLE_THROTTLE = -0.9
 """Deflection below which a standing vehicle stays, and its heading setpoint follows the heading."""
@@ -38,7 +38,7 @@ class Stabilized(FlightMode):
         sticks = self._context.sticks
         return sticks is not None and sticks.throttle > IDLE_THROTTLE
 
-    def enter(self, state: Vector, _request: Request | None, /) -> None:
+    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
         """Start with the current heading."""
         self._yaw, self._time_us = quat_yaw(state[Q:RATES]), None
 

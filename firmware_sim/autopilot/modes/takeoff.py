@@ -15,8 +15,8 @@ from firmware_sim.autopilot.modes.interface import (
     here,
     over,
 )
-from firmware_sim.autopilot.requests import ClimbOn, Place, Reposition, Request
-from firmware_sim.autopilot.trajectory import Leg, PathLimits
+from firmware_sim.autopilot.requests import ClimbOn, ModeRequest, PositionYaw, Reposition
+from firmware_sim.autopilot.trajectory import PathLimits, PathSegment
 from firmware_sim.engine.record import RISING
 
 LEAST_CLIMB_M = 0.1
@@ -28,7 +28,7 @@ class Takeoff(FlightMode):
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
-        self._place = Place((0.0, 0.0, 0.0), 0.0)
+        self._place = PositionYaw((0.0, 0.0, 0.0), 0.0)
         self._gently = True
         """True if the take-off started on the ground."""
 
@@ -52,7 +52,7 @@ class Takeoff(FlightMode):
         north, east = self._context.takeoff_place or self._place.position[:2]
         return north, east, self._context.home[2] - self._context.takeoff_altitude_m
 
-    def enter(self, state: Vector, _request: Request | None, /) -> None:
+    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
         """Start the climb at the current position."""
         self._context.climb.restart(max(0.0, -state.item(V + 2)))
         self._place = here(state)
@@ -78,15 +78,15 @@ class Takeoff(FlightMode):
         limits = travel.limits()
         if self._gently:
             limits = gentle(limits, context, state)
-        return travel.fly(state, time_us, Leg(self._end), limits=limits)
+        return travel.fly(state, time_us, PathSegment(self._end), limits=limits)
 
-    def remainder(self, state: Vector, /) -> Request | None:
+    def remainder(self, state: Vector, /) -> ModeRequest | None:
         """Return the take-off target for Hold, once near its altitude."""
         if not self.is_done(state):
             return None
         if self._context.takeoff_place is not None:
-            return Reposition(Place(self._end, NAN))
-        return ClimbOn(Place(self._end, self._place.yaw))
+            return Reposition(PositionYaw(self._end, NAN))
+        return ClimbOn(PositionYaw(self._end, self._place.yaw))
 
     def is_done(self, state: Vector, /) -> bool:
         """Return whether the take-off is near its altitude, within PX4's acceptance radius.

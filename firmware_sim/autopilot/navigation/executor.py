@@ -14,21 +14,21 @@ from typing import Protocol
 
 from airl_mav.core.frames import Geodetic, wrap_pi
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import Event
-from firmware_sim.autopilot.navigation.feasibility import Verdict
+from firmware_sim.autopilot.events.definition import MavlinkEvent
+from firmware_sim.autopilot.navigation.feasibility import FeasibilityResult
 from firmware_sim.autopilot.navigation.flown_item import (
     Arrival,
+    ExecutorState,
     FlownItem,
-    Situation,
     as_flown,
 )
 from firmware_sim.autopilot.navigation.plan import (
     STANDING,
-    Frame,
-    Kind,
+    MissionType,
     NavCommand,
+    PlanFrame,
     PlanItem,
     Plans,
     Triplet,
@@ -47,7 +47,7 @@ class _Look(Enum):
     WAYPOINT = auto()
 
 
-class RegionOfInterest:
+class VehicleRoi:
     """Region of interest."""
 
     def __init__(self) -> None:
@@ -74,7 +74,7 @@ class RegionOfInterest:
             self._look = _Look.WAYPOINT
             self._offset = offset if math.isfinite(offset) else 0.0
         elif item.command == NavCommand.DO_SET_ROI:
-            located = item.frame != Frame.MISSION and item.params[0] == _MODE_LOCATION
+            located = item.frame != PlanFrame.MISSION and item.params[0] == _MODE_LOCATION
             if located:
                 self.look_at(Geodetic(item.x, item.y, item.z))
             else:
@@ -109,7 +109,7 @@ _LOITERS = (_N.LOITER_UNLIM, _N.LOITER_TIME, _N.LOITER_TO_ALT)
 class Crew(Protocol):
     """Callbacks for mission commands other than flight."""
 
-    def say(self, message: Message, /) -> None:
+    def say(self, message: OperatorText, /) -> None:
         """Send a text to the operator."""
 
     def set_home(self, place: Geodetic | None, /) -> object:
@@ -137,7 +137,7 @@ class MissionExecutor:
         plans: Plans,
         value: Callable[[str], float],
         crew: Crew,
-        check: Callable[[Situation], Verdict],
+        check: Callable[[ExecutorState], FeasibilityResult],
         *,
         climbs_first: bool = True,
     ) -> None:
@@ -154,7 +154,7 @@ class MissionExecutor:
         """True if the mission has ended in this run."""
         self.cruise_m_s = NAN
         """Speed set by DO_CHANGE_SPEED; NaN = MPC_XY_CRUISE."""
-        self.roi = RegionOfInterest()
+        self.roi = VehicleRoi()
         self._running = False
         self._active = False
         self._work = _Work.ITEM
@@ -174,14 +174,14 @@ class MissionExecutor:
 
     # --- interface to the autopilot
 
-    def idle(self, situation: Situation, *, armed: bool) -> None:
+    def idle(self, situation: ExecutorState, *, armed: bool) -> None:
         """Track changes of the plans while another mode flies."""
         if not armed:
             self._disarmed_meanwhile = True
         self._look()
         self.review(situation)
 
-    def activate(self, situation: Situation) -> None:
+    def activate(self, situation: ExecutorState) -> None:
         """Start Mission mode."""
         plans = self._plans
         self._look()
@@ -206,7 +206,7 @@ class MissionExecutor:
         self._work = _Work.ITEM
         self._plans.reached = -1
 
-    def update(self, situation: Situation) -> None:
+    def update(self, situation: ExecutorState) -> None:
         """Advance the mission; call every PERIOD_US in Mission mode."""
         if self._look():
             self.review(situation)
@@ -229,7 +229,7 @@ class MissionExecutor:
     def _look(self) -> bool:
         """Return whether a client has changed the mission or its current item."""
         plans = self._plans
-        mission = plans.stored(Kind.MISSION)
+        mission = plans.stored(MissionType.MISSION)
         seen = (mission.revision, plans.set_current_count)
         if seen == self._seen:
             return False
@@ -238,14 +238,18 @@ class MissionExecutor:
         self._seen = seen
         return True
 
-    def review(self, situation: Situation) -> None:
+    def review(self, situation: ExecutorState) -> None:
         """Check the mission after a change of mission, fence or home."""
-        revisions = tuple(self._plans.stored(kind).revision for kind in (Kind.MISSION, Kind.FENCE))
+        revisions = tuple(
+            self._plans.stored(kind).revision for kind in (MissionType.MISSION, MissionType.FENCE)
+        )
         if (revisions, situation.home) != self._checked_for:
             self._validate(situation)
 
-    def _validate(self, situation: Situation) -> None:
-        revisions = tuple(self._plans.stored(kind).revision for kind in (Kind.MISSION, Kind.FENCE))
+    def _validate(self, situation: ExecutorState) -> None:
+        revisions = tuple(
+            self._plans.stored(kind).revision for kind in (MissionType.MISSION, MissionType.FENCE)
+        )
         self._checked_for = (revisions, situation.home)
         verdict = self._check(situation)
         for message in verdict.messages:
@@ -267,7 +271,7 @@ class MissionExecutor:
         self._work = _Work.ITEM
         self._plans.reached = -1
 
-    def _climb_first(self, situation: Situation) -> None:
+    def _climb_first(self, situation: ExecutorState) -> None:
         """Determine whether the vehicle must climb before departure."""
         self._climb_down = NAN
         following = next_places(self._plans, self._plans.current, 1)
@@ -285,7 +289,7 @@ class MissionExecutor:
         ]
         return speeds[-1] if speeds and speeds[-1] > 0.0 else NAN
 
-    def _advance(self, situation: Situation) -> None:
+    def _advance(self, situation: ExecutorState) -> None:
         """Advance to the next item, or end the mission."""
         if self._work is _Work.ITEM:
             following = go_to(self._plans, self._plans.current + 1)
@@ -300,7 +304,7 @@ class MissionExecutor:
             self._plans.current = following
         self._take_item(situation)
 
-    def _end(self, situation: Situation) -> None:
+    def _end(self, situation: ExecutorState) -> None:
         """Hold position at the end of the mission."""
         self._running = False
         self.finished = True
@@ -315,7 +319,7 @@ class MissionExecutor:
 
     # --- one item
 
-    def _take_item(self, situation: Situation) -> None:
+    def _take_item(self, situation: ExecutorState) -> None:
         """Set the path for the current item."""
         if not self._running:
             self._end(situation)
@@ -348,7 +352,7 @@ class MissionExecutor:
         self._arrival.restart()
         self._home_altitude_m = situation.home.altitude_m
 
-    def _prepare(self, item: PlanItem, situation: Situation) -> tuple[_Work, Vec | None]:
+    def _prepare(self, item: PlanItem, situation: ExecutorState) -> tuple[_Work, Vec | None]:
         """Replace the item by a preparatory step if needed; return the item's place after it."""
         flown = self._flown
         north, east, down = situation.position
@@ -377,7 +381,7 @@ class MissionExecutor:
             return _Work.MOVE_TO_LAND, then
         return _Work.ITEM, None
 
-    def _set_triplet(self, flown: FlownItem, situation: Situation, places: list[Vec]) -> None:
+    def _set_triplet(self, flown: FlownItem, situation: ExecutorState, places: list[Vec]) -> None:
         if flown.command in _LOITERS:
             kind = TripletKind.LOITER
         elif flown.command == _N.LAND:
@@ -399,14 +403,14 @@ class MissionExecutor:
             cruise_m_s=self.cruise_m_s,
         )
 
-    def _place(self, item: PlanItem, situation: Situation) -> Vec:
+    def _place(self, item: PlanItem, situation: ExecutorState) -> Vec:
         if not (item.has_position or item.command == _N.CONDITION_GATE):
             return situation.position
         north, east, down = situation.local(item.place(situation.home.altitude_m))
         # An omitted altitude is the current one.
         return north, east, down if math.isfinite(down) else situation.position[2]
 
-    def _follow_home(self, situation: Situation) -> None:
+    def _follow_home(self, situation: ExecutorState) -> None:
         """Shift relative altitudes when home has moved."""
         rise = situation.home.altitude_m - self._home_altitude_m
         self._home_altitude_m = situation.home.altitude_m
@@ -424,7 +428,7 @@ class MissionExecutor:
 
     # --- commands
 
-    def _issue(self, item: PlanItem, situation: Situation) -> None:
+    def _issue(self, item: PlanItem, situation: ExecutorState) -> None:
         """Execute an item without a place."""
         command, params = item.command, item.params
         self._arrival.issued(situation.time_us)
@@ -440,7 +444,7 @@ class MissionExecutor:
         else:
             self.roi.command(item)
 
-    def _look_at_roi(self, situation: Situation) -> None:
+    def _look_at_roi(self, situation: ExecutorState) -> None:
         """Point the nose to the region of interest, unless the mount does (MIS_MNT_YAW_CTL)."""
         turns = self.triplet.kind in (TripletKind.POSITION, TripletKind.LOITER)
         if not turns or self._value("MIS_MNT_YAW_CTL") > 0.0:
@@ -452,8 +456,8 @@ class MissionExecutor:
             self._flown.yaw = yaw
             self.triplet = self.triplet._replace(yaw=yaw)
 
-    def _say(self, severity: Severity, text: str, event: Event) -> None:
-        self._crew.say(Message(severity, text, event))
+    def _say(self, severity: Severity, text: str, event: MavlinkEvent) -> None:
+        self._crew.say(OperatorText(severity, text, event))
 
 
 def _raised(place: Vec, rise_m: float) -> Vec:

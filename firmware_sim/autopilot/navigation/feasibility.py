@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Definition
 from firmware_sim.autopilot.navigation.plan import NOT_IN_MISSIONS, NavCommand, PlanItem, distance_m
@@ -34,11 +34,11 @@ _NEVER_FIRST = frozenset(
 """Commands after which PX4 no longer counts a take-off as the first waypoint."""
 
 
-class Verdict(NamedTuple):
+class FeasibilityResult(NamedTuple):
     """Result of the checks."""
 
     valid: bool
-    messages: tuple[Message, ...] = ()
+    messages: tuple[OperatorText, ...] = ()
 
 
 def check(
@@ -48,7 +48,7 @@ def check(
     *,
     landed: bool,
     inside_fence: Callable[[Geodetic], bool],
-) -> Verdict:
+) -> FeasibilityResult:
     """Check a mission.
 
     Args:
@@ -59,10 +59,12 @@ def check(
         inside_fence: Returns whether the geofence allows a place.
     """
     if not items:
-        return Verdict(valid=False)
+        return FeasibilityResult(valid=False)
     if home is None:
         text = "Not yet ready for mission, no position lock."
-        return Verdict(False, (Message.of(Severity.INFO, events.NO_POSITION, text=text),))
+        return FeasibilityResult(
+            False, (OperatorText.of(Severity.INFO, events.NO_POSITION, text=text),)
+        )
     found = _first_invalid(items, landed=landed)
     if found is None:
         found = [
@@ -72,14 +74,14 @@ def check(
         ]
     found += _fence(items, home, inside_fence)
     warnings = _first_far_away(items, home, value("MIS_DIST_1WP"))
-    return Verdict(not found, (*warnings, *found))
+    return FeasibilityResult(not found, (*warnings, *found))
 
 
-def _critical(definition: Definition, *values: float, text: str | None = None) -> Message:
-    return Message.of(Severity.CRITICAL, definition, *values, text=text)
+def _critical(definition: Definition, *values: float, text: str | None = None) -> OperatorText:
+    return OperatorText.of(Severity.CRITICAL, definition, *values, text=text)
 
 
-def _first_invalid(items: tuple[PlanItem, ...], *, landed: bool) -> list[Message] | None:
+def _first_invalid(items: tuple[PlanItem, ...], *, landed: bool) -> list[OperatorText] | None:
     for number, item in enumerate(items, start=1):
         if item.command not in FLYABLE:
             text = f"Mission rejected: item {number}: unsupported cmd: {item.command}"
@@ -89,7 +91,7 @@ def _first_invalid(items: tuple[PlanItem, ...], *, landed: bool) -> list[Message
     return None
 
 
-def _takeoffs(items: tuple[PlanItem, ...], home: Geodetic) -> list[Message]:
+def _takeoffs(items: tuple[PlanItem, ...], home: Geodetic) -> list[OperatorText]:
     passed = False
     for item in items:
         if item.command in _TAKEOFFS:
@@ -104,13 +106,13 @@ def _takeoffs(items: tuple[PlanItem, ...], home: Geodetic) -> list[Message]:
     return []
 
 
-def _vehicle_type(items: tuple[PlanItem, ...]) -> list[Message]:
+def _vehicle_type(items: tuple[PlanItem, ...]) -> list[OperatorText]:
     if any(item.command in _VTOL for item in items):
         return [_critical(events.VTOL_ITEMS)]
     return []
 
 
-def _required(items: tuple[PlanItem, ...], required: int, *, landed: bool) -> list[Message]:
+def _required(items: tuple[PlanItem, ...], required: int, *, landed: bool) -> list[OperatorText]:
     """Return the errors for items required by MIS_TKO_LAND_REQ."""
     commands = {item.command for item in items}
     takeoff, land = not commands.isdisjoint(_TAKEOFFS), _N.LAND in commands
@@ -134,7 +136,7 @@ def _not_both(*, takeoff: bool, land: bool) -> Definition | None:
 
 def _fence(
     items: tuple[PlanItem, ...], home: Geodetic, inside_fence: Callable[[Geodetic], bool]
-) -> list[Message]:
+) -> list[OperatorText]:
     for number, item in enumerate(items, start=1):
         if item.has_position and not inside_fence(item.place(home.altitude_m)):
             text = f"Geofence violation for waypoint {number}"
@@ -142,7 +144,9 @@ def _fence(
     return []
 
 
-def _first_far_away(items: tuple[PlanItem, ...], home: Geodetic, most_m: float) -> list[Message]:
+def _first_far_away(
+    items: tuple[PlanItem, ...], home: Geodetic, most_m: float
+) -> list[OperatorText]:
     """Return the warning for a distant first waypoint; it does not affect validity."""
     first = next((item for item in items if item.has_position), None)
     if first is None or most_m <= 0.0:

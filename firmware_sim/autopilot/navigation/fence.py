@@ -16,11 +16,17 @@ import numpy as np
 
 from airl_mav.core.frames import Geodetic, local_to_geodetic
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import FenceStatus, Message, Mode, Severity
+from firmware_sim.autopilot.autopilot_state import FenceStatus, Mode, OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Definition
-from firmware_sim.autopilot.navigation.flown_item import Situation
-from firmware_sim.autopilot.navigation.plan import Kind, NavCommand, PlanItem, Plans, distance_m
+from firmware_sim.autopilot.navigation.flown_item import ExecutorState
+from firmware_sim.autopilot.navigation.plan import (
+    MissionType,
+    NavCommand,
+    PlanItem,
+    Plans,
+    distance_m,
+)
 from firmware_sim.autopilot.trajectory import Axis
 
 _POLYGONS = {
@@ -151,7 +157,7 @@ class FenceMonitor:
     """Fence storage and breach monitor."""
 
     def __init__(
-        self, plans: Plans, value: Callable[[str], float], say: Callable[[Message], object]
+        self, plans: Plans, value: Callable[[str], float], say: Callable[[OperatorText], object]
     ) -> None:
         """Store the plans, the look-up for PX4 parameters, and the text callback."""
         self._plans, self._value, self._say = plans, value, say
@@ -168,9 +174,9 @@ class FenceMonitor:
         far, high = self._limits(place, home)
         return not (far or high) and all_allow(self._areas, place)
 
-    def step(self, now: Situation, mode: Mode, place: Callable[[], Geodetic]) -> None:
+    def step(self, now: ExecutorState, mode: Mode, place: Callable[[], Geodetic]) -> None:
         """Check the fence if due; `place` returns the position selected by GF_SOURCE."""
-        if self._plans.stored(Kind.FENCE).revision != self._revision:
+        if self._plans.stored(MissionType.FENCE).revision != self._revision:
             self._take(now, place)
         if now.time_us < self._due_us:
             return
@@ -213,9 +219,9 @@ class FenceMonitor:
         far = farthest > 0.0 and distance_m(place[:2], home[:2]) >= farthest
         return far, highest > 0.0 and place.altitude_m - home.altitude_m >= highest
 
-    def _take(self, now: Situation, place: Callable[[], Geodetic]) -> None:
+    def _take(self, now: ExecutorState, place: Callable[[], Geodetic]) -> None:
         """Load a new fence, without areas that home or the flying vehicle violates."""
-        fence = self._plans.stored(Kind.FENCE)
+        fence = self._plans.stored(MissionType.FENCE)
         self._revision = fence.revision
         kept = []
         for area in areas(fence.items):
@@ -229,4 +235,4 @@ class FenceMonitor:
         self._areas = tuple(kept)
 
     def _refuse(self, why: Definition) -> None:
-        self._say(Message.of(Severity.CRITICAL, why))
+        self._say(OperatorText.of(Severity.CRITICAL, why))

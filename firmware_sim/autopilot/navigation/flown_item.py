@@ -58,7 +58,7 @@ _STAYS = (_N.WAYPOINT, _N.LOITER_TIME, _N.DELAY)
 """Commands with a stay [s] in parameter 1."""
 
 
-class Situation(NamedTuple):
+class ExecutorState(NamedTuple):
     """Flight state for the executor."""
 
     time_us: int
@@ -134,7 +134,7 @@ class Arrival:
         """Return the acceptance radius of an item [m]."""
         return flown.acceptance_m if flown.acceptance_m > 0.0 else self._value("NAV_ACC_RAD")
 
-    def is_done(self, flown: FlownItem, target: Vec, now: Situation) -> bool:
+    def is_done(self, flown: FlownItem, target: Vec, now: ExecutorState) -> bool:
         """Return whether an item is complete; `target` is the vehicle's destination."""
         if flown.command in AT_ONCE:
             return True
@@ -158,7 +158,7 @@ class Arrival:
             )
         return self._turned and now.time_us >= self._since_us + flown.stay_s * US_PER_S
 
-    def _is_there(self, flown: FlownItem, target: Vec, now: Situation) -> bool:
+    def _is_there(self, flown: FlownItem, target: Vec, now: ExecutorState) -> bool:
         if flown.command == _N.DELAY:
             return True
         if now.landed:

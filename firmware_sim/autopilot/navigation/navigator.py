@@ -9,19 +9,19 @@ import numpy as np
 
 from airl_mav.core.frames import Geodetic, local_to_geodetic
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
+from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Severity
 from firmware_sim.autopilot.events import command_events
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.failsafes.conditions import FenceBreach
 from firmware_sim.autopilot.failsafes.watch import Reports
 from firmware_sim.autopilot.modes.interface import FlightContext
 from firmware_sim.autopilot.navigation.executor import PERIOD_US, Crew, MissionExecutor
-from firmware_sim.autopilot.navigation.feasibility import Verdict, check
+from firmware_sim.autopilot.navigation.feasibility import FeasibilityResult, check
 from firmware_sim.autopilot.navigation.fence import FenceMonitor
-from firmware_sim.autopilot.navigation.flown_item import Situation
+from firmware_sim.autopilot.navigation.flown_item import ExecutorState
 from firmware_sim.autopilot.navigation.plan import (
     STANDING,
-    Kind,
+    MissionType,
     PlanItem,
     Plans,
     Triplet,
@@ -37,7 +37,7 @@ from firmware_sim.autopilot.navigation.way_home import (
     landing_start,
     onwards,
 )
-from firmware_sim.autopilot.requests import Place, Reposition, Request
+from firmware_sim.autopilot.requests import ModeRequest, PositionYaw, Reposition
 
 IDLE_US = 100_000
 """Period in other modes [µs]; its reports are read at 10 Hz."""
@@ -87,13 +87,15 @@ class Navigator:
         """True if the mission has ended."""
         return self._flying and self.mission.finished
 
-    def mission_is_valid(self, situation: Situation | None) -> bool:
+    def mission_is_valid(self, situation: ExecutorState | None) -> bool:
         """Return whether the mission is feasible, as required by Mission mode."""
         if situation is not None:
             self.mission.review(situation)
         return self.mission.valid
 
-    def permitted(self, request: Request | None, now: Situation | None) -> Request | None:
+    def permitted(
+        self, request: ModeRequest | None, now: ExecutorState | None
+    ) -> ModeRequest | None:
         """Return a request, or None with a text if the geofence forbids the place.
 
         As in PX4, any place is allowed unless GF_ACTION is stronger than a warning.
@@ -107,10 +109,10 @@ class Navigator:
             return request
         height, place = command_events.ALTITUDE_OUTSIDE, command_events.REPOSITION_OUTSIDE
         why = height if request.altitude_alone else place
-        self._crew.say(Message.of(Severity.CRITICAL, why))
+        self._crew.say(OperatorText.of(Severity.CRITICAL, why))
         return None
 
-    def return_place(self, situation: Situation, home: Place) -> Place | None:
+    def return_place(self, situation: ExecutorState, home: PositionYaw) -> PositionYaw | None:
         """Return the destination of Return by RTL_TYPE; its height is the ground's.
 
         None if Return flies mission items instead.
@@ -121,19 +123,19 @@ class Navigator:
         if goal.by_landing:
             return None
         same = goal.place == situation.home
-        return home if same else Place(situation.local(goal.place), home.yaw)
+        return home if same else PositionYaw(situation.local(goal.place), home.yaw)
 
     @property
     def _return_type(self) -> ReturnType:
         asked = round(self._value("RTL_TYPE"))
         return ReturnType(asked) if asked in set(ReturnType) else ReturnType.HOME_OR_RALLY
 
-    def _destination(self, situation: Situation) -> Destination:
+    def _destination(self, situation: ExecutorState) -> Destination:
         here = local_to_geodetic(np.array(situation.position), situation.origin)
         kind, valid = self._return_type, self.mission.valid
         return destination(self._plans, situation.home, here, kind, valid=valid)
 
-    def _plan_way_home(self, situation: Situation, *, flying: bool) -> None:
+    def _plan_way_home(self, situation: ExecutorState, *, flying: bool) -> None:
         """Store the items for Return; `flying`: a mission was active until now."""
         plans, home = self._plans, situation.home
         here = local_to_geodetic(np.array(situation.position), situation.origin)
@@ -141,9 +143,9 @@ class Navigator:
             way = along_mission(plans, home, here, flying=flying) if self.mission.valid else ()
         else:
             way = self._way_to_landing(situation, here)
-        self._way_home.store(Kind.MISSION, way, 0, 0)
+        self._way_home.store(MissionType.MISSION, way, 0, 0)
 
-    def _way_to_landing(self, situation: Situation, here: Geodetic) -> tuple[PlanItem, ...]:
+    def _way_to_landing(self, situation: ExecutorState, here: Geodetic) -> tuple[PlanItem, ...]:
         """Return the climb and the complete landing of the mission."""
         begin = landing_start(self._plans.mission)
         if begin is None:
@@ -157,11 +159,11 @@ class Navigator:
             return landing
         text = f"RTL Mission land: climb to {math.ceil(altitude)} m"
         event = events.RTL_MISSION_LAND.event(math.ceil(altitude))
-        self._crew.say(Message(Severity.INFO, text, event))
+        self._crew.say(OperatorText(Severity.INFO, text, event))
         return (climb(here, altitude), *landing)
 
-    def _check_way_home(self, _situation: Situation) -> Verdict:
-        return Verdict(bool(self._way_home.mission), ())
+    def _check_way_home(self, _situation: ExecutorState) -> FeasibilityResult:
+        return FeasibilityResult(bool(self._way_home.mission), ())
 
     def tell(self, context: FlightContext, reports: Reports) -> None:
         """Update the paths of the modes and the reports to the failsafes."""
@@ -182,7 +184,7 @@ class Navigator:
         return return_time_s(self._value, height, away)
 
     def step(
-        self, situation: Situation, mode: Mode, place: Callable[[], Geodetic], *, armed: bool
+        self, situation: ExecutorState, mode: Mode, place: Callable[[], Geodetic], *, armed: bool
     ) -> None:
         """Advance by a period; `place` returns the vehicle's position for the geofence."""
         self.due_us = situation.time_us + (PERIOD_US if mode in _LED else IDLE_US)
@@ -202,7 +204,7 @@ class Navigator:
             self.mission.idle(situation, armed=armed)
         self._flying = flying
 
-    def _step_home(self, situation: Situation, *, returning: bool) -> None:
+    def _step_home(self, situation: ExecutorState, *, returning: bool) -> None:
         """Advance Return along the mission, if it flies mission items."""
         if not returning:
             if self._home_by_mission:
@@ -213,13 +215,13 @@ class Navigator:
         elif not self._returned:
             # The path is selected once, at the start of the mode.
             self._returned = True
-            anywhere = Place((0.0, 0.0, 0.0), 0.0)
+            anywhere = PositionYaw((0.0, 0.0, 0.0), 0.0)
             if self.return_place(situation, anywhere) is None:
                 self._plan_way_home(situation, flying=self._flying)
                 self._home_by_mission = True
                 self._returning.activate(situation)
 
-    def _check(self, situation: Situation) -> Verdict:
+    def _check(self, situation: ExecutorState) -> FeasibilityResult:
         return check(
             self._plans.mission,
             situation.home,

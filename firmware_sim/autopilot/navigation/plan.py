@@ -124,7 +124,7 @@ NOT_IN_MISSIONS = frozenset(
 """Fence points and rally points."""
 
 
-class Frame(IntEnum):
+class PlanFrame(IntEnum):
     """MAV_FRAME of plan items."""
 
     GLOBAL = 0
@@ -135,7 +135,7 @@ class Frame(IntEnum):
     GLOBAL_RELATIVE_ALT_INT = 6
 
 
-class Kind(IntEnum):
+class MissionType(IntEnum):
     """MAV_MISSION_TYPE."""
 
     MISSION = 0
@@ -143,7 +143,7 @@ class Kind(IntEnum):
     RALLY = 2
 
 
-MOST_ITEMS = {Kind.MISSION: 65_534, Kind.FENCE: 64, Kind.RALLY: 32}
+MOST_ITEMS = {MissionType.MISSION: 65_534, MissionType.FENCE: 64, MissionType.RALLY: 32}
 """Maximum number of items per list, as in PX4's SITL."""
 
 POSITION_COMMANDS = frozenset(
@@ -160,7 +160,7 @@ POSITION_COMMANDS = frozenset(
 )
 """Commands with a place to fly to (MissionBlock::item_contains_position)."""
 
-_RELATIVE = (Frame.GLOBAL_RELATIVE_ALT, Frame.GLOBAL_RELATIVE_ALT_INT)
+_RELATIVE = (PlanFrame.GLOBAL_RELATIVE_ALT, PlanFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +215,7 @@ class Plans:
     """
 
     def __init__(self) -> None:
-        self._stored = {kind: Stored() for kind in Kind}
+        self._stored = {kind: Stored() for kind in MissionType}
         self.current = 0
         """Index of the active mission item, or of the next item if the mission is paused."""
         self.set_current_count = 0
@@ -236,17 +236,17 @@ class Plans:
         """Mission progress: current and reached item, newest DO_JUMP and its count."""
         return self.current, self.reached, self.jumped, self.jumps_done.get(self.jumped, 0)
 
-    def stored(self, kind: Kind) -> Stored:
+    def stored(self, kind: MissionType) -> Stored:
         """Return a stored list."""
         return self._stored[kind]
 
     @property
     def mission(self) -> tuple[PlanItem, ...]:
         """Items of the mission."""
-        return self._stored[Kind.MISSION].items
+        return self._stored[MissionType.MISSION].items
 
     def store(
-        self, kind: Kind, items: tuple[PlanItem, ...], identity: int, current: int = -1
+        self, kind: MissionType, items: tuple[PlanItem, ...], identity: int, current: int = -1
     ) -> None:
         """Replace a list.
 
@@ -254,13 +254,13 @@ class Plans:
         """
         self.changes += 1
         self._stored[kind] = Stored(items, identity, self._stored[kind].revision + 1)
-        if kind is Kind.MISSION:
+        if kind is MissionType.MISSION:
             self.current = current if current >= 0 else min(self.current, max(0, len(items) - 1))
             self.jumps_done.clear()
             self.jumped = -1
             self.reached = -1
 
-    def clear(self, kind: Kind) -> None:
+    def clear(self, kind: MissionType) -> None:
         """Delete a list."""
         self.store(kind, (), 0, 0)
 

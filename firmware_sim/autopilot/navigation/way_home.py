@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.navigation.plan import (
-    Frame,
-    Kind,
+    MissionType,
     NavCommand,
+    PlanFrame,
     PlanItem,
     Plans,
     distance_m,
@@ -65,7 +65,7 @@ def along_mission(
 def onwards(plans: Plans, index: int) -> tuple[PlanItem, ...]:
     """Return the places from an item to the landing, including remaining jumps."""
     left = Plans()
-    left.store(Kind.MISSION, plans.mission, 0)
+    left.store(MissionType.MISSION, plans.mission, 0)
     left.jumps_done = dict(plans.jumps_done)
     way: list[PlanItem] = []
     following = go_to(left, index)
@@ -85,7 +85,7 @@ def climb(here: Geodetic, altitude_m: float) -> PlanItem:
     """Return an item for a climb at a place to an altitude above mean sea level [m]."""
     params = (0.0, 0.0, 0.0, NAN)
     return PlanItem(
-        _N.WAYPOINT, Frame.GLOBAL, params, here.latitude_deg, here.longitude_deg, altitude_m
+        _N.WAYPOINT, PlanFrame.GLOBAL, params, here.latitude_deg, here.longitude_deg, altitude_m
     )
 
 
@@ -99,7 +99,7 @@ def _back(items: tuple[PlanItem, ...], index: int, home: Geodetic) -> tuple[Plan
             break
     params = (0.0, 0.0, 0.0, NAN)
     landing = PlanItem(
-        _N.LAND, Frame.GLOBAL, params, home.latitude_deg, home.longitude_deg, home.altitude_m
+        _N.LAND, PlanFrame.GLOBAL, params, home.latitude_deg, home.longitude_deg, home.altitude_m
     )
     return (*way, landing)
 
@@ -180,7 +180,7 @@ def destination(
         candidates += [Destination(place, by_landing=True) for place in places]
     rally = [
         item.place(home.altitude_m)
-        for item in plans.stored(Kind.RALLY).items
+        for item in plans.stored(MissionType.RALLY).items
         if item.command == NavCommand.RALLY_POINT
     ]
     far = [place for place in rally if distance_m(place[:2], home[:2]) > OF_HOME_M]

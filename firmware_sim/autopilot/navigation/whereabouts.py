@@ -9,7 +9,7 @@ from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.home import Home
 from firmware_sim.autopilot.modes.interface import here, triple
-from firmware_sim.autopilot.navigation.flown_item import Situation
+from firmware_sim.autopilot.navigation.flown_item import ExecutorState
 from firmware_sim.autopilot.newest_sensors import NewestSensors
 
 
@@ -27,14 +27,16 @@ class Whereabouts:
         self._estimator, self._sensors, self._home = estimator, sensors, home
         self._value = value
 
-    def situation(self, *, landed: bool) -> Situation | None:
+    def situation(self, *, landed: bool) -> ExecutorState | None:
         """Return the flight state for missions; None before the first fix."""
         sample, home, origin = self._sensors.sample, self._home.place, self._estimator.origin
         if sample is None or home is None or origin is None:
             return None
         state = self._estimator.state
         place, velocity = here(state), triple(state, V)
-        return Situation(sample.time_us, place.position, place.yaw, landed, home, origin, velocity)
+        return ExecutorState(
+            sample.time_us, place.position, place.yaw, landed, home, origin, velocity
+        )
 
     def fenced_place(self) -> Geodetic:
         """Return the position selected by GF_SOURCE: the estimate, or GPS.

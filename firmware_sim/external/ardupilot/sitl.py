@@ -19,7 +19,7 @@ from airl_mav.core.errors import UsageError
 from firmware_sim.external.ardupilot.program import PORTS_PER_INSTANCE, SIMULATOR_PORT
 from firmware_sim.external.launcher import no_process
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
+from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
 from firmware_sim.mavlink.endpoint import Address
 
 MAGIC_16, MAGIC_32 = 18_458, 29_569
@@ -62,7 +62,7 @@ AWAY_FROM_ZERO = 1.0 + 1e-8
 832.9999 instead of 833 would lose a thousandth of its time."""
 
 
-def state_line(time_us: int, sample: SensorSample, truth: Truth) -> bytes:
+def state_line(time_us: int, sample: SensorSample, truth: TrueState) -> bytes:
     """Return the reply to a servo packet: one line, with a line feed before and after.
 
     ArduPilot finds keys by substring and then reads with sscanf. A key's colon and bracket must be
@@ -121,7 +121,7 @@ class ArdupilotBridge:
         """Number of consecutive invalid datagrams."""
         self._silence_us = int(silence_s * US_PER_S)
         self._alive: Callable[[], None] = no_process
-        self._truth: Callable[[], Truth] | None = None
+        self._truth: Callable[[], TrueState] | None = None
         self._address: Address | None = None
         self._packet: ServoPacket | None = None
         """Newest packet, answered by the next line."""
@@ -159,7 +159,7 @@ class ArdupilotBridge:
                 f"{RATES_HZ.start}..{RATES_HZ.stop - 1}"
             )
 
-    def use_truth(self, truth: Callable[[], Truth]) -> None:
+    def use_truth(self, truth: Callable[[], TrueState]) -> None:
         """Set the source of the true state, from which ArduPilot simulates its other sensors."""
         self._truth = truth
 

@@ -18,7 +18,7 @@ from firmware_sim.external.transport.serial_port import (
     check_baud,
 )
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.mavlink.codec import Encoder, Layout, Values, WireMessage, dialect
+from firmware_sim.mavlink.codec import Encoder, Values, WireLayout, WireMessage, dialect
 
 HIL_SETUP = "set SYS_HITL = 1 with the airframe HIL Quadcopter X (SYS_AUTOSTART 1001) and reboot it"
 
@@ -269,7 +269,7 @@ class BoardLink:
 
     # --- sending
 
-    def send(self, layout: Layout, values: Values) -> bool:
+    def send(self, layout: WireLayout, values: Values) -> bool:
         """Send a simulator message; return False if the line did not accept it."""
         return self._router.send_ahead(self._encoder.frame(layout, layout.payload(values)))
 

@@ -18,7 +18,7 @@ from firmware_sim.external.launcher import no_process
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.external.px4.board_link import BoardLink
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
+from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
 
 SILENCE_US = US_PER_S
 """Maximum time without motor commands after the first command [wall µs]."""
@@ -33,7 +33,7 @@ _CREEP_US = 20
 _BEHIND_US = 20_000
 
 
-class Pace:
+class BoardPace:
     """Limiter to 250 ticks per second of wall time, as the board's clock is not simulated.
 
     If another clock already paces the ticks, the limiter adapts to its punctual ticks and does not
@@ -74,7 +74,7 @@ class HitlBridge:
         self.armed = False
         self.time_us = 0
         self._link = link
-        self._pace = Pace(link.clock)
+        self._pace = BoardPace(link.clock)
         self._epoch_us: int | None = None
         """Simulated time at the board's time 0 [µs]."""
         self._began_us = 0
@@ -124,7 +124,7 @@ class HitlBridge:
         self.armed = controls.armed
         return controls
 
-    def use_truth(self, truth: Callable[[], Truth]) -> None:
+    def use_truth(self, truth: Callable[[], TrueState]) -> None:
         """Ignore the true state: a board would use it as its estimate."""
 
     def close(self) -> None:

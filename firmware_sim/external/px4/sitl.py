@@ -21,8 +21,8 @@ from firmware_sim.external.process import RunningProgram, program_at
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.external.px4.program import MODEL, SIMULATOR_PORT, UNAWAITED_THREADS
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
-from firmware_sim.mavlink.codec import Decoder, Encoder, Layout, Values, WireMessage, dialect
+from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
+from firmware_sim.mavlink.codec import Decoder, Encoder, Values, WireLayout, WireMessage, dialect
 from firmware_sim.mavlink.streams.pose import hil_state_quaternion
 
 WATCH_S = 0.1
@@ -188,7 +188,7 @@ MAX_GARBAGE = 16
 MAX_GARBAGE_BYTES = 4096
 """Maximum length of a garbage run [bytes]."""
 
-_BESIDE_THE_SAMPLE: tuple[tuple[str, Layout, Callable[[Any, int], Values]], ...] = (
+_BESIDE_THE_SAMPLE: tuple[tuple[str, WireLayout, Callable[[Any, int], Values]], ...] = (
     ("gps", hil.GPS, hil.gps),
     ("odometry", hil.ODOMETRY, hil.odometry),
     ("distance", hil.DISTANCE, hil.distance),
@@ -236,7 +236,7 @@ class Px4Bridge:
         self._alive: Callable[[], None] = no_process
         self._decoder = Decoder(datagrams=False)
         self._encoder = Encoder()
-        self._truth: Callable[[], Truth] | None = None
+        self._truth: Callable[[], TrueState] | None = None
         self._state_us, self._state_due_us = STATE_US, 0
         self._first_us: int | None = None
         """Simulated time of the first sample [µs]."""
@@ -284,7 +284,7 @@ class Px4Bridge:
                 f"is stopped (process {self._program.pid}, SIGSTOP): SIGCONT resumes it"
             )
 
-    def use_truth(self, truth: Callable[[], Truth]) -> None:
+    def use_truth(self, truth: Callable[[], TrueState]) -> None:
         """Set the source of the true state."""
         self._truth = truth
 

@@ -38,7 +38,7 @@ HEARD_FRAMES = 4096
 """Frames buffered for a listener in this process: ten seconds of PX4 telemetry."""
 
 
-class Frame(NamedTuple):
+class RoutedFrame(NamedTuple):
     """Received frame."""
 
     raw: bytes
@@ -56,9 +56,9 @@ class FrameDecoder(Decoder):
 
     def __init__(self, *, datagrams: bool) -> None:
         super().__init__(datagrams=datagrams)
-        self._frames: list[Frame] = []
+        self._frames: list[RoutedFrame] = []
 
-    def frames(self, data: bytes) -> list[Frame]:
+    def frames(self, data: bytes) -> list[RoutedFrame]:
         """Return the frames completed by a chunk of bytes."""
         self.feed(data)
         found, self._frames = self._frames, []
@@ -67,11 +67,11 @@ class FrameDecoder(Decoder):
     def _decode(self, buffer: bytes, start: int, end: int) -> WireMessage | None:
         message = super()._decode(buffer, start, end)
         if message is not None:
-            self._frames.append(Frame(buffer[start:end], int(message.get_msgId()), message))
+            self._frames.append(RoutedFrame(buffer[start:end], int(message.get_msgId()), message))
         return message
 
 
-class Budget:
+class TokenBucket:
     """Token bucket: a rate in bytes per second, and a burst."""
 
     def __init__(self, bytes_s: int, clock: Clock) -> None:
@@ -92,7 +92,7 @@ class Budget:
         return True
 
 
-class Line(Protocol):
+class BoardLine(Protocol):
     """Line to the board, such as `serial_port.SerialPort`. All may raise SerialLostError."""
 
     def read(self) -> bytes:
@@ -140,10 +140,10 @@ class Router:
         sent before: a boot loader at the other end would interpret bytes as commands."""
         self._clients = {name: _Client(endpoint) for name, endpoint in clients.items()}
         self._clock = clock
-        self._line: Line | None = None
+        self._line: BoardLine | None = None
         self._line_fd = -1
         self._decoder = FrameDecoder(datagrams=False)
-        self._budget = Budget(0, clock)
+        self._budget = TokenBucket(0, clock)
         self._heard: deque[bytes] = deque(maxlen=HEARD_FRAMES)
         self._closed = False
         self._selector = selectors.DefaultSelector()
@@ -154,13 +154,13 @@ class Router:
 
     # --- the line
 
-    def attach(self, line: Line, budget_bytes_s: int) -> None:
+    def attach(self, line: BoardLine, budget_bytes_s: int) -> None:
         """Replace the line to the board, with a client budget [bytes/s]. The caller closes it."""
         self.detach()
         self._line, self._line_fd = line, line.fileno()
         self._selector.register(self._line_fd, selectors.EVENT_READ)
         self._decoder = FrameDecoder(datagrams=False)
-        self._budget = Budget(budget_bytes_s, self._clock)
+        self._budget = TokenBucket(budget_bytes_s, self._clock)
         self._heard.clear()
         self.lost, self.received_bytes, self.speaks_mavlink = None, 0, False
 
@@ -211,7 +211,7 @@ class Router:
         """Send a client's frame to the board; return False if budget or line do not allow it."""
         return self.speaks_mavlink and self._budget.take(len(frame)) and self.send_ahead(frame)
 
-    def _from_line(self) -> list[Frame]:
+    def _from_line(self) -> list[RoutedFrame]:
         line = self._line
         if line is None:
             return []

@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from firmware_sim.autopilot.autopilot_state import Arming, Message, Result, Severity
+from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.interfaces import SensorSample
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.context import Action, Command, Context
-from firmware_sim.mavlink.services.transfers import Step
+from firmware_sim.mavlink.services.context import Action, Context, VehicleCommand
+from firmware_sim.mavlink.services.transfers import CalibrationText
 
 MOVING_RAD_S = 0.2
 """Minimum body rate that counts as motion [rad/s]."""
@@ -25,30 +25,30 @@ MOVING_RAD_S = 0.2
 _GYRO_STEP_S, _LEVEL_STEP_S, _REST_S, _AGAIN_S = 0.15, 0.5, 1.0, 5.0
 
 
-def _info(text: str, after_s: float = 0.0) -> Step:
-    return Step(after_s, Message(Severity.INFO, text))
+def _info(text: str, after_s: float = 0.0) -> CalibrationText:
+    return CalibrationText(after_s, OperatorText(Severity.INFO, text))
 
 
-def _critical(text: str, after_s: float = 0.0) -> Step:
-    return Step(after_s, Message(Severity.CRITICAL, text))
+def _critical(text: str, after_s: float = 0.0) -> CalibrationText:
+    return CalibrationText(after_s, OperatorText(Severity.CRITICAL, text))
 
 
-def _started(sensor: str) -> Step:
+def _started(sensor: str) -> CalibrationText:
     return _info(f"[cal] calibration started: 2 {sensor}")
 
 
-def _done(sensor: str) -> Step:
+def _done(sensor: str) -> CalibrationText:
     return _info(f"[cal] calibration done: {sensor}")
 
 
-def failed(sensor: str) -> Step:
+def failed(sensor: str) -> CalibrationText:
     """Return the final step of a failed calibration."""
     return _critical(f"[cal] calibration failed: {sensor}")
 
 
 def _at_rest(
     context: Context, sensor: str, percents: range, step_s: float, needs_rest: bool = True
-) -> Iterator[Step]:
+) -> Iterator[CalibrationText]:
     """Return the steps of a calibration that needs no rotation of the vehicle."""
     yield _started(sensor)
     for percent in percents:
@@ -64,19 +64,19 @@ def _moving(sample: SensorSample | None) -> bool:
     return sample is None or float(np.abs(sample.gyro).max()) > MOVING_RAD_S
 
 
-def _gyro(context: Context) -> Iterator[Step]:
+def _gyro(context: Context) -> Iterator[CalibrationText]:
     return _at_rest(context, "gyro", range(0, 101, 10), _GYRO_STEP_S)
 
 
-def _level(context: Context) -> Iterator[Step]:
+def _level(context: Context) -> Iterator[CalibrationText]:
     return _at_rest(context, "level", range(0, 101, 20), _LEVEL_STEP_S)
 
 
-def _barometer(context: Context) -> Iterator[Step]:
+def _barometer(context: Context) -> Iterator[CalibrationText]:
     return _at_rest(context, "baro", range(0), _LEVEL_STEP_S, needs_rest=False)
 
 
-def _one_side(context: Context, sensor: str) -> Iterator[Step]:
+def _one_side(context: Context, sensor: str) -> Iterator[CalibrationText]:
     """Return the steps of the first of six sides, the one the vehicle rests on."""
     yield _started(sensor)
     yield _info("[cal] pending: back front left right up down")
@@ -88,7 +88,7 @@ def _one_side(context: Context, sensor: str) -> Iterator[Step]:
     yield _info("[cal] down orientation detected")
 
 
-def _accelerometer(context: Context) -> Iterator[Step]:
+def _accelerometer(context: Context) -> Iterator[CalibrationText]:
     yield from _one_side(context, "accel")
     yield _info("[cal] Hold still, measuring down side")
     sample = context.port.sample
@@ -102,32 +102,32 @@ def _accelerometer(context: Context) -> Iterator[Step]:
         yield _info("[cal] hold vehicle still on a pending side")
 
 
-def _magnetometer(context: Context) -> Iterator[Step]:
+def _magnetometer(context: Context) -> Iterator[CalibrationText]:
     yield from _one_side(context, "mag")
     yield _info("[cal] Rotate vehicle")
     while True:
         yield _info("[cal] Rotate vehicle", _AGAIN_S)
 
 
-def _airspeed(_context: Context) -> Iterator[Step]:
+def _airspeed(_context: Context) -> Iterator[CalibrationText]:
     yield _started("airspeed")
     yield _critical("[cal] Ensure sensor is not measuring wind")
     yield _critical("[cal] calibration failed: airspeed", _AGAIN_S)  # no airspeed sensor
 
 
-def _silent(_context: Context) -> Iterator[Step]:
+def _silent(_context: Context) -> Iterator[CalibrationText]:
     return iter(())
 
 
-def _trim(_context: Context) -> Iterator[Step]:
-    yield Step(0.0, Message.of(Severity.INFO, events.TRIMMED, text="trim cal done"))
+def _trim(_context: Context) -> Iterator[CalibrationText]:
+    yield CalibrationText(0.0, OperatorText.of(Severity.INFO, events.TRIMMED, text="trim cal done"))
 
 
-def _rc_begins(_context: Context) -> Iterator[Step]:
-    yield Step(0.0, Message.of(Severity.INFO, events.RC_CALIBRATION))
+def _rc_begins(_context: Context) -> Iterator[CalibrationText]:
+    yield CalibrationText(0.0, OperatorText.of(Severity.INFO, events.RC_CALIBRATION))
 
 
-Routine = Callable[[Context], Iterator[Step]]
+Routine = Callable[[Context], Iterator[CalibrationText]]
 
 ROUTINES: dict[tuple[int, int], tuple[str, Routine]] = {
     (1, 1): ("gyro", _gyro),
@@ -146,7 +146,7 @@ ROUTINES: dict[tuple[int, int], tuple[str, Routine]] = {
 _ESC = 7
 
 
-def _calibrate(command: Command, context: Context) -> Result:
+def _calibrate(command: VehicleCommand, context: Context) -> Result:
     """Handle PREFLIGHT_CALIBRATION: one parameter selects the sensor; all zero cancels."""
     running = context.calibration
     asked = {number: command.integer(number) or 0 for number in range(1, 8)}
@@ -165,17 +165,17 @@ def _calibrate(command: Command, context: Context) -> Result:
             return Result.ACCEPTED
     if asked[_ESC] == 1:
         text = "[cal] calibration failed: Disconnect battery and try again"
-        context.announce(Message(Severity.CRITICAL, text))
+        context.announce(OperatorText(Severity.CRITICAL, text))
         return Result.DENIED
     if command.integer(4) != 0:
         return Result.UNSUPPORTED  # NaN does not cancel
     if running.radio:
         running.radio = False
-        context.announce(Message.of(Severity.INFO, events.RC_CALIBRATED))
+        context.announce(OperatorText.of(Severity.INFO, events.RC_CALIBRATED))
     return Result.ACCEPTED
 
 
-def _quick_magnetometer(command: Command, context: Context) -> Result:
+def _quick_magnetometer(command: VehicleCommand, context: Context) -> Result:
     """Handle FIXED_MAG_CAL_YAW, parameter 1: heading [deg]."""
     if context.calibration.active or context.port.state().status.arming is Arming.ARMED:
         return Result.TEMPORARILY_REJECTED
@@ -184,7 +184,7 @@ def _quick_magnetometer(command: Command, context: Context) -> Result:
         f"Assuming vehicle is facing heading {heading:.1f} degrees",
         "Mag quick calibration finished",
     ):
-        context.announce(Message(Severity.INFO, text))
+        context.announce(OperatorText(Severity.INFO, text))
     return Result.ACCEPTED
 
 

@@ -17,7 +17,7 @@ from operator import attrgetter
 
 from airl_mav.faults.kinds import MOTORS, Part
 from airl_mav.faults.model import Fault
-from firmware_sim.autopilot.autopilot_state import Arming, Message, Mode, Result, Severity
+from firmware_sim.autopilot.autopilot_state import Arming, Mode, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.px4_custom_mode import requested_mode
@@ -31,8 +31,8 @@ from firmware_sim.mavlink.services import (
 from firmware_sim.mavlink.services.context import (
     ANY,
     Action,
-    Command,
     Context,
+    VehicleCommand,
     for_vehicle,
     sender,
 )
@@ -66,7 +66,7 @@ GREATEST_MOTOR = 8
 """Maximum number of ESCs in PX4."""
 
 
-def _inject(command: Command, context: Context) -> Result | None:
+def _inject(command: VehicleCommand, context: Context) -> Result | None:
     """Handle INJECT_FAILURE, parameters: unit, type, instance (0 = all)."""
     enabled = context.port.parameters.by_name(ENABLED)
     if enabled is None or not enabled.value:
@@ -139,14 +139,14 @@ def _answer(result: Result | None) -> Action:
     return lambda _command, _context: result
 
 
-def _actuator_test(_command: Command, context: Context) -> Result | None:
+def _actuator_test(_command: VehicleCommand, context: Context) -> Result | None:
     """Handle ACTUATOR_TEST: PX4 rejects it while armed; disarmed, it has no effect here."""
     armed = context.port.state().status.arming is Arming.ARMED
     return Result.DENIED if armed else None
 
 
-def _high_latency(_command: Command, context: Context) -> Result:
-    context.announce(Message.of(Severity.CRITICAL, events.NO_HIGH_LATENCY))
+def _high_latency(_command: VehicleCommand, context: Context) -> Result:
+    context.announce(OperatorText.of(Severity.CRITICAL, events.NO_HIGH_LATENCY))
     return Result.FAILED
 
 
@@ -165,22 +165,22 @@ _RELATIVE_FRAMES = (
 )
 
 
-def _arm_disarm(command: Command, context: Context) -> Result | None:
+def _arm_disarm(command: VehicleCommand, context: Context) -> Result | None:
     force = command.integer(2) == FORCE_MAGIC
     if command.integer(1) == 1:
         if context.calibration.forbids_arming:
-            context.announce(Message.of(Severity.CRITICAL, events.ARM_WHILE_CALIBRATING))
+            context.announce(OperatorText.of(Severity.CRITICAL, events.ARM_WHILE_CALIBRATING))
             return Result.TEMPORARILY_REJECTED
         return context.port.arm(force=force)
     if command.integer(1) == 0:
         return context.port.disarm(force=force)
     asked = command.params[0]
     text = f"Unsupported ARM_DISARM param: {asked:.3f}"
-    context.announce(Message.of(Severity.CRITICAL, events.ARM_PARAMETER, asked, text=text))
+    context.announce(OperatorText.of(Severity.CRITICAL, events.ARM_PARAMETER, asked, text=text))
     return None
 
 
-def _takeoff(command: Command, context: Context) -> Result:
+def _takeoff(command: VehicleCommand, context: Context) -> Result:
     """Handle NAV_TAKEOFF, parameters 5, 6: target; 7: altitude above mean sea level [m].
 
     In a relative frame the altitude is above home. NaN = vertical takeoff to MIS_TAKEOFF_ALT.
@@ -200,13 +200,13 @@ def _takeoff(command: Command, context: Context) -> Result:
 def _change_mode(base: int, main: int, sub: int, context: Context) -> Result:
     """Change the mode, given MAV_MODE_FLAG bits, PX4's main mode and sub mode."""
     request = requested_mode(base, main, sub)
-    if isinstance(request, Message):
+    if isinstance(request, OperatorText):
         context.announce(request)
         return Result.TEMPORARILY_REJECTED
     return Result.ACCEPTED if request is None else context.port.set_mode(request)
 
 
-def _set_standard_mode(command: Command, context: Context) -> Result:
+def _set_standard_mode(command: VehicleCommand, context: Context) -> Result:
     """Handle DO_SET_STANDARD_MODE, parameter 1: MAV_STANDARD_MODE; FAILED if unsupported."""
     asked = command.integer(1) or 0
     if asked != dialect.MAV_STANDARD_MODE_NON_STANDARD:
@@ -218,24 +218,24 @@ def _set_standard_mode(command: Command, context: Context) -> Result:
     return Result.FAILED
 
 
-def _set_mode(command: Command, context: Context) -> Result:
+def _set_mode(command: VehicleCommand, context: Context) -> Result:
     base, main, sub = (command.integer(number) or 0 for number in (1, 2, 3))
     return _change_mode(base, main, sub, context)
 
 
-def _terminate(command: Command, context: Context) -> Result:
+def _terminate(command: VehicleCommand, context: Context) -> Result:
     """Handle DO_FLIGHTTERMINATION: stop the motors permanently; DENIED unless armed (PX4)."""
     wanted = command.params[0] > TERMINATE_FROM
     return context.port.terminate() if wanted else Result.DENIED
 
 
-def _run_checks(_command: Command, context: Context) -> Result:
+def _run_checks(_command: VehicleCommand, context: Context) -> Result:
     """Handle RUN_PREARM_CHECKS: report the failed checks again."""
     context.port.tell_checks()
     return Result.ACCEPTED
 
 
-def _reboot(command: Command, _context: Context) -> Result:
+def _reboot(command: VehicleCommand, _context: Context) -> Result:
     """Handle a reboot request: PX4 SITL accepts only "do nothing", armed or not."""
     return Result.ACCEPTED if command.integer(1) == 0 else Result.DENIED
 
@@ -277,7 +277,7 @@ ACTIONS: dict[int, Action] = {
 
 def handle_command_long(message: WireMessage, context: Context) -> bool:
     """Execute and acknowledge a COMMAND_LONG."""
-    return _handle(Command(message.command, _PARAMS(message), sender(message)), context)
+    return _handle(VehicleCommand(message.command, _PARAMS(message), sender(message)), context)
 
 
 def handle_command_int(message: WireMessage, context: Context) -> bool:
@@ -286,7 +286,7 @@ def handle_command_int(message: WireMessage, context: Context) -> bool:
     given = (message.x, message.y) != (INT32_MAX, INT32_MAX)  # INT32_MAX = unset
     place = (message.x / 1e7, message.y / 1e7) if given else (math.nan, math.nan)
     params = (*four, *place, message.z)
-    return _handle(Command(message.command, params, sender(message), message.frame), context)
+    return _handle(VehicleCommand(message.command, params, sender(message), message.frame), context)
 
 
 def handle_set_mode(message: WireMessage, context: Context) -> bool:
@@ -298,7 +298,7 @@ def handle_set_mode(message: WireMessage, context: Context) -> bool:
     return True
 
 
-def _handle(command: Command, context: Context) -> bool:
+def _handle(command: VehicleCommand, context: Context) -> bool:
     action = ACTIONS.get(command.number)
     result = Result.UNSUPPORTED if action is None else action(command, context)
     if result is not None:

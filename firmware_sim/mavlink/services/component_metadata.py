@@ -23,7 +23,7 @@ from firmware_sim.autopilot.events.definition import Definition, sub_id
 from firmware_sim.autopilot.events.enumerations import ENUMERATIONS, Enumeration, ModeGroup, words
 from firmware_sim.autopilot.mode_numbers import STATE_BITS, custom_mode
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.context import Command, Context
+from firmware_sim.mavlink.services.context import Context, VehicleCommand
 from firmware_sim.mavlink.services.transfers import crc32part
 from firmware_sim.mavlink.streams.units import boot_ms
 from firmware_sim.storage import Storage
@@ -59,7 +59,7 @@ def provide(storage: Storage) -> None:
         (folder / name).write_bytes(data)
 
 
-def request_metadata(_command: Command, context: Context) -> Result:
+def request_metadata(_command: VehicleCommand, context: Context) -> Result:
     """Send COMPONENT_METADATA."""
     context.link.send(
         dialect.MAVLink_component_metadata_message(
@@ -69,7 +69,7 @@ def request_metadata(_command: Command, context: Context) -> Result:
     return Result.ACCEPTED
 
 
-def request_information(_command: Command, context: Context) -> Result:
+def request_information(_command: VehicleCommand, context: Context) -> Result:
     """Send COMPONENT_INFORMATION, the predecessor of COMPONENT_METADATA."""
     no_crc, no_uri = 0, b""
     context.link.send(

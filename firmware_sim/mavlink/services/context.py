@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from airl_mav.core.signing import Signing
-from firmware_sim.autopilot.autopilot_state import Message, Result
+from firmware_sim.autopilot.autopilot_state import OperatorText, Result
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
 from firmware_sim.mavlink.event_buffer import EventBuffer
@@ -40,7 +40,7 @@ class Context:
     port: AutopilotPort
     now_us: int
     """Simulated time [µs]."""
-    announce: Callable[[Message], None]
+    announce: Callable[[OperatorText], None]
     """Sends a text, with its event if available, to all clients of all links. Events are part of
     the telemetry. In lockstep, replies must not change the telemetry, so only the text is sent."""
     broadcast: Callable[[str, bytes], None]
@@ -84,7 +84,7 @@ class Context:
         """True if any transfer or repetition is in progress."""
         return self.is_getting or self.transfer.is_running
 
-    def announce_once(self, refusal: Message) -> None:
+    def announce_once(self, refusal: OperatorText) -> None:
         """Announce a rejection unless it was announced before."""
         if refusal.text not in self.refusals:
             self.refusals.add(refusal.text)
@@ -114,7 +114,7 @@ def sender(message: WireMessage) -> tuple[int, int]:
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class VehicleCommand:
     """A COMMAND_LONG or COMMAND_INT."""
 
     number: int
@@ -130,5 +130,5 @@ class Command:
         return round(value) if math.isfinite(value) else None
 
 
-Action = Callable[[Command, Context], "Result | None"]
+Action = Callable[[VehicleCommand, Context], "Result | None"]
 """Executes a command and returns its result; None = no acknowledgement, as in PX4."""

@@ -20,8 +20,8 @@ from firmware_sim.mavlink.services.transfers import (
     Burst,
     Checksum,
     Code,
+    FtpRequest,
     RefusedError,
-    Request,
     Summing,
 )
 
@@ -61,7 +61,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
         client.session.close()
     client.used_us = context.now_us
     data = payload[_HEADER.size :][: min(size, DATA_BYTES)]
-    request = Request(session, opcode, offset, size, data)
+    request = FtpRequest(session, opcode, offset, size, data)
     asked = Answered(sequence, session, opcode, offset, asker)
     try:
         if size > DATA_BYTES:
@@ -135,7 +135,7 @@ def send_pending(context: Context) -> None:
         _send(body, burst.asker, context)
 
 
-def _carried_out(request: Request, context: Context) -> bytes:
+def _carried_out(request: FtpRequest, context: Context) -> bytes:
     operation = OPERATIONS.get(request.opcode)
     if operation is None:
         raise RefusedError(Code.UNKNOWN_COMMAND)

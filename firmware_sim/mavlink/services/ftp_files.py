@@ -16,8 +16,8 @@ from typing import BinaryIO
 from firmware_sim.mavlink.services.transfers import (
     CHUNK_BYTES,
     Code,
+    FtpRequest,
     RefusedError,
-    Request,
     Session,
 )
 from firmware_sim.storage import Storage
@@ -31,13 +31,13 @@ READ_ONLY = "etc"
 _SIZE = struct.Struct("<I")
 
 
-Operation = Callable[[Request, Session, Storage], bytes]
+Operation = Callable[[FtpRequest, Session, Storage], bytes]
 """Executes a request and returns the data of the reply.
 
 Raises RefusedError or OSError for a NAK."""
 
 
-def _list(request: Request, _session: Session, storage: Storage) -> bytes:
+def _list(request: FtpRequest, _session: Session, storage: Storage) -> bytes:
     """List a folder from entry number `offset`: D and name, or F, name, tab and size."""
     folder = storage.path(request.name)
     if not folder.is_dir():
@@ -64,7 +64,7 @@ def _line(entry: os.DirEntry[str]) -> bytes:
     return b"S\0"  # for example a link: skipped, as in PX4
 
 
-def _open_to_read(request: Request, session: Session, storage: Storage) -> bytes:
+def _open_to_read(request: FtpRequest, session: Session, storage: Storage) -> bytes:
     path = storage.path(request.name)
     _check_free(session)
     if path.is_dir():
@@ -74,15 +74,15 @@ def _open_to_read(request: Request, session: Session, storage: Storage) -> bytes
     return _SIZE.pack(session.size)
 
 
-def _create(request: Request, session: Session, storage: Storage) -> bytes:
+def _create(request: FtpRequest, session: Session, storage: Storage) -> bytes:
     return _open_to_write(request, session, storage, os.O_TRUNC)
 
 
-def _open_existing(request: Request, session: Session, storage: Storage) -> bytes:
+def _open_existing(request: FtpRequest, session: Session, storage: Storage) -> bytes:
     return _open_to_write(request, session, storage, 0)
 
 
-def _open_to_write(request: Request, session: Session, storage: Storage, flags: int) -> bytes:
+def _open_to_write(request: FtpRequest, session: Session, storage: Storage, flags: int) -> bytes:
     path = _writable(request.name, storage)
     _check_free(session)
     storage.check_room(0)
@@ -101,11 +101,11 @@ def read_at(file: BinaryIO, offset: int, size: int) -> bytes:
     return data
 
 
-def _read(request: Request, session: Session, _storage: Storage) -> bytes:
+def _read(request: FtpRequest, session: Session, _storage: Storage) -> bytes:
     return read_at(session.opened(request), request.offset, request.size)
 
 
-def _write(request: Request, session: Session, storage: Storage) -> bytes:
+def _write(request: FtpRequest, session: Session, storage: Storage) -> bytes:
     file = session.opened(request)
     end = request.offset + len(request.data)
     if end > session.size:
@@ -116,13 +116,13 @@ def _write(request: Request, session: Session, storage: Storage) -> bytes:
     return _SIZE.pack(file.write(request.data))
 
 
-def _terminate(request: Request, session: Session, _storage: Storage) -> bytes:
+def _terminate(request: FtpRequest, session: Session, _storage: Storage) -> bytes:
     session.opened(request)
     session.close()
     return b""
 
 
-def _reset(_request: Request, session: Session, _storage: Storage) -> bytes:
+def _reset(_request: FtpRequest, session: Session, _storage: Storage) -> bytes:
     session.close()
     return b""
 
@@ -130,7 +130,7 @@ def _reset(_request: Request, session: Session, _storage: Storage) -> bytes:
 def _on_path(change: Callable[[Path], object], *, more: bool = False) -> Operation:
     """Return an operation on the requested path; `more`: the operation creates an entry."""
 
-    def operation(request: Request, _session: Session, storage: Storage) -> bytes:
+    def operation(request: FtpRequest, _session: Session, storage: Storage) -> bytes:
         path = _writable(request.name, storage)
         if more:
             storage.check_room(0)
@@ -140,7 +140,7 @@ def _on_path(change: Callable[[Path], object], *, more: bool = False) -> Operati
     return operation
 
 
-def _truncate(request: Request, _session: Session, storage: Storage) -> bytes:
+def _truncate(request: FtpRequest, _session: Session, storage: Storage) -> bytes:
     path = _writable(request.name, storage)
     more = request.offset - path.stat().st_size
     if more > 0:
@@ -149,7 +149,7 @@ def _truncate(request: Request, _session: Session, storage: Storage) -> bytes:
     return b""
 
 
-def _rename(request: Request, _session: Session, storage: Storage) -> bytes:
+def _rename(request: FtpRequest, _session: Session, storage: Storage) -> bytes:
     old, separator, rest = request.data.partition(b"\0")
     new = rest.split(b"\0", 1)[0]
     if not separator or not new:
@@ -159,7 +159,7 @@ def _rename(request: Request, _session: Session, storage: Storage) -> bytes:
     return b""
 
 
-def _nothing(_request: Request, _session: Session, _storage: Storage) -> bytes:
+def _nothing(_request: FtpRequest, _session: Session, _storage: Storage) -> bytes:
     return b""
 
 

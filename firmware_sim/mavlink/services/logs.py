@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import struct
 
-from firmware_sim.autopilot.autopilot_state import Message, Result, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import Action, Command, Context
+from firmware_sim.mavlink.services.context import Action, Context, VehicleCommand
 from firmware_sim.mavlink.services.transfers import (
     PIECE_BYTES,
     LogDownload,
@@ -75,7 +75,7 @@ def handle_end(_message: WireMessage, context: Context) -> bool:
 
 def handle_erase(_message: WireMessage, context: Context) -> bool:
     """Reject the request: a flight's log is its record, and clients may not delete it."""
-    context.announce(Message(Severity.WARNING, "Logs are not erased: they belong to the run"))
+    context.announce(OperatorText(Severity.WARNING, "Logs are not erased: they belong to the run"))
     return True
 
 
@@ -110,7 +110,7 @@ def _send_data(context: Context, download: LogDownload) -> None:
 # --- streaming of the open log
 
 
-def _start(command: Command, context: Context) -> Result:
+def _start(command: VehicleCommand, context: Context) -> Result:
     log = context.port.logs.open_log()
     if log is None:
         return Result.FAILED
@@ -118,7 +118,7 @@ def _start(command: Command, context: Context) -> Result:
     return Result.ACCEPTED
 
 
-def _stop(_command: Command, context: Context) -> None:
+def _stop(_command: VehicleCommand, context: Context) -> None:
     """Stop the stream. PX4 does not acknowledge this command."""
     context.log_stream = None
 

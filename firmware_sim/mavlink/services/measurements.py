@@ -14,9 +14,9 @@ import numpy as np
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector, quat_from_euler
-from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import command_events as events
-from firmware_sim.autopilot.requests import LandingTarget, Obstacles
+from firmware_sim.autopilot.requests import LandingTarget, ObstacleBins
 from firmware_sim.interfaces import DistanceReading, FlowReading, Odometry, PoseFrame, VelocityFrame
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context
@@ -58,7 +58,7 @@ def handle_odometry(message: WireMessage, context: Context) -> bool:
     if kind not in _FUSED:
         text = f"ODOMETRY: estimator_type {kind} unsupported"
         event = events.ODOMETRY_ESTIMATOR
-        context.announce_once(Message.of(Severity.CRITICAL, event, kind, text=text))
+        context.announce_once(OperatorText.of(Severity.CRITICAL, event, kind, text=text))
         return False
     naive = kind == dialect.MAV_ESTIMATOR_TYPE_NAIVE
     place = _finite(message.x, message.y, message.z)
@@ -207,13 +207,13 @@ def handle_obstacle_distance(message: WireMessage, context: Context) -> bool:
         if context.port.parameters.value("CP_DIST") > 0.0:
             text = f"Obstacle message received in unsupported frame {frame}"
             event = events.OBSTACLE_FRAME
-            context.announce_once(Message.of(Severity.CRITICAL, event, frame, text=text))
+            context.announce_once(OperatorText.of(Severity.CRITICAL, event, frame, text=text))
         return False
     increment = message.increment_f if message.increment_f > 0.0 else float(message.increment)
     if not (0.0 < increment <= 360.0 and math.isfinite(message.angle_offset)):
         return False
     context.port.see_obstacles(
-        Obstacles(
+        ObstacleBins(
             tuple(message.distances),
             increment,
             message.angle_offset,
@@ -236,7 +236,7 @@ def handle_landing_target(message: WireMessage, context: Context) -> bool:
     if message.frame != dialect.MAV_FRAME_LOCAL_NED:
         text = f"Landing target: coordinate frame {message.frame} unsupported"
         event = events.LANDING_TARGET_FRAME
-        context.announce_once(Message.of(Severity.CRITICAL, event, message.frame, text=text))
+        context.announce_once(OperatorText.of(Severity.CRITICAL, event, message.frame, text=text))
         return False
     position = message.x, message.y, message.z
     if not all(map(math.isfinite, position)):

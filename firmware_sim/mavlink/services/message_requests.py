@@ -17,7 +17,7 @@ from firmware_sim.mavlink.codec import WireMessage, dialect, message_name
 from firmware_sim.mavlink.event_buffer import KEPT, NUMBERS, message
 from firmware_sim.mavlink.scheduler import OFF
 from firmware_sim.mavlink.services import component_metadata
-from firmware_sim.mavlink.services.context import Action, Command, Context
+from firmware_sim.mavlink.services.context import Action, Context, VehicleCommand
 from firmware_sim.mavlink.streams import information
 from firmware_sim.mavlink.streams.units import INT32_MAX, boot_ms
 
@@ -51,7 +51,7 @@ GROUPS: dict[int, tuple[str, ...]] = {
 """Streams of the groups of REQUEST_DATA_STREAM."""
 
 
-def _set_message_interval(command: Command, context: Context) -> Result:
+def _set_message_interval(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 1: message id; 2: interval [µs], 0 or unset = default, negative = off."""
     number = command.integer(1)
     if number is None or number in OF_MISSING_DEVICES:
@@ -71,11 +71,11 @@ def _set_message_interval(command: Command, context: Context) -> Result:
     return Result.ACCEPTED
 
 
-def _get_message_interval(command: Command, context: Context) -> Result:
+def _get_message_interval(command: VehicleCommand, context: Context) -> Result:
     return _send_interval((command.integer(1) or 0) & 0xFFFF, context)
 
 
-def _request_message(command: Command, context: Context) -> Result:
+def _request_message(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 1: message id; 2: parameter of the message."""
     number = command.integer(1) or 0
     special = _SPECIAL.get(number)
@@ -85,12 +85,12 @@ def _request_message(command: Command, context: Context) -> Result:
     return Result.DENIED if name is None else send_stream(name, context)
 
 
-def _request_interval(command: Command, context: Context) -> Result:
+def _request_interval(command: VehicleCommand, context: Context) -> Result:
     asked = command.integer(2)
     return Result.DENIED if asked is None else _send_interval(asked & 0xFFFF, context)
 
 
-def _request_modes(command: Command, context: Context) -> Result:
+def _request_modes(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 2: number of the mode, starting at 1; 0 = all."""
     asked = command.integer(2) or 0
     modes = information.available_modes()
@@ -101,7 +101,7 @@ def _request_modes(command: Command, context: Context) -> Result:
     return Result.ACCEPTED
 
 
-def _request_storage(command: Command, context: Context) -> Result:
+def _request_storage(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 2: storage number; 0 = all. The only storage has number 1."""
     number, count, empty = 1, 1, b""
     if command.integer(2) not in (None, 0, number):
@@ -118,12 +118,12 @@ def _request_storage(command: Command, context: Context) -> Result:
     return Result.ACCEPTED
 
 
-def _first_as_second(command: Command) -> Command:
+def _first_as_second(command: VehicleCommand) -> VehicleCommand:
     first = command.params[0]
     return replace(command, params=(first, first, *command.params[2:]))
 
 
-_SPECIAL: Mapping[int, Callable[[Command, Context], Result]] = {
+_SPECIAL: Mapping[int, Callable[[VehicleCommand, Context], Result]] = {
     dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL: _request_interval,
     dialect.MAVLINK_MSG_ID_AVAILABLE_MODES: _request_modes,
     dialect.MAVLINK_MSG_ID_COMPONENT_METADATA: component_metadata.request_metadata,

@@ -13,9 +13,9 @@ from types import MappingProxyType
 
 from firmware_sim.autopilot.navigation.plan import (
     NOT_IN_MISSIONS,
-    Frame,
-    Kind,
+    MissionType,
     NavCommand,
+    PlanFrame,
     PlanItem,
 )
 from firmware_sim.mavlink.codec import WireMessage, dialect
@@ -23,8 +23,8 @@ from firmware_sim.mavlink.services.transfers import crc32part
 
 _N = NavCommand
 
-_GLOBAL_FRAMES = (Frame.GLOBAL, Frame.GLOBAL_RELATIVE_ALT)
-_INT_FRAMES = (Frame.GLOBAL_INT, Frame.GLOBAL_RELATIVE_ALT_INT)
+_GLOBAL_FRAMES = (PlanFrame.GLOBAL, PlanFrame.GLOBAL_RELATIVE_ALT)
+_INT_FRAMES = (PlanFrame.GLOBAL_INT, PlanFrame.GLOBAL_RELATIVE_ALT_INT)
 
 _ROI_NONE, _ROI_WPNEXT, _ROI_WPINDEX, _ROI_LOCATION = 0, 1, 2, 3
 """Values of MAV_ROI."""
@@ -116,7 +116,7 @@ def parse(message: WireMessage) -> PlanItem | int:
             return int(wrong_y if math.isfinite(x) else dialect.MAV_MISSION_INVALID_PARAM5_X)
         if integer:
             x, y = x * 1e-7, y * 1e-7
-    elif frame == Frame.MISSION:
+    elif frame == PlanFrame.MISSION:
         if command not in _WITHOUT_PLACE:
             return int(dialect.MAV_MISSION_UNSUPPORTED)
         if roi and _region(message.param1) not in (_ROI_NONE, _ROI_WPNEXT, _ROI_WPINDEX):
@@ -128,18 +128,18 @@ def parse(message: WireMessage) -> PlanItem | int:
     return PlanItem(command, frame, params, x, y, float(message.z), bool(message.autocontinue))
 
 
-def belongs(item: PlanItem, kind: Kind) -> bool:
+def belongs(item: PlanItem, kind: MissionType) -> bool:
     """Return True if an item is valid in a list of this type. Polygons need 3 vertices."""
-    if kind is Kind.MISSION:
+    if kind is MissionType.MISSION:
         return item.command not in NOT_IN_MISSIONS
-    if kind is Kind.FENCE and item.command in _POLYGONS:
+    if kind is MissionType.FENCE and item.command in _POLYGONS:
         return _rounded(item.params[0]) >= 3
     return True
 
 
 def format_item(
     item: PlanItem,
-    kind: Kind,
+    kind: MissionType,
     index: int,
     target: tuple[int, int],
     *,
@@ -149,15 +149,15 @@ def format_item(
     """Return the MISSION_ITEM_INT (or MISSION_ITEM) for a download."""
     x: float = item.x
     y: float = item.y
-    if item.frame == Frame.MISSION:
-        frame, params = int(Frame.MISSION), item.params
+    if item.frame == PlanFrame.MISSION:
+        frame, params = int(PlanFrame.MISSION), item.params
         if item.command == _N.DO_JUMP:
             params = (_whole(params[0]), _whole(params[1]), params[2], params[3])
         x, y = (_fit(x), _fit(y)) if integer else (x, y)
     else:
         # PX4 does not store the frame of fence points: it reports a global frame.
         frame = _frame(
-            relative=item.altitude_is_relative and kind is not Kind.FENCE, integer=integer
+            relative=item.altitude_is_relative and kind is not MissionType.FENCE, integer=integer
         )
         kept = _PLACES[item.command]
         first, second, third, fourth = (f(p) for f, p in zip(kept, item.params, strict=True))
@@ -174,8 +174,8 @@ def format_item(
 
 def _frame(*, relative: bool, integer: bool) -> int:
     if integer:
-        return int(Frame.GLOBAL_RELATIVE_ALT_INT if relative else Frame.GLOBAL_INT)
-    return int(Frame.GLOBAL_RELATIVE_ALT if relative else Frame.GLOBAL)
+        return int(PlanFrame.GLOBAL_RELATIVE_ALT_INT if relative else PlanFrame.GLOBAL_INT)
+    return int(PlanFrame.GLOBAL_RELATIVE_ALT if relative else PlanFrame.GLOBAL)
 
 
 def _fit(value: float) -> int:

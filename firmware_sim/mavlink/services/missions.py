@@ -7,10 +7,10 @@ MISSION_WRITE_PARTIAL_LIST) have no reply here either. https://mavlink.io/en/ser
 
 from __future__ import annotations
 
-from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Definition
-from firmware_sim.autopilot.navigation.plan import MOST_ITEMS, Kind
+from firmware_sim.autopilot.navigation.plan import MOST_ITEMS, MissionType
 from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
 from firmware_sim.mavlink.services import mission_items
 from firmware_sim.mavlink.services.context import ANY, Context, sender
@@ -52,7 +52,7 @@ def handle_list(message: WireMessage, context: Context) -> bool:
         and transfer.partner == partner
     )
     if transfer.activity is not _IDLE and not again:
-        context.announce(Message.of(Severity.INFO, events.DOWNLOAD_IGNORED))
+        context.announce(OperatorText.of(Severity.INFO, events.DOWNLOAD_IGNORED))
         return True
     transfer.activity, transfer.kind = _SENDING, message.mission_type
     transfer.index, transfer.partner = 0, partner
@@ -143,11 +143,11 @@ def _begin_upload(message: WireMessage, context: Context) -> bool:
         transfer.integer = False
     transfer.partner, transfer.kind, transfer.checksum = partner, message.mission_type, 0
     known = transfer.kind in MOST_ITEMS
-    if message.count > (MOST_ITEMS[Kind(transfer.kind)] if known else 0):
+    if message.count > (MOST_ITEMS[MissionType(transfer.kind)] if known else 0):
         _acknowledge(context, partner, dialect.MAV_MISSION_NO_SPACE)
     elif message.count == 0:
         if known:
-            plans.clear(Kind(transfer.kind))
+            plans.clear(MissionType(transfer.kind))
         _acknowledge(context, partner, _ACCEPTED)
     else:
         plans.receiving = True
@@ -188,7 +188,7 @@ def handle_item(message: WireMessage, context: Context) -> bool:
 
 def _take_item(message: WireMessage, context: Context) -> bool:
     transfer = context.transfer
-    item, kind = mission_items.parse(message), Kind(transfer.kind)
+    item, kind = mission_items.parse(message), MissionType(transfer.kind)
     if isinstance(item, int):
         _complain(context, "IGN MISSION_ITEM: Invalid item", events.ITEM_INVALID)
         _acknowledge(context, transfer.partner, item)
@@ -226,7 +226,7 @@ def handle_clear(message: WireMessage, context: Context) -> bool:
         _complain(context, "WPM: IGN CLEAR CMD: Busy", events.CLEAR_WHILE_BUSY)
         return True
     transfer.kind = kind
-    for cleared in Kind:
+    for cleared in MissionType:
         if kind in (cleared, ALL):
             context.port.plans.clear(cleared)
     _acknowledge(context, sender(message), _ACCEPTED)
@@ -264,7 +264,7 @@ def send_pending(context: Context) -> None:
     if jumped != transfer.told_jumped:
         transfer.told_jumped = jumped
         if jumped[0] >= 0 and transfer.activity is _IDLE and transfer.partner[0] >= 0:
-            transfer.kind = int(Kind.MISSION)
+            transfer.kind = int(MissionType.MISSION)
             _send_item(context, jumped[0])
 
 
@@ -295,11 +295,11 @@ def _settle(transfer: MissionTransfer) -> None:
 
 
 def _items(context: Context, kind: int) -> tuple[object, ...]:
-    return context.port.plans.stored(Kind(kind)).items if kind in MOST_ITEMS else ()
+    return context.port.plans.stored(MissionType(kind)).items if kind in MOST_ITEMS else ()
 
 
 def _identity(context: Context, kind: int) -> int:
-    return context.port.plans.stored(Kind(kind)).identity if kind in MOST_ITEMS else 0
+    return context.port.plans.stored(MissionType(kind)).identity if kind in MOST_ITEMS else 0
 
 
 def _request(context: Context) -> None:
@@ -314,7 +314,7 @@ def _request(context: Context) -> None:
 
 
 def _send_item(context: Context, index: int) -> None:
-    transfer, kind = context.transfer, Kind(context.transfer.kind)
+    transfer, kind = context.transfer, MissionType(context.transfer.kind)
     plans = context.port.plans
     transfer.sent_us = context.now_us
     context.link.send(
@@ -336,7 +336,7 @@ def _acknowledge(context: Context, target: tuple[int, int], result: int, identit
 
 
 def _complain(context: Context, text: str, event: Definition) -> None:
-    context.announce(Message.of(Severity.CRITICAL, event, text=text))
+    context.announce(OperatorText.of(Severity.CRITICAL, event, text=text))
 
 
 def _break_off(context: Context, why: Definition) -> bool:

@@ -12,11 +12,11 @@ from dataclasses import replace
 
 from airl_mav.core.frames import Geodetic, geodetic_to_local
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
+from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Result, Severity
 from firmware_sim.autopilot.navigation.plan import NavCommand
-from firmware_sim.autopilot.requests import OrbitRequest, Place, Reposition
+from firmware_sim.autopilot.requests import OrbitRequest, PositionYaw, Reposition
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import Action, Command, Context
+from firmware_sim.mavlink.services.context import Action, Context, VehicleCommand
 
 NAN = math.nan
 
@@ -29,27 +29,27 @@ _LOWEST_M, _HIGHEST_M = -12_000.0, 100_000.0
 """Range of valid origin altitudes above mean sea level, as in EKF2 [m]."""
 
 
-def _reposition(command: Command, context: Context) -> Result:
+def _reposition(command: VehicleCommand, context: Context) -> Result:
     """Handle parameters 1: speed [m/s], 2: flags, 4: heading [rad], 5..7: position; NaN = keep."""
     if command.integer(2) != _CHANGE_MODE:
         return Result.UNSUPPORTED
     speed, yaw = command.params[0], command.params[3]
     speed = speed if math.isfinite(speed) and speed > 0.0 else NAN
-    place = Place(local_place(command, context), yaw if math.isfinite(yaw) else NAN)
+    place = PositionYaw(local_place(command, context), yaw if math.isfinite(yaw) else NAN)
     if all(map(math.isnan, (*place.position, place.yaw))):
         return context.port.set_mode(Mode.HOLD)
     return context.port.set_mode(Mode.HOLD, Reposition(place, speed))
 
 
-def _change_altitude(command: Command, context: Context) -> Result:
+def _change_altitude(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 1: altitude [m] above mean sea level."""
     nowhere = (NAN, NAN, NAN, NAN, NAN, NAN)
     above = replace(command, params=(*nowhere, command.params[0]))
-    place = Place(local_place(above, context), NAN)
+    place = PositionYaw(local_place(above, context), NAN)
     return context.port.set_mode(Mode.HOLD, Reposition(place, altitude_alone=True))
 
 
-def _change_speed(command: Command, context: Context) -> Result:
+def _change_speed(command: VehicleCommand, context: Context) -> Result:
     """Handle parameters 1: SPEED_TYPE, 2: speed [m/s]."""
     speed = command.params[1]
     if command.integer(1) == _GROUND_SPEED and speed > 0.0 and math.isfinite(speed):
@@ -57,17 +57,17 @@ def _change_speed(command: Command, context: Context) -> Result:
     return Result.ACCEPTED
 
 
-def _orbit(command: Command, context: Context) -> Result:
+def _orbit(command: VehicleCommand, context: Context) -> Result:
     """Handle parameters 1: radius [m], 2: speed [m/s], 3: ORBIT_YAW_BEHAVIOUR, 5..7: centre."""
     radius, speed = (p if math.isfinite(p) else NAN for p in command.params[:2])
     request = OrbitRequest(local_place(command, context), radius, speed, command.integer(3))
     result = context.port.set_mode(Mode.ORBIT, request)
     if result is not Result.ACCEPTED:
-        context.announce(Message(Severity.CRITICAL, "Orbit command rejected"))
+        context.announce(OperatorText(Severity.CRITICAL, "Orbit command rejected"))
     return result
 
 
-def local_place(command: Command, context: Context) -> Vec:
+def local_place(command: VehicleCommand, context: Context) -> Vec:
     """Return parameters 5 to 7 in local NED [m]; NaN if unset or unknown."""
     latitude, longitude, altitude = command.params[4:]
     state = context.port.state()
@@ -83,7 +83,7 @@ def local_place(command: Command, context: Context) -> Vec:
     return north, east, down
 
 
-def _start(command: Command, context: Context) -> Result:
+def _start(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 1: first item; -1 = continue the mission."""
     index = command.params[0]
     if not math.isfinite(index):
@@ -91,7 +91,7 @@ def _start(command: Command, context: Context) -> Result:
     return context.port.start_mission(int(index))
 
 
-def _start_landing(_command: Command, context: Context) -> Result:
+def _start_landing(_command: VehicleCommand, context: Context) -> Result:
     """Go to the mission's landing: DO_LAND_START, or the first landing; CANCELLED without one."""
     commands = [item.command for item in context.port.plans.mission]
     for marker in (NavCommand.DO_LAND_START, NavCommand.LAND):
@@ -100,7 +100,7 @@ def _start_landing(_command: Command, context: Context) -> Result:
     return Result.CANCELLED
 
 
-def _set_home(command: Command, context: Context) -> Result:
+def _set_home(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 1: 1 = current position; otherwise parameters 5 to 7 are the position."""
     if command.params[0] > 0.5:
         return context.port.set_home(None)
@@ -110,7 +110,7 @@ def _set_home(command: Command, context: Context) -> Result:
     return context.port.set_home(place)
 
 
-def _look(command: Command, context: Context) -> Result:
+def _look(command: VehicleCommand, context: Context) -> Result:
     """Handle DO_SET_ROI_LOCATION, DO_SET_ROI (parameter 1: MAV_ROI) and DO_SET_ROI_NONE."""
     place = Geodetic(*command.params[4:7])
     located = command.number == NavCommand.DO_SET_ROI_LOCATION or (

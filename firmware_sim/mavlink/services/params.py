@@ -9,7 +9,7 @@ import struct
 from firmware_sim.autopilot.autopilot_state import Arming, Result
 from firmware_sim.autopilot.port import ParameterStore, ParameterValue
 from firmware_sim.mavlink.codec import WireMessage, dialect, param_value, payload
-from firmware_sim.mavlink.services.context import Action, Command, Context, sender
+from firmware_sim.mavlink.services.context import Action, Context, VehicleCommand, sender
 from firmware_sim.mavlink.services.transfers import crc32part
 
 HASH_NAME = "_HASH_CHECK"
@@ -138,7 +138,7 @@ def _hash_of(store: ParameterStore, _revision: int) -> int:
 _LOAD, _SAVE, _RESET, _RESET_SENSORS, _FACTORY_RESET = range(5)
 
 
-def _store(command: Command, context: Context) -> Result | None:
+def _store(command: VehicleCommand, context: Context) -> Result | None:
     """Handle parameter 1: action. PX4 does not acknowledge unknown actions."""
     if context.port.state().status.arming is Arming.ARMED:
         return Result.TEMPORARILY_REJECTED

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import count
 
 from airl_mav.core.clock import NS_PER_US
-from firmware_sim.autopilot.autopilot_state import Arming, Message, Severity
+from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import ANY, Context, sender
 from firmware_sim.mavlink.streams import Builder
@@ -57,10 +57,10 @@ def handle_setup(message: WireMessage, context: Context) -> bool:
         context.signing.change(key if any(key) else None, message.initial_timestamp)
     except OSError as error:
         text = f"Signing key not stored: {error.strerror}"
-        context.announce(Message(Severity.CRITICAL, text))
+        context.announce(OperatorText(Severity.CRITICAL, text))
     else:
         what = "set" if any(key) else "removed"
         system, component = sender(message)
         text = f"Signing key {what} by system {system} component {component}"
-        context.announce(Message(Severity.NOTICE, text))
+        context.announce(OperatorText(Severity.NOTICE, text))
     return True

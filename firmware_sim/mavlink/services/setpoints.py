@@ -18,7 +18,7 @@ from airl_mav.core.frames import (
     quat_to_euler,
 )
 from airl_mav.vehicle.rotation import rotate, yaw_of
-from firmware_sim.autopilot.autopilot_state import Message, Setpoint, Severity, Vector, Wire
+from firmware_sim.autopilot.autopilot_state import OperatorText, Setpoint, Severity, Vector, Wire
 from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context
@@ -58,10 +58,10 @@ def handle_local(message: WireMessage, context: Context) -> bool:
             acceleration = np.array(rotate((w, x, y, z), (forward, right, down)))
     else:
         text = f"{message.get_type()} coordinate frame {frame} unsupported"
-        return _reject(context, Message.of(_CRITICAL, events.LOCAL_FRAME, frame, text=text))
+        return _reject(context, OperatorText.of(_CRITICAL, events.LOCAL_FRAME, frame, text=text))
     if not _commands_something(position, velocity, acceleration):
         text = f"{message.get_type()} invalid"
-        return _reject(context, Message.of(_CRITICAL, events.LOCAL_INVALID, text=text))
+        return _reject(context, OperatorText.of(_CRITICAL, events.LOCAL_INVALID, text=text))
     return _offer(message, position, velocity, acceleration, context)
 
 
@@ -75,7 +75,9 @@ def handle_global(message: WireMessage, context: Context) -> bool:
         frame = message.coordinate_frame
         if frame not in _FRAMES_ABOVE:
             text = f"{message.get_type()} invalid coordinate frame {frame}"
-            return _reject(context, Message.of(_CRITICAL, events.GLOBAL_FRAME, frame, text=text))
+            return _reject(
+                context, OperatorText.of(_CRITICAL, events.GLOBAL_FRAME, frame, text=text)
+            )
         position = _from_globe(message, _FRAMES_ABOVE[frame], context)
     if position is None or not _commands_something(position, velocity, acceleration):
         return False  # PX4 sends no reply
@@ -126,7 +128,7 @@ def _offer(
     if forced and np.isfinite(acceleration).any():
         event = events.LOCAL_FORCE if _is_local(message) else events.GLOBAL_FORCE
         text = f"{message.get_type()} force not supported"
-        return _reject(context, Message.of(_CRITICAL, event, text=text))
+        return _reject(context, OperatorText.of(_CRITICAL, event, text=text))
     yaw = math.nan if mask & dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE else message.yaw
     yaw_rate = (
         math.nan if mask & dialect.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE else message.yaw_rate
@@ -213,7 +215,7 @@ def _is_local(message: WireMessage) -> bool:
     return bool(message.get_msgId() == dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED)
 
 
-def _reject(context: Context, why: Message) -> bool:
+def _reject(context: Context, why: OperatorText) -> bool:
     context.port.refuse_setpoint(why.text, context.now_us)
     context.announce_once(why)
     return False

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.navigation.plan import PlanItem
 from firmware_sim.autopilot.port import LogEntry
 
@@ -58,7 +58,7 @@ class RefusedError(Exception):
 
 
 @dataclass(slots=True)
-class Request:
+class FtpRequest:
     """Unpacked FTP request."""
 
     session: int
@@ -82,7 +82,7 @@ class Session:
     size: int = 0
     """Size of the file [bytes], when opened and after writes."""
 
-    def opened(self, request: Request) -> BinaryIO:
+    def opened(self, request: FtpRequest) -> BinaryIO:
         """Return the open file. Raises RefusedError if no file is open."""
         if request.session != SESSION or self.file is None:
             raise RefusedError(Code.INVALID_SESSION)
@@ -348,12 +348,12 @@ class MissionTransfer:
 # --- calibrations
 
 
-class Step(NamedTuple):
+class CalibrationText(NamedTuple):
     """Text of a calibration."""
 
     after_s: float
     """Time after the previous text [s]."""
-    message: Message
+    message: OperatorText
 
 
 class RunningCalibration:
@@ -363,8 +363,8 @@ class RunningCalibration:
         self.sensor = ""
         self.radio = False
         """True while a ground station calibrates a radio; a cancellation ends it."""
-        self._steps: Iterator[Step] = iter(())
-        self._next: Step | None = None
+        self._steps: Iterator[CalibrationText] = iter(())
+        self._next: CalibrationText | None = None
         self._due_us = 0
 
     @property
@@ -377,14 +377,14 @@ class RunningCalibration:
         """True if steps remain."""
         return self._next is not None
 
-    def start(self, sensor: str, steps: Iterator[Step], now_us: int) -> None:
+    def start(self, sensor: str, steps: Iterator[CalibrationText], now_us: int) -> None:
         """Start calibrating a sensor. Replaces a running calibration."""
         self.sensor, self._steps, self._due_us = sensor, steps, now_us
         self._plan()
 
-    def due(self, now_us: int) -> list[Message]:
+    def due(self, now_us: int) -> list[OperatorText]:
         """Return the messages due at `now_us` [µs], in order."""
-        messages: list[Message] = []
+        messages: list[OperatorText] = []
         while self._next is not None and self._due_us <= now_us:
             messages.append(self._next.message)
             self._plan()

@@ -8,7 +8,7 @@ import numpy as np
 
 from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local, local_to_geodetic
 from firmware_sim.autopilot.autopilot_state import AutopilotState
-from firmware_sim.interfaces import Truth
+from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams import units
 
@@ -70,10 +70,10 @@ def _heading(yaw: float) -> Values:
 
 _NO_AIRSPEEDS = (0, 0)
 _NO_ACCELERATION = (0, 0, 0)
-"""Placeholder: `Truth` has no acceleration, and PX4 only logs it."""
+"""Placeholder: `TrueState` has no acceleration, and PX4 only logs it."""
 
 
-def hil_state_quaternion(truth: Truth, time_us: int) -> Values:
+def hil_state_quaternion(truth: TrueState, time_us: int) -> Values:
     """Return attitude (w, x, y, z, body -> NED), rates [rad/s], position and velocity [cm/s].
 
     Args:
