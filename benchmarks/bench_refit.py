@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from airl_mav.experiments.refitted_reflight import PartFlown, refly_parts
+from airl_mav.experiments.refly import PartFlown, refly_parts
 from airl_mav.refitting.refit import refit
 from airl_mav.scenario.model import DEFAULT_ARENA
 from tests.support.recorded_flights import RecordedFlight

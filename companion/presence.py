@@ -7,8 +7,9 @@ Directions without a return within range are free, directions outside the field 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,7 +24,28 @@ from airl_mav.core.machine import temperature_c
 from airl_mav.policy.observation import Kinematics
 from airl_mav.policy.scans import NEAREST_M, level_scan, rays_of, tilt_of
 from companion.camera import FrameSource
-from companion.periodic import every
+
+
+@contextmanager
+def every(period_us: int, act: Callable[[], object], clock: Clock, name: str) -> Iterator[None]:
+    """Call `act` immediately and once per period [µs] in a named thread, skipping missed calls."""
+    ended = threading.Event()
+
+    def go_on() -> None:
+        due_us = clock.time_us()
+        while not ended.is_set():
+            act()
+            due_us = max(due_us + period_us, clock.time_us())
+            clock.sleep_until(due_us, ended)
+
+    thread = threading.Thread(target=go_on, name=name, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
 
 MESSAGE = "ONBOARD_COMPUTER_STATUS"
 

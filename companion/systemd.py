@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 
 from airl_mav.core.clock import WallClock
-from companion.periodic import every
+from companion.presence import every
 
 ALIVE_SHARE = 0.5
 """Interval of watchdog notifications as a share of systemd's timeout, as recommended by

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import Statics
 from airl_mav.arena.footprints import Boxes, Floats
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
-from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.gates import GATE
+from airl_mav.profiles.arena import GATE, ArenaSpec
 
 PARTS = 4
 """Boxes of a gate, in this order: west and east of the opening, below and above it."""

@@ -21,7 +21,7 @@ from airl_mav.arena.footprints import Boxes
 from airl_mav.arena.geometry import Bounds, Obstacles, PlacedMesh, Shape
 from airl_mav.arena.ground import COLUMNS, ROWS, Floats, Ground, Relief
 from airl_mav.core.kernels import kernel, large_kernel
-from airl_mav.profiles.terrain import Terrain
+from airl_mav.profiles.arena import Terrain
 
 TRIES = 20
 """Maximum draws of the hills; redrawn while the level area removes the highest ones."""

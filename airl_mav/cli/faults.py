@@ -17,8 +17,7 @@ from airl_mav.core.files import replace_file
 from airl_mav.core.progress import RichProgress
 from airl_mav.core.provenance import provenance, usable_cores
 from airl_mav.experiments import fault_matrix
-from airl_mav.faults.catalogue import CASES, MATRIX_PHASES
-from airl_mav.faults.kinds import LINKS, PROCESSES, Phase
+from airl_mav.faults.kinds import CASES, LINKS, MATRIX_PHASES, PROCESSES, Phase
 from airl_mav.faults.model import Fault
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.table import Column, TableView, print_table

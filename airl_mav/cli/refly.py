@@ -21,8 +21,7 @@ from airl_mav.report.table import NONE, TableView, columns_of, print_table
 from airl_mav.scenario.model import GREATEST_SEED
 
 if TYPE_CHECKING:
-    from airl_mav.experiments.refitted_reflight import PartFlown
-    from airl_mav.experiments.refly import Changes
+    from airl_mav.experiments.refly import Changes, PartFlown
 
 
 class ReflyOptions(ProfileModel):
@@ -116,7 +115,7 @@ def run(options: ReflyOptions, console: Console | None = None) -> int:
     parts: tuple[PartFlown, ...] = ()
     if options.parts and options.refit is not None:
         check_installed("refit")
-        from airl_mav.experiments.refitted_reflight import refly_parts
+        from airl_mav.experiments.refly import refly_parts
 
         found, parts = refly_parts(options.flight, out, options.refit, **flown)
     else:
@@ -168,7 +167,7 @@ def _changes(options: ReflyOptions) -> Changes:
     changes = AS_FLOWN
     if options.refit is not None:
         check_installed("refit")
-        from airl_mav.experiments.refitted_reflight import changes_of
+        from airl_mav.experiments.refly import changes_of
 
         changes = changes_of(options.refit)
     return replace(

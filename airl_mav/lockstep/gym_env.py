@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import gymnasium as gym
@@ -29,16 +30,86 @@ from airl_mav.envs.spec import EnvironmentSpec, gymnasium_spec
 from airl_mav.envs.stopping import bounded, injections_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.asked_flight import AskedFlight
-from airl_mav.lockstep.spec_scenario import BESIDE, scenario_of
 from airl_mav.policy.action_sets import command, commands
 from airl_mav.policy.layouts import encode_layout, newest_frame
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import Encoded
 from airl_mav.policy.registry import PolicyInfo
+from airl_mav.profiles.conditions import SensorNoise, Spread
 from airl_mav.rehearsal.run_folder import FlownEpisode
+from airl_mav.scenario.model import Scenario, WatchdogSettings
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.warm_up import warm_up
+
+BESIDE = (
+    "firmware",
+    "real",
+    "plant",
+    "estimator",
+    "renderer",
+    "faults",
+    "payload",
+    "battery_charge",
+    "origin",
+    "limits",
+    "arena_seed",
+    "latency_seed",
+    "speed",
+    "start",
+)
+"""Fields of a `Scenario` that an `EnvironmentSpec` lacks."""
+
+TWIN_ALONE = (
+    "camera",
+    "curriculum",
+    "delay.native_ms",
+    "delay.transport_ms",
+    "delay.link_ms",
+    "randomisation.estimation",
+    "randomisation.extra_delay_ms",
+)
+"""Fields of an `EnvironmentSpec` that only the vectorized simulator supports."""
+
+
+def scenario_of(spec: EnvironmentSpec, beside: Mapping[str, Any]) -> Scenario:
+    """Return the scenario, without a policy; of several t2 sources it uses the first.
+
+    Args:
+        spec: Specification of the environment.
+        beside: Values of the fields `BESIDE`, without defaults.
+
+    Raises:
+        FieldError: A field has a wrong type, is out of range, or needs the vectorized simulator.
+    """
+    usual = EnvironmentSpec()
+    for name in TWIN_ALONE:
+        value, accepted = (reduce(getattr, name.split("."), each) for each in (spec, usual))
+        if value != accepted:
+            raise FieldError(name, value, f"{accepted}: only the batch twin has another")
+    rules, delay, drawn = spec.episode, spec.delay, spec.randomisation
+    return Scenario(
+        level="lockstep",
+        vehicle=spec.vehicle,
+        arena=spec.arena,
+        hold_s=rules.hold_s,
+        altitude_m=rules.altitude_m,
+        goal_radius_m=rules.goal_radius_m,
+        time_limit_s=rules.time_limit_s,
+        max_speed_m_s=spec.max_speed_m_s,
+        decisions=spec.decisions,
+        compensate=spec.compensate,
+        watchdog=WatchdogSettings(
+            hover_after_s=rules.hover_after_s, decision_timeout_s=rules.decision_timeout_s
+        ),
+        computer=delay.computer,
+        workload=delay.workload,
+        latency=delay.latency[0] if delay.latency else None,
+        wind=spec.wind,
+        spread={name: getattr(drawn, name) for name in Spread.model_fields},
+        sensors={name: getattr(drawn, name) for name in SensorNoise.model_fields},
+        **beside,
+    )
 
 
 class RehearsalEnv(gym.Env[Encoded, Any]):

@@ -27,7 +27,7 @@ from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.interfaces import LinkError
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
-from companion.periodic import every
+from companion.presence import every
 from companion.program import mission_camera, prepare
 from companion.watchdog import ThreadGuard
 

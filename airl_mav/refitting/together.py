@@ -19,9 +19,8 @@ from airl_mav.flight.statistics import QUANTILE
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.refitting.air import WIND, Air
 from airl_mav.refitting.files import overrides_of, refitted, vehicle_toml, write_refit
-from airl_mav.refitting.latencies import no_latencies
 from airl_mav.refitting.quantity import Array, FittedQuantity
-from airl_mav.refitting.refit import LOG_SUFFIX, Refit, check_out, refit
+from airl_mav.refitting.refit import LOG_SUFFIX, Refit, check_out, no_latencies, refit
 from airl_mav.refitting.response import TIMES, ResponseFit
 from airl_mav.refitting.thrust import Known, thrust_of
 

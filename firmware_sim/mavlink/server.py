@@ -15,11 +15,10 @@ from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.engine.record import Record
 from firmware_sim.interfaces import TrueState
-from firmware_sim.mavlink.clients import Client, Clients, Senders
+from firmware_sim.mavlink.clients import Client, Clients, Forwarder, Senders
 from firmware_sim.mavlink.codec import COMPONENT_ID, REPLY_IDS, SYSTEM_ID, TextEncoder, WireMessage
 from firmware_sim.mavlink.endpoint import Peer, Sender
 from firmware_sim.mavlink.event_buffer import EventBuffer, EventSender
-from firmware_sim.mavlink.forwarding import Forwarder
 from firmware_sim.mavlink.limits import Allowance, Complaints, TickTime
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
 from firmware_sim.mavlink.own_streams import OwnStreams, Radio

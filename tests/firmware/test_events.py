@@ -35,8 +35,8 @@ from firmware_sim.autopilot.events.enumerations import (
 from firmware_sim.autopilot.events.health_report import ALL_MODES, HealthReport, health_report
 from firmware_sim.autopilot.failsafes.actions import FailsafeAction as FailsafeAction
 from firmware_sim.autopilot.failsafes.actions import FailsafeReason
-from firmware_sim.autopilot.failsafes.announcement import announcement
 from firmware_sim.autopilot.failsafes.conditions import NEEDS, Conditions, Need
+from firmware_sim.autopilot.failsafes.framework import announcement
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.mode_numbers import STATE_BITS, custom_mode
 from firmware_sim.autopilot.prearm import can_arm

@@ -16,7 +16,7 @@ from airl_mav.core.constants import TICK_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import HOME, Vector
 from airl_mav.experiments.fault_matrix import fly_fault
-from airl_mav.faults.catalogue import FITTED_CASES, Case
+from airl_mav.faults.kinds import FITTED_CASES, Case
 from airl_mav.profiles.sensors import OpticalFlow as Profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario

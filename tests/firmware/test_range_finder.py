@@ -15,7 +15,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import HOME
 from airl_mav.experiments.fault_matrix import fly_fault
-from airl_mav.faults.catalogue import FITTED_CASES, STANDS, Case
+from airl_mav.faults.kinds import FITTED_CASES, STANDS, Case
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve

@@ -19,8 +19,7 @@ from airl_mav.experiments.fault_matrix import (
     fly_matrix,
     markdown,
 )
-from airl_mav.faults.catalogue import CASES, FALLS, MATRIX_PHASES, End
-from airl_mav.faults.kinds import Phase
+from airl_mav.faults.kinds import CASES, FALLS, MATRIX_PHASES, End, Phase
 from airl_mav.faults.model import Fault
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.report.table import print_table

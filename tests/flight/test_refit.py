@@ -19,15 +19,15 @@ from airl_mav.cli.refit import run as airl_refit
 from airl_mav.cli.report import ReportOptions
 from airl_mav.cli.report import run as report
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.experiments.refitted_reflight import (
+from airl_mav.experiments.refly import (
     ALL,
     LATENCY,
     NOTHING,
     VEHICLE,
     WIND,
     refly_parts,
+    turned_wind,
 )
-from airl_mav.experiments.refly import turned_wind
 from airl_mav.experiments.run import load_run
 from airl_mav.latency.source import parse_latency
 from airl_mav.profiles.computer import load_computer

@@ -503,7 +503,7 @@ def test_a_row_knows_its_fields() -> None:
 @pytest.fixture
 def live(gym: Path) -> Iterator[Any]:
     pytest.importorskip("foxglove", reason="needs the [export] extra")
-    from airl_mav.report.export_log.live import LiveFlight
+    from airl_mav.report.export_log.files import LiveFlight
 
     served = LiveFlight(recorded(gym), 0)
     yield served

@@ -234,9 +234,9 @@ over = threading.Event()
 os.write(1, b"banner of a library\\n")
 print("printed", flush=True)
 channel.send(Ready())
-channel.listen(lambda r: channel.send(Progress(phase=r.type, time_us=0)), over.set)
+channel.listen(lambda r: channel.send(PhaseEntered(phase=r.type, time_us=0)), over.set)
 over.wait(60)
-channel.send(Progress(phase="gone", time_us=1))
+channel.send(PhaseEntered(phase="gone", time_us=1))
 sys.exit(7)
 '''
 

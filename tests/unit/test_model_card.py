@@ -8,8 +8,13 @@ from pathlib import Path
 import pytest
 
 from airl_mav.policy.card import MeasuredResult, read_card
-from airl_mav.policy.card_writing import add_result, write_card
-from airl_mav.policy.model_card import MODEL_CARD_FILE, QUALITIES, model_card
+from airl_mav.policy.card_writing import (
+    MODEL_CARD_FILE,
+    QUALITIES,
+    add_result,
+    model_card,
+    write_card,
+)
 from airl_mav.profiles.loading import profiles_dir
 
 yaml = pytest.importorskip("yaml", reason="needs the [docs] extra")

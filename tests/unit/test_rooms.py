@@ -18,7 +18,6 @@ from rich.console import Console
 from scipy import ndimage, stats
 
 from airl_mav.arena.appearance import srgb_of
-from airl_mav.arena.describe import arena_table
 from airl_mav.arena.draw import OPENING_COLOUR, draw_arena
 from airl_mav.arena.footprints import bounding_boxes
 from airl_mav.arena.generate import generate, local_bounds
@@ -27,6 +26,7 @@ from airl_mav.arena.rooms import Plan, draw_plan, over_doors
 from airl_mav.camera import primitives
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
+from airl_mav.cli.arena import arena_table
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.arenas import CEILING, FLOOR, NOTHING, WALL, batch_of, clearance, touches
 from airl_mav.profiles.arena import ArenaSpec

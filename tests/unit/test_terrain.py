@@ -28,10 +28,9 @@ from airl_mav.camera.render import render
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arenas import FLOOR as TOUCHED_FLOOR
 from airl_mav.envs.arenas import NOTHING, clearance, touches
-from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.arena import MOST_CELLS, ArenaSpec, Terrain
 from airl_mav.profiles.camera_kind import Projection
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.terrain import MOST_CELLS, Terrain
 from tests.support.lenses import AT_NIGHT_THE_FISHEYE
 from tests.support.meshes import kept, ring, scene_of, triangles
 from tests.unit.test_meshes_seen import in_world, nearest, rays_of
