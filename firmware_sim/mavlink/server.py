@@ -124,8 +124,7 @@ class MavlinkServer:
         self._arrivals = select.poll()
         for number in self.filenos():
             self._arrivals.register(number, select.POLLIN)
-        self._is_transferring = True
-        """True if a client may have a transfer in progress: lists, files, logs."""
+        self._is_transferring = True  # possibly: `send` checks
         self._mission_progress: object = None
         if port is not None:
             self.attach(port)

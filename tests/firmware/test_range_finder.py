@@ -24,7 +24,7 @@ from firmware_sim.autopilot.error_state import V
 from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.modes.land import landing_speed
-from firmware_sim.autopilot.modes.terrain_hold import Piloting, TerrainHold
+from firmware_sim.autopilot.modes.piloted import Piloting, TerrainHold
 from firmware_sim.autopilot.range_finder import RangeFinder
 from firmware_sim.crash_detector import TOUCHDOWN_M_S
 from firmware_sim.engine.record import LANDING, new_controller

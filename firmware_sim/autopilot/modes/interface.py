@@ -25,7 +25,7 @@ from firmware_sim.autopilot.requests import (
 )
 from firmware_sim.autopilot.travel import Travel
 
-NAN = math.nan
+NAN: float = math.nan
 FREE: Vec = (NAN, NAN, NAN)
 """Position or velocity of a demand without commanded axes."""
 
