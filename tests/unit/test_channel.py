@@ -228,7 +228,7 @@ def test_sending_to_a_harness_that_is_gone_is_no_error() -> None:
 CHATTERBOX = '''
 """A child that prints from C, as pybullet does, and speaks the channel."""
 import ctypes, os, queue, sys, threading
-from airl_mav.rehearsal.channel import ChildChannel, Progress, Ready
+from airl_mav.rehearsal.channel import ChildChannel, PhaseEntered, Ready
 channel = ChildChannel.on_stdio()
 over = threading.Event()
 os.write(1, b"banner of a library\\n")
