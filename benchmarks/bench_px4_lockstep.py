@@ -124,7 +124,7 @@ def main() -> None:
     parser.add_argument("--px4-dir", type=Path, help="PX4's build, source tree or package")
     parser.add_argument("--instance", type=int, default=7, help="moves all ports")
     parser.add_argument("--seeds", type=int, default=3, help="flights")
-    parser.add_argument("--threads", type=int, default=0, help="show so many threads, too")
+    parser.add_argument("--threads", type=int, default=0, help="also show this number of threads")
     options = parser.parse_args()
     flights = []
     with tempfile.TemporaryDirectory() as name:

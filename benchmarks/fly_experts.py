@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1, help="of the first")
     parser.add_argument("--actions", default="velocity-fixed-yaw")
-    parser.add_argument("--speed", type=float, default=4.0, help="greatest [m/s]")
+    parser.add_argument("--speed", type=float, default=4.0, help="maximum [m/s]")
     parser.add_argument("--hold", type=float, default=0.2, help="between decisions [s]")
     options = parser.parse_args()
     spec = EnvironmentSpec.model_validate(

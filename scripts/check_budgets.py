@@ -145,7 +145,7 @@ def check(measured: Table, path: Path, *, lower: bool) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(description="Check the budgets of scripts/budgets.toml.")
     parser.add_argument("--calls", action="store_true", help="measure calls per tick, too")
-    parser.add_argument("--lower", action="store_true", help="lower budgets to what is measured")
+    parser.add_argument("--lower", action="store_true", help="lower budgets to the measured values")
     options = parser.parse_args()
     measured = measure(ROOT) | (measure_calls() if options.calls else {})
     return check(measured, BUDGETS, lower=options.lower)

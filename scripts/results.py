@@ -147,7 +147,7 @@ def _parser() -> argparse.ArgumentParser:
     one = commands.add_parser("fingerprint", help="fly the fingerprint of the flight behaviour")
     one.add_argument("--accept", action="store_true", help="write it down as today's")
     one.set_defaults(run=fingerprint)
-    commands.add_parser("list", help="what is out of date").set_defaults(run=show)
+    commands.add_parser("list", help="outdated results").set_defaults(run=show)
     one = commands.add_parser("fly", help="fly again what is out of date")
     one.add_argument("names", nargs="*", metavar="NAME", help="these, out of date or not")
     one.add_argument("--quick", action="store_true", help="few flights, never published")

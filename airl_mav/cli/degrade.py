@@ -38,7 +38,7 @@ class DegradeOptions(Gate, ExperimentOptions):
     )
     compensated: bool = Field(
         default=False,
-        description="fly each policy with its latency compensated, too: a curve of its own",
+        description="also fly each policy with compensated latency, as a separate curve",
     )
     arena: ArenaName = DEFAULT_ARENA
     episodes: int = episodes("episodes at each latency", 300)

@@ -51,9 +51,9 @@ class OnboardOptions(Gate, ExperimentOptions):
     )
     reference_workload: str | None = Field(
         default=None,
-        description="workload of the reference; by default the target's if the reference has it,"
-        " otherwise what was measured there for the very policy, or else 1 ms (gym, lockstep), or"
-        " what this machine takes (sitl)",
+        description="workload of the reference; default: the target's if the reference has it, else"
+        " the one measured there with this policy, else 1 ms (gym, lockstep) or the time on this"
+        " machine (sitl)",
     )
 
 

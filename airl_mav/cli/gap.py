@@ -35,8 +35,8 @@ class GapOptions(OnboardOptions):
     )
     mitigated: str = Field(
         default=DEFAULT_MITIGATED,
-        description="policy that was trained as late as the computer decides: a name, or a path;"
-        " none: fly the gap without mitigation only",
+        description="policy trained with the computer's latency: a name, or a path; none: fly the"
+        " gap without mitigation only",
     )
     arena: tuple[str, ...] = Field(
         default=(DEFAULT_ARENA,),

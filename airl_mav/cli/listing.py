@@ -43,7 +43,7 @@ class ListOptions(BaseModel):
     kind: Annotated[
         Literal["vehicles", "arenas", "policies", "computers", "training", "sweeps", "all"],
         POSITIONAL,
-    ] = Field(default="all", description="what to list")
+    ] = Field(default="all", description="kind of items to list")
 
 
 OPTIONS = ListOptions

@@ -51,8 +51,8 @@ class RefitOptions(ProfileModel):
     )
     known: Literal["thrust", "mass"] = Field(
         default="thrust",
-        description="what the profile is right about: a flight tells only thrust per mass, and the"
-        " other one is fitted",
+        description="quantity taken from the profile: a flight determines only thrust per mass, so"
+        " the other one is fitted",
     )
     out: Path = Field(
         description="new folder for vehicle.toml, computer.toml, latency.txt, scenario.toml and"

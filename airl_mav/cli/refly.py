@@ -40,8 +40,8 @@ class ReflyOptions(ProfileModel):
     flight: Annotated[Path, POSITIONAL] = Field(description="black box of a flight (.mcap)")
     arena: str | None = Field(
         default=None,
-        description="arena profile with what stood where it flew: a shipped name, or a path to a"
-        " .toml; by default an empty plain",
+        description="arena profile of the flight's surroundings: a shipped name, or a path to a"
+        " .toml; default: an empty plain",
     )
     arena_seed: int | None = quantity(
         "seed of the arena; by default that of the flight",
@@ -64,8 +64,8 @@ class ReflyOptions(ProfileModel):
     )
     parts: bool = Field(
         default=False,
-        description="with a refit: rehearse also with its latency, its vehicle and its wind alone,"
-        " and with nothing of it, on the same seeds: what explains the flight",
+        description="with a refit: also rehearse with its latency, its vehicle and its wind alone,"
+        " and with none of them, on the same seeds, to explain the flight",
     )
     vehicle: str | None = Field(
         default=None,

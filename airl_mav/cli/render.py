@@ -102,8 +102,8 @@ class RenderOptions(ProfileModel):
     )
     camera_name: str | None = Field(
         default=None,
-        description="with --camera: which of the vehicle's further cameras, by its name in the"
-        " profile ([cameras.NAME]); by default its main one",
+        description="with --camera: name of an additional camera in the profile ([cameras.NAME]);"
+        " default: the main camera",
     )
     speed_m_s: float = quantity(
         "with --camera or --show flow: how fast it flies ahead", "m/s", ge=-100, le=100, default=0.0
@@ -116,7 +116,7 @@ class RenderOptions(ProfileModel):
         default=0.0,
     )
     renderer: Renderer = Field(
-        default="raycast", description="what draws; mitsuba draws rgb alone, without fog"
+        default="raycast", description="renderer; mitsuba draws rgb only, without fog"
     )
     samples: int | None = quantity(
         "rays or paths a pixel; by default 16, of mitsuba 64, in a film 4 and 16; a camera has one",
@@ -136,7 +136,7 @@ class RenderOptions(ProfileModel):
     )
     trust: bool = Field(
         default=False,
-        description="run the arena generators that the run names: code of whoever made the folder",
+        description="run the arena generators named by the run: code by the author of the folder",
     )
     north_m: float = quantity(
         "of the camera: distance north of the start", "m", ge=-1000, le=1000, default=0.0

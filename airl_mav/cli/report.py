@@ -40,8 +40,7 @@ class ReportOptions(ProfileModel):
     )
     names: tuple[str, ...] = Field(
         default=(),
-        description="what compared runs are called, in their order; by default what tells them"
-        " apart",
+        description="labels of the compared runs, in order; default: their differences",
     )
     out: Path | None = Field(
         default=None,
@@ -50,8 +49,8 @@ class ReportOptions(ProfileModel):
     )
     ulg: Path | None = Field(
         default=None,
-        description="with one black box: the flight controller's own log of that flight (.ulg); the"
-        " path, power and motor outputs are those of the log then",
+        description="with one black box: the flight controller's own log of that flight (.ulg),"
+        " used for path, power and motor outputs",
     )
     trust: TrustArenas = False
 

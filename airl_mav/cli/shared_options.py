@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 TrustArenas = Annotated[
     bool,
     Field(
-        description="run the arena generators that the runs name: code of whoever made the folder"
+        description="run the arena generators named by the runs: code by the author of the folder"
     ),
 ]
 
@@ -32,8 +32,8 @@ class Gate(ProfileModel):
 
     require: Annotated[tuple[str, ...], REPEATED] = Field(
         default=(),
-        description="what the flights must show, decided on the 95 % interval, as 'success >= 95"
-        " %'; may be given several times. Exit status 3: not met, 5: too few flights to tell",
+        description="requirement, decided on the 95 % interval, as 'success >= 95 %'; may be"
+        " repeated. Exit status 3: not met, 5: too few flights to decide",
     )
     junit: Path | None = Field(
         default=None, description="write the verdict as JUnit XML into this file"

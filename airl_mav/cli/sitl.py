@@ -43,8 +43,8 @@ class SitlOptions(Gate, Viewing, Telling, Scenario):
 
     out: Path | None = Field(
         default=None,
-        description="run folder; one that holds some episodes of the same run gets the others; by"
-        " default runs/<UTC time>-<level>-<policy>",
+        description="run folder; an incomplete folder of the same run is completed; default:"
+        " runs/<UTC time>-<level>-<policy>",
     )
 
     video: str | None = Field(

@@ -45,17 +45,16 @@ class VideoOptions(ProfileModel):
     vehicle: VehicleName = DEFAULT_VEHICLE
     camera_name: str | None = Field(
         default=None,
-        description="further camera of the vehicle whose images are shown; by default those of the"
-        " main one",
+        description="additional camera of the vehicle to show; default: the main camera",
     )
     to: str = Field(
         default="127.0.0.1:5600",
-        description="HOST:PORT of who watches: UDP, H.264 in RTP; QGroundControl listens on 5600",
+        description="HOST:PORT of the receiver: UDP, H.264 in RTP; QGroundControl listens on 5600",
     )
     connect: str | None = Field(
         default=f"udpin://127.0.0.1:{GIMBAL_PORT}",
-        description="MAVSDK connection over which the flight controller forwards the camera's"
-        " messages, by default that of PX4 SITL for a gimbal; None: no ground station is told",
+        description="MAVSDK connection on which the flight controller forwards the camera's"
+        " messages; default: PX4 SITL's gimbal link; None: not announced to ground stations",
     )
 
 

@@ -102,9 +102,7 @@ class CameraChange(ProfileModel):
         default=None,
     )
     range_m: float | None = quantity("farthest depth returned", "m", gt=0.5, le=65, default=None)
-    kind: CameraKind | None = Field(
-        default=None, description="what its pixels are: depth, rgb or grey"
-    )
+    kind: CameraKind | None = Field(default=None, description="pixel type: depth, rgb or grey")
 
     def of(self, camera: Camera) -> Camera:
         """Return a vehicle's camera with the changes. Raises FieldError for a mismatch."""
@@ -293,8 +291,8 @@ class EnvironmentSpec(ProfileModel):
     frames: Frames = 1
     in_flight: tuple[Told, ...] = Field(
         default=(),
-        description="what else the network is told: command, latency, age, setpoint, tilt, rates,"
-        " height",
+        description="additional inputs of the network: command, latency, age, setpoint, tilt,"
+        " rates, height",
     )
     goal_height: GoalHeight = False
     actions: ActionSetName = Field(
@@ -334,7 +332,7 @@ class EnvironmentSpec(ProfileModel):
         default=None, description="bound max_speed_m_s by the safe velocity; left out: do not"
     )
     randomisation: Randomisation = Field(
-        default_factory=Randomisation, description="what is drawn with every episode"
+        default_factory=Randomisation, description="quantities randomized in every episode"
     )
     wind: WindSettings = Field(default_factory=WindSettings, description="wind")
     curriculum: Curriculum | None = Field(

@@ -49,8 +49,8 @@ class RooflineRequest(ProfileModel):
     )
     workload: str = Field(
         default=DEFAULT_WORKLOAD,
-        description="workload of these profiles whose latency t2 is taken; policy: what was"
-        " measured there for this very policy (airl profile)",
+        description="workload of these profiles that defines the latency t2; policy: the one"
+        " measured there with this policy (airl profile)",
     )
     policy: str = Field(
         default=model.DEFAULT_POLICY,

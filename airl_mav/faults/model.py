@@ -22,8 +22,8 @@ class Fault(ProfileModel):
     Raises pydantic's ValueError if the text, or the fields together, are no valid fault.
     """
 
-    part: Part = Field(description="what fails")
-    kind: str = Field(description="how it fails; each part has kinds of its own")
+    part: Part = Field(description="faulty part")
+    kind: str = Field(description="kind of fault; each part has its kinds")
     value: tuple[float, ...] = Field(
         default=(), description="how much, in the unit of the kind: one number, or three"
     )

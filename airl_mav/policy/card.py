@@ -165,7 +165,7 @@ class PolicyFacts(ProfileModel):
         default="sequential", description="when a decision begins; see airl_mav.scenario.model"
     )
     compensate: bool = switch("it wants its decision latency compensated, as in training")
-    algorithm: str = Field(default="", description="what trained it")
+    algorithm: str = Field(default="", description="training algorithm")
     epsilon: float = quantity("share of random actions in flight", "1", ge=0, le=1, default=0.0)
     training: Training = Field(default_factory=Training)
     results: tuple[MeasuredResult, ...] = Field(default=(), description="how well it flies")
@@ -183,7 +183,7 @@ class PolicyFacts(ProfileModel):
 class Quantisation(ProfileModel):
     """Conversion of a network from floats to 8-bit integers."""
 
-    method: str = Field(description="what was quantised, and how the ranges were found")
+    method: str = Field(description="quantised parts, and the method for the ranges")
     source_sha256: Digest = Field(description=f"SHA-256 digest of the {ONNX_FILE} in floats")
     arena: str = Field(description="arena profile of the calibration's frames")
     first_seed: Count = Field(description="first seed of those flights; no evaluation uses it")
@@ -209,8 +209,8 @@ class PolicyCard(PolicyFacts):
     torch_sha256: Digest | None = optional(f"SHA-256 digest of {TORCH_FILE}, if there is one")
     state: dict[str, tuple[Count, ...]] = Field(
         default_factory=dict,
-        description="what a network with a memory remembers from decision to decision: shapes by "
-        "name; the input NAME takes it, the output next_NAME gives it, zeros begin a flight",
+        description="memory of a recurrent network: shapes by name; input NAME, output next_NAME,"
+        " zeros at the start of a flight",
     )
     network: str = Field(description="its layers, as text")
     parameters: int = quantity("weights and biases", "1", ge=1)

@@ -125,7 +125,7 @@ class SeenCamera(ProfileModel):
     distortion: SeenDistortion = later_field(UNDISTORTED)
     range_m: Range
     kind: CameraKind = Field(
-        default="depth", description="what the camera gives, which begins the image's key"
+        default="depth", description="pixel type of the camera, the prefix of the image's key"
     )
     frames: Frames = 1
 
@@ -163,15 +163,15 @@ class ObservationSpec(ProfileModel):
     range_m: Range
     kind: CameraKind = Field(
         default="depth",
-        description="what the camera gives, and the key of the image: depth, rgb or grey",
+        description="pixel type of the camera and key of the image: depth, rgb or grey",
     )
     frames: Frames = 1
     in_flight: tuple[Told, ...] = Field(
         default=(),
-        description="what else the network is told: command, the newest velocity setpoint; latency,"
-        " the t2 that is expected; age, of the image; setpoint, the newest of any kind, all four"
-        " numbers of it; tilt, where down is in the body's axes; rates, the body's; height, above"
-        " the start",
+        description="additional inputs of the network: command, the newest velocity setpoint;"
+        " latency, the expected t2; age, the age of the image; setpoint, all four numbers of the"
+        " newest setpoint of any kind; tilt, the down direction in body axes; rates, the body"
+        " rates; height, the height above the start",
     )
     goal_height: GoalHeight = later_field(default=False)
     cameras: dict[CameraName, SeenCamera] = later_field(

@@ -240,13 +240,13 @@ class Appearance(ProfileModel):
     )
     floor: Floor = Field(default_factory=Floor, description="the floor")
     walls: Surfaces = Field(default_factory=Surfaces, description="the four walls together")
-    static: Standing = Field(
-        default_factory=Standing, description="each obstacle that stands still"
-    )
+    static: Standing = Field(default_factory=Standing, description="each static obstacle")
     moving: Moving = Field(default_factory=Moving, description="each obstacle that moves")
     sun: Sun = Field(default_factory=Sun, description="direct light")
-    sky: Sky = Field(default_factory=Sky, description="what is above the walls, and diffuse light")
-    fog: Fog = Field(default_factory=Fog, description="what hides far things")
+    sky: Sky = Field(
+        default_factory=Sky, description="background above the walls, and diffuse light"
+    )
+    fog: Fog = Field(default_factory=Fog, description="fog, which hides distant surfaces")
 
     @model_validator(mode="after")
     def _materials_are_known(self) -> Appearance:

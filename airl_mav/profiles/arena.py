@@ -354,15 +354,13 @@ class ArenaSpec(ProfileModel):
     )
     generator: GeneratorName = Field(
         default=OBSTACLES,
-        description="what makes an arena of a seed: obstacles, or a function of your own as"
+        description="generator of an arena from a seed: obstacles, or a custom function as"
         " MODULE:NAME or FILE.py:NAME",
     )
     options: dict[str, Option] = Field(
         default_factory=dict, description="knobs of a generator of your own"
     )
-    static: StaticObstacles = Field(
-        default_factory=StaticObstacles, description="obstacles that stand still"
-    )
+    static: StaticObstacles = Field(default_factory=StaticObstacles, description="static obstacles")
     moving: MovingObstacles = Field(
         default_factory=MovingObstacles, description="obstacles that move"
     )

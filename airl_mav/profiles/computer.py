@@ -47,7 +47,7 @@ class Network(ProfileModel):
     image_width_px: int = quantity("image width", "px", ge=1, le=4096)
     parameters: int = quantity("weights and biases", "1", ge=1)
     macs: int = quantity("multiply-accumulates of one inference", "1", ge=1)
-    runtime: str = Field(description="what ran it: framework and version")
+    runtime: str = Field(description="framework and version")
 
 
 class LatencyDistribution(ProfileModel):
@@ -127,7 +127,7 @@ class Workload(ProfileModel):
     )
     latency: LatencyDistribution
     source: str = Field(description="where the latency comes from")
-    assumed: str = Field(default="", description="what the source does not give and we assume")
+    assumed: str = Field(default="", description="assumptions beyond the source")
     measured: MeasurementConditions | None = later_field(
         None, "how it was timed, in a profile that airl profile --share wrote"
     )
@@ -168,7 +168,7 @@ class ComputerProfile(ProfileModel):
     price_usd: float = quantity("price", "USD", ge=0, le=1_000_000)
     source: str = Field(description="where the numbers come from")
     workloads: dict[str, Workload] = Field(
-        default_factory=dict, description="what it was timed with, by name"
+        default_factory=dict, description="timed workload, by name"
     )
 
     @property

@@ -71,9 +71,8 @@ class ProfileRequest(CompanionAddresses, Inference):
     )
     soak: str | None = Field(
         default=None,
-        description="after the measurement, go on with inference alone for so long, as 90s, 10min"
-        " or 1h, and watch latency, frequency and temperature: does this computer slow down as it"
-        " gets warm?",
+        description="after the measurement, run inference alone for this time, as 90s, 10min or 1h,"
+        " and record latency, frequency and temperature, to detect thermal throttling",
     )
     on: str | None = Field(
         default=None,
@@ -84,8 +83,8 @@ class ProfileRequest(CompanionAddresses, Inference):
     workload: str | None = Field(
         default=None,
         pattern=NAME,
-        description="name of the workload in the profile; one of the same name is replaced; by"
-        " default after policy, level, runtime and threads",
+        description="name of the workload in the profile; replaces an existing one; default: from"
+        " policy, level, runtime and threads",
     )
     watts: float | None = quantity(
         "power that the computer draws; by default as measured, where this computer tells it,"

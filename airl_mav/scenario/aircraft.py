@@ -144,15 +144,15 @@ class Aircraft(ProfileModel):
     )
     plant: PlantName = Field(
         default=DEFAULT_PLANT,
-        description="what moves the vehicle's body, and finds what it touches: pybullet, or the"
-        " batch twin's compiled rigid body with contacts of its own, which needs no pybullet and"
-        " is the default where that is not installed; level gym has neither",
+        description="physics engine: pybullet, or the batch twin's compiled rigid body, which has"
+        " its own contact model, needs no pybullet and is the default without it; level gym has"
+        " neither",
     )
     renderer: Renderer = Field(
         default="raycast",
-        description="what draws the images of a colour camera: the ray caster, or Mitsuba's path"
-        " tracer, a hundred times slower: at level lockstep time waits for it, at level sitl images"
-        " are as late as they take, and fewer; level gym has none",
+        description="renderer of a colour camera: the ray caster, or Mitsuba's path tracer, a"
+        " hundred times slower: level lockstep waits for it, level sitl gets fewer and later"
+        " images; level gym does not support it",
     )
     firmware: FirmwareName = Field(
         default="builtin",

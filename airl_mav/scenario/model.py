@@ -174,7 +174,7 @@ class Inference(ProfileModel):
     """Settings of network inference."""
 
     runtime: RuntimeName = Field(
-        default="onnx", description="what runs a learned policy; torch needs its policy.pt2"
+        default="onnx", description="runtime of a learned policy; torch needs its policy.pt2"
     )
     threads: int = quantity("threads of one inference", "1", ge=1, le=64, default=1)
     trust: bool = switch(
@@ -242,7 +242,7 @@ class Decisions(Inference):
     )
     limits: LimitSettings = Field(
         default_factory=LimitSettings,
-        description="what the companion believes of telemetry and camera, and how far it flies",
+        description="limits on telemetry, camera and distance that the companion enforces",
     )
     ablate: AblationName | None = optional(
         "input of the network that is made zero; not at level sitl"
@@ -276,7 +276,7 @@ class Workers(ProfileModel):
 
     executor: Annotated[Literal["process", "ray"], FREE] = Field(
         default="process",
-        description="who carries out the jobs: processes of this machine, or a Ray cluster",
+        description="executor of the jobs: processes of this machine, or a Ray cluster",
     )
     workers: Annotated[int | None, FREE] = quantity(
         "jobs at a time, each on one core; decides the pace, not the results; by default one for"

@@ -186,8 +186,8 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
     )
     vehicle: str = Field(
         default="quad",
-        description="vehicle profile: its response to setpoints and its camera's mount are what"
-        " compensation reckons with",
+        description="vehicle profile: compensation uses its response to setpoints and its camera's"
+        " mount",
     )
     check: bool = switch(
         "look at camera, flight controller and policy on the ground, say what is wrong,"

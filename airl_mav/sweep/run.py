@@ -101,7 +101,7 @@ class SweepRequest(Workers):
         " estimated from multiply-accumulates; may change when a sweep goes on"
     )
     device: Literal["cpu", "cuda"] = Field(
-        default="cpu", description="what trains: cpu, one core a trial, or cuda"
+        default="cpu", description="device for training: cpu, one core per trial, or cuda"
     )
     ray_gpus: float | None = quantity(
         "share of a GPU that Ray keeps for each trial; by default 1 with device cuda, else 0",

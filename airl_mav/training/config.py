@@ -127,8 +127,8 @@ class AlgorithmSpec(ProfileModel):
     )
     expert: ExpertName = Field(
         default="planner",
-        description="who is imitated: greedy, which sees what the policy sees, planner, which "
-        "knows the true arena, or gates, which knows the openings of the arena's gates",
+        description="expert to imitate: greedy, with the policy's view, planner, with the true"
+        " arena, or gates, with the openings of the arena's gates",
     )
     options: dict[str, Option] = Field(
         default_factory=dict,

@@ -24,7 +24,7 @@ class Change(ProfileModel):
 
     before: str = Field(pattern=DIGEST, description="fingerprint of the code before")
     after: str = Field(pattern=DIGEST, description="fingerprint of the code with the change")
-    why: str = Field(min_length=1, description="what was changed")
+    why: str = Field(min_length=1, description="description of the change")
     flights: tuple[str, ...] = Field(min_length=1, description="of the fingerprint, that differ")
     levels: tuple[str, ...] = Field(min_length=1, description="levels that fly otherwise")
     arenas: tuple[str, ...] = Field(min_length=1, description="arenas that are flown otherwise")

@@ -33,7 +33,7 @@ class NotCovered(ProfileModel):
 
     page: str = Field(description="path from the root")
     text: str = Field(description="the table's first line, or words of the sentence, as they stand")
-    why: str = Field(description="why not, or what would cover it")
+    why: str = Field(description="reason, or the missing source")
 
 
 def not_covered() -> tuple[NotCovered, ...]:

@@ -39,7 +39,9 @@ class Declared(ProfileModel):
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", description="of results/<name>.json")
     what: str = Field(description="one line for people")
     command: str = Field(description="as a person types it; --out is added")
-    quick: str = Field(default="--episodes 20", description="what --quick adds to the command")
+    quick: str = Field(
+        default="--episodes 20", description="arguments that --quick adds to the command"
+    )
     kind: Kind = Field(
         description="file of the comparison; run: the folder is a single run; the others: a table"
     )

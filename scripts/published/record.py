@@ -94,7 +94,7 @@ class Made(ProfileModel):
     date: str = Field(pattern=r"^\d{4}-\d{2}-\d{2}$", description="when it was flown, UTC")
     version: str = Field(description="of airl-mav")
     commit: str | None = Field(description="of the checkout; None: not written down")
-    changed: bool | None = Field(description="whether the checkout had changes of its own")
+    changed: bool | None = Field(description="True if the checkout had local changes")
     cpu: str
     versions: dict[str, str] = Field(description="packages by name")
     behaviour: str | None = Field(

@@ -42,7 +42,9 @@ class PolicyConfig(ProfileModel):
 
 
 class AblationConfig(StudyConfig):
-    policies: tuple[PolicyConfig, ...] = Field(min_length=1, description="what flies where")
+    policies: tuple[PolicyConfig, ...] = Field(
+        min_length=1, description="policy and arena of each flight"
+    )
 
 
 def declare(scenario: Scenario, title: str) -> Experiment:

@@ -65,8 +65,8 @@ class StudyConfig(ProfileModel):
     filters: Annotated[tuple[int, ...], Each(1, 256, ascending=True)] = quantity("filters", "1")
     runs: int = quantity("inferences of each network", "1", ge=1, le=1_000_000, default=1000)
     seed: int = quantity("of weights and images", "1", ge=0, le=2**31, default=1)
-    observation: ObservationSpec = Field(description="what the networks see")
-    actions: ActionSpec = Field(default_factory=ActionSpec, description="what they choose among")
+    observation: ObservationSpec = Field(description="observations of the networks")
+    actions: ActionSpec = Field(default_factory=ActionSpec, description="actions of the networks")
 
 
 class StudyOptions(ProfileModel):

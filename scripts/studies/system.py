@@ -35,7 +35,9 @@ class ArenaConfig(ProfileModel):
 
 
 class SystemConfig(StudyConfig):
-    arenas: tuple[ArenaConfig, ...] = Field(min_length=1, description="what flies where")
+    arenas: tuple[ArenaConfig, ...] = Field(
+        min_length=1, description="policy and arena of each flight"
+    )
     reference: str = Field(default=REFERENCE_COMPUTER, description="computer of the reference")
     one_goal: OneGoal | None = Field(default=None, description="flights to one goal")
 
