@@ -1,4 +1,4 @@
-"""Firmware process: runs simulation, MAVLink and camera tick by tick."""
+"""Firmware: runs simulation, MAVLink and camera tick by tick; flies alone with `fly`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Coordinate frames; all conversions are in this module.
+"""Coordinate frames with all conversions, and goals as positions in them.
 
 The project uses PX4's frames: world NED (north, east, down), body FRD (forward, right, down).
 pybullet, ROS and Foxglove use ENU / FLU, and cameras look along +z of an optical frame (right,

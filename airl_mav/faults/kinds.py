@@ -1,4 +1,4 @@
-"""Table of all faults: parts, kinds and amounts.
+"""Table of all faults: parts, kinds, amounts and possible outcomes.
 
 A fault is a part and a kind: `gps off`, `motor2 weak`. Each kind defines its amount's meaning, unit
 and range, and the fidelity levels that support the fault.

@@ -1,4 +1,4 @@
-"""Stages of a decision: their stamps and durations, and deadline misses."""
+"""Stages of a decision: stamps, durations, deadline misses, and the F-1 model of safe speed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures for light and dark pages: SVG with CSS variables; PNG is always light."""
+"""Figures for light and dark pages (SVG with CSS variables, light PNG), and depth colours."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Delayed reference for fixes with a known latency (EKF2_GPS_DELAY, EKF2_EV_DELAY).
+"""Measurements of the estimator, and the delayed reference for late ones (EKF2_GPS_DELAY).
 
 A delayed fix measures a past position. PX4 runs the whole filter at that past time and predicts the
 present from it. Here the filter runs in the present, and the fix is compared with the past

@@ -1,4 +1,4 @@
-"""Clients of a link, each with separate streams and answers.
+"""Clients of a link, each with separate streams and answers; forwarding and commanders.
 
 PX4 SITL has a preset remote on each link (14540, 14550), which receives data before it sends any.
 Every other sender of a valid frame becomes a client. A client starts with the link's default

@@ -1,4 +1,4 @@
-"""Export files of a run's flights."""
+"""Export of a run's flights: MCAP and ULog files, and a live Foxglove server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Failure conditions as one typed snapshot, and the modes that remain available.
+"""Failure conditions, failsafe parameters, and the modes that remain available.
 
 Source: PX4 1.16, msg/FailsafeFlags.msg and commander/ModeUtil/mode_requirements.cpp.
 """

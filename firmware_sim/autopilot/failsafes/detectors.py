@@ -1,4 +1,4 @@
-"""Detectors with hysteresis and duration over simulated time."""
+"""Failure detectors: hysteresis over simulated time, motors, battery endurance."""
 
 from __future__ import annotations
 
