@@ -10,13 +10,16 @@ from numpy.typing import NDArray
 
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.frames import Vector
-from airl_mav.flight.trajectory import TrajectoryRecorder
+from airl_mav.core.kernels import kernel
+from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
 from airl_mav.latency.stamps import NO_STAMP
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Wire
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
 from firmware_sim.engine.record import Record
 from firmware_sim.faults.timeline import Acted
+
+Ints = NDArray[np.int64]
 
 
 class SetpointLog:
@@ -86,6 +89,81 @@ def fault_arrays(acted: Sequence[Acted]) -> dict[str, NDArray[Any]]:
     }
 
 
+@kernel
+def _sample(times_us: Ints, powers_w: Vector, memory: Vector, kept: Ints, mean_w: Vector) -> int:
+    """Select the sampled ticks and average the power between them; return their number.
+
+    Args:
+        times_us: (n,) times of the ticks.
+        powers_w: (n,) electrical power [W].
+        memory: (4,) time of the last tick and of the last sample [µs], -1 = none; energy since the
+            last sample [W µs]; power at the last tick [W]. Updated.
+        kept: (n,) output: indices of the sampled ticks.
+        mean_w: (n,) output: mean power since the previous sample [W].
+    """
+    m = 0
+    for k in range(len(times_us)):
+        time_us, power_w = times_us[k], powers_w[k]
+        if memory[0] >= 0.0:
+            memory[2] += power_w * (time_us - memory[0])
+        memory[0], memory[3] = time_us, power_w
+        first = memory[1] < 0.0
+        if first or time_us - memory[1] >= SAMPLE_US:
+            mean_w[m] = power_w if first else memory[2] / (time_us - memory[1])
+            memory[1], memory[2] = time_us, 0.0
+            kept[m] = k
+            m += 1
+    return m
+
+
+class TrajectoryRecorder:
+    """Collects the true state of every tick and samples it at 50 Hz."""
+
+    def __init__(self) -> None:
+        self._times: list[Ints] = []
+        self._states: list[Vector] = []
+        """Blocks (m, 10) of samples."""
+        self._powers: list[Vector] = []
+        self._memory = np.array([-1.0, -1.0, 0.0, 0.0])
+        """See `_sample`."""
+
+    def extend(self, times_us: Ints, powers_w: Vector, states: Vector) -> Ints:
+        """Add n ticks with states (n, >= 10); return the indices (m,) of the sampled ticks."""
+        kept, mean_w = np.empty(len(times_us), np.int64), np.empty(len(times_us))
+        m = _sample(times_us, powers_w, self._memory, kept, mean_w)
+        self._add(times_us[kept[:m]], mean_w[:m], states[kept[:m], :10])
+        return kept[:m]
+
+    def keep(self, state: Vector) -> None:
+        """Sample the newest tick, as at the end of an episode.
+
+        `state` (10,) is position NED [m], velocity NED [m/s] and quaternion [w, x, y, z] body ->
+        world. It is not copied: do not change it afterwards.
+        """
+        last_us, kept_us, energy, power_w = self._memory.tolist()
+        if last_us < 0.0:
+            raise ValueError("no tick yet: a sample has the time of the newest one")
+        mean_w = power_w if kept_us < 0.0 else energy / (last_us - kept_us)
+        self._add(np.array([int(last_us)]), np.array([mean_w]), state[None])
+        self._memory[1:3] = last_us, 0.0
+
+    def _add(self, times_us: Ints, mean_w: Vector, states: Vector) -> None:
+        self._times.append(times_us)
+        self._powers.append(mean_w)
+        self._states.append(states)
+
+    def trajectory(self) -> Trajectory:
+        """Return the recorded trajectory."""
+        rows = np.concatenate([np.zeros((0, 10)), *self._states])
+        return Trajectory(
+            np.concatenate([np.zeros(0, np.int64), *self._times]),
+            rows[:, :3],
+            rows[:, 3:6],
+            rows[:, 6:],
+            np.concatenate([np.zeros(0), *self._powers]),
+        )
+
+
 class FlightRecorder:
     """Record of one episode: true path, setpoints, estimates and tick lateness.
 
@@ -115,7 +193,7 @@ class FlightRecorder:
         self._trajectory = TrajectoryRecorder()
         self._estimates: list[Vector] = []
         """Blocks (m, 10) of estimated position, velocity and attitude at the motor commands."""
-        self._estimated_us: list[int] = []
+        self._estimated_us: list[Ints] = []
         self._lateness_us: list[int] = []
         self._slips: list[tuple[int, int]] = []
 
@@ -140,11 +218,10 @@ class FlightRecorder:
             truths: (n,) log of the aircraft.
             flown: (n,) log of the flight controller; without content for external firmware.
         """
-        times, powers_w = truths["time_us"].tolist(), truths["power_w"].tolist()
-        kept = self._trajectory.extend(times, powers_w, truths["motion"])
+        kept = self._trajectory.extend(truths["time_us"], truths["power_w"], truths["motion"])
         if self._internals is not None:
             self._estimates.append(flown["state"][kept, :RATES])
-            self._estimated_us += flown["time_us"][kept].tolist()
+            self._estimated_us.append(flown["time_us"][kept])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the recorded arrays by name in the episode file (docs/run-folder.md)."""
@@ -160,7 +237,7 @@ class FlightRecorder:
             arrays[f"setpoints/{name}"] = values
         estimates = np.concatenate([np.zeros((0, RATES)), *self._estimates])
         return arrays | {
-            "estimate/time_us": np.array(self._estimated_us, np.int64),
+            "estimate/time_us": np.concatenate([np.zeros(0, np.int64), *self._estimated_us]),
             "estimate/position": estimates[:, P:V],
             "estimate/velocity": estimates[:, V:Q],
             "estimate/quaternion": estimates[:, Q:],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -98,64 +98,3 @@ def pose_at(
     time = min(max(time_us, int(path.time_us[0])), int(path.time_us[-1]))
     at = path.between(time, time)
     return at.position[0], at.velocity[0], at.quaternion[0]
-
-
-class TrajectoryRecorder:
-    """Collects the true state of every tick and samples it at 50 Hz."""
-
-    def __init__(self) -> None:
-        self._times: list[int] = []
-        self._states: list[NDArray[np.float64]] = []
-        """Blocks (m, 10) of samples."""
-        self._powers: list[float] = []
-        self._last_us: int | None = None
-        self._kept_us = 0
-        self._energy_uj = 0.0
-        """Power [W] times microseconds since the last sample."""
-        self._power_w = 0.0
-
-    def extend(
-        self, times_us: Sequence[int], powers_w: Sequence[float], states: NDArray[np.float64]
-    ) -> list[int]:
-        """Add n ticks with states (n, >= 10); return the indices of the sampled ticks."""
-        kept, last_us, power_w = [], self._last_us, self._power_w
-        for k, (time_us, power_w) in enumerate(zip(times_us, powers_w, strict=True)):
-            if last_us is not None:
-                self._energy_uj += power_w * (time_us - last_us)
-            last_us = time_us
-            passed_us = time_us - self._kept_us
-            if passed_us >= SAMPLE_US or not self._times:
-                self._powers.append(self._energy_uj / passed_us if self._times else power_w)
-                self._times.append(time_us)
-                self._kept_us, self._energy_uj = time_us, 0.0
-                kept.append(k)
-        self._last_us, self._power_w = last_us, power_w
-        self._states.append(states[kept, :10])
-        return kept
-
-    def keep(self, state: NDArray[np.float64]) -> None:
-        """Sample the newest tick, as at the end of an episode.
-
-        `state` (10,) is position NED [m], velocity NED [m/s] and quaternion [w, x, y, z] body ->
-        world. It is not copied: do not change it afterwards.
-        """
-        time_us = self._last_us
-        if time_us is None:
-            raise ValueError("no tick yet: a sample has the time of the newest one")
-        first = not self._times
-        passed_us = time_us - self._kept_us
-        self._powers.append(self._power_w if first else self._energy_uj / passed_us)
-        self._times.append(time_us)
-        self._states.append(state[None])
-        self._kept_us, self._energy_uj = time_us, 0.0
-
-    def trajectory(self) -> Trajectory:
-        """Return the recorded trajectory."""
-        rows = np.concatenate([np.zeros((0, 10)), *self._states])
-        return Trajectory(
-            np.array(self._times, np.int64),
-            rows[:, :3],
-            rows[:, 3:6],
-            rows[:, 6:],
-            np.array(self._powers, np.float64),
-        )

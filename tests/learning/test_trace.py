@@ -18,12 +18,13 @@ from airl_mav.envs.fleet import Fleet, FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import Delay, EnvironmentSpec, EpisodeRules
 from airl_mav.envs.trace import Trace
-from airl_mav.flight.trajectory import SAMPLE_US, Trajectory, TrajectoryRecorder
+from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
 from airl_mav.latency.stages import stage_samples
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.actions import Action
 from airl_mav.policy.greedy import GreedyPolicy
 from airl_mav.policy.observation import Observation
+from firmware_sim.recording import TrajectoryRecorder
 from tests.support.recording import record_tick
 
 SEEDS = range(1, 13)

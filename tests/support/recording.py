@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from airl_mav.flight.trajectory import TrajectoryRecorder
+from firmware_sim.recording import TrajectoryRecorder
 
 
 def record_tick(
@@ -20,5 +20,5 @@ def record_tick(
 ) -> None:
     """Hand the state after a tick to a recorder; `keep` it even between samples."""
     state = np.concatenate([position, velocity, quaternion]).astype(np.float64)
-    if not recorder.extend([time_us], [power_w], state[None]) and keep:
+    if not len(recorder.extend(np.array([time_us]), np.array([power_w]), state[None])) and keep:
         recorder.keep(state)

@@ -12,13 +12,14 @@ from airl_mav.core.process_use import ProcessUse
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord, Part, Setup
-from airl_mav.flight.trajectory import Trajectory, TrajectoryRecorder
+from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.injection import choose_injection
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
+from firmware_sim.recording import TrajectoryRecorder
 from tests.support.recording import record_tick
 
 TICK_US = 20_000

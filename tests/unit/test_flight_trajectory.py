@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from airl_mav.flight.quality import measure_leg, measure_quality
-from airl_mav.flight.trajectory import SAMPLE_US, Trajectory, TrajectoryRecorder
+from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
+from firmware_sim.recording import TrajectoryRecorder
 from tests.support.recording import record_tick
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
