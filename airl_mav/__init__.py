@@ -19,8 +19,6 @@ __version__ = "0.2.0"
 
 _EXPORTS = {
     "ExperimentResult": "airl_mav.experiments.experiment",
-    "ProfileRequest": "airl_mav.profiling.request",
-    "RooflineRequest": "airl_mav.experiments.roofline",
     "Run": "airl_mav.experiments.run",
     "Scenario": "airl_mav.scenario.model",
     "degrade": "airl_mav.experiments.degrade",
@@ -28,11 +26,7 @@ _EXPORTS = {
     "gap": "airl_mav.experiments.gap",
     "ladder": "airl_mav.experiments.ladder",
     "load_run": "airl_mav.experiments.run",
-    "profile": "airl_mav.profiling.profile",
-    "refit": "airl_mav.refitting.refit",
-    "refit_together": "airl_mav.refitting.together",
     "rehearse": "airl_mav.experiments.fly",
-    "roofline": "airl_mav.experiments.roofline",
 }
 """Public names, and the modules that define them."""
 
@@ -43,18 +37,11 @@ if TYPE_CHECKING:
     from airl_mav.experiments.fly import rehearse
     from airl_mav.experiments.gap import gap
     from airl_mav.experiments.ladder import ladder
-    from airl_mav.experiments.roofline import RooflineRequest, roofline
     from airl_mav.experiments.run import Run, load_run
-    from airl_mav.profiling.profile import profile
-    from airl_mav.profiling.request import ProfileRequest
-    from airl_mav.refitting.refit import refit
-    from airl_mav.refitting.together import refit_together
     from airl_mav.scenario.model import Scenario
 
 __all__ = [
     "ExperimentResult",
-    "ProfileRequest",
-    "RooflineRequest",
     "Run",
     "Scenario",
     "degrade",
@@ -62,11 +49,7 @@ __all__ = [
     "gap",
     "ladder",
     "load_run",
-    "profile",
-    "refit",
-    "refit_together",
     "rehearse",
-    "roofline",
 ]
 
 

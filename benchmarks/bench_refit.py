@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from airl_mav.experiments.refly import PartFlown, refly_parts
-from airl_mav.refitting.refit import refit
+from airl_mav.addons.refit.refit import refit
+from airl_mav.addons.refit.refly import PartFlown, refly_parts
 from airl_mav.scenario.model import DEFAULT_ARENA
 from tests.support.recorded_flights import RecordedFlight
 from tests.support.refit_truths import RefitErrors, drawn_truth, errors_of, true_dead_time_s

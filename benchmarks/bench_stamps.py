@@ -27,6 +27,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from airl_mav.addons.profiling import hil
+from airl_mav.addons.profiling.bare import BareLoop
+from airl_mav.addons.profiling.policy_under_test import PolicyUnderTest, open_policy
+from airl_mav.addons.profiling.request import ProfileRequest
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.frames import Goal
@@ -34,10 +38,6 @@ from airl_mav.core.progress import Bar
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import AnyAction, flyable
 from airl_mav.policy.observation import Kinematics, Observation
-from airl_mav.profiling import hil
-from airl_mav.profiling.bare import BareLoop
-from airl_mav.profiling.policy_under_test import PolicyUnderTest, open_policy
-from airl_mav.profiling.request import ProfileRequest
 from companion import pilot
 from companion.camera import ReceivedFrame
 

@@ -29,6 +29,7 @@ import numpy as np
 import tyro
 import zmq
 
+from airl_mav.addons.sweep.config import SweepConfig
 from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.options import read_options, scenario_of
@@ -44,7 +45,6 @@ from airl_mav.profiles.loading import load_profile, profiles_dir
 from airl_mav.rehearsal.stand_alone import aircraft_of, episode_of
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
-from airl_mav.sweep.config import SweepConfig
 from airl_mav.training.config import TrainingConfig
 from companion.camera import ZmqFrameSource
 from companion.pilot import OLDEST_FRAME_US, age_of

@@ -11,11 +11,13 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav import __version__
+from airl_mav.core.addons import addon_commands
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_USAGE
 
 SUBCOMMANDS: dict[str, str] = {
-    # To add one: write cli/<name>.py with OPTIONS and run(), and a line here.
+    # To add one: write cli/<name>.py with OPTIONS and run(), and a line here. Add-ons have a table
+    # of their own.
     "sitl": "rehearse a policy: firmware and companion as two processes, a report (airl-sitl)",
     "firmware": "flight controller, vehicle and camera alone, for any client (airl-firmware)",
     "companion": "what runs on the drone's onboard computer (airl-companion)",
@@ -24,31 +26,31 @@ SUBCOMMANDS: dict[str, str] = {
     "gap": "the hardware gap: what a policy loses on an onboard computer, without and with"
     " mitigation",
     "degrade": "the same policy at growing latencies: where it breaks down",
-    "faults": "every fault in every phase of a flight, and how it ended: the fault matrix",
-    "roofline": "safe velocity against reaction time: which computer, and what binds it",
     "ladder": "the same policy and seeds at several levels of the fidelity ladder",
-    "profile": "measure how long this computer takes for a policy's decisions",
     "train": "train a policy on the batch twin",
     "export": "turn a stable-baselines3 model into a policy folder",
-    "sweep": "train and evaluate many networks: the architecture search",
     "view": "replay the flights of a run in a browser",
     "video": "what the camera sees, in QGroundControl and other players of RTP",
-    "export-log": "flights of a run as MCAP for Foxglove and rerun, or ULog; or live",
     "report": "a run's tables and page again, or a comparison of several runs",
-    "refit": "vehicle and computer profiles from a recorded flight",
-    "refly": "rehearse a flight that was recorded, and compare the two",
-    "render": "what a colour camera sees: an arena as a picture, a flight as a film",
     "arena": "look at an arena, or at what its profile draws",
     "asset": "an arena whose obstacles are a mesh of yours (STL, OBJ, GLB)",
     "parameters": "a vehicle's parameters as a file for firmware that you start",
-    "conformance": "does a flight controller do what the rehearsal assumes?",
     "computers": "computer profiles: what each was timed with, by whom, and how late it decides",
     "list": "shipped vehicles, arenas, policies, computers, sweeps",
 }
 """Subcommands with their purposes; module `airl_mav.cli.<name>`."""
 
-MODULES = {"export-log": "airl_mav.cli.export_log", "list": "airl_mav.cli.listing"}
+MODULES = {"list": "airl_mav.cli.listing"}
 """Modules of subcommands with another name."""
+
+
+def subcommands() -> dict[str, tuple[str, str]]:
+    """Return all subcommands, those of add-ons last: purpose and module by name."""
+    core = {
+        name: (purpose, MODULES.get(name, f"airl_mav.cli.{name}"))
+        for name, purpose in SUBCOMMANDS.items()
+    }
+    return core | addon_commands()
 
 
 def main(words: Sequence[str] | None = None) -> NoReturn:
@@ -62,9 +64,10 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
     if name == "--version":
         console.print(f"airl-mav {__version__}", highlight=False)
         sys.exit(0)
-    if name not in SUBCOMMANDS:
-        near = difflib.get_close_matches(name, SUBCOMMANDS, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"accepted: {', '.join(SUBCOMMANDS)}"
+    known = subcommands()
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"accepted: {', '.join(known)}"
         new_console(stderr=True, soft_wrap=True).print(
             f"error: airl {name}: no such command; {hint}", style="red"
         )
@@ -72,15 +75,20 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
     # Imported here: the list of commands does not need the option models.
     from airl_mav.cli.options import run_command
 
-    run_command(f"airl {name}", MODULES.get(name, f"airl_mav.cli.{name}"), rest)
+    run_command(f"airl {name}", known[name][1], rest)
 
 
 def _print_help(console: Console) -> None:
-    console.print("usage: airl COMMAND [OPTIONS]\n\nCommands:", highlight=False)
-    table = Table.grid(padding=(0, 2), pad_edge=True)
-    for name, purpose in SUBCOMMANDS.items():
-        table.add_row(name, purpose)
-    console.print(table)
+    console.print("usage: airl COMMAND [OPTIONS]", highlight=False)
+    addons = {name: purpose for name, (purpose, _) in addon_commands().items()}
+    for title, commands in (("Commands", SUBCOMMANDS), ("Add-ons", addons)):
+        if not commands:
+            continue
+        console.print(f"\n{title}:", highlight=False)
+        table = Table.grid(padding=(0, 2), pad_edge=True)
+        for name, purpose in commands.items():
+            table.add_row(name, purpose)
+        console.print(table)
     console.print(
         "\nairl COMMAND --help shows its options and examples; airl --version the version.",
         highlight=False,

@@ -7,6 +7,7 @@ parent.
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
 import signal
@@ -22,6 +23,7 @@ from multiprocessing.process import BaseProcess
 from types import ModuleType
 from typing import Any, ClassVar, Generic, NamedTuple
 
+from airl_mav.core.addons import addon_executors
 from airl_mav.core.compiling import Heard, heard_compiling
 from airl_mav.core.errors import FieldError
 from airl_mav.core.provenance import usable_cores
@@ -319,12 +321,13 @@ def side_by_side(settings: Workers) -> int:
 def open_executor(settings: Workers, *, in_process: bool = False) -> Iterator[executors.Executor]:
     """Open the configured executor; a single worker may be this process if `in_process`."""
     cores = min(usable_cores(), GREATEST_WORKERS)
-    if settings.executor == "ray":
-        # Imported here: Ray is an extra.
-        from airl_mav.experiments.ray_executor import connected
-
+    if settings.executor != "process":
+        known = addon_executors()
+        if settings.executor not in known:
+            raise FieldError("executor", settings.executor, f"process, {', '.join(known)}")
         gpus = settings.ray_gpus if isinstance(settings, executors.ExecutorSettings) else 0.0
-        with connected(settings, cores, gpus) as executor:
+        module = importlib.import_module(known[settings.executor])
+        with module.connected(settings, cores, gpus) as executor:
             yield executor
         return
     most = side_by_side(settings)

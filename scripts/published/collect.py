@@ -8,20 +8,20 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from airl_mav.addons.fault_matrix.matrix import load, markdown
+from airl_mav.addons.roofline.points import Roofline, RooflinePoint
+from airl_mav.addons.roofline.roofline import RESULT_FILE as ROOFLINE_FILE
+from airl_mav.addons.roofline.roofline import SCHEMA as ROOFLINE_SCHEMA
+from airl_mav.addons.sweep.store import SCHEMA as SWEEP_SCHEMA
+from airl_mav.addons.sweep.store import SWEEP_FILE
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json
-from airl_mav.envs.roofline import Roofline, RooflinePoint
-from airl_mav.experiments.fault_matrix import load, markdown
-from airl_mav.experiments.roofline import RESULT_FILE as ROOFLINE_FILE
-from airl_mav.experiments.roofline import SCHEMA as ROOFLINE_SCHEMA
 from airl_mav.experiments.run import load_run
 from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate
 from airl_mav.rehearsal.run_folder import RunInfo, load_info
 from airl_mav.report.comparison.model import Comparison, load_comparison
 from airl_mav.report.table import read_table
-from airl_mav.sweep.store import SCHEMA as SWEEP_SCHEMA
-from airl_mav.sweep.store import SWEEP_FILE
 from published.declared import Declared
 from published.record import (
     MEASURES,

@@ -25,6 +25,7 @@ from pydantic import Field
 from rich.console import Console
 from size_latency_fit import Fit, fit_times
 
+from airl_mav.addons.sweep.tables import count, t2_ms
 from airl_mav.cli.options import run_command
 from airl_mav.core.clock import utc_now
 from airl_mav.core.console import new_console
@@ -44,7 +45,6 @@ from airl_mav.report.heatmap import Field as Cell
 from airl_mav.report.heatmap import HeatMap, draw_heat_map
 from airl_mav.report.table import TOO_FEW_CELL, Column, TableView, markdown_table, print_table
 from airl_mav.report.theme import PAPER, new_figure, render_png
-from airl_mav.sweep.tables import count, t2_ms
 
 SCHEMA = 1
 DEFAULT = Path(__file__).with_suffix(".toml")

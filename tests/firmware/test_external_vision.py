@@ -11,10 +11,10 @@ from mavsdk.plugins.mocap import mocap
 from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
+from airl_mav.addons.fault_matrix.matrix import fly_fault
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import HOME, Vector, geodetic_to_local, quat_wxyz_to_xyzw, quat_yaw
-from airl_mav.experiments.fault_matrix import fly_fault
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve

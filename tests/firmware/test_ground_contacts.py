@@ -235,6 +235,7 @@ def test_on_the_level_ground_around_the_start_it_moves_as_without_hills() -> Non
         np.testing.assert_array_equal(rows[0], rows[1])
 
 
+@pytest.mark.nightly
 def test_a_rangefinder_sees_hills_as_pybullet_s_rays_do() -> None:
     arena, rng = hills(), np.random.default_rng(3)
     finder = PlantRangefinder(QUIET, arena, rng, 1.0)

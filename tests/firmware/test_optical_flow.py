@@ -11,11 +11,11 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
+from airl_mav.addons.fault_matrix.matrix import fly_fault
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import HOME, Vector
-from airl_mav.experiments.fault_matrix import fly_fault
 from airl_mav.faults.kinds import FITTED_CASES, Case
 from airl_mav.profiles.sensors import OpticalFlow as Profile
 from airl_mav.profiles.vehicle import load_vehicle
@@ -244,6 +244,7 @@ def tampered(rig: Rig, change: Callable[[FlowReading], FlowReading | None]) -> N
     rig.step_through(lambda sample: step(changed(sample)))
 
 
+@pytest.mark.nightly
 def test_absurd_flow_has_no_part_in_where_the_velocity_is_put() -> None:
     rig = flown_by_flow()
     rig.take_off(2.5)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from airl_mav.addons.fault_matrix.matrix import fly_fault
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
 from airl_mav.core.frames import quat_wxyz_to_xyzw, quat_yaw
-from airl_mav.experiments.fault_matrix import fly_fault
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import FlightPhase

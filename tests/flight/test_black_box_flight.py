@@ -12,6 +12,7 @@ from pydantic import TypeAdapter
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from airl_mav.addons.refit.refly import FLOWN, REHEARSED, from_its_start, refly
 from airl_mav.black_box.messages import (
     Decision,
     End,
@@ -29,7 +30,6 @@ from airl_mav.cli.report import run as report
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import quat_yaw
-from airl_mav.experiments.refly import FLOWN, REHEARSED, from_its_start, refly
 from airl_mav.experiments.run import Run, load_run
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import Setup

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from airl_mav.cli.conformance import ConformanceOptions, run
-from airl_mav.conformance import vehicle_clock
-from airl_mav.conformance.checklist import (
+from airl_mav.addons.conformance import vehicle_clock
+from airl_mav.addons.conformance.checklist import (
     CheckDefinition,
     CheckFailedError,
     Checklist,
@@ -26,10 +25,11 @@ from airl_mav.conformance.checklist import (
     TranscriptLine,
     require,
 )
-from airl_mav.conformance.mavlink_names import version_name
-from airl_mav.conformance.reference import StoredStep, Tolerance, deviations, load_reference
-from airl_mav.conformance.result import ConformanceResult, ConformanceSettings
-from airl_mav.conformance.steps import (
+from airl_mav.addons.conformance.command import ConformanceOptions, run
+from airl_mav.addons.conformance.mavlink_names import version_name
+from airl_mav.addons.conformance.reference import StoredStep, Tolerance, deviations, load_reference
+from airl_mav.addons.conformance.result import ConformanceResult, ConformanceSettings
+from airl_mav.addons.conformance.steps import (
     BEFORE_S,
     MANOEUVRES,
     STEP_NAMES,
@@ -40,8 +40,8 @@ from airl_mav.conformance.steps import (
     plan,
     step_response,
 )
-from airl_mav.conformance.telemetry import EstimatedMotion, TelemetryBuffer
-from airl_mav.conformance.vehicle_clock import Method, VehicleClock
+from airl_mav.addons.conformance.telemetry import EstimatedMotion, TelemetryBuffer
+from airl_mav.addons.conformance.vehicle_clock import Method, VehicleClock
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.loading import list_profiles

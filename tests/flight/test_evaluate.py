@@ -255,6 +255,7 @@ def test_a_learned_policy_flies_in_the_environment_of_its_card(
         assert len(run_.latency[episode.index]["sent_us"]) == flown.decisions
 
 
+@pytest.mark.nightly
 def test_ablation_costs_what_the_input_is_worth(linear: Path, tmp_path: Path) -> None:
     rates = {}
     for ablate in (None, "depth", "goal"):
@@ -442,6 +443,7 @@ def test_the_picture_of_all_flights(greedy: tuple[LoadedRun, str]) -> None:
     assert green.sum() > 5 * red.sum()
 
 
+@pytest.mark.nightly
 def test_obstacles_are_drawn_where_all_flights_share_them(
     greedy: tuple[LoadedRun, str], tmp_path: Path
 ) -> None:

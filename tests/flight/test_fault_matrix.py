@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from airl_mav.cli import faults
-from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.experiments import fault_matrix
-from airl_mav.experiments.fault_matrix import (
+from airl_mav.addons.fault_matrix import command as faults
+from airl_mav.addons.fault_matrix import matrix as fault_matrix
+from airl_mav.addons.fault_matrix.matrix import (
     FaultFlight,
     MatrixCell,
     cell_text,
@@ -19,6 +18,7 @@ from airl_mav.experiments.fault_matrix import (
     fly_matrix,
     markdown,
 )
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.faults.kinds import CASES, FALLS, MATRIX_PHASES, End, Phase
 from airl_mav.faults.model import Fault
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -140,7 +140,7 @@ def test_a_stopped_run_goes_on_where_it_was(
         asked.append(fault)
         return fly_fault(vehicle, fault, phase, seed)
 
-    monkeypatch.setattr("airl_mav.experiments.fault_matrix.fly_fault", spy)
+    monkeypatch.setattr("airl_mav.addons.fault_matrix.matrix.fly_fault", spy)
     faults.run(options("accel off", "gyro off"), Console(quiet=True))
     assert asked == ["gyro off"]
     found = fault_matrix.load(tmp_path / "faults.json")

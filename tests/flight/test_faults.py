@@ -769,6 +769,7 @@ def test_taken_port(tmp_path: Path, option: str, kind: socket.SocketKind) -> Non
 # --- Ctrl-C at the companion alone
 
 
+@pytest.mark.nightly
 def test_companion_interrupted_before_takeoff_stays_on_the_ground(
     tmp_path: Path, ground: Ground
 ) -> None:

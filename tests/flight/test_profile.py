@@ -18,7 +18,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from airl_mav.cli import profile as command
+from airl_mav.addons.profiling import command, hil
+from airl_mav.addons.profiling.measurement import Recording
+from airl_mav.addons.profiling.profile import busy_remark, profile
+from airl_mav.addons.profiling.report import correlation_line, verdict
+from airl_mav.addons.profiling.request import ProfileRequest
 from airl_mav.cli.options import read_options, run_command
 from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import UsageError
@@ -30,11 +34,6 @@ from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.computer import existing_profile, load_computer, write_profile
 from airl_mav.profiles.loading import list_profiles
-from airl_mav.profiling import hil
-from airl_mav.profiling.measurement import Recording
-from airl_mav.profiling.profile import busy_remark, profile
-from airl_mav.profiling.report import correlation_line, verdict
-from airl_mav.profiling.request import ProfileRequest
 from airl_mav.scenario.model import DEFAULT_POLICY, Lateness
 from airl_mav.scenario.piloting import select_latency
 from companion.mission import MissionResult
@@ -360,7 +359,7 @@ def test_an_interrupted_soak_keeps_what_was_measured(tmp_path: Path) -> None:
 def test_power_that_the_computer_tells_is_its_watts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("airl_mav.profiling.profile.IDLE_US", 20_000)
+    monkeypatch.setattr("airl_mav.addons.profiling.profile.IDLE_US", 20_000)
     root, out = write(tmp_path / "machine", ORIN_NX), tmp_path / "out"
     few = ProfileRequest(on="box", decisions=10, warm_up=1)
     measured = profile(few, out=out, root=root)

@@ -12,14 +12,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from airl_mav.black_box.reading import read_black_box
-from airl_mav.cli.main import main
-from airl_mav.cli.refit import RefitOptions
-from airl_mav.cli.refit import run as airl_refit
-from airl_mav.cli.report import ReportOptions
-from airl_mav.cli.report import run as report
-from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.experiments.refly import (
+from airl_mav.addons.refit.flown import flown_of
+from airl_mav.addons.refit.refit import Refit, refit
+from airl_mav.addons.refit.refit_command import RefitOptions
+from airl_mav.addons.refit.refit_command import run as airl_refit
+from airl_mav.addons.refit.refly import (
     ALL,
     LATENCY,
     NOTHING,
@@ -28,14 +25,17 @@ from airl_mav.experiments.refly import (
     refly_parts,
     turned_wind,
 )
+from airl_mav.addons.refit.together import refit_together
+from airl_mav.black_box.reading import read_black_box
+from airl_mav.cli.main import main
+from airl_mav.cli.report import ReportOptions
+from airl_mav.cli.report import run as report
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.experiments.run import load_run
 from airl_mav.latency.source import parse_latency
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.refitting.flown import flown_of
-from airl_mav.refitting.refit import Refit, refit
-from airl_mav.refitting.together import refit_together
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.recording_folder import take_in
 from airl_mav.report.tracking import track
@@ -113,6 +113,7 @@ def test_what_is_written_loads_as_it_is(refitted: Refitted) -> None:
         refit(refitted.flight.black_box, out=out)
 
 
+@pytest.mark.nightly
 def test_only_their_ratio_is_observable_so_the_profile_says_which(refitted: Refitted) -> None:
     flight, truth = refitted.flight, refitted.truth
     found = refit(flight.black_box, ulg=flight.ulg, known="mass")
@@ -201,7 +202,7 @@ def test_a_mode_that_plans_its_way_does_not_show_how_long_a_vehicle_answers(
     log = read_vehicle_log(refitted.flight.ulg)
     mission = Series(log.nav_state.time_us, np.full_like(log.nav_state.values, 3.0))
     monkeypatch.setattr(
-        "airl_mav.refitting.refit.read_vehicle_log", lambda _: replace(log, nav_state=mission)
+        "airl_mav.addons.refit.refit.read_vehicle_log", lambda _: replace(log, nav_state=mission)
     )
     found = refit(refitted.flight.ulg)
     assert "no flight by velocity setpoints" in found.estimate("dead_time_s").unobservable
@@ -233,7 +234,7 @@ def test_a_log_of_no_flight_of_a_quadrotor_is_refused(
         motion=Series(log.motion.time_us, motion),
         parameters={**log.parameters, **parameters},
     )
-    monkeypatch.setattr("airl_mav.refitting.refit.read_vehicle_log", lambda _: held)
+    monkeypatch.setattr("airl_mav.addons.refit.refit.read_vehicle_log", lambda _: held)
     with pytest.raises(UsageError, match=problem):
         refit(refitted.flight.ulg)
 
@@ -243,7 +244,7 @@ def test_a_computer_whose_profile_is_elsewhere_is_told_and_stops_nothing(
 ) -> None:
     box = read_black_box(refitted.flight.black_box)
     box.run["config"]["computer"] = "/home/pi/computers/my-pi.toml"
-    monkeypatch.setattr("airl_mav.refitting.refit.read_black_box", lambda _: box)
+    monkeypatch.setattr("airl_mav.addons.refit.refit.read_black_box", lambda _: box)
     found = refit(refitted.flight.black_box, ulg=refitted.flight.ulg)
     assert found.notes[0].startswith("the computer's mass is not known here")
     assert found.estimate("mass_kg") == refitted.found.estimate("mass_kg")

@@ -90,6 +90,7 @@ def test_the_card_says_which_cameras_it_needs(policy: Path) -> None:
     assert "; camera `down`: grey image of 32x24 px; camera `left`: depth image" in page
 
 
+@pytest.mark.nightly
 def test_the_network_has_an_input_for_each(policy: Path) -> None:
     import onnxruntime
 

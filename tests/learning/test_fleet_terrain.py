@@ -171,6 +171,7 @@ def test_on_the_planner_s_map_ground_at_the_height_of_the_flight_is_in_the_way(
         assert high.any()
 
 
+@pytest.mark.nightly
 @pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
 def test_the_planner_reaches_its_goals_among_hills() -> None:
     spec = EnvironmentSpec.model_validate(

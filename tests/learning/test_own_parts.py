@@ -104,6 +104,7 @@ def test_a_reward_that_cannot_be_paid_is_told_in_one_line(
         env.step(np.array([22, 22]))
 
 
+@pytest.mark.nightly
 def test_a_network_of_the_user_s_trains_and_flies(parts: str, tmp_path: Path) -> None:
     config = validated(
         TrainingConfig,

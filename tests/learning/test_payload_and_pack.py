@@ -185,6 +185,7 @@ def test_the_twin_hovers_level_with_a_mass_off_the_centre() -> None:
     assert fleet.rotor[0].std() > 0.02 > centred.rotor[0].std()
 
 
+@pytest.mark.nightly
 def test_mean_power_does_not_depend_on_how_often_it_is_sampled() -> None:
     """A minute and a half of manoeuvres: 250 Hz against every 5th, 25th, 50th and 250th tick."""
     rng = np.random.default_rng(3)

@@ -193,6 +193,7 @@ def test_a_policy_with_a_memory_flies_in_a_companion_of_its_own(model: Any, tmp_
     assert np.isfinite(setpoints).all()
 
 
+@pytest.mark.nightly
 def test_a_memory_of_what_several_cameras_saw(tmp_path: Path) -> None:
     """The export decides as the learner, and each image counts."""
     left = SeenCamera(height_px=24, width_px=32, horizontal_fov_deg=90.0, range_m=10.0)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from airl_mav.addons.roofline.points import noticed_m
 from airl_mav.core.errors import FieldError
 from airl_mav.envs import stopping
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.roofline import noticed_m
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.stopping import (
     Braking,

@@ -14,7 +14,12 @@ from matplotlib.colors import to_rgb
 from rich.console import Console
 from scipy import stats
 
-from airl_mav.cli.sweep import SweepOptions, run
+from airl_mav.addons.sweep.command import SweepOptions, run
+from airl_mav.addons.sweep.config import SweepConfig, load_sweep
+from airl_mav.addons.sweep.document import document_of
+from airl_mav.addons.sweep.store import SweepFolder, declaration
+from airl_mav.addons.sweep.summary import Computer, estimated_ms, over_seeds, summarize, write_sweep
+from airl_mav.addons.sweep.trial import size_of, training_of, trials
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.provenance import provenance
@@ -29,11 +34,6 @@ from airl_mav.profiles.loading import list_profiles
 from airl_mav.report.document import write_document
 from airl_mav.report.heatmap import Field, HeatMap, _ink_on, colours, draw_heat_map
 from airl_mav.report.theme import new_figure, render_png
-from airl_mav.sweep.config import SweepConfig, load_sweep
-from airl_mav.sweep.document import document_of
-from airl_mav.sweep.store import SweepFolder, declaration
-from airl_mav.sweep.summary import Computer, estimated_ms, over_seeds, summarize, write_sweep
-from airl_mav.sweep.trial import size_of, training_of, trials
 from airl_mav.training.config import NetworkSpec
 from tests.support.policy_kit import parameters_of
 from tests.support.sweep_kit import TINY, fake_results, write_sweep_file

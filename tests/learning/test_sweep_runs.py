@@ -14,14 +14,14 @@ from unittest.mock import patch
 
 import pytest
 
-from airl_mav.cli import sweep as sweep_command
+from airl_mav.addons.sweep import command as sweep_command
+from airl_mav.addons.sweep.config import load_sweep
+from airl_mav.addons.sweep.store import SweepFolder
+from airl_mav.addons.sweep.trial import size_of, trials
 from airl_mav.core.errors import EXIT_INTERRUPTED
 from airl_mav.experiments.process_executor import open_executor
 from airl_mav.policy.card import read_card
 from airl_mav.policy.template import NetworkSize
-from airl_mav.sweep.config import load_sweep
-from airl_mav.sweep.store import SweepFolder
-from airl_mav.sweep.trial import size_of, trials
 from tests.support.command_line import airl
 from tests.support.processes import PATIENCE_S, Running, has_ended, running, wait_until
 from tests.support.sweep_kit import TINY, write_sweep_file

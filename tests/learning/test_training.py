@@ -133,6 +133,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(
     ).read_bytes()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_ctrl_c_says_how_to_go_on(short: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"

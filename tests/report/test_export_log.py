@@ -17,6 +17,9 @@ from pyulog import ULog
 from scipy.spatial.transform import Rotation, Slerp
 
 from airl_mav import Scenario, rehearse
+from airl_mav.addons.export_log.files import flight_of
+from airl_mav.addons.export_log.recorded import RecordedFlight
+from airl_mav.addons.export_log.ulog_log import row, samples, write_ulog
 from airl_mav.arena.generate import generate
 from airl_mav.black_box.messages import Decision, End, Latency, Phase, Telemetry
 from airl_mav.black_box.reading import read_black_box
@@ -29,9 +32,6 @@ from airl_mav.latency.stamps import STAMPS
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.report.export_log.files import flight_of
-from airl_mav.report.export_log.recorded import RecordedFlight
-from airl_mav.report.export_log.ulog_log import row, samples, write_ulog
 from airl_mav.report.recorded_flight import episode_of
 from airl_mav.report.replay.runs import ReplayedRun
 from tests.support.command_line import airl, option_words
@@ -199,7 +199,7 @@ def test_hills_are_in_the_scene_and_the_goal_stands_on_them() -> None:
     pytest.importorskip("foxglove")
     from foxglove.messages import Timestamp
 
-    from airl_mav.report.export_log.scene import arena_scene
+    from airl_mav.addons.export_log.scene import arena_scene
 
     spec = load_profile("arenas", "hills", ArenaSpec)
     arenas = (generate(spec, seed, name="hills", vehicle_width_m=0.6) for seed in range(30))
@@ -503,7 +503,7 @@ def test_a_row_knows_its_fields() -> None:
 @pytest.fixture
 def live(gym: Path) -> Iterator[Any]:
     pytest.importorskip("foxglove", reason="needs the [export] extra")
-    from airl_mav.report.export_log.files import LiveFlight
+    from airl_mav.addons.export_log.files import LiveFlight
 
     served = LiveFlight(recorded(gym), 0)
     yield served

@@ -8,9 +8,9 @@ from unittest.mock import patch
 
 import pytest
 
+from airl_mav.addons.roofline import roofline as roofline_module
 from airl_mav.core.errors import UsageError
 from airl_mav.core.provenance import provenance
-from airl_mav.experiments import roofline as roofline_module
 from airl_mav.experiments.evaluate import evaluate
 from airl_mav.experiments.fly import rehearse
 from airl_mav.flight.statistics import aggregate

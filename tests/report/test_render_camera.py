@@ -10,6 +10,7 @@ import pytest
 from PIL import Image, ImageSequence
 from rich.console import Console
 
+from airl_mav.addons.render.ground_truth import _rates
 from airl_mav.arena.generate import generate
 from airl_mav.camera.flow import CameraMotion, optical_flow, velocities_of
 from airl_mav.camera.imaging import ImageFormation
@@ -22,7 +23,6 @@ from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.report.ground_truth import _rates
 from airl_mav.report.replay.runs import ReplayedRun
 from firmware_sim.plant.camera_server import SimulatedCamera
 from tests.support.run_demo import write_demo_run
@@ -47,7 +47,9 @@ def vehicle(tmp_path: Path) -> Path:
 
 
 def render(*words: str) -> None:
-    code = carry_out("airl render", "airl_mav.cli.render", list(words), console=Console(quiet=True))
+    code = carry_out(
+        "airl render", "airl_mav.addons.render.command", list(words), console=Console(quiet=True)
+    )
     assert code == 0
 
 

@@ -10,12 +10,12 @@ import pytest
 from PIL import Image, ImageSequence
 from rich.console import Console
 
+from airl_mav.addons.render.camera_pictures import Drawn, Shown, film, moments, still, write_film
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
 from airl_mav.camera.render import camera_pose
 from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
-from airl_mav.report.camera_pictures import Drawn, Shown, film, moments, still, write_film
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.replay.runs import ReplayedRun
 from tests.support.run_demo import write_demo_run
@@ -30,7 +30,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def render(*words: str) -> None:
-    code = carry_out("airl render", "airl_mav.cli.render", list(words), console=Console(quiet=True))
+    code = carry_out(
+        "airl render", "airl_mav.addons.render.command", list(words), console=Console(quiet=True)
+    )
     assert code == 0
 
 

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.optimize import brentq
 
-from airl_mav import RooflineRequest, roofline
-from airl_mav.cli import roofline as command
+from airl_mav.addons.roofline import command
+from airl_mav.addons.roofline import roofline as experiment
+from airl_mav.addons.roofline.points import Roofline, RooflinePoint, noticed_m
+from airl_mav.addons.roofline.roofline import RooflineRequest, roofline
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json
-from airl_mav.envs.roofline import Roofline, RooflinePoint, noticed_m
-from airl_mav.experiments import roofline as experiment
 from airl_mav.policy.card import read_card
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.profiles.loading import profiles_dir
@@ -102,6 +102,7 @@ def test_every_computer_is_carried(found: Roofline) -> None:
     assert heavy.missions_per_charge == pytest.approx(pack_j / flight_j, rel=1e-6)
 
 
+@pytest.mark.nightly
 def test_what_flies_is_what_was_measured_and_not_the_closed_form(found: Roofline) -> None:
     for point in found.points:
         assert point.measured_m_s <= point.flown_m_s < 1.15 * point.measured_m_s
@@ -180,6 +181,7 @@ def test_a_policy_takes_notice_at_the_depth_at_which_it_acts() -> None:
     assert not noticed_m(LearnedPolicy(CARD, StopsBefore(0.0)), QUAD).any()
 
 
+@pytest.mark.nightly
 def test_the_sensing_distance_is_the_least_that_the_policy_took_notice_at(tmp_path: Path) -> None:
     asked: dict[str, Any] = {"policy": "static-obstacles", "computers": ("workstation",)}
     result = roofline(**asked, draws=1, out=tmp_path / "out")

@@ -12,7 +12,7 @@ import pytest
 from airl_mav import __version__
 from airl_mav.cli import entry
 from airl_mav.cli.listing import KINDS
-from airl_mav.cli.main import SUBCOMMANDS, main
+from airl_mav.cli.main import main, subcommands
 from airl_mav.policy.registry import policy_names
 from airl_mav.profiles.loading import list_profiles
 from tests.support.processes import ROOT
@@ -20,7 +20,7 @@ from tests.support.processes import ROOT
 OLD = ("profile",)
 """Subcommands whose modules do not have their options as a model yet."""
 
-NAMES = [name for name in SUBCOMMANDS if name not in OLD]
+NAMES = [name for name in subcommands() if name not in OLD]
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
@@ -40,7 +40,7 @@ def test_without_a_word_it_says_what_there_is(capsys: pytest.CaptureFixture[str]
     code, told, _ = run(capsys)
     assert code == 2
     assert run(capsys, "--help") == (0, told, "")
-    for name in SUBCOMMANDS:
+    for name in subcommands():
         assert f"\n  {name} " in told
 
 

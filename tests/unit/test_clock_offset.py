@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common as dialect
 
+from airl_mav.addons.profiling.hil import TimesyncLink
 from airl_mav.core.clock import NS_PER_US, WallClock
 from airl_mav.latency.clock_offset import (
     GREATEST_DRIFT,
@@ -24,7 +25,6 @@ from airl_mav.latency.clock_offset import (
     best_reading,
     relate,
 )
-from airl_mav.profiling.hil import TimesyncLink
 from tests.support.mavlink_clients import wait_for
 from tests.support.ports import LOOPBACK, free_ports
 

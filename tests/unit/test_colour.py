@@ -387,6 +387,7 @@ def test_patterns_repeat_without_a_seam(name: str) -> None:
     assert PERIOD[name] >= 1.0
 
 
+@pytest.mark.nightly
 def test_every_level_of_the_atlas_has_the_same_mean() -> None:
     for number, name in enumerate(TEXTURES):
         n = SIDE

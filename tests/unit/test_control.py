@@ -260,6 +260,7 @@ def test_no_error_no_rate(q: Quat) -> None:
     np.testing.assert_allclose(rate_setpoint(q, minus, 0.0, GAINS), 0.0, atol=1e-6)
 
 
+@pytest.mark.nightly
 @given(quaternions, quaternions)
 def test_rates_reduce_the_error(q: Quat, q_sp: Quat) -> None:
     goal, now = scipy_of(q_sp), scipy_of(q)

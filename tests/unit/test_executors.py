@@ -323,7 +323,7 @@ def test_ray_where_there_is_none_is_told_in_one_line(address: str, message: str)
 
 
 def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("airl_mav.experiments.ray_executor.find_spec", lambda _: None)
+    monkeypatch.setattr("airl_mav.addons.ray.executor.find_spec", lambda _: None)
     with (
         pytest.raises(
             UsageError, match=r"executor 'ray': not installed: pip install 'airl-mav\[ray\]'"

@@ -97,6 +97,7 @@ def test_a_step_is_shown_and_the_next_start_prints_nothing(cache: Path) -> None:
     assert {file: file.stat().st_mtime_ns for file in cache.rglob("*")} == before
 
 
+@pytest.mark.nightly
 def test_a_terminal_gets_a_bar(cache: Path) -> None:
     text = shown(terminal=True)
     assert LABEL in text

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from airl_mav.conformance.reference import StoredStep
-from airl_mav.conformance.result import ConformanceResult, ConformanceSettings
-from airl_mav.conformance.steps import (
+from airl_mav.addons.conformance.reference import StoredStep
+from airl_mav.addons.conformance.result import ConformanceResult, ConformanceSettings
+from airl_mav.addons.conformance.steps import (
     MANOEUVRES,
     MeasuredStep,
     SetpointStep,

@@ -99,7 +99,7 @@ MESHES: dict[str, tuple[trimesh.Trimesh, Inside]] = {
 
 
 @pytest.mark.parametrize("name", MESHES)
-@pytest.mark.parametrize("most", [8, 64])
+@pytest.mark.parametrize("most", [8, pytest.param(64, marks=pytest.mark.nightly)])
 def test_boxes_cover_the_mesh_and_reach_no_further_than_is_told(
     name: str, most: int, tmp_path: Path
 ) -> None:

@@ -120,6 +120,7 @@ def test_plain_materials_are_within_three_percent(
     assert inner < 0.03
 
 
+@pytest.mark.nightly
 def test_textures_lie_where_they_do_in_the_reference() -> None:
     """Bricks on every obstacle, checks on the floor, by bitmaps of the same patterns."""
     textured = {
@@ -158,6 +159,7 @@ INDOORS = [
 ]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("seed", "position", "yaw"), INDOORS)
 def test_rooms_below_a_ceiling_are_within_three_percent(
     seed: int, position: tuple[float, float, float], yaw: float
@@ -260,6 +262,7 @@ def test_cylinders_and_fisheyes_are_within_three_percent(camera: Intrinsics) -> 
     assert float(np.abs(other.astype(float) - theirs).mean()) / 255.0 > 1.5 * whole
 
 
+@pytest.mark.nightly
 def test_a_face_of_the_cube_is_what_a_pinhole_sees() -> None:
     """A pinhole is drawn as before; the same rays by faces give the same light but for noise."""
     scene = arena("dense-obstacles", 3, **LIGHT, **PLAIN)

@@ -107,6 +107,7 @@ def test_torch_and_onnx_give_the_same(exported: Path, name: str) -> None:
     np.testing.assert_allclose(by_torch, by_onnx, atol=1e-5)
 
 
+@pytest.mark.nightly
 def test_threads_do_not_change_what_comes_out(exported: Path) -> None:
     seen = noise(5)
     one = load_learned(exported / "continuous", threads=1).act_batch(seen)

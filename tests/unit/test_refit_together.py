@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from airl_mav.addons.refit.quantity import FittedQuantity
+from airl_mav.addons.refit.together import pooled, random_effects, refit_together
 from airl_mav.cli.main import main
 from airl_mav.core.errors import FieldError
 from airl_mav.flight.statistics import QUANTILE
-from airl_mav.refitting.quantity import FittedQuantity
-from airl_mav.refitting.together import pooled, random_effects, refit_together
 
 
 def told(value: float, sigma: float) -> FittedQuantity:

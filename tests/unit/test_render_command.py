@@ -22,6 +22,8 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.report.theme import coloured
 from tests.support.lenses import BARREL
 
+COMMAND = "airl_mav.addons.render.command"
+
 SMALL = ("--width-px", "64", "--height-px", "48")
 POSE = ("--north-m", "8", "--east-m", "-2", "--height-m", "3", "--yaw-deg", "20")
 
@@ -29,7 +31,7 @@ POSE = ("--north-m", "8", "--east-m", "-2", "--height-m", "3", "--yaw-deg", "20"
 def render(folder: Path, *words: str) -> np.ndarray:
     out = folder / "some.png"
     code = carry_out(
-        "airl render", "airl_mav.cli.render", [*words, "--out", str(out)],
+        "airl render", COMMAND, [*words, "--out", str(out)],
         console=Console(quiet=True),
     )  # fmt: skip
     assert code == 0
@@ -139,5 +141,7 @@ def test_mitsuba_has_neither_depth_nor_fog(tmp_path: Path) -> None:
 
 def test_only_png_files_are_written(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"accepted: a file name that ends in \.png or \.npy"):
-        carry_out("airl render", "airl_mav.cli.render", ["--out", str(tmp_path / "x.jpg")])
+        carry_out(
+            "airl render", "airl_mav.addons.render.command", ["--out", str(tmp_path / "x.jpg")]
+        )
     assert not list(tmp_path.iterdir())

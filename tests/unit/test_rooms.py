@@ -17,6 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from rich.console import Console
 from scipy import ndimage, stats
 
+from airl_mav.addons.render.camera_pictures import ROOM, coloured_segmentation
 from airl_mav.arena.appearance import srgb_of
 from airl_mav.arena.draw import OPENING_COLOUR, draw_arena
 from airl_mav.arena.footprints import bounding_boxes
@@ -31,7 +32,6 @@ from airl_mav.core.errors import UsageError
 from airl_mav.envs.arenas import CEILING, FLOOR, NOTHING, WALL, batch_of, clearance, touches
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profile_digest
-from airl_mav.report.camera_pictures import ROOM, coloured_segmentation
 
 WIDTH_M = 0.55
 SEEDS = range(60)

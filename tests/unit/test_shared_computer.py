@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from airl_mav.addons.profiling.measurement import share
+from airl_mav.addons.profiling.profile import profile
+from airl_mav.addons.profiling.request import ProfileRequest
 from airl_mav.cli.computers import ComputersOptions
 from airl_mav.cli.computers import run as computers
 from airl_mav.cli.main import main
@@ -16,9 +19,6 @@ from airl_mav.core.errors import UsageError
 from airl_mav.latency.source import select_injection
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import profile_digest
-from airl_mav.profiling.measurement import share
-from airl_mav.profiling.profile import profile
-from airl_mav.profiling.request import ProfileRequest
 
 RAS_PI_4 = "9a586d1ed2f0597f62bcacc007f53849d2ed52c3da1d63e0f80db514b7365b53"
 

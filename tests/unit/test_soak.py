@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from airl_mav.addons.profiling.request import ProfileRequest
+from airl_mav.addons.profiling.soak import MachineReading, Soak, soak
 from airl_mav.core.clock import SimClock
 from airl_mav.core.machine import MachineState, throttled_since
-from airl_mav.profiling.request import ProfileRequest
-from airl_mav.profiling.soak import MachineReading, Soak, soak
 
 
 @dataclass

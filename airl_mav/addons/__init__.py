@@ -1,0 +1,1 @@
+"""Add-ons: see `airl_mav.core.addons`."""

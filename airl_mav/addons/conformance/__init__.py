@@ -1,0 +1,16 @@
+"""Conformance test of a flight controller.
+
+Checks a flight controller over MAVSDK against the assumptions of a rehearsal, flies step responses
+and compares them with PX4's. Always lands.
+
+Command: `airl conformance`. From Python: `conformance.run.check_conformance`.
+Depends on: MAVSDK, the `vehicle_clock` of this folder, `airl_mav.report` for the page.
+Guide: docs/conformance.md.
+"""
+
+COMMANDS = {
+    "conformance": (
+        "does a flight controller do what the rehearsal assumes?",
+        "airl_mav.addons.conformance.command",
+    )
+}

@@ -1,0 +1,16 @@
+"""Export of flights: MCAP for Foxglove and rerun, ULog for PX4's tools.
+
+Writes the flights of a run as files, or sends the flights of a run in progress.
+
+Command: `airl export-log`.
+Depends on: `airl_mav.black_box` for MCAP, replays of runs (`airl_mav.report.replay`), the ULog
+topics of `firmware_sim.flight_log`.
+Guide: docs/how-to/export-log.md.
+"""
+
+COMMANDS = {
+    "export-log": (
+        "flights of a run as MCAP for Foxglove and rerun, or ULog; or live",
+        "airl_mav.addons.export_log.command",
+    )
+}

@@ -1,0 +1,115 @@
+"""`airl export-log`: export flights of a run to log files, or stream them to Foxglove."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+from rich.console import Console
+
+from airl_mav.addons.export_log.files import Format, flight_of, write_flight
+from airl_mav.cli.options import POSITIONAL, check_installed
+from airl_mav.cli.shared_options import TrustArenas, folder_of
+from airl_mav.core.console import new_console
+from airl_mav.core.constants import LOOPBACK
+from airl_mav.core.errors import FieldError
+from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.progress import RichProgress
+from airl_mav.rehearsal.run_folder import load
+from airl_mav.report.arenas import trust_arenas
+from airl_mav.report.replay.runs import ReplayedRun
+from airl_mav.scenario.aircraft import GREATEST_PORT
+
+FOXGLOVE_PORT = 8765
+"""Default port of Foxglove's connections."""
+
+
+class ExportLogOptions(ProfileModel):
+    """Write flights of a run as MCAP (Foxglove, rerun) or ULog (PlotJuggler, Flight Review).
+
+    Writes one file per flight, flight-NNN.mcap or flight-NNN.ulg. --stream publishes a flight in
+    real time instead, for Foxglove's "open connection"; Ctrl-C ends it.
+
+    Examples:
+        airl export-log runs/20261122T101530Z-sitl-static-obstacles
+        airl export-log runs/A 3 7 --format ulog --out logs
+        airl export-log runs/A 7 --stream
+    """
+
+    run: Annotated[Path, POSITIONAL] = Field(
+        description="run folder, or the black box of a flight (.mcap)"
+    )
+    flights: Annotated[tuple[int, ...], POSITIONAL] = Field(
+        default=(), description="numbers of the flights; by default all that are recorded"
+    )
+    format: Format = Field(default="mcap", description="of the files")
+    out: Path | None = Field(
+        default=None, description="folder of the files; by default that of the run"
+    )
+    stream: bool = Field(
+        default=False, description="publish one flight live on the loopback address, write nothing"
+    )
+    port: int = quantity("TCP port of --stream", "1", ge=1, le=GREATEST_PORT, default=FOXGLOVE_PORT)
+    trust: TrustArenas = False
+
+
+OPTIONS = ExportLogOptions
+
+
+def run(options: ExportLogOptions, console: Console | None = None) -> int:
+    """Write the files, or stream until Ctrl-C; return 0."""
+    console = console or new_console()
+    if options.stream or options.format == "mcap":
+        check_installed("export")
+    folder = folder_of(options.run)
+    if options.trust:
+        trust_arenas(load(folder))
+    replayed = ReplayedRun(folder)
+    numbers = options.flights or tuple(sorted(record.index for record in replayed.records))
+    for number in numbers:
+        _check_recorded(replayed, number)
+    if options.stream:
+        return _stream(replayed, numbers, options.port, console)
+    out = options.out or folder
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FieldError("out", f"{out}", problem=f"{error.strerror}") from None
+    with RichProgress(console) as progress:
+        bar = progress.bar("flights", len(numbers), unit="flights")
+        for number in numbers:
+            path = write_flight(flight_of(replayed, number), folder, out, options.format)
+            bar.advance()
+            progress.note(f"{path}  {path.stat().st_size / 1e6:.1f} MB")
+        bar.close()
+    return 0
+
+
+def _check_recorded(run: ReplayedRun, number: int) -> None:
+    try:
+        run.record(number)
+    except FieldError as error:
+        raise FieldError("flights", number, error.accepted) from None
+
+
+def _stream(run: ReplayedRun, numbers: tuple[int, ...], port: int, console: Console) -> int:
+    if len(numbers) != 1:
+        raise FieldError("flights", len(numbers), "one flight, with --stream")
+    # Imported here: the streaming server is an extra.
+    from airl_mav.addons.export_log.files import LiveFlight
+
+    live = LiveFlight(flight_of(run, numbers[0]), port)
+    try:
+        console.print(
+            f"stream  ws://{LOOPBACK}:{live.port}  (begins when Foxglove connects)",
+            soft_wrap=True,
+            highlight=False,
+        )
+        console.file.flush()
+        live.run(lambda: console.print("again from the beginning", highlight=False))
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        live.close()
+    return 0

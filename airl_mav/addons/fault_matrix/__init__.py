@@ -1,0 +1,15 @@
+"""Fault matrix: every fault in every phase of a flight, and its outcome.
+
+Flies each fault of the table at each phase in lockstep and tabulates how the flights ended.
+
+Command: `airl faults`.
+Depends on: `airl_mav.faults`, `firmware_sim.faults`, lockstep, experiments.
+Guide: docs/how-to/faults.md.
+"""
+
+COMMANDS = {
+    "faults": (
+        "every fault in every phase of a flight, and how it ended: the fault matrix",
+        "airl_mav.addons.fault_matrix.command",
+    )
+}

@@ -1,0 +1,133 @@
+"""`airl faults`: fault matrix of the flight controller."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, get_args
+
+from pydantic import Field
+from rich.console import Console
+
+from airl_mav.addons.fault_matrix import matrix as fault_matrix
+from airl_mav.core.clock import utc_now
+from airl_mav.core.console import new_console
+from airl_mav.core.errors import EXIT_NOT_MET, FieldError
+from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.files import replace_file
+from airl_mav.core.progress import RichProgress
+from airl_mav.core.provenance import provenance, usable_cores
+from airl_mav.faults.kinds import CASES, LINKS, MATRIX_PHASES, PROCESSES, Phase
+from airl_mav.faults.model import Fault
+from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.report.table import Column, TableView, print_table
+from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, IN_WORDS, VehicleName
+from airl_mav.scenario.model import GREATEST_SEED, GREATEST_WORKERS
+
+ELSEWHERE = (*LINKS, *PROCESSES, "camera")
+
+
+class FaultsOptions(ProfileModel):
+    """Fly every fault in every phase of a flight, in simulated time, and report how flights end.
+
+    The command runs only the flight controller and its plant. A scripted pilot arms, climbs to 5 m,
+    holds, flies in offboard mode or a mission, and lands. Undocumented ends are marked and give
+    exit status 3. The same --out resumes an interrupted run.
+
+    Examples:
+        airl faults
+        airl faults --fault 'gps off' --fault 'motor1 off' --episodes 100
+        airl faults --episodes 1 --phases hold
+    """
+
+    faults: Annotated[tuple[Fault, ...], IN_WORDS] = Field(
+        default=(),
+        description="faults in words, without a time; by default those of the catalogue",
+    )
+    phases: tuple[str, ...] = Field(
+        default=MATRIX_PHASES, description="phases of the flight in which they begin"
+    )
+    episodes: int = quantity(
+        "flights with each fault in each phase", "1", ge=1, le=10_000, default=20
+    )
+    seed: int = quantity(
+        "seed of the first; the others follow", "1", ge=0, le=GREATEST_SEED, default=1
+    )
+    vehicle: VehicleName = DEFAULT_VEHICLE
+    workers: int | None = quantity(
+        "processes that fly; by default one for each core",
+        "1",
+        ge=1,
+        le=GREATEST_WORKERS,
+        default=None,
+    )
+    out: Path | None = Field(
+        default=None,
+        description="folder of faults.json, every flight, and faults.md, the table; by default"
+        " runs/<UTC time>-faults",
+    )
+
+
+OPTIONS = FaultsOptions
+
+
+def run(options: FaultsOptions, console: Console | None = None) -> int:
+    """Fly the matrix, show and save it; return 0 if every flight ended as documented, else 3."""
+    console = console or new_console()
+    phases = tuple(_phase(name) for name in options.phases)
+    faults = [_without_time(fault) for fault in options.faults] or [c.fault for c in CASES]
+    seeds = range(options.seed, options.seed + options.episodes)
+    workers = options.workers or usable_cores()
+    vehicle = load_vehicle(options.vehicle)
+    out = options.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-faults"
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / "faults.json"
+    matrix = fault_matrix.resumed(
+        file, provenance("airl faults"), fault_matrix.vehicle_digest(vehicle)
+    )
+    done: list[fault_matrix.MatrixCell] = []
+    with RichProgress(console) as progress:
+        bar = progress.bar("faults", len(faults) * len(phases) * len(seeds), unit="flights")
+
+        def flown(cell: fault_matrix.MatrixCell) -> None:
+            done.append(cell)
+            fault_matrix.save(fault_matrix.with_cells(matrix, done), file)
+            bar.update(completed=len(done) * len(seeds))
+
+        cells = fault_matrix.fly_matrix(
+            vehicle, faults, phases, seeds, workers=workers, known=matrix.cells, flown=flown
+        )
+        bar.close()
+    replace_file(out / "faults.md", fault_matrix.markdown(cells).encode())
+    print_table(table_of(faults, phases, cells), console, wrap=True)
+    console.print(f"{out}", soft_wrap=True)
+    return EXIT_NOT_MET if any(cell.unexpected for cell in cells) else 0
+
+
+def table_of(
+    faults: Sequence[str], phases: Sequence[Phase], cells: Sequence[fault_matrix.MatrixCell]
+) -> TableView:
+    """Return the matrix as a table with a row per fault, for a terminal of any width."""
+    rows = tuple(
+        (fault, *(fault_matrix.cell_text(cell) for cell in cells if cell.fault == fault))
+        for fault in faults
+    )
+    columns = (Column("fault", number=False), *(Column(p, number=False) for p in phases))
+    note = "!: a flight ended otherwise than documented. In brackets: fastest touch-down."
+    return TableView("fault-matrix", "Faults", columns, rows, (note,))
+
+
+def _phase(name: str) -> Phase:
+    for phase in get_args(Phase):
+        if phase == name and phase in MATRIX_PHASES:
+            known: Phase = phase
+            return known
+    raise FieldError("phases", name, ", ".join(MATRIX_PHASES))
+
+
+def _without_time(fault: Fault) -> str:
+    if fault.phase is not None or fault.at_s:
+        raise FieldError("faults", str(fault), "without a time: each phase gives it one")
+    if fault.part in ELSEWHERE:
+        raise FieldError("faults", str(fault), "a part of the aircraft: it flies alone here")
+    return str(fault)

@@ -1,0 +1,290 @@
+"""Level hil: the companion on this computer, against a simulator on another one."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+from contextlib import AbstractContextManager, closing
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from airl_mav.addons.profiling.bare import cold_start
+from airl_mav.addons.profiling.measurement import ProfilingError, Recording, Stamps
+from airl_mav.addons.profiling.policy_under_test import PolicyUnderTest
+from airl_mav.addons.profiling.request import FLOWN_SPEED_M_S, ProfileRequest
+from airl_mav.core.clock import NS_PER_US, WallClock
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.progress import Bar
+from airl_mav.latency.clock_offset import ClockError, ClockRelation, Exchanges, relate
+from airl_mav.latency.stamps import STAMPS
+from airl_mav.policy.actions import AnyAction, Policy
+from airl_mav.policy.observation import Observation
+from airl_mav.rehearsal.signals import signal_handlers
+from airl_mav.scenario.stand_alone import StandAloneCompanion
+from companion.interfaces import LinkError
+from companion.mavsdk_link import MavsdkLink
+from companion.mission import MissionResult, check_camera, fly_mission
+from companion.presence import every
+from companion.program import mission_camera, prepare
+from companion.watchdog import ThreadGuard
+
+GOAL = 9_000.0, 0.0
+"""North, east of the start [m]: out of reach."""
+
+GROUND_EXCHANGES = 100
+"""Number of TIMESYNC exchanges before the flight, and again after it."""
+
+GROUND_INTERVAL_S = 0.005
+"""Interval between them [s], out of step with the simulator's tick."""
+
+FLIGHT_INTERVAL_S = 0.1
+"""Interval between exchanges in flight [s]. Each takes 0.3 ms of processor time on a desktop core,
+and one or two decisions of a hundred coincide with one."""
+
+
+@dataclass(frozen=True)
+class TimedMission:
+    """Mission, and the exchanges with the simulator's clock."""
+
+    result: MissionResult
+    before: Exchanges
+    during: Exchanges
+    after: Exchanges
+
+
+class DecisionLimit:
+    """Policy that ends the flight after a number of decisions. Implements `actions.Policy`."""
+
+    def __init__(self, policy: Policy, limit: int, stop: threading.Event, bar: Bar) -> None:
+        self._policy, self._limit = policy, limit
+        self._stop, self._bar = stop, bar
+        self._count = 0
+
+    def act(self, observation: Observation) -> AnyAction:
+        """Return the policy's action."""
+        # Stopped before the decision, because the pilot drops a decision interrupted by a stop.
+        if self._count == self._limit:
+            self._stop.set()
+        else:
+            self._count += 1
+            self._bar.update(completed=self._count)
+        return self._policy.act(observation)
+
+
+def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recording:
+    """Fly until there are enough decisions; Ctrl-C lands. Arguments as `bare.measure`."""
+    load_us, first_us, _ = cold_start(request, policy)
+    interrupted, stop = threading.Event(), threading.Event()
+
+    def interrupt(*_: object) -> None:
+        interrupted.set()
+        stop.set()
+
+    with signal_handlers(interrupt, signal.SIGINT, signal.SIGTERM):
+        try:
+            mission = _fly(request, policy, bar, stop, interrupted)
+        except LinkError as error:
+            if interrupted.is_set():
+                raise KeyboardInterrupt from None
+            raise ProfilingError(str(error)) from error
+    if interrupted.is_set():
+        raise KeyboardInterrupt
+    decisions = len(mission.result.log)
+    if decisions < request.warm_up + request.decisions:
+        raise ProfilingError(f"{mission.result.reason} after {decisions} decisions: too few")
+    stamps, exposure, remarks = relate_stamps(mission, request.warm_up)
+    return Recording(
+        flights=(stamps,),
+        exposure=exposure,
+        load_us=load_us,
+        first_us=first_us,
+        remarks=(
+            f"in flight against a simulator elsewhere, hold {request.hold_s:g} s and at most "
+            f"{FLOWN_SPEED_M_S:g} m/s: timing was measured, not the quality of flight",
+            *remarks,
+        ),
+    )
+
+
+def _fly(
+    request: ProfileRequest,
+    policy: PolicyUnderTest,
+    bar: Bar,
+    stop: threading.Event,
+    interrupted: threading.Event,
+) -> TimedMission:
+    """Fly until there are enough decisions, or until `stop`. Raises UsageError, LinkError."""
+    asked = StandAloneCompanion(
+        policy=policy.name,
+        goal=GOAL,
+        connect=request.connect,
+        camera=request.camera,
+        **request.flown_as,
+    )
+    mission = prepare(asked)
+    decisions = request.warm_up + request.decisions
+    limited = DecisionLimit(mission.policy, decisions, stop, bar)
+    clock, abandon = WallClock(), threading.Event()
+    with (
+        closing(mission_camera(asked, mission, clock)) as frames,
+        closing(TimesyncLink(asked.connect, clock, abandon)) as link,
+    ):
+        link.connect(asked.connect_timeout, stop)
+        check_camera(mission.policy, frames, stop, mission.compensator)
+        link.exchange(GROUND_EXCHANGES, GROUND_INTERVAL_S, stop)
+        before = link.take_exchanges()
+        with link.exchanging(FLIGHT_INTERVAL_S):
+            result = fly_mission(
+                link,
+                frames,
+                limited,
+                mission.goal,
+                clock,
+                stop,
+                abandon,
+                lambda _: None,
+                pilot_settings=mission.pilot,
+                watchdog_settings=mission.watchdog,
+                limit_settings=mission.limits,
+                guard=ThreadGuard(clock),
+                compensator=mission.compensator,
+                mount_pitch_up_rad=mission.mount_pitch_up_rad,
+                mount_yaw_rad=mission.mount_yaw_rad,
+            )
+        during = link.take_exchanges()
+        # `stop` is set by now: it ends the flight.
+        link.exchange(GROUND_EXCHANGES, GROUND_INTERVAL_S, interrupted)
+        return TimedMission(result, before, during, link.take_exchanges())
+
+
+def relate_stamps(mission: TimedMission, warm_up: int) -> tuple[Stamps, str, tuple[str, ...]]:
+    """Convert the frames' exposure to this computer's clock, if the clocks can be related.
+
+    Returns columns after the warm-up, with `exchange_*` columns of one row per exchange in flight;
+    the stamp from which command age counts; remarks. `capture_us` is the exposure by this
+    computer's clock, within `capture_uncertainty_us`, `capture_simulator_us` by the simulator's.
+    """
+    columns = mission.result.log.columns()
+    stamps = {name: np.asarray(columns[name][warm_up:], np.int64) for name in STAMPS}
+    exposed_us = stamps.pop("capture_us")
+    during = mission.during
+    flying = during.sent_us >= stamps["infer_start_us"][0]
+    flying &= during.received_us <= stamps["held_until_us"][-1]
+    exchanges = {
+        "exchange_sent_us": during.sent_us[flying],
+        "exchange_simulator_us": during.remote_us[flying],
+        "exchange_received_us": during.received_us[flying],
+    }
+    try:
+        relation = relate(mission.before, during, mission.after)
+        captured_us = np.rint(relation.own_time(exposed_us)).astype(np.int64)
+        # Plus one for rounding.
+        within_us = np.ceil(relation.uncertainty_at(captured_us)).astype(np.int64) + 1
+        if (early := int(np.count_nonzero(captured_us - within_us > stamps["decoded_us"]))) > 0:
+            raise ClockError(
+                f"{early} frames would have been decoded before they were exposed: they are "
+                "stamped by another clock than the autopilot's, or it was set back"
+            )
+    except ClockError as error:
+        remark = (
+            "t1, link, control and end to end were not measured (-): nothing relates the "
+            f"simulator's clock to this computer's: {error}"
+        )
+        return {**stamps, **exchanges}, "decoded_us", (remark,)
+    related = {
+        "capture_simulator_us": exposed_us,
+        "capture_us": captured_us,
+        "capture_uncertainty_us": within_us,
+    }
+    remarks = (
+        _relation_remark(mission, relation, int(within_us.max())),
+        "link, control and end to end were not measured (-): the autopilot reports only 10 times a "
+        "second what it flies; a setpoint's way there is a part of the MAVLink round trip",
+    )
+    return {**related, **stamps, **exchanges}, "capture_us", remarks
+
+
+def _relation_remark(mission: TimedMission, relation: ClockRelation, within_us: int) -> str:
+    ground = " and ".join(
+        f"{len(exchanges)} exchanges {when} the flight (least round trip "
+        f"{exchanges.round_trip_us.min() / US_PER_MS:.3f} ms)"
+        for exchanges, when in ((mission.before, "before"), (mission.after, "after"))
+    )
+    return (
+        f"t1 is uncertain by ±{within_us / US_PER_MS:.3f} ms, all decisions alike: the simulator's "
+        f"clock was related to this computer's by TIMESYNC, {ground}; it gained "
+        f"{relation.drift * 1e6:+.1f} ppm (±{relation.drift_uncertainty * 1e6:.1f}), and "
+        f"{relation.agreeing} of {relation.checked} exchanges in flight agree"
+    )
+
+
+MESSAGE = "TIMESYNC"
+
+AUTOPILOT_COMPONENT = 1
+"""MAV_COMP_ID_AUTOPILOT1: other components of the vehicle may answer too, by other clocks."""
+
+LAST_ANSWER_S = 0.2
+"""Wait time for the last answer of a series [s]."""
+
+
+class TimesyncLink(MavsdkLink):
+    """Link that also exchanges TIMESYNC with the flight controller."""
+
+    _system_id: int
+    _pending: set[int]
+    """Send times of unanswered requests [µs]."""
+    _answered: list[tuple[int, int, int]]
+
+    def connect(self, timeout_s: float, stop: threading.Event | None = None) -> None:
+        """Wait for a flight controller, as `MavsdkLink.connect`."""
+        super().connect(timeout_s, stop)
+        self._pending, self._answered = set(), []
+        self._system_id = self._system.get_system_id()
+        self._hear_messages(MESSAGE, self._hear)
+
+    def exchange(self, count: int, interval_s: float, stop: threading.Event) -> None:
+        """Send requests at an interval [s] after `connect`, and wait for the answers or `stop`."""
+        asked_us = self._clock.time_us()
+        for _ in range(count):
+            if stop.is_set():
+                return
+            self._ask()
+            asked_us += int(interval_s * US_PER_S)
+            self._clock.sleep_until(asked_us, stop)
+        self._clock.sleep_until(self._clock.time_us() + int(LAST_ANSWER_S * US_PER_S), stop)
+
+    def exchanging(self, interval_s: float) -> AbstractContextManager[None]:
+        """Return a context that sends requests at an interval [s] from a thread."""
+        return every(int(interval_s * US_PER_S), self._ask, self._clock, "timesync")
+
+    def take_exchanges(self) -> Exchanges:
+        """Return the answered requests since the last call, in the order of the answers."""
+        # Keeps answers that arrive during the copy.
+        taken = self._answered[:]
+        del self._answered[: len(taken)]
+        columns = np.array(taken, np.int64).reshape(-1, 3)
+        return Exchanges(columns[:, 0], columns[:, 1], columns[:, 2])
+
+    def _ask(self) -> None:
+        sent_us = self._clock.time_us()
+        self._pending.add(sent_us)
+        if not self.send_message(MESSAGE, {"tc1": 0, "ts1": sent_us * NS_PER_US}):
+            # Treated as lost.
+            self._pending.discard(sent_us)
+
+    def _hear(self, message: Any, _: object) -> None:
+        """Process an answer; called from a MAVSDK thread."""
+        received_us = self._clock.time_us()
+        sender = message.system_id, message.component_id
+        if sender != (self._system_id, AUTOPILOT_COMPONENT):
+            return
+        fields = json.loads(message.fields_json)
+        remote_ns, sent_us = fields["tc1"], fields["ts1"] // NS_PER_US
+        # Requests of the flight controller have no tc1; ignore duplicate answers.
+        if remote_ns == 0 or sent_us not in self._pending:
+            return
+        self._pending.discard(sent_us)
+        self._answered.append((sent_us, remote_ns // NS_PER_US, received_us))

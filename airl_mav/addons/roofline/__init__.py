@@ -1,0 +1,16 @@
+"""Roofline: safe velocity against reaction time, and the stage that limits it.
+
+Flies straight towards an obstacle in the vectorized simulator at several reaction times, and
+compares with the F-1 model of safe velocity.
+
+Command: `airl roofline`. From Python: `roofline.roofline.roofline`.
+Depends on: the vectorized simulator (`airl_mav.envs`), computer profiles, report pages.
+Guide: docs/how-to/roofline.md.
+"""
+
+COMMANDS = {
+    "roofline": (
+        "safe velocity against reaction time: which computer, and what binds it",
+        "airl_mav.addons.roofline.command",
+    )
+}

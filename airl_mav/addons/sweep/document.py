@@ -1,0 +1,290 @@
+"""Page of an architecture search: the networks of each arena, and their cost."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from airl_mav.addons.sweep.store import SWEEP_FILE, as_data
+from airl_mav.addons.sweep.summary import NetworkSummary, Sweep, published_best
+from airl_mav.addons.sweep.tables import count, interval, networks_table, percent, t2_ms
+from airl_mav.addons.sweep.trial import training_of, trials
+from airl_mav.report import theme
+from airl_mav.report.document import Document, Facts, Headline, Section, provenance_facts
+from airl_mav.report.heatmap import Field, HeatMap, heat_picture
+from airl_mav.report.table import NONE
+from airl_mav.report.theme import FigureImage
+
+ASIDE = 1.03
+"""Horizontal factor between the dots of one network in two arenas."""
+MARKERS = ("o", "s", "^", "D", "v")
+LABELLED = 20
+"""Maximum number of labelled networks in the trade-off; beyond, only each arena's best."""
+
+
+def success_picture(sweep: Sweep, arena: str) -> theme.FigureImage:
+    """Draw the mean success rate of each network of an arena, with its standard deviation."""
+    best = sweep.best(arena)
+    known = [cell for cell in sweep.of(arena) if cell.success_rate.value is not None]
+    rates = [cell.success_rate.value or 0.0 for cell in known]
+    fields = [
+        Field(100.0 * rate, _success_text(cell), marked=cell is best)
+        for cell, rate in zip(known, rates, strict=True)
+    ]
+    heat = _heat_map(
+        sweep,
+        arena,
+        known,
+        fields,
+        title=arena,
+        unit="success [%]",
+        limits=(min(10.0 * math.floor(10.0 * min(rates, default=0.0)), 90.0), 100.0),
+        note="success, mean ± std over training seeds [%]",
+    )
+    told = ", ".join(f"{cell.network} {percent(cell.success_rate.value)} %" for cell in known)
+    alt = f"Success by layers and filters in {arena}: {told}"
+    return heat_picture(f"sweep-{arena}", alt, heat)
+
+
+def _success_text(cell: NetworkSummary) -> str:
+    text = percent(cell.success_rate.value)
+    if cell.success_std is not None:
+        text += f"\n± {percent(cell.success_std)}"
+    elif len(cell.results) < cell.planned:
+        text += f"\n{len(cell.results)} of {cell.planned}"
+    return text
+
+
+def cost_picture(sweep: Sweep, arena: str) -> theme.FigureImage:
+    """Draw the cost of each network: multiply-accumulates, or the latency estimated from them."""
+    cells = sweep.of(arena)
+    values = [_cost(sweep, cell) for cell in cells]
+    sizes = [f"{count(cell.macs)} MAC" for cell in cells]
+    if sweep.computer is not None:
+        title, unit = f"t2 on {sweep.computer.name}, estimated", "t2, estimated [ms]"
+        note = "from multiply-accumulates"
+        texts = [f"{t2_ms(value)} ms\n{size}" for value, size in zip(values, sizes, strict=True)]
+    else:
+        title, unit = "size", "multiply-accumulates"
+        note = "multiply-accumulates, parameters"
+        texts = [
+            f"{size}\n{count(cell.parameters)} par."
+            for cell, size in zip(cells, sizes, strict=True)
+        ]
+    heat = _heat_map(
+        sweep,
+        arena,
+        cells,
+        [Field(value, text) for value, text in zip(values, texts, strict=True)],
+        title=title,
+        unit=unit,
+        limits=(min(values), max(max(values), 1.01 * min(values))),
+        note=note,
+        logarithmic=True,
+    )
+    alt = f"{heat.title} by layers and filters, {arena}"
+    return heat_picture(f"sweep-size-{arena}", alt, heat)
+
+
+def _heat_map(
+    sweep: Sweep,
+    arena: str,
+    cells: Sequence[NetworkSummary],
+    fields: Sequence[Field],
+    **look: Any,
+) -> HeatMap:
+    """Return a heat map of some networks in the grid of an arena."""
+    grid = next(grid for grid in sweep.config.grids if grid.name == arena)
+    return HeatMap(
+        rows=grid.layers,
+        row_title="layers",
+        columns=grid.filters,
+        column_title="filters",
+        fields={(c.layers, c.filters): field for c, field in zip(cells, fields, strict=True)},
+        **look,
+    )
+
+
+def _cost(sweep: Sweep, cell: NetworkSummary) -> float:
+    return cell.t2_ms if sweep.computer is not None and cell.t2_ms is not None else cell.macs
+
+
+def trade_picture(sweep: Sweep) -> theme.FigureImage:
+    """Draw success against cost: a dot with its interval for each network."""
+    figure = theme.new_figure(7.4, 4.2)
+    ax: Axes = figure.subplots()
+    known = {arena: [c for c in sweep.of(arena) if c.results] for arena in sweep.arenas}
+    many = sum(map(len, known.values())) > LABELLED
+    for number, (arena, cells) in enumerate(known.items()):
+        best = sweep.best(arena)
+        for cell in cells:
+            x = _cost(sweep, cell) * ASIDE ** (number - 0.5 * (len(known) - 1))
+            chosen = best is not None and cell.network == best.network
+            first = arena if cell is cells[0] else None
+            _draw_network(ax, cell, x, number, chosen=chosen, label=first)
+            if chosen or not many:
+                rise = 6 * (len(known) > 1) * (1 - number)
+                ax.annotate(
+                    cell.network,
+                    (x, 100.0 * (cell.success_rate.value or 0.0)),
+                    xytext=(8, rise),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize=8,
+                    color=theme.INK,
+                    zorder=4,
+                )
+    ax.set_xscale("log")
+    # Label every 1, 2 and 5: a grid spans hardly more than a decade.
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.xaxis.set_major_formatter(
+        FuncFormatter(lambda v, _: f"{v:g}" if sweep.computer is not None else count(v))
+    )
+    ax.xaxis.set_minor_formatter(NullFormatter())
+    cost = "multiply-accumulates of an inference"
+    if sweep.computer is not None:
+        cost = f"t2 on {sweep.computer.name}, estimated from multiply-accumulates [ms]"
+    theme.label_axes(ax, cost, "success [%], 95 % interval", "What success costs")
+    ax.set_ylim(top=101.5)
+    theme.plain_axes(ax)
+    if len(sweep.arenas) > 1:
+        ax.legend(frameon=False, fontsize=8.5, labelcolor=theme.INK, loc="lower right")
+    return theme.render(figure, "sweep-trade-off", f"Success against {cost}, all networks")
+
+
+def _draw_network(
+    ax: Axes, cell: NetworkSummary, x: float, number: int, *, chosen: bool, label: str | None
+) -> None:
+    """Draw one network of an arena, styled by the arena's number."""
+    rate, colour = cell.success_rate, theme.line_style(number).colour
+    if rate.low is not None and rate.high is not None:
+        ends = [100.0 * rate.low, 100.0 * rate.high]
+        ax.plot([x, x], ends, color=colour, lw=1.4, alpha=0.55)
+    ax.plot(
+        x,
+        100.0 * (rate.value or 0.0),
+        MARKERS[number % len(MARKERS)],
+        ms=8 if chosen else 6,
+        color=colour,
+        mec=theme.MARK if chosen else theme.PAPER,
+        mew=1.8 if chosen else 0.8,
+        label=label,
+        zorder=3,
+    )
+
+
+def document_of(sweep: Sweep) -> Document:
+    """Return the page of a sweep with at least one finished trial."""
+    sections = [
+        Section(
+            arena,
+            sentences=best_sentences(sweep, arena),
+            tables=(networks_table(sweep, arena),),
+            draw=partial(_arena_pictures, sweep, arena),
+        )
+        for arena in sweep.arenas
+    ]
+    trade = Section("Success against cost", draw=lambda: [trade_picture(sweep)], in_terminal=False)
+    made = sweep.made
+    begun = f"{made['created_utc']}".replace("T", " ").replace("+00:00", " UTC")
+    return Document(
+        name="sweep",
+        title=sweep.config.description,
+        kicker=f"Architecture search · begun {begun} · {sweep.ended} of {sweep.planned} trials",
+        lead="Templates of L convolutions x F filters, and as many dense layers of as many units.",
+        headlines=tuple(_headline(sweep, arena) for arena in sweep.arenas),
+        sections=(*sections, trade),
+        facts=sweep_facts(sweep),
+        facts_title="What was searched",
+        provenance=(
+            ("command", f"{made['command']}"),
+            *provenance_facts(made["machine"], made["git"], made["versions"]),
+        ),
+        configurations=(
+            ("the sweep", json.dumps(as_data(sweep.config), indent=2, ensure_ascii=False)),
+        ),
+        footer=(
+            f"airl-mav {made['versions'].get('airl-mav', '')} · figures as data in {SWEEP_FILE} "
+            "beside this page; a trial's policy flies with airl-sitl --policy "
+            "trials/<trial>/policy"
+        ),
+    )
+
+
+def _arena_pictures(sweep: Sweep, arena: str) -> list[FigureImage]:
+    return [success_picture(sweep, arena), cost_picture(sweep, arena)]
+
+
+def best_sentences(sweep: Sweep, arena: str) -> tuple[str, ...]:
+    """Return sentences on an arena's best network, its interval, and the published one."""
+    best, published = sweep.best(arena), published_best(arena)
+    if best is None:
+        return ("No trial has ended yet.",)
+    n = best.success_rate.n
+    seeds = "1 training seed" if n == 1 else f"{n} training seeds"
+    lines = [
+        f"Best: {best.network} with {percent(best.success_rate.value)} % "
+        f"({interval(best)} %, {seeds}, {sum(r.episodes for r in best.results):,} flights)."
+    ]
+    known = [cell for cell in sweep.of(arena) if cell.results]
+    if rivals := sweep.rivals(arena):
+        told = ", ".join(cell.network for cell in rivals)
+        lines.append(
+            f"Within its interval, too: {told} ({len(rivals)} of {len(known) - 1}). The best of "
+            "many is also the luckiest: its own figure flatters it."
+        )
+    if published is not None:
+        lines.append(f"The paper's best: {published[0]} with {100.0 * published[1]:.0f} %.")
+    return tuple(lines)
+
+
+def sweep_facts(sweep: Sweep) -> Facts:
+    """Return the facts of the search."""
+    config = sweep.config
+    training = training_of(config, trials(config)[0])
+    environment, judged = training.environment, config.evaluation
+    networks = (
+        f"{grid.name}: layers {_listed(grid.layers)}, filters {_listed(grid.filters)}"
+        for grid in config.grids
+    )
+    last = judged.seed + judged.episodes - 1
+    rows = [
+        ("what", config.description),
+        ("trials", f"{sweep.ended} of {sweep.planned} ended"),
+        ("networks", "; ".join(networks)),
+        ("training seeds", _listed(config.seeds)),
+        ("training", f"{training.algorithm.name}, {training.steps:,} decisions each"),
+        (
+            "image",
+            f"{environment.image_width_px}x{environment.image_height_px} px, "
+            f"layout {environment.layout}, actions {environment.actions}",
+        ),
+        (
+            "judged by",
+            f"{judged.episodes:,} flights each, seeds {judged.seed} to {last}, level gym",
+        ),
+    ]
+    if sweep.computer is not None:
+        rows.append(("computer", f"{sweep.computer.name} – {sweep.computer.profile.description}"))
+    return tuple(rows)
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return ", ".join(f"{number}" for number in numbers)
+
+
+def _headline(sweep: Sweep, arena: str) -> Headline:
+    best, published = sweep.best(arena), published_best(arena)
+    theirs = ""
+    if published is not None:
+        theirs = f"; the paper: {published[0]}, {100.0 * published[1]:.0f} %"
+    if best is None:
+        return Headline(arena, NONE, "", f"no trial has ended{theirs}")
+    detail = f"{percent(best.success_rate.value)} % ({interval(best)}){theirs}"
+    return Headline(arena, best.network, "", detail)

@@ -1,1 +1,0 @@
-"""Refit: vehicle and computer profiles estimated from a recorded flight."""

@@ -1,1 +1,0 @@
-"""Architecture search: many trainings of template networks, and their results."""

@@ -1,0 +1,96 @@
+"""The core works without add-ons: each folder of `airl_mav/addons` is removed in turn."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from airl_mav.cli.main import SUBCOMMANDS
+from tests.support.processes import ROOT
+
+ADDONS = sorted(each.parent.name for each in (ROOT / "airl_mav" / "addons").glob("*/__init__.py"))
+
+MODULES = """
+import importlib, pkgutil, airl_mav, companion, firmware_sim
+for package in (airl_mav, companion, firmware_sim):
+    for each in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if not each.name.startswith(("airl_mav.addons.", "companion.cameras.")):
+            importlib.import_module(each.name)
+"""
+
+
+CUSTOMIZE = """
+import importlib.util, sys
+class Finder:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        if name == "airl_mav.addons":
+            return importlib.util.spec_from_file_location(
+                name, {init!r}, submodule_search_locations=[{folder!r}]
+            )
+sys.meta_path.insert(0, Finder)
+"""
+"""Replaces the folder of the add-ons before anything is imported."""
+
+
+def remove(folder: Path, removed: Sequence[str]) -> dict[str, str]:
+    """Return an environment for Python in which some add-ons do not exist."""
+    kept = folder / "addons"
+    kept.mkdir()
+    for name in ADDONS:
+        if name not in removed:
+            (kept / name).symlink_to(ROOT / "airl_mav" / "addons" / name)
+    init = str(ROOT / "airl_mav" / "addons" / "__init__.py")
+    (folder / "sitecustomize.py").write_text(CUSTOMIZE.format(init=init, folder=str(kept)))
+    return {**os.environ, "PYTHONPATH": str(folder)}
+
+
+def python(folder: Path, environment: dict[str, str], *words: str) -> str:
+    """Run Python; return its output."""
+    done = subprocess.run(
+        [sys.executable, *words],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def fly_without(folder: Path, removed: Sequence[str], *, whole: bool = True) -> None:
+    """List the commands and fly, without some add-ons; if `whole`, import all and report too."""
+    run = partial(python, folder, remove(folder, removed))
+    found = run("-c", "from airl_mav.core.addons import names; print(*names())").split()
+    assert found == [name for name in ADDONS if name not in removed]
+    listed = run("-m", "airl_mav.cli.main", "--help")
+    assert all(f"\n  {name} " in listed for name in SUBCOMMANDS)
+    words = ("static-obstacles-fast", "--level", "lockstep", "--episodes", "1", "--out", "run")
+    assert "success" in run("-m", "airl_mav.cli.main", "evaluate", *words)
+    if not whole:
+        return
+    run("-c", MODULES)
+    assert "success" in run("-m", "airl_mav.cli.main", "report", "run")
+    assert (folder / "run" / "report.html").exists()
+
+
+def test_there_are_addons() -> None:
+    assert "refit" in ADDONS
+
+
+def test_the_core_flies_without_addons(tmp_path: Path) -> None:
+    fly_without(tmp_path, ADDONS, whole=False)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", ADDONS)
+def test_the_core_flies_without_one(name: str, tmp_path: Path) -> None:
+    fly_without(tmp_path, [name])
