@@ -26,7 +26,7 @@ _EXPORTS = {
     "gap": "airl_mav.experiments.gap",
     "ladder": "airl_mav.experiments.ladder",
     "load_run": "airl_mav.experiments.run",
-    "rehearse": "airl_mav.experiments.fly",
+    "rehearse": "airl_mav.experiments.run",
 }
 """Public names, and the modules that define them."""
 
@@ -34,10 +34,9 @@ if TYPE_CHECKING:
     from airl_mav.experiments.degrade import degrade
     from airl_mav.experiments.evaluate import evaluate
     from airl_mav.experiments.experiment import ExperimentResult
-    from airl_mav.experiments.fly import rehearse
     from airl_mav.experiments.gap import gap
     from airl_mav.experiments.ladder import ladder
-    from airl_mav.experiments.run import Run, load_run
+    from airl_mav.experiments.run import Run, load_run, rehearse
     from airl_mav.scenario.model import Scenario
 
 __all__ = [

@@ -35,14 +35,13 @@ from airl_mav.arena.geometry import Arena, PlacedMesh
 from airl_mav.arena.triangles import Triangles, encoded, triangles_of
 from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.colour import Work
-from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.intrinsics import Intrinsics, rays_of
 from airl_mav.camera.picture import ColourArrays
 from airl_mav.camera.projection import bent_of
-from airl_mav.camera.rays import rays_of
 from airl_mav.camera.render import render
 from airl_mav.camera.textures import atlas
 from airl_mav.core.frames import quat_to_matrix
-from airl_mav.profiles.asset_files import MeshFile
+from airl_mav.profiles.assets import MeshFile
 
 THINGS = 10
 ROUNDS = 15

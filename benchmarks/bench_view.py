@@ -418,8 +418,8 @@ def measure_drawing(run: Path) -> None:
     """Measure the server's time to draw a moment of a replayed flight in the scene."""
     import viser
 
+    from airl_mav.report.replay.flight import ReplayedRun
     from airl_mav.report.replay.page import ReplayPage
-    from airl_mav.report.replay.runs import ReplayedRun
 
     began = time.process_time()
     replayed = ReplayedRun(run)

@@ -17,8 +17,8 @@ from typing import Any, Protocol
 import psutil
 
 from airl_mav.black_box import messages
+from airl_mav.black_box.mcap_file import BlackBoxFile
 from airl_mav.black_box.messages import encoded
-from airl_mav.black_box.writing import BlackBoxFile
 from airl_mav.core.clock import Clock, processor_time_us, utc_now, utc_us
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError

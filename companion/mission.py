@@ -13,7 +13,7 @@ from typing import Literal, TypeAlias
 from airl_mav.core.clock import Clock
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import Goal
-from airl_mav.latency.samplers import LatencySampler
+from airl_mav.latency.injection import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import CameraBound, Policy, RigBound
 from airl_mav.prediction.compensator import Compensator

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Goal, goal_distance_m
-from airl_mav.latency.samplers import LatencySampler
+from airl_mav.latency.injection import LatencySampler
 from airl_mav.latency.stamps import NO_STAMP, DecisionLog
 from airl_mav.policy.actions import Action, AnyAction, Policy, flyable, vertical_speed
 from airl_mav.policy.observation import Kinematics, Observation, observe, views_of

@@ -18,7 +18,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Goal
 from airl_mav.core.provenance import describe_machine
 from airl_mav.flight.record import Part, Setup
-from airl_mav.latency.samplers import LatencySampler, latency_generator
+from airl_mav.latency.injection import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import camera_refused, find_policy

@@ -21,10 +21,8 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
 from firmware_sim.engine.record import Record
 from firmware_sim.faults.link import FailingEndpoint
-from firmware_sim.flight_controller import FlightController
-from firmware_sim.flight_log.flight_log import FlightLog
-from firmware_sim.flight_log.log_folder import ULOG_SUFFIX, LogFolder
-from firmware_sim.interfaces import TrueState
+from firmware_sim.flight_log.flight_log import ULOG_SUFFIX, FlightLog, LogFolder
+from firmware_sim.interfaces import FlightController, TrueState
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.tlog import TlogWriter

@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, TypeAdapter
 
-from airl_mav.addons.conformance.reference import Reference, StoredStep
-from airl_mav.addons.conformance.result import SCHEMA
+from airl_mav.addons.conformance.result import SCHEMA, Reference, StoredStep
 from airl_mav.addons.conformance.steps import StepName
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated

@@ -53,8 +53,12 @@ from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.external.launcher import no_process
 from firmware_sim.external.parameter_file import KeptParameters, qgroundcontrol_file
 from firmware_sim.external.px4.sitl import EPOCH_US, Px4Bridge
-from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.interfaces import BatterySample, SensorSample
+from firmware_sim.interfaces import (
+    BatterySample,
+    FirmwareLostError,
+    FirmwareMissingError,
+    SensorSample,
+)
 from firmware_sim.mavlink.codec import Encoder, dialect
 from firmware_sim.simulation import Simulation
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from airl_mav.core.fields import ArrayField
 from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.appearance import Appearance, Material, SurfaceName, Surfaces, TextureName
-from airl_mav.profiles.asset_files import ImageFile
+from airl_mav.profiles.assets import ImageFile
 
 Floats = NDArray[np.float64]
 Rgb = tuple[int, int, int]

@@ -10,15 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import Statics
-from airl_mav.arena.footprints import Floats, bounding_half
 from airl_mav.arena.geometry import Arena, Obstacles, PlacedMesh, Shape
+from airl_mav.arena.placement import Floats, bounding_half
 from airl_mav.core import plugins
 from airl_mav.core.errors import UsageError
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.appearance import DEFAULT
 from airl_mav.profiles.arena import SHAPES, SPHERE_OFFSET, ArenaSpec, StaticObstacles
-from airl_mav.profiles.asset_files import MeshFile
-from airl_mav.profiles.assets import Asset
+from airl_mav.profiles.assets import Asset, MeshFile
 
 _BOX, _SPHERE = int(Shape.BOX), int(Shape.SPHERE)
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from airl_mav.arena.appearance import Statics
 from airl_mav.arena.assets import AssetBodies, Things, draw_bodies, draw_things, generate_own
-from airl_mav.arena.footprints import Boxes, Floats, bounding_boxes, footprint_areas, join
 from airl_mav.arena.gates import (
     Openings,
     behind,
@@ -23,7 +22,18 @@ from airl_mav.arena.gates import (
 from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
 from airl_mav.arena.ground import Ground
 from airl_mav.arena.passage import Hills, free_share, least_gap_m, passage_exists
-from airl_mav.arena.placement import TRIES, NoRoomError, draw_goal, place_all, zone_radius_m
+from airl_mav.arena.placement import (
+    TRIES,
+    Boxes,
+    Floats,
+    NoRoomError,
+    bounding_boxes,
+    draw_goal,
+    footprint_areas,
+    join,
+    place_all,
+    zone_radius_m,
+)
 from airl_mav.arena.relief import draw_ground, stand_on
 from airl_mav.arena.rooms import Plan, draw_plan, room_walls, standing_on_the_floor
 from airl_mav.arena.tours import draw_tours

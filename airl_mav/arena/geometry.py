@@ -39,7 +39,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.fields import ArrayField
 from airl_mav.core.frames import Goal
 from airl_mav.profiles.appearance import DEFAULT, Appearance
-from airl_mav.profiles.asset_files import MeshFile
+from airl_mav.profiles.assets import MeshFile
 
 
 def indoors(look: Drawn, floor_m2: float, walls: tuple[tuple[int, float], ...]) -> Drawn:

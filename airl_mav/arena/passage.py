@@ -9,9 +9,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from airl_mav.arena.footprints import Boxes, Floats, bounding_boxes, inner, outside
 from airl_mav.arena.geometry import Bounds, Obstacles, Shape
 from airl_mav.arena.ground import STEEPEST, Ground
+from airl_mav.arena.placement import Boxes, Floats, bounding_boxes, inner, outside
 from airl_mav.core.kernels import kernel
 
 CELL_M = 0.25

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import Statics
-from airl_mav.arena.footprints import Boxes
 from airl_mav.arena.geometry import Bounds, Obstacles, PlacedMesh, Shape
 from airl_mav.arena.ground import COLUMNS, ROWS, Floats, Ground, Relief
+from airl_mav.arena.placement import Boxes
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.profiles.arena import Terrain
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import Statics
-from airl_mav.arena.footprints import Boxes, Floats
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
+from airl_mav.arena.placement import Boxes, Floats
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.rooms import EDGE_M, ROOM_WALL, Rooms

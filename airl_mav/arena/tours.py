@@ -13,9 +13,16 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.footprints import Boxes, Floats, draw_numbers, inner, segment_clear, with_room
 from airl_mav.arena.geometry import Arena, Bounds, Tour
-from airl_mav.arena.placement import draw_place
+from airl_mav.arena.placement import (
+    Boxes,
+    Floats,
+    draw_numbers,
+    draw_place,
+    inner,
+    segment_clear,
+    with_room,
+)
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.profiles.arena import MovingObstacles
 

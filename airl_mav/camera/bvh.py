@@ -24,7 +24,7 @@ from airl_mav.arena.triangles import KEPT, Triangles, triangles_of
 from airl_mav.camera.primitives import GROUND, OBSTACLE
 from airl_mav.camera.projection import MIN_DEPTH_M
 from airl_mav.core.kernels import borrowing_kernel, large_kernel
-from airl_mav.profiles.asset_files import MeshFile
+from airl_mav.profiles.assets import MeshFile
 from airl_mav.vehicle.rotation import Vec
 
 BINS: Final = 16

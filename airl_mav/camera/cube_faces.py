@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.rays import finer, rays_of
+from airl_mav.camera.intrinsics import Intrinsics, finer, rays_of
 from airl_mav.profiles.distortion import sees_to, steepness
 
 Floats = NDArray[np.float64]

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.intrinsics import Intrinsics, rays_of
 from airl_mav.camera.picture import Picture
 from airl_mav.camera.primitives import OBSTACLE
-from airl_mav.camera.rays import rays_of
 from airl_mav.camera.render import Motion, Mount, camera_pose
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import quat_to_matrix

@@ -18,17 +18,15 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import LUMINANCE
+from airl_mav.arena.appearance import LUMINANCE, linear_of
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera import image_sensor
 from airl_mav.camera.frame import image_of, jpeg_of
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import grey, render_picture
 from airl_mav.camera.render import Motion, Mount, camera_pose, carried_on
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.streams import Stream, stream, words_of
-from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.imaging import AutoExposure, Imaging
+from airl_mav.profiles.camera import AutoExposure, Camera, Imaging
 
 MOST_METERED: Final = 5
 """Maximum images to settle a gain: an all-white or all-black image contains little information."""
@@ -58,7 +56,7 @@ class ImageFormation:
         self._mount = Mount.of(camera)
         self._period_s = camera.period_us / US_PER_S
         share = self._imaging.vignetting
-        self._through = image_sensor.vignette(self._camera, share)[..., None] if share else None
+        self._through = vignette(self._camera, share)[..., None] if share else None
         self.restart()
 
     @property
@@ -91,9 +89,7 @@ class ImageFormation:
         light = self._exposed(arena, elapsed_us, motion, self.gain)
         return self._formed(light, self.gain, seed, frame)
 
-    def _exposed(
-        self, arena: Arena, elapsed_us: int, motion: Motion, gain: float
-    ) -> image_sensor.Light:
+    def _exposed(self, arena: Arena, elapsed_us: int, motion: Motion, gain: float) -> Light:
         """Return the light (h, w, channels) of all rows, each at its time in the readout."""
         readout_us = US_PER_MS * self._imaging.readout_ms
         if not readout_us:
@@ -112,7 +108,7 @@ class ImageFormation:
 
     def _exposed_at(
         self, arena: Arena, elapsed_us: int, motion: Motion, middle_us: float, gain: float
-    ) -> image_sensor.Light:
+    ) -> Light:
         """Return the light (h, w, channels) of an exposure centred at timestamp + `middle_us`."""
         asked = self._imaging
         count = asked.samples if asked.exposure_ms else 1
@@ -121,10 +117,10 @@ class ImageFormation:
             for k in range(count)
         )
         lights = (
-            image_sensor.LIGHT_OF[self._codes(arena, elapsed_us + since_us, motion, since_us, gain)]
+            LIGHT_OF[self._codes(arena, elapsed_us + since_us, motion, since_us, gain)]
             for since_us in moments_us
         )
-        total: image_sensor.Light = reduce(np.add, lights)
+        total: Light = reduce(np.add, lights)
         return total if count == 1 else total * np.float32(1.0 / count)
 
     def _codes(
@@ -165,19 +161,19 @@ class ImageFormation:
                 break
         return float(gain)
 
-    def _formed(self, light: image_sensor.Light, gain: float, seed: int, frame: int) -> FormedImage:
+    def _formed(self, light: Light, gain: float, seed: int, frame: int) -> FormedImage:
         """Return the image of light (h, w, channels) after lens and sensor."""
         asked, channels = self._imaging, light.shape[2]
         if self._through is not None:
             light = light * self._through
         if asked.bayer:
-            light = image_sensor.mosaic(light)
+            light = mosaic(light)
         if asked.full_well_e is not None:
             rng = stream(seed, Stream.PHOTONS, frame, *self._own)
-            light = image_sensor.noisy(light, gain, asked.full_well_e, asked.read_noise_e, rng)
+            light = noisy(light, gain, asked.full_well_e, asked.read_noise_e, rng)
         if asked.bayer:
-            light = image_sensor.demosaiced(np.minimum(light, np.float32(1.0)))
-        image: NDArray[Any] = image_sensor.codes_of(light)
+            light = demosaiced(np.minimum(light, np.float32(1.0)))
+        image: NDArray[Any] = codes_of(light)
         if asked.jpeg_quality is None:
             return FormedImage(image, None)
         jpeg = jpeg_of(image, asked.jpeg_quality)
@@ -198,5 +194,86 @@ def _mean_light(codes: NDArray[np.uint8]) -> float:
     mean = 0.0
     for channel, weight in enumerate(weights.tolist()):
         counts = np.bincount(codes[..., channel].ravel(), minlength=256)
-        mean += weight * float(counts @ image_sensor.LIGHT_OF.astype(np.float64)) / counts.sum()
+        mean += weight * float(counts @ LIGHT_OF.astype(np.float64)) / counts.sum()
     return mean
+
+
+Light = NDArray[np.float32]
+"""Image (h, w) or (h, w, channels), linear."""
+
+_NUMBERS = np.arange(256, dtype=np.float64)
+
+LIGHT_OF: Final[Light] = linear_of(_NUMBERS / 255.0).astype(np.float32)
+"""(256,) light of each sRGB code."""
+
+_EDGES: Final[Light] = linear_of((_NUMBERS[:-1] + 0.5) / 255.0).astype(np.float32)
+"""(255,) lower bound of light for each code from 1 on, by rounding to the nearest."""
+
+
+def codes_of(light: Light) -> NDArray[np.uint8]:
+    """Return the nearest sRGB codes of light of any shape; 255 beyond white."""
+    return np.searchsorted(_EDGES, light, side="right").astype(np.uint8)
+
+
+def vignette(camera: Intrinsics, share: float) -> Light:
+    """Return a lens's transmission (h, w).
+
+    1 - share (r / R)² at a distance r from the optical axis, with R at the most distant pixel: the
+    first term of the even polynomials used to calibrate lenses (Goldman, Chen, "Vignette and
+    exposure calibration and compensation", ICCV 2005).
+    """
+    across = np.arange(camera.width) - camera.cx
+    down = np.arange(camera.height) - camera.cy
+    square = across**2 + down[:, None] ** 2
+    through: Light = (1.0 - share * square / square.max()).astype(np.float32)
+    return through
+
+
+def noisy(
+    light: Light, gain: float, full_well_e: float, read_noise_e: float, rng: np.random.Generator
+) -> Light:
+    """Return light (...) as measured by a photon-counting sensor.
+
+    A pixel with the value x holds N = x full_well_e / max(gain, 1) electrons. A gain above 1
+    multiplies the count, a gain below 1 is a darker exposure. The count has the variance N
+    (Poisson, in its normal approximation), and reading adds read_noise_e² (EMVA 1288, release 4.0,
+    section 2). The light is after the gain. Above 1 the sensor saturates.
+    """
+    full = np.minimum(light, np.float32(1.0))
+    per_light = full_well_e / max(gain, 1.0)
+    sd_e = np.sqrt(full * np.float32(per_light) + np.float32(read_noise_e**2))
+    draws = rng.standard_normal(light.shape, np.float32)
+    measured: Light = full + sd_e * draws * np.float32(1.0 / per_light)
+    return measured
+
+
+def mosaic(light: Light) -> Light:
+    """Return the pixel values (h, w) behind a Bayer filter RGGB, from RGB light (h, w, 3)."""
+    raw = light[..., 1].copy()
+    raw[::2, ::2] = light[::2, ::2, 0]
+    raw[1::2, 1::2] = light[1::2, 1::2, 2]
+    return raw
+
+
+def demosaiced(raw: Light) -> Light:
+    """Return RGB light (h, w, 3) of a mosaic (h, w) by bilinear interpolation."""
+    height, width = raw.shape
+    red, blue = np.zeros_like(raw), np.zeros_like(raw)
+    red[::2, ::2] = blue[1::2, 1::2] = 1.0
+    found = np.empty((height, width, 3), np.float32)
+    for channel, here in enumerate((red, 1.0 - red - blue, blue)):
+        cross = channel == 1
+        total, weight = _around(raw * here, cross=cross), _around(here, cross=cross)
+        between = total / np.maximum(weight, np.float32(1e-6))
+        found[..., channel] = np.where(here > 0.0, raw, between)
+    return found
+
+
+def _around(plane: Light, *, cross: bool) -> Light:
+    """Return sums over neighbours: beside, above and below; or all eight, corners by half."""
+    p = np.pad(plane, 1)
+    beside = p[1:-1, :-2] + p[1:-1, 2:] + p[:-2, 1:-1] + p[2:, 1:-1]
+    if cross:
+        return beside
+    corners = p[:-2, :-2] + p[:-2, 2:] + p[2:, :-2] + p[2:, 2:]
+    return beside + np.float32(0.5) * corners

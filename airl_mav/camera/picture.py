@@ -14,9 +14,8 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.gloss import Gloss
-from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.intrinsics import Intrinsics, finer
 from airl_mav.camera.projection import bent_of
-from airl_mav.camera.rays import finer
 from airl_mav.camera.render import pose_of
 from airl_mav.camera.textures import atlas, mean_of, periods
 from airl_mav.core.kernels import kernel

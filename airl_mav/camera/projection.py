@@ -13,8 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.rays import fisheye_rays
+from airl_mav.camera.intrinsics import Intrinsics, fisheye_rays
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.profiles.distortion import Distortion, distorted, sees_to
 from airl_mav.vehicle.rotation import Vec

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import TEXTURES, Finish, image_number, linear_of
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.asset_files import MOST_IMAGES, ImageFile, read_checked
+from airl_mav.profiles.assets import MOST_IMAGES, ImageFile, read_checked
 
 Floats = NDArray[np.float64]
 

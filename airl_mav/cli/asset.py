@@ -17,8 +17,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import replace_file
 from airl_mav.profiles.arena import ASSET_NAME, SHAPES, ArenaSpec
-from airl_mav.profiles.asset_files import MOST_TRIANGLES, MeshFile
-from airl_mav.profiles.assets import MOST_PARTS
+from airl_mav.profiles.assets import MOST_PARTS, MOST_TRIANGLES, MeshFile
 from airl_mav.profiles.loading import load_profile
 from airl_mav.scenario.model import DEFAULT_ARENA, ArenaName
 

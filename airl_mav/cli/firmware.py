@@ -19,7 +19,7 @@ from airl_mav.scenario.compile_plans import flight_plan
 from airl_mav.scenario.resolved import FIRMWARE_TITLES
 from airl_mav.scenario.stand_alone import StandAloneVehicle
 from firmware_sim.autopilot.autopilot_state import OperatorText
-from firmware_sim.flight_controller import FirmwareLostError
+from firmware_sim.interfaces import FirmwareLostError
 
 
 class FirmwareOptions(StandAloneVehicle):

@@ -15,8 +15,7 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
-from airl_mav.core.json_progress import JsonProgress
-from airl_mav.core.progress import Event, Progress, RichProgress
+from airl_mav.core.progress import Event, JsonProgress, Progress, RichProgress
 
 if TYPE_CHECKING:
     from airl_mav.rehearsal.run_folder import LoadedRun

@@ -18,7 +18,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.arenas import trust_arenas
-from airl_mav.report.replay.runs import ReplayedRuns, run_folders
+from airl_mav.report.replay.flight import ReplayedRuns, run_folders
 from airl_mav.scenario.aircraft import GREATEST_PORT
 
 
@@ -76,7 +76,7 @@ def run(options: ViewOptions, console: Console | None = None) -> int:
         if (same := each.same(first)) is not None:
             each.check(same)
     # Imported here: the viewer is an extra.
-    from airl_mav.view.local_server import LocalServer
+    from airl_mav.view.server import LocalServer
 
     # Its output repeats the address.
     with redirect_stdout(io.StringIO()):

@@ -22,7 +22,7 @@ from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, copy_rows, move_obstacles, relief_of
 from airl_mav.envs.fleet import Fleet, FramePoses
 from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
-from airl_mav.profiles.asset_files import ImageFile
+from airl_mav.profiles.assets import ImageFile
 
 
 class LookBatch(NamedTuple):

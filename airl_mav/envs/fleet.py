@@ -20,11 +20,17 @@ from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.envs.arenas import NOTHING
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.vehicle.airframe import Airframe, airframe_of
+from airl_mav.vehicle.airframe import (
+    N_ROTORS,
+    Airframe,
+    airframe_of,
+    command_for,
+    hover_speeds,
+    lag,
+)
 from airl_mav.vehicle.power import PowerModel
 from airl_mav.vehicle.rigid_body import drag_force
 from airl_mav.vehicle.rotation import Quat, Vec
-from airl_mav.vehicle.rotor import N_ROTORS, command_for, hover_speeds, lag
 
 
 class FlightStatus(IntEnum):

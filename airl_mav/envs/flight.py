@@ -95,7 +95,7 @@ from airl_mav.envs.fleet import (
     unload,
     vec,
 )
-from airl_mav.vehicle.airframe import airframe_of
+from airl_mav.vehicle.airframe import airframe_of, settle, wrench
 from airl_mav.vehicle.power import (
     drain,
     felt,
@@ -106,7 +106,6 @@ from airl_mav.vehicle.power import (
 )
 from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Vec, rotate
-from airl_mav.vehicle.rotor import settle, wrench
 
 REPEAT_US = 50_000
 """Interval of MAVSDK's setpoint repeats, 20 Hz [µs]."""

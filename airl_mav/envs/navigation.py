@@ -57,8 +57,7 @@ from airl_mav.policy.observation_spec import Encoded, ObservationSpec
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.conditions import Payload
-from airl_mav.profiles.loaded import check_spread, equipped
+from airl_mav.profiles.conditions import Payload, check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import VehicleProfile

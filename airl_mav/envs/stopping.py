@@ -33,12 +33,17 @@ from airl_mav.envs.fleet import (
 )
 from airl_mav.envs.flight import advance
 from airl_mav.envs.spec import Delay, EnvironmentSpec
-from airl_mav.latency.injection import Injection, choose_injection
-from airl_mav.latency.samplers import FixedSampler, LatencySampler, latency_generator
-from airl_mav.latency.source import longest_ms, parse_latency
+from airl_mav.latency.injection import (
+    FixedSampler,
+    Injection,
+    LatencySampler,
+    choose_injection,
+    latency_generator,
+    longest_ms,
+    parse_latency,
+)
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.conditions import Payload
-from airl_mav.profiles.loaded import equipped
+from airl_mav.profiles.conditions import Payload, equipped
 from airl_mav.profiles.loading import profile_digest
 from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import VehicleProfile

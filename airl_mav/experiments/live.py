@@ -15,10 +15,9 @@ from airl_mav.core.first_start import compile_first
 from airl_mav.core.progress import Progress
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.lockstep.turns import LockstepError
-from airl_mav.rehearsal.lock import locked
 from airl_mav.rehearsal.progress import LiveObserver, Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
-from airl_mav.rehearsal.run_folder import RUN_FILE, open_folder
+from airl_mav.rehearsal.run_folder import RUN_FILE, locked, open_folder
 from airl_mav.rehearsal.signals import terminated_as_interrupted
 from airl_mav.scenario.compile_plans import plan_of
 from airl_mav.scenario.resolved import ResolvedScenario

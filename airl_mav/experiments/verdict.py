@@ -14,9 +14,9 @@ from airl_mav.core.progress import Progress
 from airl_mav.experiments.campaign import Cell
 from airl_mav.experiments.executors import Executor
 from airl_mav.experiments.experiment import entry_of, file_name, known_seeds
-from airl_mav.experiments.fly import fly_scenario, workers_of
 from airl_mav.experiments.gap import NOT_MITIGATED, declare_gap
 from airl_mav.experiments.live import Ended, FlownRun
+from airl_mav.experiments.run import fly_scenario, workers_of
 from airl_mav.flight.requirements import Requirement
 from airl_mav.flight.sequential import LOOKS, RequirementDecision
 from airl_mav.flight.statistics import reached_goals

@@ -3,14 +3,133 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
-from typing import Literal
+from pathlib import Path
+from typing import Literal, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import UsageError
-from airl_mav.latency.samplers import LatencySampler, build_sampler
-from airl_mav.profiles.computer import ComputerProfile, LatencyDistribution, Workload
+from airl_mav.core.fields import validated
+from airl_mav.profiles.computer import (
+    LONGEST_MS,
+    ComputerProfile,
+    LatencyDistribution,
+    Workload,
+    load_computer,
+    read_samples,
+)
+from airl_mav.profiles.loading import list_profiles
+
+LATENCY_STREAM = 2
+"""Second word of the seed of latencies with another `draw`."""
+
+
+class LatencySampler(Protocol):
+    """Source of latencies."""
+
+    def sample_us(self) -> int:
+        """Return the next latency [µs], >= 0."""
+
+
+class FixedSampler:
+    """Constant latency."""
+
+    def __init__(self, latency_us: int) -> None:
+        """Take the latency [µs], >= 0."""
+        if latency_us < 0:
+            raise ValueError(f"latency_us={latency_us}: must be >= 0")
+        self._latency_us = latency_us
+
+    def sample_us(self) -> int:
+        """Return the latency [µs]."""
+        return self._latency_us
+
+
+class LognormalSampler:
+    """Minimum latency plus a log-normal; mean and standard deviation apply to the sum."""
+
+    def __init__(
+        self, mean_us: float, std_us: float, min_us: float, rng: np.random.Generator
+    ) -> None:
+        """Take the moments [µs]: 0 <= min_us < mean_us, std_us > 0."""
+        self._mu, self._sigma = lognormal_parameters(mean_us - min_us, std_us)
+        self._min_us = min_us
+        self._rng = rng
+
+    def sample_us(self) -> int:
+        """Return the next latency [µs]."""
+        return round(self._min_us + self._rng.lognormal(self._mu, self._sigma))
+
+
+class TruncatedNormalSampler:
+    """Normal distribution, redrawn below the minimum latency."""
+
+    def __init__(
+        self, mean_us: float, std_us: float, min_us: float, rng: np.random.Generator
+    ) -> None:
+        """Take the moments of the untruncated normal [µs]; min_us < mean_us keeps redraws rare."""
+        self._mean_us, self._std_us, self._min_us = mean_us, std_us, min_us
+        self._rng = rng
+
+    def sample_us(self) -> int:
+        """Return the next latency [µs]."""
+        while (latency_us := self._rng.normal(self._mean_us, self._std_us)) < self._min_us:
+            pass
+        return round(latency_us)
+
+
+class ReplaySampler:
+    """Measured latencies in their order, cyclic, from a random start.
+
+    The order preserves runs of slow decisions (another process, a hot processor), which a histogram
+    loses. Every sample is equally likely at every decision, and neighbours stay neighbours. This is
+    the circular block bootstrap (Politis & Romano 1992) with one block per flight.
+    """
+
+    def __init__(self, samples_us: ArrayLike, rng: np.random.Generator) -> None:
+        """Take the measured latencies (n,) [µs], n >= 1, in order."""
+        self._samples_us: NDArray[np.int64] = np.asarray(samples_us, np.int64)
+        if not self._samples_us.size:
+            raise ValueError("no samples to draw from")
+        self._next = int(rng.integers(self._samples_us.size))
+
+    def sample_us(self) -> int:
+        """Return the next latency [µs]."""
+        latency_us = int(self._samples_us[self._next])
+        self._next = (self._next + 1) % self._samples_us.size
+        return latency_us
+
+
+def lognormal_parameters(mean: float, std: float) -> tuple[float, float]:
+    """Return mean and standard deviation of the logarithm of a log-normal with these moments."""
+    # mean = exp(mu + s²/2), variance = (exp(s²) - 1) mean².
+    variance = math.log1p((std / mean) ** 2)
+    return math.log(mean) - 0.5 * variance, math.sqrt(variance)
+
+
+def latency_generator(seed: int, draw: int = 0) -> np.random.Generator:
+    """Return the generator of an episode's latencies; another `draw` gives other latencies."""
+    return np.random.default_rng((seed, LATENCY_STREAM, draw) if draw else seed)
+
+
+def build_sampler(latency: LatencyDistribution, rng: np.random.Generator) -> LatencySampler:
+    """Build the sampler of a latency whose sample file `load_computer` has read."""
+    if latency.distribution == "samples":
+        if latency.samples_ms is None:
+            raise ValueError(f"samples_file {latency.samples_file} not read: use load_computer")
+        return ReplaySampler(np.rint(np.array(latency.samples_ms) * US_PER_MS), rng)
+    mean_us = (latency.mean_ms or 0.0) * US_PER_MS
+    std_us = (latency.std_ms or 0.0) * US_PER_MS
+    if not std_us:
+        return FixedSampler(round(mean_us))
+    if latency.distribution == "lognormal":
+        return LognormalSampler(mean_us, std_us, latency.min_ms * US_PER_MS, rng)
+    return TruncatedNormalSampler(mean_us, std_us, latency.min_ms * US_PER_MS, rng)
+
 
 Origin = Literal["measured", "injected", "estimated"]
 
@@ -119,3 +238,89 @@ def moments(latency: LatencyDistribution) -> str:
         return f"{len(samples)} samples, {samples.mean():.3g} ± {samples.std():.2g} ms"
     spread = f" ± {latency.std_ms:.3g}" if latency.std_ms else ""
     return f"{latency.mean_ms:.5g}{spread} ms"
+
+
+ACCEPTED = (
+    "150ms, lognormal:396ms,20ms, normal:396ms,20ms, COMPUTER/WORKLOAD, "
+    "or a file of latencies, one a line in ms"
+)
+
+Z_999 = 3.0902323061678132
+"""99.9 % quantile of the standard normal distribution."""
+
+_DISTRIBUTIONS = {"lognormal": "lognormal", "normal": "normal-truncated"}
+_MS = {"us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1e3, "min": 60e3, "h": 3600e3}
+_TIME = re.compile(rf"(\d+(?:\.\d*)?|\.\d+)\s*({'|'.join(_MS)})")
+
+
+def select_injection(
+    source: str | None,
+    computer: ComputerProfile,
+    workload: str | None,
+    *,
+    policy_sha256: str | None = None,
+    macs: int | None = None,
+) -> Injection:
+    """Choose a flight's latency, by a text source or a computer. Raises UsageError."""
+    if source is None:
+        return choose_injection(computer, workload, policy_sha256=policy_sha256, macs=macs)
+    if workload is not None:
+        raise UsageError(f"--latency {source} with --workload {workload}: accepted: one of them")
+    return parse_latency(source)
+
+
+def parse_latency(text: str, option: str = "--latency") -> Injection:
+    """Return the latency of a text source; a UsageError names the option."""
+    path = Path(text)
+    if path.is_file():
+        latency = LatencyDistribution(distribution="samples", samples_ms=read_samples(path, option))
+        label = f"replayed from {path.name} ({moments(latency)})"
+        return Injection("injected", label, f"{path}", latency=latency)
+    kind, colon, values = text.partition(":")
+    if colon and kind in _DISTRIBUTIONS:
+        return _parametric(kind, values, text, option)
+    if (fixed_ms := _milliseconds(text)) is not None:
+        latency = _latency({"distribution": "fixed", "mean_ms": fixed_ms}, text, option)
+        return Injection("injected", f"{fixed_ms:g} ms in every decision", latency=latency)
+    computer, slash, workload = text.rpartition("/")
+    if slash and (computer in list_profiles("computers") or computer.endswith(".toml")):
+        return choose_injection(load_computer(computer), workload)
+    raise UsageError(f"{option} {text}: accepted: {ACCEPTED}")
+
+
+def longest_ms(latency: LatencyDistribution) -> float:
+    """Return the maximum latency [ms], for an unbounded distribution the 99.9 % quantile."""
+    if latency.samples_ms is not None:
+        return max(latency.samples_ms)
+    mean_ms, std_ms = latency.mean_ms or 0.0, latency.std_ms or 0.0
+    if latency.distribution == "lognormal" and std_ms:
+        mu, sigma = lognormal_parameters(mean_ms - latency.min_ms, std_ms)
+        return latency.min_ms + math.exp(mu + Z_999 * sigma)
+    return mean_ms + Z_999 * std_ms
+
+
+def _parametric(kind: str, values: str, text: str, option: str) -> Injection:
+    """Return a distribution given by its moments."""
+    numbers = [_milliseconds(value) for value in values.split(",")]
+    given = [number for number in numbers if number is not None]
+    if len(given) != len(numbers) or not 2 <= len(given) <= 3:
+        raise UsageError(f"{option} {text}: accepted: {kind}:MEAN,SD[,LEAST], each with its unit")
+    fields = dict(zip(("mean_ms", "std_ms", "min_ms"), given, strict=False))
+    latency = _latency({"distribution": _DISTRIBUTIONS[kind], **fields}, text, option)
+    return Injection("injected", f"{kind}, {moments(latency)}", latency=latency)
+
+
+def _latency(fields: dict[str, object], text: str, option: str) -> LatencyDistribution:
+    return validated(LatencyDistribution, fields, f"{option} {text}")
+
+
+def duration_ms(text: str) -> float | None:
+    """Return a time with its unit, as `150ms` or `10min`, in ms; None if invalid."""
+    found = _TIME.fullmatch(text.strip())
+    return None if found is None else float(found[1]) * _MS[found[2]]
+
+
+def _milliseconds(text: str) -> float | None:
+    """Return a latency with its unit in ms, infinite above `LONGEST_MS`; None if invalid."""
+    value_ms = duration_ms(text)
+    return math.inf if value_ms is not None and value_ms > LONGEST_MS else value_ms

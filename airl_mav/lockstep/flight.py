@@ -26,17 +26,23 @@ from airl_mav.lockstep.threaded import PATIENCE_S
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.policy.actions import Policy
 from airl_mav.rehearsal.channel import Text
-from airl_mav.rehearsal.episode import faults_of, join_stamps, judged_record, part_of
+from airl_mav.rehearsal.episode import (
+    EpisodeSupervisor,
+    Order,
+    faults_of,
+    join_stamps,
+    judged_record,
+    part_of,
+)
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
 from airl_mav.rehearsal.progress import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
-from airl_mav.rehearsal.supervisor import EpisodeSupervisor, Order
 from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view.ends import ViewEnds
 from companion.mission import MissionResult, Start, check_camera, fly_mission
 from firmware_sim.autopilot.autopilot_state import OperatorText
-from firmware_sim.flight_controller import FirmwareLostError
+from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.simulation import Simulation
 from firmware_sim.warm_up import warm_up
 

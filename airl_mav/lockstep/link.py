@@ -12,7 +12,7 @@ from airl_mav.faults.model import Fault, link_fails
 from airl_mav.lockstep.vehicle_end import InMemory, RealFirmwareEnd, VehicleEnd
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
-from firmware_sim.external.conducted import conducted_px4
+from firmware_sim.external.compose import conducted_px4
 from firmware_sim.faults.link import FailingEndpoint
 from firmware_sim.firmware import BuiltinFlightStack, FlightStack
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, SharedEndpoint

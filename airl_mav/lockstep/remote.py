@@ -23,8 +23,8 @@ from airl_mav.lockstep.link import BOOT_UNIX_US, builtin_vehicle
 from airl_mav.lockstep.tokens import TokenPartner
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
 from airl_mav.lockstep.wire import Wire
+from airl_mav.rehearsal.episode import EpisodeSupervisor
 from airl_mav.rehearsal.stand_alone import Listener, aircraft_of, episode_of
-from airl_mav.rehearsal.supervisor import EpisodeSupervisor
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.firmware import Firmware, FrameServer, LoadedEpisode
 from firmware_sim.mavlink.endpoint import UdpEndpoint

@@ -15,8 +15,8 @@ from queue import Empty, SimpleQueue
 
 from airl_mav.core.clock import Patience
 from airl_mav.core.constants import US_PER_S
-from airl_mav.lockstep.frames import newest, newest_heartbeat
 from airl_mav.lockstep.turns import Handle, LockstepError, Turn
+from airl_mav.lockstep.wire import newest, newest_heartbeat
 from companion.conducted import Abandoned, Poll
 from companion.mavsdk_link import MavsdkLink
 from firmware_sim.mavlink.codec import Encoder, dialect, layout

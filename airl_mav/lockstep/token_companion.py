@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from contextlib import closing
 
-from airl_mav.latency.samplers import FixedSampler
+from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
 from airl_mav.scenario.piloting import NATIVE_T2_US
 from airl_mav.scenario.stand_alone import StandAloneCompanion
@@ -16,7 +16,7 @@ from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.program import MissionSetup
 from companion.signing_proxy import signed
-from companion.token_clock import TokenFrameSource, TokenTurns
+from companion.tokens import TokenFrameSource, TokenTurns
 
 ANSWER_TIMEOUT_S = 20.0
 """Timeout after which MAVSDK repeats a command, at most four times [wall s]. Long enough for all

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.lockstep.camera import TokenCamera
-from airl_mav.lockstep.frames import newest_heartbeat
 from airl_mav.lockstep.turns import Handle, LockstepError, Turn
-from airl_mav.lockstep.wire import Heard, Wire
-from airl_mav.rehearsal.supervisor import Order
+from airl_mav.lockstep.wire import Heard, Wire, newest_heartbeat
+from airl_mav.rehearsal.episode import Order
 from airl_mav.scenario.stand_alone import COMPANION_TIMEOUT_S, LONGEST_REST_US, TURN_US
 from companion.tokens import Order as Word
 from companion.tokens import PhaseToken, TurnBack, TurnGiven

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.rays import fisheye_rays
+from airl_mav.camera.intrinsics import fisheye_rays
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from airl_mav.core.fields import Each, ProfileModel, later_field, quantity
-from airl_mav.profiles.asset_files import MOST_IMAGES, ImageFile
+from airl_mav.profiles.assets import MOST_IMAGES, ImageFile
 
 TextureName = Literal["plain", "checker", "noise", "brick", "foliage"]
 SurfaceName = Literal["matt", "glossy", "metal", "glass"]

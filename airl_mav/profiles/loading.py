@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from airl_mav.core.errors import UsageError, shown
 from airl_mav.core.fields import validated
 from airl_mav.core.files import DEEPEST, deeper_than
-from airl_mav.profiles.asset_files import CONTENT, CheckedFile, read_checked
+from airl_mav.profiles.assets import CONTENT, CheckedFile, read_checked
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -9,8 +9,7 @@ from airl_mav.core.frames import Geodetic, quat_yaw
 from airl_mav.rehearsal.channel import State
 from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.autopilot.commander import FlightPhase
-from firmware_sim.hover_start import HoverStart
-from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.simulation import EpisodeSetup, HoverStart, Simulation
 
 
 def episode_setup(resolved: ResolvedScenario, arena: Arena, seed: int) -> EpisodeSetup:

@@ -29,7 +29,7 @@ from firmware_sim.external.parameter_file import KeptParameters
 from firmware_sim.faults.link import FailingEndpoint
 from firmware_sim.faults.timeline import FaultTimeline
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack
-from firmware_sim.flight_controller import FirmwareLostError
+from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.mavlink.link import LinkConfig
 from firmware_sim.mavlink.udp_links import UdpLinks, bind_udp_links, udp_server
 from firmware_sim.pacing import Pacing, WallPacing

@@ -16,7 +16,15 @@ from airl_mav.core.constants import MAX_ATTEMPTS, US_PER_S
 from airl_mav.flight.judge import Referee, TruthSample, Verdict
 from airl_mav.flight.validity import BY_HAND
 from airl_mav.rehearsal import channel
-from airl_mav.rehearsal.episode import RunningEpisode, disturbances, disturbing, join_episode
+from airl_mav.rehearsal.episode import (
+    TAKEOFF_LIMIT_S,
+    EpisodeSupervisor,
+    Order,
+    RunningEpisode,
+    disturbances,
+    disturbing,
+    join_episode,
+)
 from airl_mav.rehearsal.process_pair import (
     COMPANION,
     FIRMWARE,
@@ -28,7 +36,6 @@ from airl_mav.rehearsal.process_pair import (
 )
 from airl_mav.rehearsal.progress import WARNING, Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
-from airl_mav.rehearsal.supervisor import TAKEOFF_LIMIT_S, EpisodeSupervisor, Order
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view.ends import ViewEnds
 from firmware_sim.external.programs import load_timeout_s

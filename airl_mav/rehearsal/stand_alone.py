@@ -11,7 +11,7 @@ from airl_mav.arena.generate import generate
 from airl_mav.camera.conditions import check_noise, check_renderer
 from airl_mav.core.frames import Goal
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.loaded import check_spread, equipped
+from airl_mav.profiles.conditions import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.firmware_process import build_firmware, unix_us

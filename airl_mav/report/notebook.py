@@ -18,8 +18,7 @@ from airl_mav.report.flights_above import overview_picture
 from airl_mav.report.forensics.worst import flown_path
 from airl_mav.report.measures import MEASURES, summarize_run
 from airl_mav.report.run_figures import map_figure
-from airl_mav.report.run_page import run_headlines
-from airl_mav.report.run_report import verdict_of
+from airl_mav.report.run_report import run_headlines, verdict_of
 from airl_mav.report.scene import SceneFlight, top_speed
 from airl_mav.report.shown_flights import pictured
 from airl_mav.report.table import TableView, columns_of

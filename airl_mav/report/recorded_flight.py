@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter
 
+from airl_mav.black_box.mcap_file import BlackBox
 from airl_mav.black_box.messages import Decision, End, Phase, Resources, Status, Telemetry
-from airl_mav.black_box.reading import BlackBox
 from airl_mav.core.constants import UNMEASURED_A, US_PER_S, CommandKind
 from airl_mav.core.files import typed
 from airl_mav.core.frames import Goal, goal_distance_m

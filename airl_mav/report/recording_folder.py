@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.black_box.reading import BlackBox, read_black_box
+from airl_mav.black_box.mcap_file import BlackBox, read_black_box
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import sha256_of

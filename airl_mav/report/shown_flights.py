@@ -2,24 +2,156 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
+from airl_mav.camera.frame import rgb_of
+from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.files import Arrays
 from airl_mav.flight.record import EpisodeRecord
+from airl_mav.latency.stages import STAGES, decision_series
+from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.flight_data import chosen, flight_data
 from airl_mav.report.forensics.evidence import Cause, ranked
 from airl_mav.report.forensics.worst import flown_path
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision, policy_again, seen_decisions
 from airl_mav.report.run_figures import map_figure
 from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, scene_json, top_speed
-from airl_mav.report.theme import FigureImage, palette
-from airl_mav.report.tracking import TrackedFlight, track
+from airl_mav.report.theme import FigureImage, palette, shades
+from airl_mav.report.tracking import EstimateErrors, TrackedFlight, TrackedMotion, track
 from airl_mav.report.tracking_figure import IMAGES, tracking_figure
+
+
+class Steps(TypedDict):
+    """Sequence of numbers stored as integer differences, which compress well."""
+
+    unit: float
+    """Value of a step of 1."""
+    steps: list[int]
+    """Differences from 0 to the first number and from each number to the next."""
+
+
+LEVEL = 7
+"""Compression level of gzip, 1 to 9; level 9 takes three times longer for 1 % smaller data."""
+
+
+def packed(text: str) -> str:
+    """Return a text as base64 of gzip; the output is reproducible."""
+    return base64.b64encode(gzip.compress(text.encode(), compresslevel=LEVEL, mtime=0)).decode()
+
+
+def steps_of(values: NDArray[np.float64] | Sequence[float], unit: float) -> Steps:
+    """Encode finite numbers (n,) as steps of a unit, accurate to half a unit."""
+    whole = np.round(np.asarray(values, np.float64) / unit).astype(np.int64)
+    return {"unit": unit, "steps": np.diff(whole, prepend=0).tolist()}
+
+
+TIME_POINTS = 1000
+"""Maximum number of points of a line: 20 s at the recorded rate; longer flights are thinned."""
+
+UNITS = {"_m_s": 0.01, "_m": 0.01, "_deg": 0.1, "_deg_s": 0.1, "thrust": 0.001}
+"""Resolution of stored numbers by the suffix of their name."""
+
+MAX_IMAGES = 24
+"""Maximum number of decisions with an image: first, last and evenly spaced ones."""
+
+LAST = 8
+"""Number of these images from the last decisions, which led to the outcome."""
+
+BEST = 5
+"""Number of scores shown per decision, best first."""
+
+
+def chosen(count: int, most: int = MAX_IMAGES, last: int = LAST) -> list[int]:
+    """Return the indices of up to `most` of `count` decisions, increasing."""
+    if count <= most:
+        return list(range(count))
+    before = np.linspace(0, count - last - 1, most - last).round().astype(int)
+    return [*np.unique(before).tolist(), *range(count - last, count)]
+
+
+def flight_data(
+    flight: TrackedFlight,
+    stamps: Arrays,
+    seen: Sequence[SeenDecision],
+    range_m: float,
+    again: PolicyAgain | None,
+) -> dict[str, Any]:
+    """Return a flight as plain data, with depth up to `range_m` [m] and the policy's scores."""
+    count = len(flight.time_s)
+    keep = np.unique(np.linspace(0, count - 1, min(count, TIME_POINTS)).round().astype(int))
+    commands = flight.commands
+    return {
+        "time": steps_of(flight.time_s[keep], 0.001),
+        "flown": _lines(flight.flown, keep),
+        "estimated": None if flight.estimated is None else _lines(flight.estimated, keep),
+        "errors": None if flight.errors is None else _lines(flight.errors, keep),
+        "power": None if flight.power_w is None else steps_of(flight.power_w[keep], 1.0),
+        "motors": None
+        if flight.motors is None
+        else [steps_of(column, 0.002) for column in flight.motors[keep].T],
+        "altitude": flight.altitude_m,
+        "commands": {
+            "sent": steps_of(commands.sent_s, 0.001),
+            **{name: steps_of(values, _unit(name)) for name, values in commands.values.items()},
+        },
+        "stages": _stages(stamps),
+        "seen": [_seen(seen[k], range_m, again) for k in chosen(len(seen))],
+    }
+
+
+def _lines(of: TrackedMotion | EstimateErrors, keep: NDArray[np.int64]) -> dict[str, Steps]:
+    known = {name: values for name, values in vars(of).items() if values is not None}
+    return {name: steps_of(values[keep], _unit(name)) for name, values in known.items()}
+
+
+def _unit(name: str) -> float:
+    ends = [end for end in UNITS if name.endswith(end)]
+    return UNITS[max(ends, key=len)]
+
+
+def _stages(stamps: Arrays) -> dict[str, list[float | None]]:
+    """Return the durations of the sent decisions by stage [ms]; None = unknown."""
+    series = decision_series(stamps)
+    sent = np.asarray(stamps.get("sent_us", np.zeros(0, np.int64)))
+    there = sent != NO_STAMP
+    found = {}
+    for stage in STAGES:
+        values = series.get(stage.key)
+        if values is None or len(values) != len(sent) or (values[there] == NO_STAMP).all():
+            continue
+        found[stage.key] = [
+            None if us == NO_STAMP else round(float(us) / US_PER_MS, 2) for us in values[there]
+        ]
+    return found
+
+
+def _seen(decision: SeenDecision, range_m: float, again: PolicyAgain | None) -> Mapping[str, Any]:
+    """Return a decision: its image as base64, and its best actions."""
+    seen = decision.image
+    height, width = seen.shape[:2]
+    # One palette byte per depth pixel, three bytes per colour pixel.
+    pixels = rgb_of(seen) if seen.ndim == 3 else shades(seen, range_m)
+    image = base64.b64encode(pixels.tobytes()).decode()
+    told: dict[str, Any] = {"number": decision.number, "size": [width, height], "image": image}
+    if decision.scores is not None and again is not None:
+        best = np.argsort(-decision.scores, kind="stable")[:BEST]
+        told["best"] = [
+            [round(float(decision.scores[k]), 3), *np.round(again.actions[k], 3).tolist()]
+            for k in best
+        ]
+        told["again"] = decision.again
+    return told
+
 
 MAX_PICTURED = 6
 """Maximum number of flights with still pictures, worst first."""

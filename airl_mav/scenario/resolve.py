@@ -8,11 +8,10 @@ from airl_mav.camera.conditions import check_noise, check_renderer
 from airl_mav.core.errors import FieldError
 from airl_mav.core.first_start import compile_shown
 from airl_mav.flight.judge import GOAL_RADIUS_M
-from airl_mav.latency.injection import Injection, without_timing
-from airl_mav.latency.source import select_injection
+from airl_mav.latency.injection import Injection, select_injection, without_timing
 from airl_mav.policy.registry import PolicyInfo, camera_refused, find_policy
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.loaded import check_spread, equipped
+from airl_mav.profiles.conditions import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.scenario.checks import (
     check_firmware,

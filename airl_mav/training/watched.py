@@ -28,8 +28,8 @@ from airl_mav.training.store import Evaluation, TrainingProgress
 from airl_mav.view import messages
 from airl_mav.view.ends import ViewEnds, ViewSettings
 from airl_mav.view.feed import Feed
-from airl_mav.view.pace import Pace
 from airl_mav.view.shown import OFFBOARD
+from airl_mav.view.viewer import Pace
 
 SPEED = 2.0
 """Default replay speed; viewers can change it [simulated s per wall s]."""

@@ -18,7 +18,7 @@ from airl_mav.core.frames import goal_height_m
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE
 from airl_mav.view import style
 from airl_mav.view.messages import Episode, VehicleShape, VehicleState
-from airl_mav.view.pictures import camera_picture
+from airl_mav.view.panel import camera_picture
 from airl_mav.view.shown import Shown
 
 FRUSTUM_M = 0.6

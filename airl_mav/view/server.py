@@ -7,25 +7,70 @@ process ends with the run, at the end of its input.
 from __future__ import annotations
 
 import os
+import re
 import sys
 import threading
 import warnings
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import viser
+import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
 
 from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.scheduling import give_way
 from airl_mav.view.ends import ViewAnswer, ViewSettings
 from airl_mav.view.feed import Ends
-from airl_mav.view.local_server import LocalServer
 from airl_mav.view.messages import Steering
 from airl_mav.view.panel import Panel
 from airl_mav.view.scene import FlightScene
 from airl_mav.view.shown import Shown
 from airl_mav.view.watchers import Watchers
+
+OWN_PAGES = [re.compile(r"http://(127\.0\.0\.1|localhost)(:\d+)?"), None]
+"""Accepted origins: pages served by this computer, and programs, which send no origin."""
+
+Answering = Callable[[ServerConnection, Request], Response | None]
+"""Handler of HTTP requests; returns None to continue with the WebSocket."""
+
+
+def uncompressed(answering: Answering) -> Answering:
+    """Return the handler without compression, which only slows viser's page on loopback."""
+
+    def answer(connection: ServerConnection, request: Request) -> Response | None:
+        if "Accept-Encoding" in request.headers:
+            del request.headers["Accept-Encoding"]
+        return answering(connection, request)
+
+    return answer
+
+
+class LocalServer(viser.ViserServer):
+    """Server on the loopback address that rejects other sites' pages and public tunnels."""
+
+    def __init__(self, port: int) -> None:
+        """Serve on a port, 0 = any free port; a port in use is replaced by another."""
+        module: Any = websockets.asyncio.server
+        serve = module.serve
+
+        def serve_locally(*words: Any, process_request: Answering, **more: Any) -> Any:
+            answering = uncompressed(process_request)
+            return serve(*words, origins=OWN_PAGES, process_request=answering, **more)
+
+        # viser has no option for origins, and listens before its constructor returns.
+        module.serve = serve_locally
+        try:
+            super().__init__(LOOPBACK, port, verbose=False)
+        finally:
+            module.serve = serve
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """Ignore requests for a public tunnel."""
+
 
 FASTEST = "fastest"
 SPEEDS = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "5 x": 5.0}

@@ -11,7 +11,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import US_PER_MS
-from airl_mav.latency.samplers import LatencySampler
+from airl_mav.latency.injection import LatencySampler
 from airl_mav.policy.observation import Kinematics
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -20,7 +20,7 @@ from airl_mav.view.ends import ViewEnds
 from airl_mav.view.feed import Asked, Feed
 from companion.pilot import SentDecision as Decision
 from firmware_sim.autopilot.commander import FlightPhase
-from firmware_sim.engine.kinematics import POSITION, QUATERNION, VELOCITY
+from firmware_sim.engine.dynamics import POSITION, QUATERNION, VELOCITY
 from firmware_sim.simulation import Simulation
 
 

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MAX_MM
-from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.rays import finer, rays_of
+from airl_mav.camera.intrinsics import Intrinsics, finer, rays_of
 from airl_mav.core.errors import FieldError
 from airl_mav.policy.images import nearest_returns
 from airl_mav.profiles.distortion import Distortion, distorted, sees_to, undistorted

@@ -10,7 +10,6 @@ from airl_mav.control.memory import ticks_to_motors
 from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import TICK_HZ
 from airl_mav.core.frames import Geodetic, Vector
-from firmware_sim.autopilot.auto_disarm import AutoDisarm
 from firmware_sim.autopilot.autopilot_state import (
     UNTOLD,
     WITH_STICKS,
@@ -38,7 +37,7 @@ from firmware_sim.autopilot.events.definition import MavlinkEvent as Told
 from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.filter_kernel import KernelFilter
-from firmware_sim.autopilot.flight_commander import Commanded, FlightCommander
+from firmware_sim.autopilot.flight_commander import AutoDisarm, Commanded, FlightCommander
 from firmware_sim.autopilot.fusion_horizon import NewFilter
 from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.home import Home
@@ -48,7 +47,6 @@ from firmware_sim.autopilot.navigation.flown_item import ExecutorState
 from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.whereabouts import Whereabouts
-from firmware_sim.autopilot.newest_sensors import NewestSensors
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
 from firmware_sim.autopilot.requests import (
@@ -58,6 +56,7 @@ from firmware_sim.autopilot.requests import (
     ObstacleBins,
     PositionYaw,
 )
+from firmware_sim.autopilot.sensor_monitor import NewestSensors
 from firmware_sim.autopilot.snapshot import Parts, Snapshot
 from firmware_sim.engine.controller import Controller
 from firmware_sim.engine.record import LANDING, LIFT_OFF, NOTHING

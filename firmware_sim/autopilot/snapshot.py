@@ -27,7 +27,7 @@ from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.home import Home
 from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.navigation.plan import MissionType, Plans
-from firmware_sim.autopilot.newest_sensors import NewestSensors
+from firmware_sim.autopilot.sensor_monitor import NewestSensors
 from firmware_sim.engine.controller import Controller, ControlSetpoints
 from firmware_sim.engine.record import POSITION, TRAJECTORY
 from firmware_sim.interfaces import SensorSample

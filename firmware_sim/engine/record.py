@@ -19,7 +19,7 @@ from airl_mav.vehicle.power import PowerModel
 from firmware_sim.autopilot.consistency import LOOK_BACK
 from firmware_sim.autopilot.error_state import N_STATES, ROW_SIZE
 from firmware_sim.autopilot.yaw_estimator import LONGEST, MODEL_SIZE, N_MODELS, SHARED_SIZE, WINDOW
-from firmware_sim.engine.kinematics import WIDTH
+from firmware_sim.engine.dynamics import WIDTH
 
 Record = NDArray[Any]
 """Array (1,) of a structured dtype."""

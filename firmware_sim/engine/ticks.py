@@ -42,12 +42,21 @@ from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.alignment import ALIGN_US, FIXES, add
 from firmware_sim.autopilot.climb import climb_if_due
 from firmware_sim.autopilot.consistency import FAR, note_velocity
-from firmware_sim.autopilot.emergency_yaw import REFUSED_US
 from firmware_sim.autopilot.filter_kernel import fuse, predict, spread
 from firmware_sim.autopilot.land_detector import lifts_off, rests
+from firmware_sim.autopilot.recovery import REFUSED_US
 from firmware_sim.autopilot.yaw_estimator import feel, observe
-from firmware_sim.engine.dynamics import Speeds, absorb, actuate
-from firmware_sim.engine.kinematics import WIDTH, force, quaternion, rates, velocity, write
+from firmware_sim.engine.dynamics import (
+    WIDTH,
+    Speeds,
+    absorb,
+    actuate,
+    force,
+    quaternion,
+    rates,
+    velocity,
+    write,
+)
 from firmware_sim.engine.record import (
     ATTITUDE,
     BARO_ROW,

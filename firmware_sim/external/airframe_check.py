@@ -8,7 +8,7 @@ from functools import partial
 
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE, Corner, VehicleProfile
 from firmware_sim.external.parameter_client import Value, same
-from firmware_sim.flight_controller import FirmwareMissingError
+from firmware_sim.interfaces import FirmwareMissingError
 
 MOTORS = range(4)
 

@@ -13,9 +13,14 @@ from firmware_sim.autopilot.commander import CommanderState
 from firmware_sim.external.airframe_check import GROUND_LOSS, differences
 from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import FirmwareObserver
-from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.flight_log.log_folder import ULOG_SUFFIX
-from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
+from firmware_sim.flight_log.flight_log import ULOG_SUFFIX
+from firmware_sim.interfaces import (
+    ActuatorControls,
+    FirmwareLostError,
+    FirmwareMissingError,
+    SensorSample,
+    TrueState,
+)
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.simulation import EpisodeSetup

@@ -10,9 +10,14 @@ from typing import Protocol
 from airl_mav.core.log_file import PARTIAL_SUFFIX
 from firmware_sim.external.airframe_check import RequiredAirframe
 from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
-from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.flight_log.log_folder import ULOG_SUFFIX
-from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
+from firmware_sim.flight_log.flight_log import ULOG_SUFFIX
+from firmware_sim.interfaces import (
+    ActuatorControls,
+    FirmwareLostError,
+    FirmwareMissingError,
+    SensorSample,
+    TrueState,
+)
 
 
 def no_process() -> None:

@@ -10,8 +10,7 @@ from typing import Any
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Severity
-from firmware_sim.autopilot.commander import CommanderState, FlightPhase
-from firmware_sim.autopilot.mode_numbers import custom_mode
+from firmware_sim.autopilot.commander import CommanderState, FlightPhase, custom_mode
 from firmware_sim.external.parameter_client import ParameterClient
 from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect, message_id
 from firmware_sim.mavlink.endpoint import Endpoint

@@ -18,7 +18,7 @@ import psutil
 
 from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.clock import Patience
-from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
+from firmware_sim.interfaces import FirmwareLostError, FirmwareMissingError
 
 REST_LIMIT_S = 1.0
 """Timeout until all threads sleep [wall s]; a thread that never sleeps must not stop a flight."""

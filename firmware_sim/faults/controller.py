@@ -18,18 +18,16 @@ from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic
 from airl_mav.faults.kinds import MOTORS, SENSORS
 from airl_mav.faults.model import Fault, gust_share
-from airl_mav.profiles.sensors import Sensors
-from airl_mav.profiles.vehicle import Battery, VehicleProfile
-from airl_mav.vehicle.airframe import Airframe
-from airl_mav.vehicle.rotor import command_for, steady_speed
+from airl_mav.profiles.vehicle import Battery, Sensors, VehicleProfile
+from airl_mav.vehicle.airframe import Airframe, command_for, steady_speed
 from firmware_sim.engine.dynamics import Speeds
 from firmware_sim.engine.ticks import PA_PER_HPA
 from firmware_sim.faults.timeline import Acting, FaultTimeline
-from firmware_sim.flight_controller import FlightController
 from firmware_sim.interfaces import (
     ActuatorControls,
     BatterySample,
     DistanceReading,
+    FlightController,
     FlowReading,
     GpsFix,
     Odometry,

@@ -15,7 +15,7 @@ from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic, quat_yaw
 from airl_mav.vehicle import atmosphere
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
-from firmware_sim.autopilot.mode_numbers import NAVIGATION_STATES
+from firmware_sim.autopilot.commander import NAVIGATION_STATES
 from firmware_sim.autopilot.optical_flow import (
     GREATEST_HEIGHT_M,
     GREATEST_RAD_S,

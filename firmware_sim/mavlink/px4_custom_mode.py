@@ -14,15 +14,14 @@ from firmware_sim.autopilot.autopilot_state import (
     OperatorText,
     Severity,
 )
-from firmware_sim.autopilot.events.command_events import AUTO_MODE_UNSUPPORTED
-from firmware_sim.autopilot.events.enumerations import NavigationMode
-from firmware_sim.autopilot.events.flight_events import MODE_NOT_AVAILABLE
-from firmware_sim.autopilot.mode_numbers import (
+from firmware_sim.autopilot.commander import (
     MAIN_AUTO,
     MAIN_POSCTL,
     MAIN_SUB,
     MAIN_TERMINATION,
 )
+from firmware_sim.autopilot.events.enumerations import NavigationMode
+from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, MODE_NOT_AVAILABLE
 from firmware_sim.mavlink.codec import dialect
 
 _CRITICAL = Severity.CRITICAL

@@ -34,7 +34,7 @@ from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotation import Quat, Vec
-from firmware_sim.engine.kinematics import (
+from firmware_sim.engine.dynamics import (
     POSITION,
     QUATERNION,
     RATES,

@@ -25,7 +25,7 @@ from airl_mav.core.scheduling import give_way
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import SensorNoise
-from firmware_sim.flight_controller import FirmwareLostError
+from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.plant.camera_server import SimulatedCamera
 
 NICENESS = 10

@@ -16,7 +16,7 @@ from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
 from airl_mav.vehicle.airframe import Airframe, airframe_of
 from airl_mav.vehicle.rigid_body import accelerate, drift
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
-from firmware_sim.engine.kinematics import WIDTH, quaternion, rates, velocity, write
+from firmware_sim.engine.dynamics import WIDTH, quaternion, rates, velocity, write
 from firmware_sim.plant.body import FLOOR, NOTHING, Touch
 from firmware_sim.plant.contacts.box import BREAKING_SHARE, MOST, ROW
 from firmware_sim.plant.contacts.convex import touch_obstacle

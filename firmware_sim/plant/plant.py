@@ -14,14 +14,20 @@ from airl_mav.core.streams import sensors_and_gusts
 from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, PlantName
-from airl_mav.vehicle.airframe import Airframe
+from airl_mav.vehicle.airframe import Airframe, lag
 from airl_mav.vehicle.power import PowerModel, standing_power_w
 from airl_mav.vehicle.rotation import Quat, Vec
-from airl_mav.vehicle.rotor import lag
 from airl_mav.vehicle.wind import Wind
 from firmware_sim.autopilot.climb import climb_record
-from firmware_sim.engine.dynamics import Speeds, pack_row, supply
-from firmware_sim.engine.kinematics import POSITION, QUATERNION, RATES, VELOCITY
+from firmware_sim.engine.dynamics import (
+    POSITION,
+    QUATERNION,
+    RATES,
+    VELOCITY,
+    Speeds,
+    pack_row,
+    supply,
+)
 from firmware_sim.engine.record import Record, new_aircraft
 from firmware_sim.engine.ticks import (
     CLIMBED,
@@ -44,8 +50,7 @@ from firmware_sim.engine.ticks import (
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, TrueState
 from firmware_sim.plant.body import FLOOR, PlantBody, Touch
 from firmware_sim.plant.contacts.box import BREAKING_SHARE
-from firmware_sim.plant.optical_flow import PlantOpticalFlow
-from firmware_sim.plant.rangefinder import PlantRangefinder
+from firmware_sim.plant.downward_sensors import PlantOpticalFlow, PlantRangefinder
 from firmware_sim.plant.sensors import SensorSuite
 from firmware_sim.plant.solids import Room
 

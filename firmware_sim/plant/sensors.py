@@ -9,7 +9,7 @@ import numpy as np
 
 from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import HOME, Vector, local_to_geodetic
-from airl_mav.profiles.sensors import Sensors, Vision
+from airl_mav.profiles.vehicle import Sensors, Vision
 from airl_mav.vehicle.rotation import (
     Quat,
     conjugate,
@@ -18,7 +18,7 @@ from airl_mav.vehicle.rotation import (
     rotate,
     yaw_of,
 )
-from firmware_sim.engine.kinematics import POSITION, VELOCITY, quaternion
+from firmware_sim.engine.dynamics import POSITION, VELOCITY, quaternion
 from firmware_sim.engine.record import GPS, MAG, PRESSURE, Record, new_aircraft, new_sample
 from firmware_sim.engine.ticks import sense_record
 from firmware_sim.interfaces import BatterySample, GpsFix, Odometry, SensorSample

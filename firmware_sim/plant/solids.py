@@ -15,7 +15,7 @@ from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import BodyProfile
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.engine.kinematics import quaternion
+from firmware_sim.engine.dynamics import quaternion
 from firmware_sim.plant.body import walls_of
 from firmware_sim.plant.contacts.box import reach_along
 

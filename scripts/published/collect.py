@@ -12,8 +12,8 @@ from airl_mav.addons.fault_matrix.matrix import load, markdown
 from airl_mav.addons.roofline.points import Roofline, RooflinePoint
 from airl_mav.addons.roofline.roofline import RESULT_FILE as ROOFLINE_FILE
 from airl_mav.addons.roofline.roofline import SCHEMA as ROOFLINE_SCHEMA
-from airl_mav.addons.sweep.store import SCHEMA as SWEEP_SCHEMA
-from airl_mav.addons.sweep.store import SWEEP_FILE
+from airl_mav.addons.sweep.summary import SCHEMA as SWEEP_SCHEMA
+from airl_mav.addons.sweep.summary import SWEEP_FILE
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from airl_mav.addons.conformance.reference import Reference
+from airl_mav.addons.conformance.result import Reference
 from airl_mav.core.constants import MS_PER_S
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle

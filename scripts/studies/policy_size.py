@@ -25,7 +25,7 @@ from pydantic import Field
 from rich.console import Console
 from size_latency_fit import Fit, fit_times
 
-from airl_mav.addons.sweep.tables import count, t2_ms
+from airl_mav.addons.sweep.document import count, t2_ms
 from airl_mav.cli.options import run_command
 from airl_mav.core.clock import utc_now
 from airl_mav.core.console import new_console

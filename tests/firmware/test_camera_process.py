@@ -25,7 +25,7 @@ from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
-from firmware_sim.flight_controller import FirmwareLostError
+from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.plant.camera_process import CameraProcess, SlowCamera
 from firmware_sim.plant.camera_server import SimulatedCamera
 from tests.support.lenses import BARREL

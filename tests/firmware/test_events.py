@@ -19,6 +19,7 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Result, Severity
+from firmware_sim.autopilot.commander import STATE_BITS, custom_mode
 from firmware_sim.autopilot.events import flight_events
 from firmware_sim.autopilot.events.definition import (
     FORMATS,
@@ -38,9 +39,7 @@ from firmware_sim.autopilot.failsafes.actions import FailsafeReason
 from firmware_sim.autopilot.failsafes.conditions import NEEDS, Conditions, Need
 from firmware_sim.autopilot.failsafes.framework import announcement
 from firmware_sim.autopilot.manual_control import Source, Sticks
-from firmware_sim.autopilot.mode_numbers import STATE_BITS, custom_mode
-from firmware_sim.autopilot.prearm import can_arm
-from firmware_sim.autopilot.readiness import ArmingSettings, Readiness
+from firmware_sim.autopilot.prearm import ArmingSettings, Readiness, can_arm
 from firmware_sim.autopilot.sensor_monitor import ACCEL, BARO, GPS, GYRO, MAG, SensorWatch
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.event_buffer import FIRST_SEQUENCE, KEPT

@@ -28,8 +28,14 @@ from firmware_sim.external.ardupilot.sitl import (
     parse_servos,
     state_line,
 )
-from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, TrueState
+from firmware_sim.interfaces import (
+    ActuatorControls,
+    BatterySample,
+    FirmwareLostError,
+    FirmwareMissingError,
+    SensorSample,
+    TrueState,
+)
 from tests.support.ardupilot_copter import GUIDED, LAND
 from tests.support.ardupilot_peer import ArdupilotPeer
 from tests.support.ardupilot_stage import bridged

@@ -21,16 +21,16 @@ from airl_mav.core.errors import UsageError
 from airl_mav.lockstep.vehicle_end import acknowledged, command_of
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import Aircraft, RealFirmware
-from firmware_sim.external import conducted as conducted_module
+from firmware_sim.external import compose as conducted_module
 from firmware_sim.external.airframe_check import SITL_OUTPUT, px4_airframe
-from firmware_sim.external.conducted import conducted_px4
+from firmware_sim.external.compose import conducted_px4
 from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.process import RunningProgram, StartCommand, WorkingFolders, program_at
 from firmware_sim.external.px4 import onboard_link as link_module
 from firmware_sim.external.px4.onboard_link import OnboardLink
 from firmware_sim.external.px4.program import API_LOCAL_PORT, SIMULATOR_PORT, check_free
 from firmware_sim.external.px4.sitl import EPOCH_US, Px4Bridge
-from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
+from firmware_sim.interfaces import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.codec import Decoder, Encoder, dialect
 from firmware_sim.plant.plant import Plant
 from tests.support.ports import CONDUCTED_INSTANCE as INSTANCE

@@ -19,8 +19,13 @@ from firmware_sim.external.px4 import board_link, hitl
 from firmware_sim.external.px4.board_link import BoardLink
 from firmware_sim.external.px4.hitl import HitlBridge
 from firmware_sim.external.transport.router import Router
-from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample
+from firmware_sim.interfaces import (
+    ActuatorControls,
+    BatterySample,
+    FirmwareLostError,
+    FirmwareMissingError,
+    SensorSample,
+)
 from firmware_sim.mavlink.codec import Encoder
 from tests.support.hitl_peer import HitlPeer
 

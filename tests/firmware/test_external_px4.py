@@ -21,8 +21,12 @@ from firmware_sim.autopilot.commander import CommanderState
 from firmware_sim.external.process import FirmwareProcess
 from firmware_sim.external.px4.program import find_px4
 from firmware_sim.external.px4.sitl import EPOCH_US, Px4Bridge
-from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.interfaces import ActuatorControls, SensorSample
+from firmware_sim.interfaces import (
+    ActuatorControls,
+    FirmwareLostError,
+    FirmwareMissingError,
+    SensorSample,
+)
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from firmware_sim.warm_up import warm_up
 from tests.support.flight_rig import quad

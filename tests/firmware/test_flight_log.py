@@ -20,7 +20,7 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import parameter_values
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.mode_numbers import NAVIGATION_STATES
+from firmware_sim.autopilot.commander import NAVIGATION_STATES
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.flight_log.flight_log import GRID_US
 from firmware_sim.flight_log.topics import TOPICS

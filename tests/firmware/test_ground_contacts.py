@@ -23,8 +23,8 @@ from firmware_sim.interfaces import ActuatorControls
 from firmware_sim.plant.bullet_body import BulletWorld
 from firmware_sim.plant.contacts.box import BREAKING_SHARE, MOST, ROW
 from firmware_sim.plant.contacts.ground import near_ground, touch_ground
+from firmware_sim.plant.downward_sensors import PlantRangefinder
 from firmware_sim.plant.plant import Plant
-from firmware_sim.plant.rangefinder import PlantRangefinder
 from tests.firmware.test_kernel_body import HALF, HEIGHT, both
 from tests.firmware.test_rangefinder_plant import QUIET
 from tests.firmware.test_world import OFF

@@ -18,8 +18,7 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import FlightPhase
-from firmware_sim.hover_start import HoverStart
-from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.simulation import EpisodeSetup, HoverStart, Simulation
 
 ALTITUDE_M = 2.5
 

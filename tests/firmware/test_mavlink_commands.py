@@ -8,7 +8,7 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from firmware_sim.autopilot.autopilot_state import Arming, Mode, Result
-from firmware_sim.autopilot.mode_numbers import custom_mode
+from firmware_sim.autopilot.commander import custom_mode
 from firmware_sim.autopilot.navigation.plan import MissionType
 from tests.support.kinematic_autopilot import ORIGIN
 from tests.support.mavlink_clients import RawClient, Rig, text_of

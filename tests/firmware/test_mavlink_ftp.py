@@ -24,8 +24,7 @@ from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, UdpEndpoint
 from firmware_sim.mavlink.link import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
-from firmware_sim.mavlink.services.ftp import BURST_MESSAGES
-from firmware_sim.mavlink.services.ftp_files import DATA_BYTES
+from firmware_sim.mavlink.services.ftp import BURST_MESSAGES, DATA_BYTES
 from firmware_sim.mavlink.services.transfers import crc32part
 from firmware_sim.storage import Storage
 from tests.support.kinematic_autopilot import KinematicAutopilot

@@ -15,8 +15,7 @@ from mavsdk.plugins.log_streaming import LogStreaming
 from pyulog import ULog
 
 from firmware_sim.engine.record import TRUE_TICK
-from firmware_sim.flight_log.flight_log import FlightLog
-from firmware_sim.flight_log.log_folder import LogFolder
+from firmware_sim.flight_log.flight_log import FlightLog, LogFolder
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.services.transfers import NO_MESSAGE
 from firmware_sim.mavlink.telemetry import flown_of

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.mode_numbers import custom_mode
+from firmware_sim.autopilot.commander import custom_mode
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.streams.information import KNOWN, existing
 from tests.support.mavlink_clients import Rig

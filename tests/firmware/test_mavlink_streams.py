@@ -22,7 +22,7 @@ from firmware_sim.autopilot.autopilot_state import (
     Mode,
     Setpoint,
 )
-from firmware_sim.autopilot.mode_numbers import custom_mode
+from firmware_sim.autopilot.commander import custom_mode
 from firmware_sim.interfaces import BatterySample
 from firmware_sim.mavlink.px4_custom_mode import (
     base_mode,

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from airl_mav.core.constants import TICK_S
-from airl_mav.vehicle.airframe import Airframe
-from airl_mav.vehicle.rotor import lag, settle, steady_speed
+from airl_mav.vehicle.airframe import Airframe, lag, settle, steady_speed
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.failsafes.detectors import MotorFailure, Undercurrent
 from firmware_sim.faults.controller import slowed, weakened

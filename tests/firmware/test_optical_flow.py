@@ -17,7 +17,7 @@ from airl_mav.core.constants import TICK_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import HOME, Vector
 from airl_mav.faults.kinds import FITTED_CASES, Case
-from airl_mav.profiles.sensors import OpticalFlow as Profile
+from airl_mav.profiles.vehicle import OpticalFlow as Profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
@@ -25,14 +25,14 @@ from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.optical_flow import STUCK, OpticalFlowFusion, flow_by_errors
 from firmware_sim.crash_detector import TOUCHDOWN_M_S
-from firmware_sim.engine.kinematics import WIDTH
+from firmware_sim.engine.dynamics import WIDTH
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import FlowReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder, layout
-from firmware_sim.mavlink.streams.distance import optical_flow_rad
+from firmware_sim.mavlink.streams.sensors import optical_flow_rad
 from firmware_sim.mavlink.telemetry import payload
-from firmware_sim.plant.optical_flow import BEST, INVALID, PlantOpticalFlow
+from firmware_sim.plant.downward_sensors import BEST, INVALID, PlantOpticalFlow
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig, velocity_setpoint
 

@@ -33,7 +33,7 @@ from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import DOWNWARD, DistanceReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder
-from firmware_sim.mavlink.streams import distance, status
+from firmware_sim.mavlink.streams import sensors, status
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig, velocity_setpoint
 
@@ -132,9 +132,9 @@ def test_a_flight_over_a_box() -> None:
     state = rig.ap.state()
     ground, told, down = state.clearance, state.distance, float(state.estimate.position[2])
     assert ground is not None and told is not None and ground.by_range
-    terrain, bottom = distance.clearance(state, float(state.estimate.position[2]))
+    terrain, bottom = sensors.clearance(state, float(state.estimate.position[2]))
     assert bottom == ground.dist_bottom_m and terrain == -down - ground.dist_bottom_m
-    sent = distance.distance_sensor(state)
+    sent = sensors.distance_sensor(state)
     assert sent is not None
     assert sent[1:7] == (10, 1200, int(told.distance_m * 100.0), 0, 0, DOWNWARD)
     sent_status = status.estimator_status(state)
@@ -163,9 +163,9 @@ def test_ranges_that_are_not_fused_tell_no_ground() -> None:
     rig.take_off(2.0)
     assert not clearance(rig).valid and not finder(rig).tells_ground
     state = rig.ap.state()
-    terrain, bottom = distance.clearance(state, float(state.estimate.position[2]))
+    terrain, bottom = sensors.clearance(state, float(state.estimate.position[2]))
     assert math.isnan(terrain) and math.isnan(bottom)
-    assert distance.distance_sensor(rig.ap.state()) is not None
+    assert sensors.distance_sensor(rig.ap.state()) is not None
 
 
 def test_the_ground_as_the_reference_of_height() -> None:
@@ -428,7 +428,7 @@ def test_a_client_s_rangefinder_tells_the_ground_and_another_direction_does_not(
     assert clearance(rig).dist_bottom_m == pytest.approx(0.3, abs=0.02)
     # Without new ranges, the message stops and fusion ends.
     rig.run(1.0)
-    assert distance.distance_sensor(rig.ap.state()) is None
+    assert sensors.distance_sensor(rig.ap.state()) is None
     assert not finder(rig).tells_ground
 
 

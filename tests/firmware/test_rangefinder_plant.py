@@ -15,12 +15,11 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector, ned_to_enu
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.sensors import Rangefinder
-from airl_mav.profiles.vehicle import load_vehicle
-from firmware_sim.engine.kinematics import POSITION, QUATERNION
+from airl_mav.profiles.vehicle import Rangefinder, load_vehicle
+from firmware_sim.engine.dynamics import POSITION, QUATERNION
 from firmware_sim.interfaces import ActuatorControls
+from firmware_sim.plant.downward_sensors import PlantRangefinder
 from firmware_sim.plant.plant import Plant
-from firmware_sim.plant.rangefinder import PlantRangefinder
 
 QUIET = Rangefinder(rate_hz=50.0, least_m=0.1, greatest_m=30.0, noise_m=0.0)
 

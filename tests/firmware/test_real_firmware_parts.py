@@ -42,7 +42,7 @@ from firmware_sim.external.parameter_client import ParameterClient, same
 from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
 from firmware_sim.external.programs import how_to_start, load_timeout_s
 from firmware_sim.external.px4.program import find_px4
-from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
+from firmware_sim.interfaces import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from tests.support.flight_rig import quad
 from tests.support.processes import ROOT, is_running, wait_until

@@ -23,8 +23,7 @@ from airl_mav.scenario.aircraft import HAS_PYBULLET, Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import FlightPhase
-from firmware_sim.hover_start import HoverStart
-from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.simulation import EpisodeSetup, HoverStart, Simulation
 from tests.support.flight_rig import velocity_setpoint
 
 PLANTS = [

@@ -16,7 +16,7 @@ from airl_mav.core.frames import quat_wxyz_to_xyzw, quat_yaw
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import FlightPhase
-from firmware_sim.autopilot.emergency_yaw import EXPLAINED, EmergencyYaw, turn_to
+from firmware_sim.autopilot.recovery import EXPLAINED, EmergencyYaw, turn_to
 from firmware_sim.autopilot.yaw_estimator import WEIGHT, YAW, YawEstimator
 from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
 

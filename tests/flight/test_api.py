@@ -14,8 +14,8 @@ import pytest
 import airl_mav
 from airl_mav import Run, Scenario, degrade, evaluate, load_run, rehearse
 from airl_mav.core.errors import UsageError
+from airl_mav.experiments.campaign import EpisodeSaver
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.report import shown_flights

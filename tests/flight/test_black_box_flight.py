@@ -13,6 +13,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from airl_mav.addons.refit.refly import FLOWN, REHEARSED, from_its_start, refly
+from airl_mav.black_box.mcap_file import BlackBoxFile, read_black_box
 from airl_mav.black_box.messages import (
     Decision,
     End,
@@ -23,8 +24,6 @@ from airl_mav.black_box.messages import (
     Status,
     Telemetry,
 )
-from airl_mav.black_box.reading import read_black_box
-from airl_mav.black_box.writing import BlackBoxFile
 from airl_mav.cli.report import ReportOptions
 from airl_mav.cli.report import run as report
 from airl_mav.core.constants import US_PER_S

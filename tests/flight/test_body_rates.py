@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from airl_mav import Scenario, rehearse
-from airl_mav.black_box.reading import read_black_box
+from airl_mav.black_box.mcap_file import read_black_box
 from airl_mav.core.frames import quat_to_euler
 from airl_mav.flight.judge import Outcome
 from airl_mav.latency.stamps import NO_STAMP, SETPOINTS, commanded

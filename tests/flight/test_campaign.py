@@ -16,19 +16,25 @@ import pytest
 from airl_mav.core.errors import UsageError
 from airl_mav.core.progress import Progress
 from airl_mav.experiments import campaign, experiment
-from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cell, run_cells
+from airl_mav.experiments.campaign import (
+    CampaignRun,
+    Cell,
+    CellRun,
+    EpisodeSaver,
+    run_cell,
+    run_cells,
+)
 from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor
 from airl_mav.experiments.experiment import Experiment, run_experiment
-from airl_mav.experiments.fly import fly_scenario
 from airl_mav.experiments.process_executor import open_executor
+from airl_mav.experiments.run import fly_scenario
 from airl_mav.experiments.store import (
     Declaration,
     DeclaredCell,
     load_campaign,
     open_campaign,
 )
-from airl_mav.rehearsal import lock
-from airl_mav.rehearsal.episode_saver import EpisodeSaver
+from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE, FlownEpisode, load
 from tests.support.campaign_kit import cells, declared, gym_cell, same_runs
 from tests.support.processes import ROOT, has_ended, running, wait_until
@@ -348,7 +354,7 @@ def test_a_folder_of_something_else_is_no_campaign(tmp_path: Path, file: str, wh
 def test_a_campaign_belongs_to_one_process_at_a_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lock, "WAIT_S", 0.0)
+    monkeypatch.setattr(run_folder, "WAIT_S", 0.0)
     told: list[str] = []
     asked = declared(cells())
     with (

@@ -252,10 +252,11 @@ FORKS = """
 import json, os, sys
 from airl_mav.cli import main
 from airl_mav.experiments import evaluate, gym_flier
-from airl_mav.rehearsal import episode_saver
-from airl_mav.report import run_page, shown_flights
+from airl_mav.experiments import campaign
+from airl_mav.report import shown_flights
+from airl_mav.report import run_report
 
-episode_saver.INTERVAL_S, episode_saver.INTERVAL_PER_SAVE = 0.02, 0.0
+campaign.INTERVAL_S, campaign.INTERVAL_PER_SAVE = 0.02, 0.0
 shown_flights.MAX_PICTURED = 1
 for script in json.loads(sys.argv.pop(1)):
     if (pid := os.fork()) == 0:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from airl_mav.addons.conformance import vehicle_clock
+from airl_mav.addons.conformance import vehicle
 from airl_mav.addons.conformance.checklist import (
     CheckDefinition,
     CheckFailedError,
@@ -24,11 +24,17 @@ from airl_mav.addons.conformance.checklist import (
     Transcript,
     TranscriptLine,
     require,
+    version_name,
 )
 from airl_mav.addons.conformance.command import ConformanceOptions, run
-from airl_mav.addons.conformance.mavlink_names import version_name
-from airl_mav.addons.conformance.reference import StoredStep, Tolerance, deviations, load_reference
-from airl_mav.addons.conformance.result import ConformanceResult, ConformanceSettings
+from airl_mav.addons.conformance.result import (
+    ConformanceResult,
+    ConformanceSettings,
+    StoredStep,
+    Tolerance,
+    deviations,
+    load_reference,
+)
 from airl_mav.addons.conformance.steps import (
     BEFORE_S,
     MANOEUVRES,
@@ -41,7 +47,7 @@ from airl_mav.addons.conformance.steps import (
     step_response,
 )
 from airl_mav.addons.conformance.telemetry import EstimatedMotion, TelemetryBuffer
-from airl_mav.addons.conformance.vehicle_clock import Method, VehicleClock
+from airl_mav.addons.conformance.vehicle import Method, VehicleClock
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.loading import list_profiles
@@ -531,7 +537,7 @@ def test_the_time_is_asked_for_in_the_way_that_is_answered(
     told: tuple[float, bool],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(vehicle_clock, "ANSWER_S", 0.02)
+    monkeypatch.setattr(vehicle, "ANSWER_S", 0.02)
     telemetry, shown = a_telemetry()
     clock = Vehicle(telemetry, *methods).clock
     telemetry.boot_s = 5.1
@@ -543,7 +549,7 @@ def test_the_time_is_asked_for_in_the_way_that_is_answered(
 
 
 def test_another_clock_is_not_taken_for_telemetrys(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vehicle_clock, "ANSWER_S", 0.02)
+    monkeypatch.setattr(vehicle, "ANSWER_S", 0.02)
     telemetry, _ = a_telemetry()
     clock = Vehicle(telemetry, Method.TIMESYNC).clock
     telemetry.boot_s = 1_700.0

@@ -27,16 +27,16 @@ from airl_mav.arena.generate import generate
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.evaluation import fly_episodes
 from airl_mav.envs.spec import EnvironmentSpec, EpisodeRules
-from airl_mav.experiments import gym_flier
+from airl_mav.experiments import campaign, gym_flier
+from airl_mav.experiments.campaign import EpisodeSaver
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.policy.card import load_card
 from airl_mav.policy.observation_spec import Encoded
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profiles_dir
-from airl_mav.rehearsal import episode_saver, run_folder
-from airl_mav.rehearsal.episode_saver import EpisodeSaver
+from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, load
-from airl_mav.report import run_page, shown_flights
+from airl_mav.report import run_report, shown_flights
 from airl_mav.report.arenas import arena_of
 from airl_mav.report.comparison import show
 from airl_mav.report.run_report import write_report
@@ -410,7 +410,7 @@ def test_a_long_table_is_cut_short_and_says_so(
 ) -> None:
     run_, text = greedy
     assert f"25 of {EPISODES} flights, those that failed first; all: episodes.jsonl." in text
-    monkeypatch.setattr(run_page, "MAX_LISTED", 5)
+    monkeypatch.setattr(run_report, "MAX_LISTED", 5)
     monkeypatch.setattr(shown_flights, "MAX_PICTURED", 1)
     shutil.copytree(run_.path, tmp_path / "copy")
     path = write_report(tmp_path / "copy")
@@ -472,8 +472,8 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> LoadedRun:
 
 SCRIPT = """
 import sys
-from airl_mav.rehearsal import episode_saver
-episode_saver.INTERVAL_S, episode_saver.MAX_WAITING = 60.0, 5
+from airl_mav.experiments import campaign
+campaign.INTERVAL_S, campaign.MAX_WAITING = 60.0, 5
 from airl_mav.cli.main import main
 main()
 """
@@ -532,8 +532,8 @@ def test_a_crash_between_arrays_and_lines_doubles_nothing(
 ) -> None:
     out = tmp_path / "run"
     options: dict[str, Any] = {"arena": ("no-obstacles",), "episodes": 40, "out": out}
-    monkeypatch.setattr(episode_saver, "INTERVAL_S", 60.0)
-    monkeypatch.setattr(episode_saver, "MAX_WAITING", 10)
+    monkeypatch.setattr(campaign, "INTERVAL_S", 60.0)
+    monkeypatch.setattr(campaign, "MAX_WAITING", 10)
     real, calls = RunFolder.save_episodes, []
 
     def save(folder: RunFolder, episodes: Sequence[FlownEpisode]) -> None:

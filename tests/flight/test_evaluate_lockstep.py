@@ -158,8 +158,8 @@ def test_a_table_of_arenas(reference: tuple[LoadedRun, str], tmp_path: Path) -> 
 
 SCRIPT = """
 from airl_mav.cli import main
-from airl_mav.rehearsal import episode_saver
-episode_saver.INTERVAL_S, episode_saver.INTERVAL_PER_SAVE = 0.05, 0.0
+from airl_mav.experiments import campaign
+campaign.INTERVAL_S, campaign.INTERVAL_PER_SAVE = 0.05, 0.0
 main.main()
 """
 

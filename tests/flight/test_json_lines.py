@@ -12,7 +12,7 @@ import pytest
 
 from airl_mav import load_run
 from airl_mav.core.errors import UsageError
-from airl_mav.rehearsal.episode_saver import EpisodeSaver
+from airl_mav.experiments.campaign import EpisodeSaver
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.report import shown_flights
 from airl_mav.report.comparison.model import load_comparison

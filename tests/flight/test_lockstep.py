@@ -21,15 +21,15 @@ from pyulog import ULog
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.judge import Outcome
-from airl_mav.latency.samplers import FixedSampler
+from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep import stage as stage_module
+from airl_mav.lockstep.conductor import REPEAT_US, Inbound
 from airl_mav.lockstep.digest import LANES
 from airl_mav.lockstep.flight import fly
-from airl_mav.lockstep.frames import newest
-from airl_mav.lockstep.inbound import REPEAT_US, Inbound
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.lockstep.threaded import ThreadPartner
 from airl_mav.lockstep.turns import Handle, LockstepError, Turn
+from airl_mav.lockstep.wire import newest
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.profiles.conditions import WindSettings

@@ -12,7 +12,7 @@ from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from companion.camera import ReceivedFrame
 from companion.conducted import Abandoned, ConductedClock
-from companion.token_clock import TokenFrameSource, TokenTurns
+from companion.tokens import TokenFrameSource, TokenTurns
 
 
 class ScriptedLink:

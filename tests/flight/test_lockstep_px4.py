@@ -17,7 +17,7 @@ import pytest
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
-from airl_mav.experiments.fly import rehearse
+from airl_mav.experiments.run import rehearse
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.link import ConductedVehicle, builtin_vehicle
@@ -27,7 +27,7 @@ from airl_mav.lockstep.vehicle_end import VehicleEnd, acknowledged
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from firmware_sim.flight_controller import FirmwareLostError
+from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.simulation import EpisodeSetup
 from tests.support.processes import write_arena
 from tests.support.px4_peer import write_build

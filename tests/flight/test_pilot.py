@@ -20,7 +20,7 @@ from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock, SimClock, WallClock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.latency.samplers import FixedSampler, LatencySampler, ReplaySampler
+from airl_mav.latency.injection import FixedSampler, LatencySampler, ReplaySampler
 from airl_mav.policy.actions import ALTITUDE_P, MAX_VERTICAL_M_S, Action
 from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings

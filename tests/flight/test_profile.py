@@ -28,7 +28,7 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import UsageError
 from airl_mav.core.machine import MachineState
 from airl_mav.latency.clock_offset import Exchanges
-from airl_mav.latency.samplers import latency_generator
+from airl_mav.latency.injection import latency_generator
 from airl_mav.latency.stages import STAGES
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.registry import find_policy

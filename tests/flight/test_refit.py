@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from airl_mav.addons.refit.flown import flown_of
-from airl_mav.addons.refit.refit import Refit, refit
+from airl_mav.addons.refit.refit import Refit, refit, refit_together
 from airl_mav.addons.refit.refit_command import RefitOptions
 from airl_mav.addons.refit.refit_command import run as airl_refit
 from airl_mav.addons.refit.refly import (
@@ -25,22 +25,21 @@ from airl_mav.addons.refit.refly import (
     refly_parts,
     turned_wind,
 )
-from airl_mav.addons.refit.together import refit_together
-from airl_mav.black_box.reading import read_black_box
+from airl_mav.black_box.mcap_file import read_black_box
 from airl_mav.cli.main import main
 from airl_mav.cli.report import ReportOptions
 from airl_mav.cli.report import run as report
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.experiments.run import load_run
-from airl_mav.latency.source import parse_latency
+from airl_mav.latency.injection import parse_latency
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.recording_folder import take_in
 from airl_mav.report.tracking import track
-from airl_mav.scenario.file import read_scenario_file
 from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolved import read_scenario_file
 from airl_mav.vehicle_log.alignment import align
 from airl_mav.vehicle_log.ulog import Series, VehicleLog, read_vehicle_log
 from tests.support.recorded_flights import RecordedFlight

@@ -32,7 +32,7 @@ from airl_mav.lockstep.gym_env import RehearsalEnv
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from firmware_sim.flight_controller import FirmwareLostError
+from firmware_sim.interfaces import FirmwareLostError
 from tests.flight.test_lockstep_px4 import REAL
 from tests.support.processes import write_arena
 from tests.support.px4_peer import write_build

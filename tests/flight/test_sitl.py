@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
-from airl_mav.latency.samplers import build_sampler
+from airl_mav.latency.injection import build_sampler
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.computer import load_computer
 from tests.support.command_line import airl

@@ -23,7 +23,7 @@ from airl_mav.cli import sitl
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments import live
 from airl_mav.experiments.live import FlownRun
-from airl_mav.rehearsal import lock
+from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.progress import LiveObserver
 from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load
@@ -265,17 +265,17 @@ def test_what_a_killed_run_left_is_swept_and_flown_again(
 def test_a_folder_is_kept_to_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
     folder = tmp_path / "new" / "run"
-    monkeypatch.setattr(lock, "WAIT_S", 0.1)
-    with lock.locked(folder, told.append):
+    monkeypatch.setattr(run_folder, "WAIT_S", 0.1)
+    with run_folder.locked(folder, told.append):
         assert told == []
         with pytest.raises(UsageError, match="another run flies into it"):
-            lock.locked(folder, told.append).__enter__()
+            run_folder.locked(folder, told.append).__enter__()
     assert told == [f"{folder}: waiting for the processes of an earlier run to end"]
-    with lock.locked(folder, told.append):
+    with run_folder.locked(folder, told.append):
         assert len(told) == 1
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match=r"--out .*file: File exists"):
-        lock.locked(tmp_path / "file", told.append).__enter__()
+        run_folder.locked(tmp_path / "file", told.append).__enter__()
 
 
 def test_a_file_system_without_locks_is_flown_into(
@@ -285,5 +285,5 @@ def test_a_file_system_without_locks_is_flown_into(
         raise OSError(errno.EBADF, "not of a folder")
 
     monkeypatch.setattr(fcntl, "flock", no_locks)
-    with lock.locked(tmp_path, lambda _: None):
+    with run_folder.locked(tmp_path, lambda _: None):
         pass

@@ -25,7 +25,7 @@ from airl_mav.envs.fleet import Rules, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
-from airl_mav.latency.samplers import FixedSampler
+from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep.flight import fly
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Kinematics, Observation

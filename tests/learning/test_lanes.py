@@ -22,11 +22,10 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import Spread
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.vehicle.airframe import airframe_of, draw_airframe
+from airl_mav.vehicle.airframe import airframe_of, draw_airframe, lag, settle, wrench
 from airl_mav.vehicle.power import PowerModel, flight_power_w
 from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Vec, rotate
-from airl_mav.vehicle.rotor import lag, settle, wrench
 from firmware_sim.autopilot.parameter_store import Parameters
 
 QUAD = load_profile("vehicles", "quad", VehicleProfile)

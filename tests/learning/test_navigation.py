@@ -23,8 +23,7 @@ from airl_mav.envs.fleet import Fleet, FlightStatus, Rules, hover, new_fleet, ve
 from airl_mav.envs.flight import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
-from airl_mav.latency.injection import choose_injection
-from airl_mav.latency.source import parse_latency
+from airl_mav.latency.injection import choose_injection, parse_latency
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.profiles.arena import ArenaSpec

@@ -27,11 +27,10 @@ from airl_mav.envs.stopping import (
     speed_bound,
 )
 from airl_mav.envs.vector import NavigationVectorEnv
-from airl_mav.latency.source import longest_ms, parse_latency
+from airl_mav.latency.injection import longest_ms, parse_latency
 from airl_mav.policy.learned import load_learned
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.conditions import Payload
-from airl_mav.profiles.loaded import loaded
+from airl_mav.profiles.conditions import Payload, loaded
 from airl_mav.profiles.loading import load_profile, profile_digest, profiles_dir
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.training.config import TrainingConfig

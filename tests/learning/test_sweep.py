@@ -15,11 +15,17 @@ from rich.console import Console
 from scipy import stats
 
 from airl_mav.addons.sweep.command import SweepOptions, run
-from airl_mav.addons.sweep.config import SweepConfig, load_sweep
+from airl_mav.addons.sweep.config import SweepConfig, load_sweep, size_of, training_of, trials
 from airl_mav.addons.sweep.document import document_of
-from airl_mav.addons.sweep.store import SweepFolder, declaration
-from airl_mav.addons.sweep.summary import Computer, estimated_ms, over_seeds, summarize, write_sweep
-from airl_mav.addons.sweep.trial import size_of, training_of, trials
+from airl_mav.addons.sweep.summary import (
+    Computer,
+    SweepFolder,
+    declaration,
+    estimated_ms,
+    over_seeds,
+    summarize,
+    write_sweep,
+)
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.provenance import provenance

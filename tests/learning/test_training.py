@@ -22,7 +22,7 @@ from airl_mav.policy.card import load_card
 from airl_mav.policy.learned import load_learned
 from airl_mav.policy.observation_spec import Encoded
 from airl_mav.profiles.loading import list_profiles, load_profile
-from airl_mav.rehearsal import lock
+from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.training import run
 from airl_mav.training.config import TrainingConfig, check_fields
@@ -280,10 +280,10 @@ def test_a_folder_without_a_run_is_said_to_be_none(tmp_path: Path) -> None:
 
 
 def test_two_do_not_train_in_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lock, "WAIT_S", 0.0)
+    monkeypatch.setattr(run_folder, "WAIT_S", 0.0)
     config = TrainingConfig(description="one")
     with (
-        lock.locked(tmp_path / "run", lambda _: None),
+        run_folder.locked(tmp_path / "run", lambda _: None),
         pytest.raises(UsageError, match="another run"),
     ):
         run.train(config, tmp_path / "run", name="one")

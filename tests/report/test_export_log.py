@@ -21,9 +21,8 @@ from airl_mav.addons.export_log.files import flight_of
 from airl_mav.addons.export_log.recorded import RecordedFlight
 from airl_mav.addons.export_log.ulog_log import row, samples, write_ulog
 from airl_mav.arena.generate import generate
+from airl_mav.black_box.mcap_file import BlackBoxFile, read_black_box
 from airl_mav.black_box.messages import Decision, End, Latency, Phase, Telemetry
-from airl_mav.black_box.reading import read_black_box
-from airl_mav.black_box.writing import BlackBoxFile
 from airl_mav.cli import options as cli_options
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
@@ -33,7 +32,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.recorded_flight import episode_of
-from airl_mav.report.replay.runs import ReplayedRun
+from airl_mav.report.replay.flight import ReplayedRun
 from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here
 from tests.support.lenses import angles

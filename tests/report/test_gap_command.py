@@ -24,6 +24,7 @@ from PIL import Image
 from airl_mav.cli.gap import OPTIONS
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments import gap as gap_experiment
+from airl_mav.experiments.campaign import EpisodeSaver
 from airl_mav.experiments.gap import (
     DEFAULT_MITIGATED,
     DEFAULT_UNMITIGATED,
@@ -33,10 +34,9 @@ from airl_mav.experiments.gap import (
 from airl_mav.flight.paired import tango
 from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.loading import profiles_dir
-from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.report.comparison import show
-from airl_mav.report.comparison.documents import worst_seeds
+from airl_mav.report.comparison.build import worst_seeds
 from airl_mav.report.comparison.gap import gaps_table, runs_table
 from airl_mav.report.comparison.model import load_comparison, save_comparison
 from airl_mav.report.comparison.show import build_comparison, rebuild_comparison

@@ -24,12 +24,11 @@ from airl_mav.cli import main
 from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments import ladder as ladder_experiment
-from airl_mav.experiments.campaign import Cell
+from airl_mav.experiments.campaign import Cell, EpisodeSaver
 from airl_mav.experiments.experiment import make_cell
 from airl_mav.experiments.ladder import declare_ladder
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import tango
-from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load
 from airl_mav.report.comparison import show
 from airl_mav.report.comparison.figures import contrast_pictures

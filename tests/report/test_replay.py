@@ -14,8 +14,13 @@ import pytest
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE
-from airl_mav.report.replay.flight import ReplayedFlight, parting_s
-from airl_mav.report.replay.runs import ReplayedRun, ReplayedRuns, run_folders
+from airl_mav.report.replay.flight import (
+    ReplayedFlight,
+    ReplayedRun,
+    ReplayedRuns,
+    parting_s,
+    run_folders,
+)
 from airl_mav.view.shown import Shown
 from tests.support.processes import PATIENCE_S, running
 from tests.support.run_demo import write_demo_run

@@ -14,8 +14,7 @@ import pytest
 
 from airl_mav.cli.main import main
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.report.replay.flight import ReplayedFlight
-from airl_mav.report.replay.runs import ReplayedRun
+from airl_mav.report.replay.flight import ReplayedFlight, ReplayedRun
 from tests.support.processes import ROOT
 from tests.support.run_demo import write_demo_run
 
@@ -144,7 +143,7 @@ def refused(
     def serve(_port: int) -> None:
         raise AssertionError("it is served")
 
-    monkeypatch.setattr("airl_mav.view.local_server.LocalServer", serve)
+    monkeypatch.setattr("airl_mav.view.server.LocalServer", serve)
     with pytest.raises(SystemExit) as end:
         main(["view", str(folder), *words])
     out, err = capsys.readouterr()
@@ -158,7 +157,7 @@ def test_the_flight_is_shown_before_its_arena_and_before_anyone_looks(
     flown: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from airl_mav.report.replay.page import ReplayPage
-    from airl_mav.view.local_server import LocalServer
+    from airl_mav.view.server import LocalServer
 
     run = ReplayedRun(flown)
     server = LocalServer(0)

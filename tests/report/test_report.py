@@ -20,12 +20,10 @@ from airl_mav.latency.injection import NOTHING_INJECTED
 from airl_mav.latency.stages import SHOWN_STAGES
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder, load
-from airl_mav.report.conduct import conduct_table
 from airl_mav.report.energy import energy_flights_table, energy_table, flight_energies
 from airl_mav.report.forensics.worst import examine_worst
-from airl_mav.report.measures import summarize_run
-from airl_mav.report.run_page import build_page
-from airl_mav.report.run_report import print_report, verdict_of
+from airl_mav.report.measures import conduct_table, summarize_run
+from airl_mav.report.run_report import build_page, print_report, verdict_of
 from airl_mav.report.run_tables import (
     ages_table,
     episodes_table,

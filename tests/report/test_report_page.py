@@ -17,7 +17,7 @@ from PIL import Image
 
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.run_page import build_page
+from airl_mav.report.run_report import build_page
 from tests.support.browser import CHROMIUM, browser
 from tests.support.browser import Page as Tab
 from tests.support.page_alone import page_alone

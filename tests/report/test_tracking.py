@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from airl_mav.core.frames import quat_wxyz_to_xyzw
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.report.flight_data import chosen, flight_data, packed, steps_of
 from airl_mav.report.run_tables import estimation_table
+from airl_mav.report.shown_flights import chosen, flight_data, packed, steps_of
 from airl_mav.report.tracking import track
 from airl_mav.report.tracking_figure import held
 from tests.support.page_alone import unpacked

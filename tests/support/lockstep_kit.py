@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from airl_mav.core.frames import Goal
-from airl_mav.latency.samplers import FixedSampler
+from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.policy.actions import Policy

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh
 from airl_mav.arena.triangles import Triangles, encoded
-from airl_mav.profiles.asset_files import MeshFile
+from airl_mav.profiles.assets import MeshFile
 
 ROOM = Bounds(-12.0, 12.0, -12.0, 12.0, 5.0)
 

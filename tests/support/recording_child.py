@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from airl_mav.black_box.writing import BlackBoxFile
+from airl_mav.black_box.mcap_file import BlackBoxFile
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock, WallClock

@@ -11,7 +11,7 @@ import numpy as np
 from airl_mav.addons.refit.flown import flown_of
 from airl_mav.addons.refit.refit import Refit
 from airl_mav.addons.refit.response import TELEMETRY_AGE_S, fit_response
-from airl_mav.black_box.reading import read_black_box
+from airl_mav.black_box.mcap_file import read_black_box
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle

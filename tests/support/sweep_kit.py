@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from airl_mav.addons.sweep.config import SweepConfig
-from airl_mav.addons.sweep.trial import TrainedTrial, Trial, TrialResult, size_of
+from airl_mav.addons.sweep.config import SweepConfig, TrainedTrial, Trial, TrialResult, size_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.profiles.loading import profiles_dir
 

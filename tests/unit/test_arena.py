@@ -21,11 +21,18 @@ from scipy import ndimage, stats
 
 from airl_mav.arena import generate as generate_module
 from airl_mav.arena.draw import draw_arena, save_png
-from airl_mav.arena.footprints import Boxes
 from airl_mav.arena.generate import LAYOUTS, free_area_fraction, generate, local_bounds
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.arena.passage import gaps_suffice, passage_exists, raster_passage
-from airl_mav.arena.placement import BATCH, BATCHES, NoRoomError, place_all, zone_of, zone_radius_m
+from airl_mav.arena.placement import (
+    BATCH,
+    BATCHES,
+    Boxes,
+    NoRoomError,
+    place_all,
+    zone_of,
+    zone_radius_m,
+)
 from airl_mav.arena.tours import set_out_later
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.arena import ArenaSpec

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from airl_mav.black_box.mcap_file import BlackBoxFile, read_black_box
 from airl_mav.black_box.messages import (
     SCHEMAS,
     TOPICS,
@@ -31,8 +32,6 @@ from airl_mav.black_box.messages import (
     image_of,
     text,
 )
-from airl_mav.black_box.reading import read_black_box
-from airl_mav.black_box.writing import BlackBoxFile
 from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import SimClock

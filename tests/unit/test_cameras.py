@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.generate import generate
 from airl_mav.camera.frame import MAX_MM, depth_to_z16
-from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.rays import finer
+from airl_mav.camera.intrinsics import Intrinsics, finer
 from airl_mav.camera.render import render
 from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.errors import FieldError

@@ -26,13 +26,6 @@ from airl_mav.report.forensics.camera_view import (
     view_obstacle,
     view_wall,
 )
-from airl_mav.report.forensics.causes import (
-    USUAL,
-    cause_of,
-    decisions_in_effect,
-    examine_collision,
-    hit_number,
-)
 from airl_mav.report.forensics.evidence import (
     NO_CAUSE,
     Evidence,
@@ -47,6 +40,13 @@ from airl_mav.report.forensics.long_flights import (
     SPOT_M,
     longest_limit_cycle,
     swinging_stretches,
+)
+from airl_mav.report.forensics.worst import (
+    USUAL,
+    cause_of,
+    decisions_in_effect,
+    examine_collision,
+    hit_number,
 )
 
 CAMERA = load_vehicle("quad").camera

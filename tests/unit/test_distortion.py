@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from airl_mav.camera.frame import Frame, FrameError
-from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.rays import fisheye_places, fisheye_rays
+from airl_mav.camera.intrinsics import Intrinsics, fisheye_places, fisheye_rays
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.spec import CameraChange
 from airl_mav.policy.observation import Kinematics

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from airl_mav.rehearsal import episode_saver
-from airl_mav.rehearsal.episode_saver import EpisodeSaver
+from airl_mav.experiments import campaign
+from airl_mav.experiments.campaign import EpisodeSaver
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, FlownEpisode, RunFolder, load
 from tests.support.processes import wait_until
 from tests.support.run_demo import demo_arena, demo_episode, demo_setup
@@ -66,7 +66,7 @@ def has_lines(folder: RunFolder, count: int) -> bool:
 def test_after_a_while_they_are_saved_though_more_will_come(
     folder: RunFolder, episode: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(episode_saver, "INTERVAL_S", 0.01)
+    monkeypatch.setattr(campaign, "INTERVAL_S", 0.01)
     with EpisodeSaver(folder) as saver:
         for index in range(2):
             saver.add(episode(index))
@@ -77,8 +77,8 @@ def test_after_a_while_they_are_saved_though_more_will_come(
 def test_no_more_than_so_many_wait(
     folder: RunFolder, episode: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(episode_saver, "INTERVAL_S", 3600.0)
-    monkeypatch.setattr(episode_saver, "MAX_WAITING", 2)
+    monkeypatch.setattr(campaign, "INTERVAL_S", 3600.0)
+    monkeypatch.setattr(campaign, "MAX_WAITING", 2)
     watched = Watched(folder.path)
     with EpisodeSaver(watched) as saver:
         for index in range(5):
@@ -104,20 +104,20 @@ def test_saving_that_takes_long_is_done_less_often(
         return real(saver, pause_s)
 
     monkeypatch.setattr(EpisodeSaver, "_collect", collect)
-    monkeypatch.setattr(episode_saver, "WallClock", Slow)
-    monkeypatch.setattr(episode_saver, "MAX_WAITING", 1)
+    monkeypatch.setattr(campaign, "WallClock", Slow)
+    monkeypatch.setattr(campaign, "MAX_WAITING", 1)
     with EpisodeSaver(folder) as saver:
         for index in range(3):
             saver.add(episode(index))
-    assert pauses[:2] == [episode_saver.INTERVAL_S, episode_saver.INTERVAL_PER_SAVE]
+    assert pauses[:2] == [campaign.INTERVAL_S, campaign.INTERVAL_PER_SAVE]
 
 
 @pytest.mark.parametrize("when", ["while flying", "at the end"])
 def test_what_goes_wrong_is_raised_where_the_episodes_come_from(
     folder: RunFolder, episode: Make, monkeypatch: pytest.MonkeyPatch, when: str
 ) -> None:
-    monkeypatch.setattr(episode_saver, "INTERVAL_S", 3600.0)
-    monkeypatch.setattr(episode_saver, "MAX_WAITING", 2)
+    monkeypatch.setattr(campaign, "INTERVAL_S", 3600.0)
+    monkeypatch.setattr(campaign, "MAX_WAITING", 2)
     watched = Watched(folder.path, fail_at=2)
     with pytest.raises(OSError, match="disk full"), EpisodeSaver(watched) as saver:
         for index in range(9 if when == "while flying" else 3):

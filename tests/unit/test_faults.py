@@ -16,9 +16,9 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.faults.kinds import KINDS, Part, Phase
 from airl_mav.faults.model import FOREVER_US, Fault, active, gust_share, next_change_us, window_us
-from airl_mav.scenario.file import read_scenario_file, save_scenario
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
+from airl_mav.scenario.resolved import read_scenario_file, save_scenario
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 
 TIMES = st.floats(min_value=0.0, max_value=99_999.0, allow_nan=False)

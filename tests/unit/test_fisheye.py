@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera.frame import depth_to_z16
-from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.intrinsics import Intrinsics, fisheye_places, fisheye_rays
 from airl_mav.camera.picture import render_picture
 from airl_mav.camera.primitives import OBSTACLE
-from airl_mav.camera.rays import fisheye_places, fisheye_rays
 from airl_mav.camera.render import render
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
@@ -23,7 +22,7 @@ from airl_mav.policy.greedy import near_points
 from airl_mav.policy.observation import Kinematics, observe
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
 from airl_mav.policy.scans import rays_of
-from airl_mav.prediction.reprojection import CameraPose, PosedImage, Reprojector
+from airl_mav.prediction.compensator import CameraPose, PosedImage, Reprojector
 from airl_mav.profiles.appearance import DEFAULT
 from airl_mav.profiles.distortion import UNDISTORTED, Distortion
 from airl_mav.profiles.vehicle import load_vehicle

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from airl_mav.addons.conformance.reference import StoredStep
-from airl_mav.addons.conformance.result import ConformanceResult, ConformanceSettings
+from airl_mav.addons.conformance.result import ConformanceResult, ConformanceSettings, StoredStep
 from airl_mav.addons.conformance.steps import (
     MANOEUVRES,
     MeasuredStep,

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from airl_mav.flight.quality import measure_quality
-from airl_mav.flight.smoothness import (
+from airl_mav.flight.quality import (
     BANDWIDTH_HZ,
     command_steps,
     commanded_velocity,
     flown_velocity,
     jerk_of,
+    measure_quality,
     sample_times,
 )
 from airl_mav.flight.trajectory import Trajectory

@@ -24,7 +24,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.colour_images import Looks
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.asset_files import ImageFile
+from airl_mav.profiles.assets import ImageFile
 from airl_mav.profiles.loading import load_profile, profile_digest
 
 PROFILE = """

@@ -18,23 +18,22 @@ from airl_mav.arena.geometry import Arena, Shape, Tour
 from airl_mav.camera.conditions import check_renderer
 from airl_mav.camera.exposure import expose
 from airl_mav.camera.frame import Frame, FrameError, image_of, jpeg_of
-from airl_mav.camera.image_sensor import (
+from airl_mav.camera.imaging import (
     LIGHT_OF,
+    ImageFormation,
     codes_of,
     demosaiced,
     mosaic,
     noisy,
     vignette,
 )
-from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera import Camera
+from airl_mav.profiles.camera import Camera, Imaging
 from airl_mav.profiles.camera_kind import CameraKind
-from airl_mav.profiles.imaging import Imaging
 from airl_mav.profiles.loading import load_profile
 from tests.unit.test_colour import arena, bodies, sky, sun
 

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 from scipy.optimize import brentq
 
-from airl_mav.latency.samplers import FixedSampler, LatencySampler, ReplaySampler, build_sampler
+from airl_mav.latency.injection import FixedSampler, LatencySampler, ReplaySampler, build_sampler
 from airl_mav.profiles.computer import LatencyDistribution
 
 N = 20_000

@@ -9,8 +9,13 @@ import pytest
 import scipy.stats
 
 from airl_mav.core.errors import UsageError
-from airl_mav.latency.samplers import ReplaySampler, latency_generator
-from airl_mav.latency.source import longest_ms, parse_latency, select_injection
+from airl_mav.latency.injection import (
+    ReplaySampler,
+    latency_generator,
+    longest_ms,
+    parse_latency,
+    select_injection,
+)
 from airl_mav.profiles.computer import LatencyDistribution, load_computer
 
 

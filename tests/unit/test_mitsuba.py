@@ -17,10 +17,9 @@ from airl_mav.arena.appearance import linear_of, srgb_of
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.cube_faces import cube_of, resampled
-from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.intrinsics import Intrinsics, fisheye_rays
 from airl_mav.camera.mitsuba import PathTracer
 from airl_mav.camera.picture import antialiased, render_picture
-from airl_mav.camera.rays import fisheye_rays
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.profiles.appearance import Appearance

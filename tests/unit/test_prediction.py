@@ -17,9 +17,17 @@ from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.policy.observation import Kinematics
-from airl_mav.prediction.compensator import LINK_US, Compensator, MotionBatch, flown_on, leaning
+from airl_mav.prediction.compensator import (
+    LINK_US,
+    CameraPose,
+    Compensator,
+    MotionBatch,
+    PosedImage,
+    Reprojector,
+    flown_on,
+    leaning,
+)
 from airl_mav.prediction.memory import REMEMBERED, ExpectedLatency
-from airl_mav.prediction.reprojection import CameraPose, PosedImage, Reprojector
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import Response, load_vehicle

@@ -12,8 +12,7 @@ from rich.text import Text
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.json_progress import JsonProgress
-from airl_mav.core.progress import Event, Progress, RichProgress
+from airl_mav.core.progress import Event, JsonProgress, Progress, RichProgress
 
 
 def drawn(*, terminal: bool) -> str:

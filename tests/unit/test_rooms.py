@@ -20,9 +20,9 @@ from scipy import ndimage, stats
 from airl_mav.addons.render.camera_pictures import ROOM, coloured_segmentation
 from airl_mav.arena.appearance import srgb_of
 from airl_mav.arena.draw import OPENING_COLOUR, draw_arena
-from airl_mav.arena.footprints import bounding_boxes
 from airl_mav.arena.generate import generate, local_bounds
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, seen_across
+from airl_mav.arena.placement import bounding_boxes
 from airl_mav.arena.rooms import Plan, draw_plan, over_doors
 from airl_mav.camera import primitives
 from airl_mav.camera.intrinsics import Intrinsics

@@ -20,10 +20,9 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import unit_of, validated
 from airl_mav.profiles.conditions import Payload, WindSettings
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.scenario.file import anchored, read_scenario_file, save_scenario
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolved import ResolvedScenario, anchored, read_scenario_file, save_scenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion, StandAloneVehicle
 from tests.support.processes import ROOT
 

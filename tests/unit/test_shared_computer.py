@@ -16,7 +16,7 @@ from airl_mav.cli.computers import ComputersOptions
 from airl_mav.cli.computers import run as computers
 from airl_mav.cli.main import main
 from airl_mav.core.errors import UsageError
-from airl_mav.latency.source import select_injection
+from airl_mav.latency.injection import select_injection
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import profile_digest
 

@@ -53,5 +53,5 @@ def test_flies_and_draws_without_other_extras(tmp_path: Path, program: str, page
 
 
 def test_the_check_itself_can_fail(tmp_path: Path) -> None:
-    done = run_alone(BLOCK + "import airl_mav.black_box.reading\n", tmp_path)
+    done = run_alone(BLOCK + "import airl_mav.black_box.mcap_file\n", tmp_path)
     assert "No module named mcap" in done.stderr

@@ -15,11 +15,11 @@ from matplotlib.tri import LinearTriInterpolator, Triangulation
 from numpy.typing import NDArray
 
 from airl_mav.arena.assets import _problem
-from airl_mav.arena.footprints import Boxes, bounding_half
 from airl_mav.arena.generate import generate, local_bounds
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.arena.ground import Ground, no_relief
 from airl_mav.arena.passage import Hills, raster_passage
+from airl_mav.arena.placement import Boxes, bounding_half
 from airl_mav.arena.relief import draw_ground, extreme_within, plane_at, stand_on
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture

@@ -19,11 +19,18 @@ from airl_mav.core.frames import ned_to_enu, quat_ned_frd_to_enu_flu, quat_wxyz_
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.vehicle.airframe import Airframe, airframe_of
+from airl_mav.vehicle.airframe import (
+    Airframe,
+    airframe_of,
+    hover_speeds,
+    lag,
+    settle,
+    steady_speed,
+    wrench,
+)
 from airl_mav.vehicle.power import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Quat, Vec
-from airl_mav.vehicle.rotor import hover_speeds, lag, settle, steady_speed, wrench
 
 QUAD = Airframe.from_profile(load_profile("vehicles", "quad", VehicleProfile))
 LEVEL = (1.0, 0.0, 0.0, 0.0)

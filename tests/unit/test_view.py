@@ -27,7 +27,7 @@ from airl_mav.cli.sitl import SitlOptions
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.latency.samplers import FixedSampler
+from airl_mav.latency.injection import FixedSampler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
@@ -46,11 +46,10 @@ from airl_mav.view.messages import (
     from_parts,
     to_parts,
 )
-from airl_mav.view.pace import Pace
-from airl_mav.view.pictures import NO_RETURN, VIRIDIS, camera_picture, numbers_html, texts_html
+from airl_mav.view.panel import NO_RETURN, VIRIDIS, camera_picture, numbers_html, texts_html
 from airl_mav.view.shown import STRIP_S, Shown
 from airl_mav.view.taps import Hand, HandCompensator, HandLatency
-from airl_mav.view.viewer import Viewer, request_of
+from airl_mav.view.viewer import Pace, Viewer, request_of
 from tests.support.ports import free_ports
 from tests.support.processes import run_alone, wait_until
 
@@ -393,7 +392,7 @@ def test_pages_of_other_sites_are_turned_away(origin: str | None, taken: bool) -
     viser = pytest.importorskip("viser")
     from websockets.exceptions import InvalidStatus
 
-    from airl_mav.view.local_server import LocalServer
+    from airl_mav.view.server import LocalServer
 
     server = LocalServer(0)
     port = server.get_port()
@@ -415,7 +414,7 @@ def test_pages_of_other_sites_are_turned_away(origin: str | None, taken: bool) -
 @pytest.mark.parametrize("headers", [{}, {"Accept-Encoding": "gzip, br"}])
 def test_the_page_is_not_compressed_once_more(headers: dict[str, str]) -> None:
     pytest.importorskip("viser")
-    from airl_mav.view.local_server import LocalServer
+    from airl_mav.view.server import LocalServer
 
     server = LocalServer(0)
     try:
@@ -434,7 +433,7 @@ def test_no_tunnel_is_opened_whoever_asks(monkeypatch: pytest.MonkeyPatch) -> No
     import msgspec
     from viser import _messages, _viser
 
-    from airl_mav.view.local_server import LocalServer
+    from airl_mav.view.server import LocalServer
 
     opened, answered = threading.Event(), threading.Event()
     answer = LocalServer.request_share_url

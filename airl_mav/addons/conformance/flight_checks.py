@@ -7,10 +7,16 @@ from functools import partial
 
 import numpy as np
 
-from airl_mav.addons.conformance.autopilots import Reaction
-from airl_mav.addons.conformance.checklist import CheckDefinition, require
+from airl_mav.addons.conformance.checklist import (
+    CheckDefinition,
+    LandedState,
+    MavCommand,
+    MavFrame,
+    Reaction,
+    name_of,
+    require,
+)
 from airl_mav.addons.conformance.ground_checks import TEXT_S, require_answer
-from airl_mav.addons.conformance.mavlink_names import LandedState, MavCommand, MavFrame, name_of
 from airl_mav.addons.conformance.steps import STOP_BODY, STOP_NED, StepSetpoint
 from airl_mav.addons.conformance.vehicle import (
     IGNORE_ALL,

@@ -5,26 +5,23 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from airl_mav.addons.conformance.autopilots import ExpectedAnswer
 from airl_mav.addons.conformance.checklist import (
-    CheckDefinition,
-    CheckFailedError,
-    NotApplicableError,
-    require,
-)
-from airl_mav.addons.conformance.mavlink_names import (
     CUSTOM_MODE_FLAG,
     PREARM_CHECK,
     UNKNOWN_COMMAND,
     VEHICLE_TYPES,
+    CheckDefinition,
+    CheckFailedError,
+    ExpectedAnswer,
     MavCommand,
     MavResult,
+    NotApplicableError,
     name_of,
+    require,
     version_name,
 )
 from airl_mav.addons.conformance.telemetry import Fields
-from airl_mav.addons.conformance.vehicle import VehicleConnection
-from airl_mav.addons.conformance.vehicle_clock import Method
+from airl_mav.addons.conformance.vehicle import Method, VehicleConnection
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 

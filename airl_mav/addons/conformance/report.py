@@ -8,8 +8,13 @@ from rich.table import Table
 from rich.text import Text
 
 from airl_mav.addons.conformance.checklist import CheckOutcome, TranscriptLine
-from airl_mav.addons.conformance.reference import JUDGED, Reference, StoredStep, deviations
-from airl_mav.addons.conformance.result import ConformanceResult
+from airl_mav.addons.conformance.result import (
+    JUDGED,
+    ConformanceResult,
+    Reference,
+    StoredStep,
+    deviations,
+)
 from airl_mav.addons.conformance.steps import STEP_NAMES, StepResponse
 
 FIGURES: dict[str, tuple[str, float, int]] = {

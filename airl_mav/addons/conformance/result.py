@@ -3,17 +3,145 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from airl_mav.addons.conformance.checklist import CheckOutcome, ConformanceCheck, TranscriptLine
-from airl_mav.addons.conformance.reference import Reference
+from pydantic import Field
+
+from airl_mav.addons.conformance.checklist import (
+    CheckFailedError,
+    CheckOutcome,
+    ConformanceCheck,
+    TranscriptLine,
+    require,
+)
 from airl_mav.addons.conformance.steps import STEP_NAMES, MeasuredStep, StepName, StepResponse
 from airl_mav.addons.conformance.telemetry import Fields
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import write_json
+from airl_mav.profiles.loading import list_profiles, load_profile
+
+AUTO = "auto"
+"""Selects the stored column of the vehicle's autopilot, the first by name of several."""
+
+JUDGED = ("latency_s", "rise_s", "overshoot_percent")
+"""Figures with a tolerance; the others follow from these, or are noise."""
+
+
+class Tolerance(ProfileModel):
+    """Maximum deviation of a figure from the stored one."""
+
+    latency_share: float = quantity("latency, of the stored one", "1", gt=0, le=1, default=0.10)
+    rise_share: float = quantity("rise time, of the stored one", "1", gt=0, le=1, default=0.10)
+    floor_s: float = quantity(
+        "any time may be so far off: one sample of telemetry", "s", ge=0, le=1, default=0.010
+    )
+    overshoot_points: float = quantity("overshoot", "% of step", gt=0, le=100, default=5.0)
+
+
+class StoredStep(ProfileModel):
+    """Measured step; figures without a measurement are omitted."""
+
+    latency_s: float | None = quantity("until the first movement", "s", gt=0, default=None)
+    t10_s: float | None = quantity("until 10 %", "s", gt=0, default=None)
+    t50_s: float | None = quantity("until 50 %", "s", gt=0, default=None)
+    rise_s: float | None = quantity("10 % to 90 %", "s", gt=0, default=None)
+    overshoot_percent: float | None = quantity("overshoot", "% of step", ge=0, default=None)
+    error: float | None = quantity("size of the error at the end", "unit", ge=0, default=None)
+    settle_s: float | None = quantity("until within 5 %", "s", gt=0, default=None)
+
+
+class Reference(ProfileModel):
+    """Stored column of one firmware."""
+
+    title: str = Field(description="name of the firmware")
+    source: str = Field(description="where the figures come from")
+    autopilot: int = Field(description="HEARTBEAT.autopilot, a MAV_AUTOPILOT")
+    tolerance: Tolerance = Field(default_factory=Tolerance, description="tolerances")
+    streams_hz: Mapping[str, float] = Field(
+        description="messages that a fresh UDP link carries unasked [Hz]"
+    )
+    steps: Mapping[StepName, StoredStep] = Field(description="step responses")
+
+
+class Deviation(NamedTuple):
+    """Figure outside its tolerance."""
+
+    figure: str
+    measured: float
+    stored: float
+    allowed: float
+    """Maximum allowed difference, in the figure's unit."""
+
+    def __str__(self) -> str:
+        name, _, unit = self.figure.rpartition("_")
+        sign, points, scale, digits = ("ms", "ms", 1e3, 0)
+        if unit == "percent":
+            sign, points, scale, digits = ("%", "points", 1.0, 1)
+        return (
+            f"{name} {scale * self.measured:.{digits}f} {sign}, stored "
+            f"{scale * self.stored:.{digits}f} +- {scale * self.allowed:.{digits}f} {points}"
+        )
+
+
+def deviations(measured: StepResponse, stored: StoredStep, tolerance: Tolerance) -> list[Deviation]:
+    """Return the deviations of latency, rise time and overshoot; NaN always deviates."""
+    floor_s = tolerance.floor_s
+    found = []
+    for figure, share, floor in (
+        ("latency_s", tolerance.latency_share, floor_s),
+        ("rise_s", tolerance.rise_share, floor_s),
+        ("overshoot_percent", 0.0, tolerance.overshoot_points),
+    ):
+        expected: float | None = getattr(stored, figure)
+        if expected is None:
+            continue
+        allowed = max(share * expected, floor)
+        value: float = getattr(measured, figure)
+        # Undershoot counts as zero overshoot: the final error shows it.
+        compared = max(value, 0.0) if figure == "overshoot_percent" else value
+        if math.isnan(value) or abs(compared - expected) > allowed:
+            found.append(Deviation(figure, value, expected, allowed))
+    return found
+
+
+def summary(response: StepResponse) -> str:
+    """Return the judged figures in one line."""
+    return (
+        f"latency {1e3 * response.latency_s:.0f} ms, rise {1e3 * response.rise_s:.0f} ms, "
+        f"overshoot {max(response.overshoot_percent, 0.0):.1f} %"
+    )
+
+
+def judge(measured: MeasuredStep | None, reference: Reference) -> str:
+    """Return the finding of a step. Raises CheckFailedError if missing or deviating."""
+    if measured is None:
+        raise CheckFailedError("not flown")
+    stored = reference.steps.get(measured.step.name)
+    if stored is None:
+        raise CheckFailedError(f"nothing stored for {reference.title}")
+    found = deviations(measured.median, stored, reference.tolerance)
+    require(not found, "; ".join(map(str, found)))
+    return summary(measured.median)
+
+
+def load_reference(name: str, autopilot: int) -> Reference:
+    """Return stored steps: `auto` (by HEARTBEAT.autopilot), a name or path. Raises UsageError."""
+    if name != AUTO:
+        return load_profile("conformance", name, Reference)
+    for shipped in list_profiles("conformance"):
+        reference = load_profile("conformance", shipped, Reference)
+        if reference.autopilot == autopilot:
+            return reference
+    known = ", ".join(list_profiles("conformance"))
+    accepted = f"{known}, or a path to a .toml"
+    problem = f"nothing stored for HEARTBEAT.autopilot {autopilot}; accepted: {accepted}"
+    raise FieldError("reference", AUTO, problem=problem)
+
 
 SCHEMA = 1
 

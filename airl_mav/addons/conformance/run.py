@@ -15,8 +15,14 @@ from airl_mav.addons.conformance.checklist import (
     require,
 )
 from airl_mav.addons.conformance.ground_checks import GROUND_CHECKS, heartbeat
-from airl_mav.addons.conformance.reference import AUTO, judge, load_reference, summary
-from airl_mav.addons.conformance.result import ConformanceResult, ConformanceSettings
+from airl_mav.addons.conformance.result import (
+    AUTO,
+    ConformanceResult,
+    ConformanceSettings,
+    judge,
+    load_reference,
+    summary,
+)
 from airl_mav.addons.conformance.steps import (
     BEFORE_S,
     MANOEUVRES,

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.addons.conformance.checklist import Transcript
-from airl_mav.addons.conformance.mavlink_names import (
+from airl_mav.addons.conformance.checklist import (
     ARMED_FLAG,
     LandedState,
     MavCommand,
     MavResult,
+    Transcript,
     name_of,
 )
 from airl_mav.core.clock import WallClock

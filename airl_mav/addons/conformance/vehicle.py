@@ -10,6 +10,7 @@ import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
+from enum import Enum
 from typing import Any, NamedTuple
 
 from mavsdk import ComponentType
@@ -18,12 +19,19 @@ from mavsdk.plugins.action import Action
 from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
 from mavsdk.plugins.offboard import Offboard, VelocityBodyYawspeed, VelocityNedYaw
 
-from airl_mav.addons.conformance import mavlink_names, telemetry, vehicle_clock
-from airl_mav.addons.conformance.autopilots import AUTOPILOTS, PX4, Autopilot
-from airl_mav.addons.conformance.checklist import Transcript
+from airl_mav.addons.conformance import checklist, telemetry
+from airl_mav.addons.conformance.checklist import (
+    AUTOPILOTS,
+    PX4,
+    Autopilot,
+    MavCommand,
+    Transcript,
+    command_long,
+)
 from airl_mav.addons.conformance.steps import StepSetpoint
-from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import US_PER_S
+from airl_mav.addons.conformance.telemetry import AUTOPILOT_COMPONENT, TelemetryBuffer
+from airl_mav.core.clock import NS_PER_US, WallClock
+from airl_mav.core.constants import MS_PER_S, US_PER_S
 from airl_mav.core.errors import FieldError
 from companion.interfaces import LinkError
 from companion.mavsdk_connection import first_autopilot, open_connection
@@ -55,7 +63,7 @@ class VehicleConnection:
         self.url, self.speed = url, speed
         self.transcript = transcript
         self.telemetry = telemetry.TelemetryBuffer(transcript)
-        self.clock = vehicle_clock.VehicleClock(self.telemetry, self.send, speed)
+        self.clock = VehicleClock(self.telemetry, self.send, speed)
         self.autopilot: Autopilot = PX4
         self.unasked_hz: Mapping[str, float] = {}
         """Expected default messages [Hz]."""
@@ -78,7 +86,7 @@ class VehicleConnection:
         self._direct = MavlinkDirect(system)
         for name in telemetry.MESSAGES:
             self._direct.subscribe_message(name, self.telemetry.receive)
-        for name in vehicle_clock.MESSAGES:
+        for name in MESSAGES:
             self._direct.subscribe_message(name, self.clock.receive)
         self.action, self.offboard = Action(system), Offboard(system)
 
@@ -117,9 +125,9 @@ class VehicleConnection:
     def command(self, number: int, *params: float, note: str = "") -> int:
         """Send a COMMAND_LONG until answered and return its MAV_RESULT. Raises LinkError."""
         values = " ".join(f"{value:g}" for value in params)
-        what = f"{mavlink_names.name_of(mavlink_names.MavCommand, number)} {values}".strip()
+        what = f"{checklist.name_of(checklist.MavCommand, number)} {values}".strip()
         self.transcript.add("sent", f"COMMAND_LONG {what}{note and f': {note}'}")
-        message = self._message("COMMAND_LONG", mavlink_names.command_long(number, *params))
+        message = self._message("COMMAND_LONG", checklist.command_long(number, *params))
         for left in reversed(range(COMMAND_ATTEMPTS)):
             try:
                 answer = self._direct.send_command(message)
@@ -131,8 +139,8 @@ class VehicleConnection:
 
     def set_mode(self, mode: tuple[int, int], note: str) -> int:
         """Request a mode, by DO_SET_MODE's parameters 2 and 3, and return the MAV_RESULT."""
-        flags = mavlink_names.CUSTOM_MODE_FLAG | (mavlink_names.ARMED_FLAG if self.armed else 0)
-        return self.command(mavlink_names.MavCommand.DO_SET_MODE, flags, *mode, note=note)
+        flags = checklist.CUSTOM_MODE_FLAG | (checklist.ARMED_FLAG if self.armed else 0)
+        return self.command(checklist.MavCommand.DO_SET_MODE, flags, *mode, note=note)
 
     def fly(self, setpoint: StepSetpoint) -> float:
         """Send a setpoint, repeated by MAVSDK at 20 Hz; return its arrival [s, vehicle time]."""
@@ -212,7 +220,7 @@ class VehicleConnection:
     @property
     def armed(self) -> bool:
         """True if the newest heartbeat reports armed."""
-        return bool(self._newest("HEARTBEAT", "base_mode") & mavlink_names.ARMED_FLAG)
+        return bool(self._newest("HEARTBEAT", "base_mode") & checklist.ARMED_FLAG)
 
     @property
     def mode(self) -> int:
@@ -256,7 +264,7 @@ class VehicleConnection:
 class RawSetpoint(NamedTuple):
     """SET_POSITION_TARGET_LOCAL_NED; None is NaN."""
 
-    frame: mavlink_names.MavFrame = mavlink_names.MavFrame.LOCAL_NED
+    frame: checklist.MavFrame = checklist.MavFrame.LOCAL_NED
     mask: int = VELOCITY_AND_YAW
     vx: float | None = 0.0
     yaw_rad: float = 0.0
@@ -306,3 +314,124 @@ class SetpointStream:
             # Missed setpoints are skipped.
             due_us = max(due_us + int(STREAM_PERIOD_S * US_PER_S), clock.time_us())
             clock.sleep_until(due_us, self._stop)
+
+
+MESSAGES = ("SYSTEM_TIME", "TIMESYNC")  # Messages that `VehicleClock.receive` takes
+ANSWER_S = 2.0  # Answer timeout [wall s]
+SAME_CLOCK_S = 1.0  # Maximum difference between an answer and telemetry of the same clock [s]
+ATTEMPTS = 8  # Maximum exchanges in a row
+SHORT_US = 2000  # Maximum age of an exchange's middle [wall µs]
+SYSTEM_TIME_ID = 2
+
+
+class Method(Enum):
+    """Method to request the vehicle's time."""
+
+    TIMESYNC = "TIMESYNC"
+    SYSTEM_TIME = "REQUEST_MESSAGE(SYSTEM_TIME)"
+    """Needed for PX4 1.16, whose TIMESYNC answer lacks a target, so that MAVSDK drops it."""
+    TELEMETRY = "the newest telemetry"
+    """No request: up to one message early."""
+
+
+class Exchange(NamedTuple):
+    """Request and answer."""
+
+    boot_s: float
+    """Vehicle time since boot at the answer [s]."""
+    middle_us: float
+    """Midpoint between request and answer [wall µs]."""
+    round_trip_us: int
+    """Time from request to answer [wall µs]."""
+
+
+class VehicleClock:
+    """Requests the vehicle's time, by the first supported method."""
+
+    def __init__(
+        self, telemetry: TelemetryBuffer, send: Callable[[str, dict[str, Any]], None], speed: float
+    ) -> None:
+        self._telemetry, self._send, self._speed = telemetry, send, speed
+        self.wall = WallClock()
+        self._question = 0
+        """ts1 of the newest TIMESYNC [ns]."""
+        self._answer: tuple[float, int] | None = None
+        """Time since boot [s], and its reception time [wall µs]."""
+        self._answered = threading.Event()
+        self.method = Method.TIMESYNC
+        self.inexact = 0
+        """Number of sending times taken from telemetry because an answer was missing."""
+
+    def receive(self, message: Any, _: object) -> None:
+        """Process a SYSTEM_TIME or TIMESYNC of MAVSDK's mavlink_direct."""
+        if message.component_id != AUTOPILOT_COMPONENT or self._answered.is_set():
+            return
+        received_us, fields = self.wall.time_us(), json.loads(message.fields_json)
+        if message.message_name != self.method.name:
+            return
+        if self.method is Method.SYSTEM_TIME:
+            boot_s = fields["time_boot_ms"] / MS_PER_S
+        elif fields["tc1"] and fields["ts1"] == self._question:
+            boot_s = fields["tc1"] / (US_PER_S * NS_PER_US)
+        else:
+            return
+        self._answer = boot_s, received_us
+        self._answered.set()
+
+    def choose_method(self) -> Method:
+        """Select the first method that the vehicle answers."""
+        for self.method in Method:
+            if self._ask() is not None:
+                break
+        return self.method
+
+    def exchange(self) -> Exchange | None:
+        """Return the first exchange that is short enough, or the shortest of several."""
+        best: Exchange | None = None
+        for _ in range(ATTEMPTS):
+            found = self._ask()
+            if found is None:
+                break
+            if self.wall.time_us() - found.middle_us <= SHORT_US:
+                return found
+            if best is None or found.round_trip_us < best.round_trip_us:
+                best = found
+        return best
+
+    def now(self) -> float:
+        """Return the vehicle's time since boot [s], from the newest telemetry without an answer."""
+        found = self.exchange()
+        return self._telemetry.boot_s if found is None else found.boot_s
+
+    def sending_time(self) -> float:
+        """Return the arrival time of a message that is sent right after this call [s]."""
+        newest_s, found = self._telemetry.boot_s, self.exchange()
+        if found is None:
+            self.inexact += 1
+            return newest_s
+        since_us = self.wall.time_us() - found.middle_us
+        return found.boot_s + since_us * self._speed / US_PER_S
+
+    def _ask(self) -> Exchange | None:
+        """Exchange once; None without an answer, or for an answer by another clock."""
+        if self.method is Method.TELEMETRY:
+            return None
+        newest_s = self._telemetry.boot_s
+        self._answer = None
+        # Set before an answer can come.
+        self._question += 1
+        self._answered.clear()
+        asked_us = self.wall.time_us()
+        if self.method is Method.TIMESYNC:
+            self._send("TIMESYNC", {"tc1": 0, "ts1": self._question})
+        else:
+            self._telemetry.unlogged_acks[MavCommand.REQUEST_MESSAGE] += 1
+            question = command_long(MavCommand.REQUEST_MESSAGE, SYSTEM_TIME_ID)
+            self._send("COMMAND_LONG", question)
+        if not self._answered.wait(ANSWER_S) or self._answer is None:
+            return None
+        boot_s, received_us = self._answer
+        # Before the first telemetry there is nothing to compare with.
+        if newest_s > 0.0 and abs(boot_s - newest_s) > SAME_CLOCK_S:
+            return None
+        return Exchange(boot_s, (asked_us + received_us) / 2.0, received_us - asked_us)

@@ -15,15 +15,15 @@ from foxglove.websocket import ChannelView, Client, ServerListener
 from airl_mav.addons.export_log.recorded import RecordedFlight
 from airl_mav.addons.export_log.told import FlightMessages
 from airl_mav.addons.export_log.ulog_log import write_ulog
+from airl_mav.black_box.mcap_file import McapFile
 from airl_mav.black_box.messages import Channel
-from airl_mav.black_box.writing import McapFile
 from airl_mav.core.clock import NS_PER_US, Clock, WallClock
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.files import replacing
 from airl_mav.rehearsal.run_folder import info_data
-from airl_mav.report.replay.runs import ReplayedRun
-from firmware_sim.flight_log.log_folder import ULOG_SUFFIX
+from airl_mav.report.replay.flight import ReplayedRun
+from firmware_sim.flight_log.flight_log import ULOG_SUFFIX
 
 PAUSE_US = 2_000_000
 """Pause between repetitions of a flight [wall µs]."""

@@ -48,7 +48,7 @@ from airl_mav.black_box.messages import (
 from airl_mav.core.clock import since_1970_us
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.frames import frd_to_flu, quat_flu_from_optical
-from airl_mav.flight.smoothness import commanded_velocity
+from airl_mav.flight.quality import commanded_velocity
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from airl_mav.addons.export_log.recorded import RecordedFlight, charge_of
 from airl_mav.core.frames import quat_from_euler, quats_to_euler
-from airl_mav.flight.smoothness import commanded_velocity
+from airl_mav.flight.quality import commanded_velocity
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import ATTITUDE, RATES, SETPOINT
 from airl_mav.report.replay.flight import INFO, STANDING_M, WARNING
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.mode_numbers import NAVIGATION_STATES
+from firmware_sim.autopilot.commander import NAVIGATION_STATES
 from firmware_sim.flight_log.flight_log import DESCRIBED
 from firmware_sim.flight_log.topics import ARMED, DISARMED, ON_CHANGE_US, ROTARY_WING, TOPICS
 from firmware_sim.flight_log.ulog import Topic, UlogWriter, Values

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from airl_mav.addons.profiling import measurement
-from airl_mav.addons.profiling.bare import BareLoop
-from airl_mav.addons.profiling.policy_under_test import PolicyUnderTest, open_policy
+from airl_mav.addons.profiling.policy_under_test import BareLoop, PolicyUnderTest, open_policy
 from airl_mav.addons.profiling.request import ProfileRequest
 from airl_mav.addons.profiling.soak import MachineReading, Soak, soak
 from airl_mav.core.clock import WallClock, utc_now
@@ -132,7 +131,7 @@ def profile(
 def _measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> measurement.Recording:
     """Measure at the requested level. Imports late: only sitl needs the simulator."""
     if request.level == "bare":
-        from airl_mav.addons.profiling.bare import measure
+        from airl_mav.addons.profiling.policy_under_test import measure
     elif request.level == "hil":
         from airl_mav.addons.profiling.hil import measure
     else:

@@ -9,7 +9,7 @@ from pydantic import Field, field_validator
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import quantity
-from airl_mav.latency.source import duration_ms
+from airl_mav.latency.injection import duration_ms
 from airl_mav.scenario.aircraft import Ports
 from airl_mav.scenario.model import GREATEST_SEED, Inference
 from airl_mav.scenario.stand_alone import CompanionAddresses

@@ -9,9 +9,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from airl_mav.addons.profiling.bare import cold_start
 from airl_mav.addons.profiling.measurement import ProfilingError, Recording, Stamps
-from airl_mav.addons.profiling.policy_under_test import PolicyUnderTest
+from airl_mav.addons.profiling.policy_under_test import PolicyUnderTest, cold_start
 from airl_mav.addons.profiling.request import FLOWN_SPEED_M_S, ProfileRequest
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.progress import Bar, Progress

@@ -15,7 +15,7 @@ from airl_mav.addons.refit.air import Air
 from airl_mav.addons.refit.quantity import FittedQuantity
 from airl_mav.addons.refit.response import ResponseFit
 from airl_mav.addons.refit.thrust import Thrust
-from airl_mav.black_box.reading import BlackBox
+from airl_mav.black_box.mcap_file import BlackBox
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.files import replace_file, write_json

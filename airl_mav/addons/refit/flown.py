@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.black_box.mcap_file import BlackBox
 from airl_mav.black_box.messages import Decision, Phase
-from airl_mav.black_box.reading import BlackBox
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.trajectory import Trajectory

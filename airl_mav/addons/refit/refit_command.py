@@ -78,8 +78,7 @@ def run(options: RefitOptions, console: Console | None = None) -> int:
     console = console or new_console()
     check_installed("sim", "refit")
     # Imported here: MCAP and pyulog are extras.
-    from airl_mav.addons.refit.refit import refit
-    from airl_mav.addons.refit.together import refit_together
+    from airl_mav.addons.refit.refit import refit, refit_together
 
     if len(options.flights) > 1:
         if options.ulg is not None:

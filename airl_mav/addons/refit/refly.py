@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.addons.refit.files import REFIT_FILE, VEHICLE_FILE
 from airl_mav.addons.refit.refit import SCHEMA
-from airl_mav.black_box.reading import BlackBox, read_black_box
+from airl_mav.black_box.mcap_file import BlackBox, read_black_box
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.files import read_typed, replace_file, write_json
 from airl_mav.core.frames import Goal, goal_height_m, quat_yaw
 from airl_mav.core.plugins import names_code
-from airl_mav.experiments.fly import rehearse
+from airl_mav.experiments.run import rehearse
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import successful
 from airl_mav.flight.trajectory import Trajectory

@@ -31,8 +31,7 @@ from airl_mav.policy.card import vehicle_mismatch
 from airl_mav.policy.learned import load_learned
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.profiles.computer import ComputerProfile, load_computer
-from airl_mav.profiles.conditions import Payload
-from airl_mav.profiles.loaded import loaded
+from airl_mav.profiles.conditions import Payload, loaded
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.report.document import Document, write_document
 from airl_mav.scenario import model

@@ -9,9 +9,8 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.addons.sweep.document import document_of
+from airl_mav.addons.sweep.document import document_of, print_plan
 from airl_mav.addons.sweep.run import SweepRequest, run_sweep
-from airl_mav.addons.sweep.tables import print_plan
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError

@@ -11,17 +11,25 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from airl_mav.addons.sweep.config import SweepConfig, load_sweep
-from airl_mav.addons.sweep.store import SweepFolder, declaration
-from airl_mav.addons.sweep.summary import Computer, Sweep, estimated_ms, summarize, write_sweep
-from airl_mav.addons.sweep.trial import (
+from airl_mav.addons.sweep.config import (
+    SweepConfig,
     TrainedTrial,
     Trial,
     TrialResult,
+    load_sweep,
     result_of,
     size_of,
     training_of,
     trials,
+)
+from airl_mav.addons.sweep.summary import (
+    Computer,
+    Sweep,
+    SweepFolder,
+    declaration,
+    estimated_ms,
+    summarize,
+    write_sweep,
 )
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
@@ -36,7 +44,7 @@ from airl_mav.policy.learned import load_learned
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
-from airl_mav.rehearsal.lock import locked
+from airl_mav.rehearsal.run_folder import locked
 from airl_mav.scenario.model import Workers
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.run import export_best, fit, nominal

@@ -15,8 +15,7 @@ from airl_mav.flight.statistics import Estimate
 from airl_mav.profiles.published import load_published, published_gap
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
-from airl_mav.report.comparison.build import compare
-from airl_mav.report.comparison.documents import comparison_document
+from airl_mav.report.comparison.build import compare, comparison_document
 from airl_mav.report.comparison.model import Comparison, Contrast, ContrastEntry, RunEntry
 from airl_mav.report.comparison.tables import common_rules, contrasts_table, plain_facts, signed
 from airl_mav.report.document import Document, Section

@@ -12,8 +12,7 @@ from airl_mav.flight.statistics import Estimate
 from airl_mav.profiles.published import PublishedRun, load_published, published_gap
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import measures
-from airl_mav.report.comparison.build import compare
-from airl_mav.report.comparison.documents import comparison_document, worst_seeds
+from airl_mav.report.comparison.build import compare, comparison_document, worst_seeds
 from airl_mav.report.comparison.figures import contrast_pictures, flight_panels, seed_picture
 from airl_mav.report.comparison.model import (
     ComparedRun,

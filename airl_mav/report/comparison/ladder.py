@@ -10,8 +10,7 @@ from typing import Any
 from airl_mav.flight.judge import Outcome
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison import tables
-from airl_mav.report.comparison.build import compare
-from airl_mav.report.comparison.documents import comparison_document, split_seeds, widest_seeds
+from airl_mav.report.comparison.build import compare, comparison_document, split_seeds, widest_seeds
 from airl_mav.report.comparison.figures import contrast_pictures
 from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast, RunEntry
 from airl_mav.report.document import Document, Section

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.comparison.build import compare
-from airl_mav.report.comparison.documents import comparison_document
+from airl_mav.report.comparison.build import compare, comparison_document
 from airl_mav.report.comparison.model import ComparedRun, Comparison, RunEntry
 from airl_mav.report.comparison.tables import plain_facts
 from airl_mav.report.document import Document, Section

@@ -8,11 +8,11 @@ from dataclasses import replace
 from airl_mav.latency.stages import SETPOINT_TO_MOTOR, SHOWN_STAGES
 from airl_mav.report import table
 from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast
-from airl_mav.report.conduct import CONDUCT_NOTE
 from airl_mav.report.document import Facts, Headline, estimate_headline
 from airl_mav.report.measures import (
     COMPUTER_ENERGY,
     CONDUCT,
+    CONDUCT_NOTE,
     FEW_FLIGHTS,
     MEASURES,
     QualityMeasure,

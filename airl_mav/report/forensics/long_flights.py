@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.footprints import bounding_boxes, segments_clear
+from airl_mav.arena.placement import bounding_boxes, segments_clear
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import goal_distance_m
 from airl_mav.flight.judge import Outcome

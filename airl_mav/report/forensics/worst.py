@@ -2,25 +2,273 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
 from airl_mav.envs.stopping import braking_of
 from airl_mav.flight.judge import Outcome
+from airl_mav.flight.quality import measure_leg
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.trajectory import Trajectory, pose_at
+from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.forensics import evidence
-from airl_mav.report.forensics.camera_view import PolicyCamera
-from airl_mav.report.forensics.causes import cause_of
+from airl_mav.report.forensics.camera_view import (
+    ObstacleView,
+    PolicyCamera,
+    bearing,
+    passes_through,
+    view_obstacle,
+    view_wall,
+)
+from airl_mav.report.forensics.long_flights import cause_of_long_flight
 from airl_mav.report.table import NONE, OUTCOME_LABELS, TableView, columns_of
+
+LOOK_BACK = 5
+"""Number of decisions before a collision with examined frames."""
+
+SEEN_SHARE = 0.002
+"""Minimum share of the image for a visible obstacle: 6 pixels of 64 x 48."""
+
+_THING = re.compile(r"hit (?:(?:static|moving)-)?([a-z]+(?:-[a-z]+)*(?:[- ](\d+))?)")
+
+
+@dataclass(frozen=True)
+class CollisionAnalysis:
+    """Analysis of a collision."""
+
+    what: str
+    """Obstacle as named by the plant: `static-box-3`, `wall`, `floor`."""
+    speed_m_s: float
+    """Speed at the collision."""
+    off_heading_rad: float
+    """Direction of flight at the collision relative to the heading, positive to the right."""
+    before_s: float | None
+    """Time from the exposure of the last effective frame to the collision [s]; None if no decision
+    took effect."""
+    blind_m: float | None
+    """Distance flown since that exposure."""
+    lag_s: float | None
+    """Time from that exposure to the motors' response."""
+    lag_m: float | None
+    """Distance flown before the motors' response."""
+    answer_m_s: float | None
+    """Speed at the motors' response."""
+    view: ObstacleView | None
+    """Point of impact as seen in that frame; None without the arena or the camera."""
+    glass: bool
+    """True if the obstacle is glass and the camera measures through it."""
+    seen: tuple[bool, ...]
+    """Visibility of the obstacle in each of the last frames with a decision, oldest first."""
+
+
+def decisions_in_effect(stamps: Mapping[str, NDArray[Any]], ended_us: int) -> NDArray[np.int64]:
+    """Return the decisions that moved the motors before a time, or the sent ones if unknown."""
+    if "sent_us" not in stamps or "capture_us" not in stamps:
+        return np.zeros(0, np.int64)
+    acts = stamps["sent_us"]
+    motor = stamps.get("motor_us")
+    if motor is not None and np.any(motor != NO_STAMP):
+        acts = motor
+    flown = (acts != NO_STAMP) & (acts <= ended_us) & (stamps["capture_us"] != NO_STAMP)
+    return np.flatnonzero(flown).astype(np.int64)
+
+
+def hit_number(reason: str, arena: Arena | None) -> int | None:
+    """Return the obstacle number in a verdict; None for walls, floor and unknown obstacles."""
+    found = _THING.match(reason)
+    if found is None or found[2] is None or arena is None:
+        return None
+    number = int(found[2])
+    return number if number < len(arena.obstacles) else None
+
+
+def examine_collision(flight: evidence.Evidence) -> CollisionAnalysis | None:
+    """Return the analysis of a collision; None without a collision or a recording."""
+    record, path, stamps, arena = flight.record, flight.path, flight.stamps, flight.arena
+    if record.outcome is not Outcome.COLLISION or not len(path):
+        return None
+    hit_us = record.ended_us
+    _, velocity, quaternion = pose_at(path, hit_us)
+    number = hit_number(record.reason, arena)
+    before_s = blind_m = lag_s = lag_m = answer_m_s = view = None
+    seen: tuple[bool, ...] = ()
+    glass = False
+    decisions = decisions_in_effect(stamps, hit_us)
+    if decisions.size:
+        frames = stamps["capture_us"][decisions[-LOOK_BACK:]]
+        frame_us = int(frames[-1])
+        before_s, blind_m = (
+            (hit_us - frame_us) / US_PER_S,
+            measure_leg(path, frame_us, hit_us).distance_m,
+        )
+        motor_us = int(stamps.get("motor_us", stamps["sent_us"])[decisions[-1]])
+        if motor_us != NO_STAMP:
+            lag_s, lag_m = (
+                (motor_us - frame_us) / US_PER_S,
+                measure_leg(path, frame_us, motor_us).distance_m,
+            )
+            answer_m_s = float(np.linalg.norm(pose_at(path, motor_us)[1]))
+        if arena is not None and flight.camera is not None:
+            if number is not None:
+                began_us, camera = record.started_us, flight.camera
+                views = [
+                    view_obstacle(path, int(frame), hit_us, arena, began_us, number, camera)
+                    for frame in frames
+                ]
+                view = views[-1]
+                glass = passes_through(arena, number, camera)
+                seen = tuple((v.share or 0.0) >= SEEN_SHARE for v in views)
+            elif "wall" in record.reason:
+                view = view_wall(path, frame_us, hit_us, arena)
+    return CollisionAnalysis(
+        what=record.reason.removeprefix("hit ").removesuffix(" during the take-off"),
+        speed_m_s=float(np.linalg.norm(velocity)),
+        off_heading_rad=bearing(quaternion, velocity) if math.hypot(*velocity[:2]) > 0.2 else 0.0,
+        before_s=before_s,
+        blind_m=blind_m,
+        lag_s=lag_s,
+        lag_m=lag_m,
+        answer_m_s=answer_m_s,
+        view=view,
+        glass=glass,
+        seen=seen,
+    )
+
+
+SLOW_EXCESS = 0.25
+"""Excess over the run's median, as a fraction, above which a flight is slow or long."""
+
+ACT_S = 0.2
+"""Minimum time from the motors' response to an effect on the path [s]: a multicopter has to tilt
+before it brakes or swerves."""
+
+USUAL = "as usual"
+
+
+def cause_of(flight: evidence.Evidence, usual: evidence.UsualFlight) -> evidence.Cause:
+    """Return the cause of a failure or of a longer flight than usual."""
+    outcome = flight.record.outcome
+    if outcome is Outcome.ABORTED:
+        return evidence.Cause("aborted", (f"{flight.record.reason}.",))
+    if outcome is Outcome.COLLISION:
+        crash = examine_collision(flight)
+        return (
+            evidence.Cause(evidence.NO_CAUSE, ())
+            if crash is None
+            else _cause_of_collision(flight, crash)
+        )
+    if not len(flight.path):
+        return evidence.Cause(evidence.NO_CAUSE, ())
+    if outcome is Outcome.SUCCESS and not _slow(flight.record, usual):
+        return evidence.Cause(USUAL, ())
+    return cause_of_long_flight(flight, usual)
+
+
+def _slow(record: EpisodeRecord, usual: evidence.UsualFlight) -> bool:
+    """Return True if time or distance of a flight clearly exceeds the run's median."""
+    lost, excess = evidence.time_lost_s(record, usual), evidence.path_excess(record)
+    if lost is None or excess is None or usual.pace_s_m is None or usual.path_ratio is None:
+        return False
+    slow = lost > SLOW_EXCESS * usual.pace_s_m * evidence.straight_m(record)
+    return slow or excess + 1.0 > (1.0 + SLOW_EXCESS) * usual.path_ratio
+
+
+def _cause_of_collision(flight: evidence.Evidence, crash: CollisionAnalysis) -> evidence.Cause:
+    if flight.record.navigation_us is None or flight.record.reason.endswith("take-off"):
+        return evidence.Cause("hit during the take-off", (f"At {crash.speed_m_s:.1f} m/s.",))
+    if crash.before_s is None or crash.blind_m is None:
+        return evidence.Cause(
+            "hit before the first decision", ("No decision had reached the motors yet.",)
+        )
+    sentences = [
+        f"The last frame that still moved the motors was {crash.before_s:.2f} s old at the "
+        f"collision; the vehicle flew {crash.blind_m:.1f} m on it."
+    ]
+    kind = evidence.NO_CAUSE
+    if (view := crash.view) is not None:
+        sentences.insert(0, _where(crash, flight.camera))
+        half_angle = flight.camera.half_angle_rad if flight.camera else math.pi
+        aside = flight.camera.aside_rad if flight.camera else abs
+        shown = crash.seen[-1] if crash.seen else aside(view.bearing_rad) <= half_angle
+        if crash.glass:
+            kind = "glass, which depth passes through"
+        elif not shown:
+            kind = "hidden behind something nearer" if view.hidden else "hit out of the picture"
+        else:
+            kind = _seen(crash, view, flight.braking_m)
+        if len(crash.seen) > 1 and not crash.glass:
+            sentences.append(
+                f"It was in {sum(crash.seen)} of the last {len(crash.seen)} frames used."
+            )
+        if aside(crash.off_heading_rad) > half_angle:
+            sentences.append(
+                f"It was flying {_side(crash.off_heading_rad)} of its heading, where the camera "
+                "does not look."
+            )
+    if crash.lag_s is not None and crash.lag_m is not None:
+        sentences.append(
+            f"Until the motors answered that frame, {crash.lag_s:.2f} s and {crash.lag_m:.1f} m "
+            f"went by; speed at the collision {crash.speed_m_s:.1f} m/s."
+        )
+    return evidence.Cause(kind, tuple(sentences))
+
+
+def _seen(
+    crash: CollisionAnalysis, view: ObstacleView, braking_m: Callable[[float], float] | None
+) -> str:
+    """Return the cause for a visible obstacle, by the time to act and the distance to stop."""
+    if crash.lag_m is None or crash.lag_s is None or crash.before_s is None:
+        return "seen and flown into"
+    if crash.before_s - crash.lag_s < ACT_S:
+        return "seen too late to act"
+    room_m = max(0.0, view.distance_m - evidence.HALF_WIDTH_M - crash.lag_m)
+    if braking_m is None or crash.answer_m_s is None:
+        return "seen and flown into"
+    stops = braking_m(crash.answer_m_s) <= room_m
+    return "seen and flown into" if stops else "seen too late to stop"
+
+
+def _where(crash: CollisionAnalysis, camera: PolicyCamera | None) -> str:
+    """Return a sentence on the obstacle's position in the last effective frame."""
+    view = crash.view
+    if view is None or camera is None:
+        return ""
+    place = f"{view.distance_m:.1f} m off, {_side(view.bearing_rad)}"
+    if view.share is not None and view.share >= SEEN_SHARE:
+        return f"On the last frame used, {crash.what} filled {view.share:.1%} of it: {place}."
+    limit = math.degrees(camera.half_angle_rad)
+    if crash.glass:
+        return f"{crash.what} is of glass; the camera measured through it. It lay {place}."
+    if view.hidden:
+        return f"On the last frame used, {crash.what} was hidden by something nearer: {place}."
+    if camera.aside_rad(view.bearing_rad) > camera.half_angle_rad:
+        return (
+            f"On the last frame used, {crash.what} lay {place}; the camera sees {limit:.0f}° to "
+            "either side."
+        )
+    if view.share is None:
+        return f"On the last frame used, the spot of the {crash.what} that was hit lay {place}."
+    return f"On the last frame used, {crash.what} was barely in the picture: {place}."
+
+
+def _side(angle_rad: float) -> str:
+    degrees = round(math.degrees(angle_rad))
+    if degrees == 0:
+        return "straight ahead"
+    return f"{abs(degrees)}° to the {'right' if degrees > 0 else 'left'}"
+
 
 EXAMINED = 100
 """Maximum number of flights with a derived cause, worst first."""

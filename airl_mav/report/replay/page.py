@@ -11,8 +11,7 @@ from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.report.replay.flight import ReplayedFlight, parting_s
-from airl_mav.report.replay.runs import ReplayedRun, ReplayedRuns
+from airl_mav.report.replay.flight import ReplayedFlight, ReplayedRun, ReplayedRuns, parting_s
 from airl_mav.view.panel import Panel
 from airl_mav.view.scene import FlightScene
 from airl_mav.view.shown import Shown

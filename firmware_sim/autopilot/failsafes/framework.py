@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Severity
+from firmware_sim.autopilot.commander import custom_mode
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import MavlinkEvent
 from firmware_sim.autopilot.events.enumerations import FailsafeCause
@@ -35,7 +36,6 @@ from firmware_sim.autopilot.failsafes.table import (
     mode_of,
     possible,
 )
-from firmware_sim.autopilot.mode_numbers import custom_mode
 
 _WARNINGS = {
     FailsafeReason.BATTERY_LOW: events.FAILSAFE_BATTERY_LOW,

@@ -34,8 +34,7 @@ from firmware_sim.autopilot.failsafes.framework import (
     update,
 )
 from firmware_sim.autopilot.failsafes.watch import Watch
-from firmware_sim.autopilot.prearm import PrearmCheck
-from firmware_sim.autopilot.readiness import ArmingSettings, Readiness
+from firmware_sim.autopilot.prearm import ArmingSettings, PrearmCheck, Readiness
 from firmware_sim.autopilot.sensor_monitor import NO_DATA_US
 from firmware_sim.interfaces import SensorSample
 

@@ -14,7 +14,7 @@ from airl_mav.core.frames import Vector, quat_yaw, wrap_pi
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import OperatorText, OrbitStatus, Severity
 from firmware_sim.autopilot.error_state import RATES, P, Q
-from firmware_sim.autopilot.events import command_events as events
+from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.modes.interface import (
     NAN,
     FlightContext,

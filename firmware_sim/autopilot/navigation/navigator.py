@@ -10,7 +10,7 @@ import numpy as np
 from airl_mav.core.frames import Geodetic, local_to_geodetic
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Severity
-from firmware_sim.autopilot.events import command_events
+from firmware_sim.autopilot.events import flight_events
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.failsafes.conditions import FenceBreach
 from firmware_sim.autopilot.failsafes.watch import Reports
@@ -107,7 +107,7 @@ class Navigator:
         there = [here if math.isnan(axis) else axis for axis, here in wanted]
         if self.fence.inside(local_to_geodetic(np.array(there), now.origin), now.home):
             return request
-        height, place = command_events.ALTITUDE_OUTSIDE, command_events.REPOSITION_OUTSIDE
+        height, place = flight_events.ALTITUDE_OUTSIDE, flight_events.REPOSITION_OUTSIDE
         why = height if request.altitude_alone else place
         self._crew.say(OperatorText.of(Severity.CRITICAL, why))
         return None

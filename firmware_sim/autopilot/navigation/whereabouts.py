@@ -10,7 +10,7 @@ from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.home import Home
 from firmware_sim.autopilot.modes.interface import here, triple
 from firmware_sim.autopilot.navigation.flown_item import ExecutorState
-from firmware_sim.autopilot.newest_sensors import NewestSensors
+from firmware_sim.autopilot.sensor_monitor import NewestSensors
 
 
 class Whereabouts:

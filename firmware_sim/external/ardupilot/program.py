@@ -11,7 +11,7 @@ from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.frames import HOME
 from firmware_sim.external.parameter_file import ardupilot_file
 from firmware_sim.external.process import StartCommand
-from firmware_sim.flight_controller import FirmwareMissingError
+from firmware_sim.interfaces import FirmwareMissingError
 
 SIMULATOR_PORT, PORTS_PER_INSTANCE = 9002, 10
 """Port to which instance 0 sends its servo packets, and the step to the next instance (`-I`)."""

@@ -18,8 +18,13 @@ from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import UsageError
 from firmware_sim.external.ardupilot.program import PORTS_PER_INSTANCE, SIMULATOR_PORT
 from firmware_sim.external.launcher import no_process
-from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
+from firmware_sim.interfaces import (
+    ActuatorControls,
+    FirmwareLostError,
+    FirmwareMissingError,
+    SensorSample,
+    TrueState,
+)
 from firmware_sim.mavlink.endpoint import Address
 
 MAGIC_16, MAGIC_32 = 18_458, 29_569

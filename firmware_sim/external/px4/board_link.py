@@ -17,7 +17,7 @@ from firmware_sim.external.transport.serial_port import (
     carries_bytes_s,
     check_baud,
 )
-from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
+from firmware_sim.interfaces import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.codec import Encoder, Values, WireLayout, WireMessage, dialect
 
 HIL_SETUP = "set SYS_HITL = 1 with the airframe HIL Quadcopter X (SYS_AUTOSTART 1001) and reboot it"

@@ -17,8 +17,13 @@ from airl_mav.core.constants import TICK_HZ, US_PER_S
 from firmware_sim.external.launcher import no_process
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.external.px4.board_link import BoardLink
-from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
+from firmware_sim.interfaces import (
+    ActuatorControls,
+    FirmwareLostError,
+    FirmwareMissingError,
+    SensorSample,
+    TrueState,
+)
 
 SILENCE_US = US_PER_S
 """Maximum time without motor commands after the first command [wall µs]."""

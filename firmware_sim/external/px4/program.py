@@ -9,7 +9,7 @@ from pathlib import Path
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import UsageError
 from firmware_sim.external.process import StartCommand
-from firmware_sim.flight_controller import FirmwareMissingError
+from firmware_sim.interfaces import FirmwareMissingError
 
 SIMULATOR_PORT = 4560
 API_PORT, API_LOCAL_PORT = 14540, 14580

@@ -20,8 +20,13 @@ from firmware_sim.external.launcher import no_process
 from firmware_sim.external.process import RunningProgram, program_at
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.external.px4.program import MODEL, SIMULATOR_PORT, UNAWAITED_THREADS
-from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
-from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
+from firmware_sim.interfaces import (
+    ActuatorControls,
+    FirmwareLostError,
+    FirmwareMissingError,
+    SensorSample,
+    TrueState,
+)
 from firmware_sim.mavlink.codec import Decoder, Encoder, Values, WireLayout, WireMessage, dialect
 from firmware_sim.mavlink.streams.pose import hil_state_quaternion
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
-from firmware_sim.autopilot.events import command_events as events
+from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.interfaces import SensorSample
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.services.context import Action, Context, VehicleCommand

@@ -17,11 +17,11 @@ from typing import Any
 
 from airl_mav.profiles.parameters import SPECS, ParameterSpec
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.autopilot.events import check_events, command_events, flight_events
+from firmware_sim.autopilot.commander import STATE_BITS, custom_mode
+from firmware_sim.autopilot.events import check_events, flight_events
 from firmware_sim.autopilot.events.check_events import CheckEvent
 from firmware_sim.autopilot.events.definition import Definition, sub_id
 from firmware_sim.autopilot.events.enumerations import ENUMERATIONS, Enumeration, ModeGroup, words
-from firmware_sim.autopilot.mode_numbers import STATE_BITS, custom_mode
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.services.context import Context, VehicleCommand
 from firmware_sim.mavlink.services.transfers import crc32part
@@ -115,7 +115,7 @@ def _parameter_described(spec: ParameterSpec) -> dict[str, Any]:
 
 def definitions() -> Iterator[Definition]:
     """Yield all events that this vehicle can send."""
-    for module in (flight_events, command_events, check_events):
+    for module in (flight_events, check_events):
         for value in vars(module).values():
             if isinstance(value, Definition):
                 yield value

@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.mavlink.codec import Values
-from firmware_sim.mavlink.streams import distance, information, pose, sensors, status
+from firmware_sim.mavlink.streams import information, pose, sensors, status
 
 Builder = Callable[[AutopilotState], "Values | None"]
 """Returns one message's fields, in order of definition, from a snapshot; None = no content yet.
@@ -75,8 +75,8 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "PROTOCOL_VERSION": information.protocol_version,
         "HIGH_LATENCY2": status.high_latency2,
         # Last, because start times of streams depend on their order.
-        "DISTANCE_SENSOR": distance.distance_sensor,
-        "OPTICAL_FLOW_RAD": distance.optical_flow_rad,
+        "DISTANCE_SENSOR": sensors.distance_sensor,
+        "OPTICAL_FLOW_RAD": sensors.optical_flow_rad,
     }
 )
 """Streams that need only the snapshot; the server adds the others. None = packed by compiled code

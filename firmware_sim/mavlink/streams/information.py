@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from airl_mav.core.frames import geodetic_to_local
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Landed, Mode
-from firmware_sim.autopilot.mode_numbers import custom_mode
+from firmware_sim.autopilot.commander import custom_mode
 from firmware_sim.autopilot.navigation.return_path import return_time_s
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams.units import boot_ms

@@ -11,7 +11,7 @@ from typing import Final
 
 from airl_mav.core.frames import local_to_geodetic, quat_yaw
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed, Mode
-from firmware_sim.autopilot.mode_numbers import custom_mode
+from firmware_sim.autopilot.commander import custom_mode
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.px4_custom_mode import base_mode, system_status
 from firmware_sim.mavlink.streams import units
