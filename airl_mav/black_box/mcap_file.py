@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
+from mcap import records as mcap_records
 from mcap.exceptions import InvalidMagic, McapError
 from mcap.records import DataEnd, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader
