@@ -26,9 +26,9 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.rehearsal.channel import State
-from airl_mav.rehearsal.progress import Observer
+from airl_mav.rehearsal.observer import Observer
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from tests.support.px4_peer import write_build

@@ -38,7 +38,7 @@ from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import AnyAction, flyable
 from airl_mav.policy.observation import Kinematics, Observation
 from companion import pilot
-from companion.camera import ReceivedFrame
+from companion.frame_source import ReceivedFrame
 
 CALLS, REPEATS = 10_000, 50
 FLIGHTS, DECISIONS, WARM_UP = 3, 200, 20
@@ -119,7 +119,7 @@ def firmware(vehicle: str, folder: Path) -> Iterator[tuple[str, str]]:
     """Run a separate simulator; yield its two addresses."""
     udp = [free_port(socket.SOCK_DGRAM) for _ in range(2)]
     tcp = free_port(socket.SOCK_STREAM)
-    words = [sys.executable, "-m", "airl_mav.cli.firmware", "--vehicle", vehicle]
+    words = [sys.executable, "-m", "airl_mav.cli.firmware_command", "--vehicle", vehicle]
     words += ["--arena", "no-obstacles", "--api-port", f"{udp[0]}", "--gcs-port", f"{udp[1]}"]
     words += ["--api-local-port", "0", "--gcs-local-port", "0", "--camera-port", f"{tcp}"]
     said = folder / "firmware.log"

@@ -48,7 +48,7 @@ from airl_mav.profiles.loading import load_profile  # noqa: E402
 from airl_mav.profiles.vehicle import load_vehicle  # noqa: E402
 from airl_mav.view.ends import ViewEnds, ViewSettings  # noqa: E402
 from airl_mav.view.feed import Feed  # noqa: E402
-from airl_mav.view.messages import (  # noqa: E402
+from airl_mav.view.view_messages import (  # noqa: E402
     CameraImage,
     Decided,
     Episode,
@@ -255,7 +255,7 @@ def viewed(*, paced: bool = False) -> Iterator[Viewer]:
 def drawing_process() -> psutil.Process:
     """Return the view's own process."""
     children = psutil.Process().children()
-    return next(each for each in children if "airl_mav.view.server" in each.cmdline())
+    return next(each for each in children if "airl_mav.view.view_server" in each.cmdline())
 
 
 @contextmanager
@@ -286,7 +286,7 @@ def measure_live(folder: Path) -> None:
         open_page(page, viewer.url)
         wait_for(lambda: page.evaluate("window.told?.pose > 20"))
         server = next(
-            p for p in psutil.Process().children() if "airl_mav.view.server" in p.cmdline()
+            p for p in psutil.Process().children() if "airl_mav.view.view_server" in p.cmdline()
         )
         for size, name in (((900, 600), "page 900x600"),):
             page.resize(*size)
@@ -318,7 +318,7 @@ def measure_memory(folder: Path, minutes: float = 30.0, speed: float = 30.0) -> 
     with viewed() as viewer, browser(folder) as page:
         open_page(page, viewer.url)
         server = next(
-            p for p in psutil.Process().children() if "airl_mav.view.server" in p.cmdline()
+            p for p in psutil.Process().children() if "airl_mav.view.view_server" in p.cmdline()
         )
         with flying(viewer.ends, 60.0 * minutes, speed) as flight:
             wait_for(lambda: page.evaluate("window.told?.pose > 20"))
@@ -418,8 +418,8 @@ def measure_drawing(run: Path) -> None:
     """Measure the server's time to draw a moment of a replayed flight in the scene."""
     import viser
 
-    from airl_mav.report.replay.flight import ReplayedRun
     from airl_mav.report.replay.page import ReplayPage
+    from airl_mav.report.replay.replayed_flight import ReplayedRun
 
     began = time.process_time()
     replayed = ReplayedRun(run)

@@ -78,7 +78,7 @@ def wait_until_shown(page: Page, seconds: float = 60.0) -> None:
 
 
 def measure_lockstep(folder: Path, pairs: int = 4) -> None:
-    from airl_mav.lockstep.flight import fly
+    from airl_mav.lockstep.lockstep_flight import fly
 
     resolved = resolve(
         Scenario(policy="static-obstacles", level="lockstep", time_limit_s=60.0, speed=None)
@@ -250,7 +250,7 @@ def measure_training(folder: Path, pairs: int = 3) -> None:
 def train(config: str, out: str, ends: str | None) -> None:
     """Train once, and print wall and processor time."""
     from airl_mav.training.config import TrainingConfig
-    from airl_mav.training.run import train as learn
+    from airl_mav.training.training_run import train as learn
 
     view = None if ends is None else ViewEnds.model_validate_json(ends)
     wall, cpu = time.monotonic(), time.process_time()

@@ -27,7 +27,7 @@ from airl_mav.core.machine import temperature_c
 from airl_mav.core.provenance import describe_machine, git_state, package_versions
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.observation import Kinematics
-from companion.interfaces import BatteryState, VehicleStatus
+from companion.link_interface import BatteryState, VehicleStatus
 from companion.pilot import OLDEST_FRAME_US, SentDecision
 
 SAMPLE_US = US_PER_S // 25

@@ -6,7 +6,7 @@ import threading
 from typing import NamedTuple, Protocol
 
 from airl_mav.core.clock import Clock
-from companion.interfaces import Due, Quiet
+from companion.link_interface import Due, Quiet
 from companion.watchdog import Watchdog
 
 

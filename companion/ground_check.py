@@ -15,11 +15,11 @@ from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import UsageError
 from airl_mav.policy.observation import InFlight, Kinematics, observe, views_of
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.camera import FrameSource, ReceivedFrame
 from companion.dialects import RATE_HZ
-from companion.interfaces import LinkError
+from companion.frame_source import FrameSource, ReceivedFrame
+from companion.link_interface import LinkError
 from companion.mavsdk_link import MavsdkLink
-from companion.mission import FRAME_TIMEOUT_S, check_camera
+from companion.offboard_mission import FRAME_TIMEOUT_S, check_camera
 from companion.pilot import age_of
 from companion.program import MissionSetup, mission_camera
 from companion.signing_proxy import signed

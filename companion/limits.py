@@ -19,8 +19,8 @@ from airl_mav.core.frames import Goal, goal_height_m
 from airl_mav.policy.observation import Kinematics
 from airl_mav.profiles.distortion import sees_to, undistorted
 from airl_mav.scenario.model import LimitSettings, PilotSettings
-from companion.camera import ReceivedFrame
-from companion.interfaces import FRAMES_LATE, TELEMETRY_FROZEN, VehicleStatus
+from companion.frame_source import ReceivedFrame
+from companion.link_interface import FRAMES_LATE, TELEMETRY_FROZEN, VehicleStatus
 
 TAKEN_OVER = "taken over"
 """A pilot has control: the mode is no longer offboard. The companion stops sending."""

@@ -13,7 +13,7 @@ from mavsdk.logging import log_subscribe
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from companion.interfaces import LinkError
+from companion.link_interface import LinkError
 
 SLICE_S = 0.5
 """Maximum single wait for a flight controller [wall s]."""

@@ -22,7 +22,7 @@ from airl_mav.core import constants
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.policy.actions import Attitude
 from airl_mav.policy.observation import Kinematics
-from companion import interfaces
+from companion import link_interface
 from companion.dialects import POSITION, PX4, Dialect, dialect_of
 from companion.mavsdk_connection import exchange_raw, first_autopilot, open_connection, set_timeout
 
@@ -76,7 +76,7 @@ class MavsdkLink:
         clock: Clock,
         abandon: threading.Event | None = None,
         heard: Callable[[], bool] | None = None,
-        poll: Callable[[int, interfaces.Due, interfaces.Quiet], None] | None = None,
+        poll: Callable[[int, link_interface.Due, link_interface.Quiet], None] | None = None,
     ) -> None:
         """Open a connection, see `open_connection`; `connect` waits for the vehicle.
 
@@ -108,7 +108,7 @@ class MavsdkLink:
         """Wait for a flight controller; LinkError after a timeout [wall s] or on `stop`."""
         system = first_autopilot(self._mavsdk, timeout_s, stop)
         if system is None:
-            raise interfaces.LinkError(
+            raise link_interface.LinkError(
                 f"no flight controller heard on {self.url} in {timeout_s:g} s"
             )
         self._release_plugins()
@@ -132,7 +132,7 @@ class MavsdkLink:
         stopwatch = WallClock()
         while not self.connected:
             if stopwatch.time_us() > timeout_s * constants.US_PER_S:
-                raise interfaces.LinkError(
+                raise link_interface.LinkError(
                     f"no flight controller heard on {self.url} in {timeout_s:g} s"
                 )
             self._pause_wall(stop)
@@ -153,12 +153,12 @@ class MavsdkLink:
                     break
                 except TelemetryError as error:
                     if stopwatch.time_us() > STREAM_TIMEOUT_S * constants.US_PER_S:
-                        raise interfaces.LinkError(f"no telemetry: {_refusal(error)}") from None
+                        raise link_interface.LinkError(f"no telemetry: {_refusal(error)}") from None
                 self._pause_wall(stop)
 
     def _pause_wall(self, stop: threading.Event | None) -> None:
         if self._abandon.is_set() or (stop is not None and stop.is_set()):
-            raise interfaces.LinkError("stopped")
+            raise link_interface.LinkError("stopped")
         WallClock().sleep_until(int(STREAM_RETRY_S * constants.US_PER_S), self._abandon)
 
     def exchange_raw(self, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
@@ -241,18 +241,20 @@ class MavsdkLink:
             np.array([w.roll_rad_s, w.pitch_rad_s, w.yaw_rad_s]),
         )
 
-    def status(self) -> interfaces.VehicleStatus:
+    def status(self) -> link_interface.VehicleStatus:
         """Return armed state, flight mode and charge."""
         mode = FlightMode(self._telemetry.flight_mode())
         words = mode.name.lower().replace("_", " ")
         remaining = self.battery().remaining
-        return interfaces.VehicleStatus(self.armed, mode is FlightMode.OFFBOARD, words, remaining)
+        return link_interface.VehicleStatus(
+            self.armed, mode is FlightMode.OFFBOARD, words, remaining
+        )
 
-    def battery(self) -> interfaces.BatteryState:
+    def battery(self) -> link_interface.BatteryState:
         """Return the newest state of the battery."""
         told = self._telemetry.battery()
         percent, current_a = _known(told.remaining_percent), _known(told.current_battery_a)
-        return interfaces.BatteryState(
+        return link_interface.BatteryState(
             # 0 V means that no battery report was received yet.
             _known(told.voltage_v) or None,
             None if current_a == constants.UNMEASURED_A else current_a,
@@ -340,7 +342,7 @@ class MavsdkLink:
 
     def enter_offboard(self) -> None:
         """Send a zero setpoint, switch to offboard and wait until setpoints take effect."""
-        self.send_setpoint(interfaces.STOP)
+        self.send_setpoint(link_interface.STOP)
         self._call("offboard", self._offboard.start)
         self._pause(OFFBOARD_SETTLE_S)
 
@@ -358,7 +360,7 @@ class MavsdkLink:
         """
         while not self._flies_offboard():
             self._check(None, stop=stop)
-            self.send_setpoint(interfaces.STOP)
+            self.send_setpoint(link_interface.STOP)
             self._pause(OFFBOARD_REPEAT_S)
 
     def _flies_offboard(self) -> bool:
@@ -387,13 +389,13 @@ class MavsdkLink:
             self._direct = MavlinkDirect(self._system)
         self._direct.subscribe_message(name, heard)
 
-    def send_setpoint(self, setpoint: interfaces.Setpoint) -> None:
+    def send_setpoint(self, setpoint: link_interface.Setpoint) -> None:
         """Send a setpoint; MAVSDK repeats it at 20 Hz until the next setpoint of any kind."""
         self.setpoints_sent += 1
         offboard = self._offboard
         try:
             # MAVSDK uses degrees.
-            if isinstance(setpoint, interfaces.BodyVelocity):
+            if isinstance(setpoint, link_interface.BodyVelocity):
                 *velocity, yaw_rate = setpoint
                 offboard.set_velocity_body(VelocityBodyYawspeed(*velocity, math.degrees(yaw_rate)))
                 return
@@ -404,7 +406,7 @@ class MavsdkLink:
             else:
                 offboard.set_attitude_rate(AttitudeRate(*degrees, thrust))
         except OffboardError as error:
-            raise interfaces.LinkError(f"setpoint refused: {_reason(error)}") from None
+            raise link_interface.LinkError(f"setpoint refused: {_reason(error)}") from None
 
     def leave_offboard(self) -> None:
         """Switch to Hold; MAVSDK stops repeating setpoints."""
@@ -429,7 +431,7 @@ class MavsdkLink:
         try:
             call()
         except (ActionError, OffboardError, TelemetryError) as error:
-            raise interfaces.LinkError(f"{what} failed: {_reason(error)}") from None
+            raise link_interface.LinkError(f"{what} failed: {_reason(error)}") from None
 
     def _deadline(self, timeout_s: float) -> int:
         return self._clock.time_us() + int(timeout_s * constants.US_PER_S)
@@ -438,7 +440,7 @@ class MavsdkLink:
         self, deadline_us: int | None, message: str = "", stop: threading.Event | None = None
     ) -> None:
         if (why := self._over(deadline_us, message, stop)) is not None:
-            raise interfaces.LinkError(why)
+            raise link_interface.LinkError(why)
 
     def _over(
         self, deadline_us: int | None, message: str = "", stop: threading.Event | None = None
@@ -459,8 +461,8 @@ class MavsdkLink:
 
     def _pause_until(
         self,
-        due: interfaces.Due,
-        quiet_us: interfaces.Quiet,
+        due: link_interface.Due,
+        quiet_us: link_interface.Quiet,
         deadline_us: int,
         stop: threading.Event | None = None,
     ) -> None:

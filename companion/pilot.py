@@ -25,11 +25,11 @@ from airl_mav.policy.actions import Action, AnyAction, Policy, flyable, vertical
 from airl_mav.policy.observation import Kinematics, Observation, observe, views_of
 from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.prediction.compensator import Compensator
-from airl_mav.prediction.memory import DecisionMemory
+from airl_mav.prediction.decision_memory import DecisionMemory
 from airl_mav.scenario.model import PilotSettings
-from companion.camera import FrameSource, ReceivedFrame
-from companion.interfaces import BodyVelocity, PilotLink, Setpoint
+from companion.frame_source import FrameSource, ReceivedFrame
 from companion.limits import Limits
+from companion.link_interface import BodyVelocity, PilotLink, Setpoint
 from companion.watchdog import Watchdog
 
 FRAME_WAIT_S = 0.1

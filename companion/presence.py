@@ -23,7 +23,7 @@ from airl_mav.core.frames import Vector, quats_to_euler
 from airl_mav.core.machine import temperature_c
 from airl_mav.policy.observation import Kinematics
 from airl_mav.policy.scans import NEAREST_M, level_scan, rays_of, tilt_of
-from companion.camera import FrameSource
+from companion.frame_source import FrameSource
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Goal
 from airl_mav.core.provenance import describe_machine
-from airl_mav.flight.record import Part, Setup
+from airl_mav.flight.episode_record import Part, Setup
 from airl_mav.latency.injection import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
@@ -28,10 +28,10 @@ from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario import piloting
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
-from companion.camera import FrameSource, SharedFrames
 from companion.cameras.by_name import OpenCamera, open_named_camera
+from companion.frame_source import FrameSource, SharedFrames
 from companion.mavsdk_link import MavsdkLink
-from companion.mission import MissionResult, check_camera, fly_mission
+from companion.offboard_mission import MissionResult, check_camera, fly_mission
 from companion.presence import obstacles_told, present
 from companion.signing_proxy import signed
 from companion.watchdog import ThreadGuard

@@ -13,7 +13,7 @@ from pathlib import Path
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import UsageError
 from airl_mav.core.signing import StoredSigning, frames_of
-from companion.interfaces import LinkError
+from companion.link_interface import LinkError
 
 LINK_ID = 2
 """Link id in signatures of a companion; the flight controller's links are 0 and 1."""

@@ -25,8 +25,8 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import FieldError
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.vehicle import VehicleProfile
-from companion.camera import FrameSource, ReceivedFrame
 from companion.cameras.by_name import OpenCamera, open_named_camera
+from companion.frame_source import FrameSource, ReceivedFrame
 from companion.mavsdk_connection import open_connection
 from companion.video import RtpVideo, VideoReceiver, picture_of, picture_size
 

@@ -19,7 +19,7 @@ from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.actions import Attitude, BodyRates
 from airl_mav.scenario.model import WatchdogSettings
-from companion.interfaces import STOP, BodyVelocity, LinkError, PilotLink, Setpoint
+from companion.link_interface import STOP, BodyVelocity, LinkError, PilotLink, Setpoint
 
 
 class Watchdog:

@@ -6,7 +6,7 @@ Simulated time stands still while the program computes and moves only while it s
 
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.profiles.vehicle import load_vehicle
-from companion.interfaces import BodyVelocity
+from companion.link_interface import BodyVelocity
 from firmware_sim.simulation import EpisodeSetup
 
 with LockstepStage() as stage:

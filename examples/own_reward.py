@@ -24,7 +24,7 @@ def short_and_cheap(step: Step) -> NDArray[np.float64]:
 if __name__ == "__main__":
     # Here, because whoever takes the reward from this file needs no learner.
     from airl_mav.training.config import TrainingConfig
-    from airl_mav.training.run import train
+    from airl_mav.training.training_run import train
 
     config = TrainingConfig(
         description="short and cheap flights",

@@ -20,7 +20,7 @@ from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
 from firmware_sim.engine.record import Record
-from firmware_sim.faults.link import FailingEndpoint
+from firmware_sim.faults.faulty_link import FailingEndpoint
 from firmware_sim.flight_log.flight_log import ULOG_SUFFIX, FlightLog, LogFolder
 from firmware_sim.interfaces import FlightController, TrueState
 from firmware_sim.mavlink.link import LinkCounters

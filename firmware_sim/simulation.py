@@ -41,9 +41,9 @@ from firmware_sim.engine.ticks import (
     log_flown_record,
     log_record,
 )
-from firmware_sim.faults.camera import FailingCamera
-from firmware_sim.faults.controller import FailingParts
-from firmware_sim.faults.timeline import ClientFaults, FaultTimeline
+from firmware_sim.faults.fault_timeline import ClientFaults, FaultTimeline
+from firmware_sim.faults.faulty_camera import FailingCamera
+from firmware_sim.faults.faulty_controller import FailingParts
 from firmware_sim.interfaces import ActuatorControls, FlightController, SensorSample, TrueState
 from firmware_sim.pacing import Arrivals
 from firmware_sim.plant.camera_server import SimulatedCamera

@@ -33,7 +33,7 @@ from airl_mav.addons.sweep.config import SweepConfig
 from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.options import read_options, scenario_of
-from airl_mav.cli.sitl import SitlOptions
+from airl_mav.cli.sitl_command import SitlOptions
 from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.constants import LOOPBACK, TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
@@ -42,17 +42,17 @@ from airl_mav.policy.actions import limited
 from airl_mav.policy.greedy import GreedyPolicy
 from airl_mav.policy.observation import Kinematics, encode
 from airl_mav.profiles.loading import load_profile, profiles_dir
-from airl_mav.rehearsal.stand_alone import aircraft_of, episode_of
+from airl_mav.rehearsal.stand_alone_vehicle import aircraft_of, episode_of
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from airl_mav.training.config import TrainingConfig
-from companion.camera import ZmqFrameSource
+from companion.frame_source import ZmqFrameSource
 from companion.pilot import OLDEST_FRAME_US, age_of
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.external.launcher import no_process
 from firmware_sim.external.parameter_file import KeptParameters, qgroundcontrol_file
-from firmware_sim.external.px4.sitl import EPOCH_US, Px4Bridge
+from firmware_sim.external.px4.px4_sitl import EPOCH_US, Px4Bridge
 from firmware_sim.interfaces import (
     BatterySample,
     FirmwareLostError,

@@ -109,7 +109,7 @@ def _run() -> Path:
     run = _folder() / "run"
     words = ["no-obstacles", "--episodes", "2", "--level", "lockstep", "--out", str(run)]
     with redirect_stdout(io.StringIO()):
-        carry_out("airl evaluate", "airl_mav.cli.evaluate", words)
+        carry_out("airl evaluate", "airl_mav.cli.evaluate_command", words)
     return run
 
 

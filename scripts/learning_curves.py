@@ -30,7 +30,7 @@ from scipy import stats
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json, replace_file
 from airl_mav.report.table import NONE, Column, TableView, markdown_table, write_table
-from airl_mav.training.store import CONFIG_FILE, SCHEMA, Evaluation, TrainingFolder
+from airl_mav.training.training_folder import CONFIG_FILE, SCHEMA, Evaluation, TrainingFolder
 
 CONFIGS = (
     *("paper-dqn", "paper-dqn-curriculum", "paper-ppo", "paper-ppo-curriculum"),

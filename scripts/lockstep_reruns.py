@@ -121,8 +121,8 @@ def busy(processes: int) -> Iterator[None]:
 
 def fly(command: Reruns, flights: int) -> None:
     """Fly, and print the start and the hash of each flight."""
-    from airl_mav.lockstep.flight import fly as fly_episode
-    from airl_mav.rehearsal.progress import Observer
+    from airl_mav.lockstep.lockstep_flight import fly as fly_episode
+    from airl_mav.rehearsal.observer import Observer
     from airl_mav.scenario.model import Scenario
     from airl_mav.scenario.resolve import resolve
 

@@ -24,7 +24,7 @@ from rich.table import Table
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_USAGE, UsageError
 from airl_mav.flight.judge import Outcome
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.aircraft import PlantName
 from airl_mav.scenario.model import Scenario

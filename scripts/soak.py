@@ -239,7 +239,7 @@ def main(asked: Soak) -> int:
         words = [
             sys.executable,
             "-m",
-            "airl_mav.cli.firmware",
+            "airl_mav.cli.firmware_command",
             f"--vehicle={tireless(Path(folder))}",
         ]
         words += ["--arena=no-obstacles", "--speed=max", f"--instance={asked.instance}"]

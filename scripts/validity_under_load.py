@@ -24,8 +24,8 @@ from rich.table import Table
 from airl_mav import load_run
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INVALID
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import Estimate
 from airl_mav.rehearsal.run_folder import RUN_FILE
 
@@ -73,7 +73,7 @@ def main() -> int:
 def rehearse(asked: UnderLoad, number: int, more: Sequence[str]) -> tuple[list[str], str]:
     """Fly a run; return its table row, and its violation of the rule."""
     out, seed = asked.out / f"{number:02d}", 1 + number * asked.episodes
-    words = [sys.executable, "-m", "airl_mav.cli.sitl", f"--episodes={asked.episodes}"]
+    words = [sys.executable, "-m", "airl_mav.cli.sitl_command", f"--episodes={asked.episodes}"]
     words += [f"--seed={seed}", f"--speed={asked.speed}", f"--out={out}", *more]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     said = done.stdout + done.stderr

@@ -106,7 +106,15 @@ def page_of(words: tuple[str, ...], size: tuple[int, int]) -> Iterator[Page]:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         printed = folder / "printed.txt"
-        command = [sys.executable, "-m", "airl_mav.cli.sitl", *words, "--view", "--out", "run"]
+        command = [
+            sys.executable,
+            "-m",
+            "airl_mav.cli.sitl_command",
+            *words,
+            "--view",
+            "--out",
+            "run",
+        ]
         with browser(folder) as page, printed.open("wb") as file:
             environment = {**os.environ, "PYTHONPATH": str(ROOT)}
             flight = subprocess.Popen(

@@ -8,8 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from airl_mav.arena.appearance import Statics
-from airl_mav.arena.assets import AssetBodies, Things, draw_bodies, draw_things, generate_own
+from airl_mav.arena.finishes import Statics
 from airl_mav.arena.gates import (
     Openings,
     behind,
@@ -22,6 +21,7 @@ from airl_mav.arena.gates import (
 from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
 from airl_mav.arena.ground import Ground
 from airl_mav.arena.passage import Hills, free_share, least_gap_m, passage_exists
+from airl_mav.arena.placed_assets import AssetBodies, Things, draw_bodies, draw_things, generate_own
 from airl_mav.arena.placement import (
     TRIES,
     Boxes,
@@ -35,7 +35,7 @@ from airl_mav.arena.placement import (
     zone_radius_m,
 )
 from airl_mav.arena.relief import draw_ground, stand_on
-from airl_mav.arena.rooms import Plan, draw_plan, room_walls, standing_on_the_floor
+from airl_mav.arena.room_plan import Plan, draw_plan, room_walls, standing_on_the_floor
 from airl_mav.arena.tours import draw_tours
 from airl_mav.core.errors import UsageError
 from airl_mav.core.seeding import seeded

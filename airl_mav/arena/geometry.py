@@ -21,7 +21,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import (
+from airl_mav.arena.finishes import (
     FLOOR,
     LUMINANCE,
     OBSTACLE,

@@ -15,8 +15,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
-from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
+from airl_mav.arena.finishes import FLOOR as FLOOR_ROW
+from airl_mav.arena.finishes import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.geometry import PlacedMesh
 from airl_mav.arena.ground import Ground, Relief, no_relief
 from airl_mav.arena.relief import plane_at

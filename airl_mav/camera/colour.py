@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
-from airl_mav.arena.appearance import WALLS as WALLS_ROW
+from airl_mav.arena.finishes import OBSTACLE as OBSTACLE_ROW
+from airl_mav.arena.finishes import WALLS as WALLS_ROW
 from airl_mav.camera import surfaces
 from airl_mav.camera.bvh import Meshes, count_of, is_owned, raised
 from airl_mav.camera.gloss import Gloss, let_through

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import LUMINANCE, SURFACES, WALLS, Finish
+from airl_mav.arena.finishes import LUMINANCE, SURFACES, WALLS, Finish
 from airl_mav.camera.projection import dot
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Vec

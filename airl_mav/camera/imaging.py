@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import LUMINANCE, linear_of
+from airl_mav.arena.finishes import LUMINANCE, linear_of
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import image_of, jpeg_of
 from airl_mav.camera.intrinsics import Intrinsics

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import FLOOR, OBSTACLE, TEXTURES, WALLS, Finish, Light, srgb_of
+from airl_mav.arena.finishes import FLOOR, OBSTACLE, TEXTURES, WALLS, Finish, Light, srgb_of
 from airl_mav.arena.geometry import Arena, PlacedMesh, Shape
 from airl_mav.arena.ground import Ground
 from airl_mav.arena.triangles import standing, triangles_of

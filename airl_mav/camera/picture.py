@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
-from airl_mav.arena.appearance import Drawn, linear_of, srgb_of
+from airl_mav.arena.finishes import FLOOR as FLOOR_ROW
+from airl_mav.arena.finishes import Drawn, linear_of, srgb_of
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.colour import Work, render_colour

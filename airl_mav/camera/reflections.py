@@ -15,9 +15,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
-from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
-from airl_mav.arena.appearance import WALLS as WALLS_ROW
+from airl_mav.arena.finishes import FLOOR as FLOOR_ROW
+from airl_mav.arena.finishes import OBSTACLE as OBSTACLE_ROW
+from airl_mav.arena.finishes import WALLS as WALLS_ROW
 from airl_mav.camera import gloss, shading
 from airl_mav.camera.bvh import STACK, Meshes
 from airl_mav.camera.primitives import (

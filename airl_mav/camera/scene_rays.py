@@ -13,8 +13,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
-from airl_mav.arena.appearance import WALLS as WALLS_ROW
+from airl_mav.arena.finishes import OBSTACLE as OBSTACLE_ROW
+from airl_mav.arena.finishes import WALLS as WALLS_ROW
 from airl_mav.camera import primitives
 from airl_mav.camera.bvh import Meshes, is_owned, material_row
 from airl_mav.camera.meshes import distance_to, inverse_of, stopped_by

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import TEXTURES
+from airl_mav.arena.finishes import TEXTURES
 from airl_mav.camera.gloss import Gloss
 from airl_mav.camera.textures import LEVELS, SIDE, STRIDE
 from airl_mav.core.kernels import borrowing_kernel, kernel

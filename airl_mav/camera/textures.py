@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import TEXTURES, Finish, image_number, linear_of
+from airl_mav.arena.finishes import TEXTURES, Finish, image_number, linear_of
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.assets import MOST_IMAGES, ImageFile, read_checked
 

@@ -16,8 +16,8 @@ from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_USAGE
 
 SUBCOMMANDS: dict[str, str] = {
-    # To add one: write cli/<name>.py with OPTIONS and run(), and a line here. Add-ons have a table
-    # of their own.
+    # To add one: write cli/<name>_command.py with OPTIONS and run(), and a line here. Add-ons have
+    # a table of their own.
     "sitl": "rehearse a policy: firmware and companion as two processes, a report (airl-sitl)",
     "firmware": "flight controller, vehicle and camera alone, for any client (airl-firmware)",
     "companion": "what runs on the drone's onboard computer (airl-companion)",
@@ -38,17 +38,13 @@ SUBCOMMANDS: dict[str, str] = {
     "computers": "computer profiles: what each was timed with, by whom, and how late it decides",
     "list": "shipped vehicles, arenas, policies, computers, sweeps",
 }
-"""Subcommands with their purposes; module `airl_mav.cli.<name>`."""
-
-MODULES = {"list": "airl_mav.cli.listing"}
-"""Modules of subcommands with another name."""
+"""Subcommands with their purposes; module `airl_mav.cli.<name>_command`."""
 
 
 def subcommands() -> dict[str, tuple[str, str]]:
     """Return all subcommands, those of add-ons last: purpose and module by name."""
     core = {
-        name: (purpose, MODULES.get(name, f"airl_mav.cli.{name}"))
-        for name, purpose in SUBCOMMANDS.items()
+        name: (purpose, f"airl_mav.cli.{name}_command") for name, purpose in SUBCOMMANDS.items()
     }
     return core | addon_commands()
 

@@ -16,7 +16,7 @@ from airl_mav.view.ends import ViewRequest
 
 if TYPE_CHECKING:
     from airl_mav.flight.requirements import Requirement
-    from airl_mav.report.verdict import OverallVerdict
+    from airl_mav.report.run_verdict import OverallVerdict
 
 
 TrustArenas = Annotated[
@@ -63,7 +63,7 @@ def requirements_of(gate: Gate, *, reference: bool = True) -> tuple[Requirement,
 
 def leave(gate: Gate, verdict: OverallVerdict, suite: str) -> None:
     """Write the requested files of the verdict; `suite` is the command."""
-    from airl_mav.report.verdict import write_badge, write_junit
+    from airl_mav.report.run_verdict import write_badge, write_junit
 
     if gate.junit is not None:
         write_junit(verdict, gate.junit, suite)

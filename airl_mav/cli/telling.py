@@ -19,7 +19,7 @@ from airl_mav.core.progress import Event, JsonProgress, Progress, RichProgress
 
 if TYPE_CHECKING:
     from airl_mav.rehearsal.run_folder import LoadedRun
-    from airl_mav.report.verdict import OverallVerdict
+    from airl_mav.report.run_verdict import OverallVerdict
 
 SCHEMA = 1
 """Version of the JSON lines; docs/reference/json-lines.md describes them."""
@@ -155,7 +155,7 @@ class Voice:
 
 def _told(name: str, run: LoadedRun) -> ToldRun:
     # Imported here: flights do not need statistics.
-    from airl_mav.flight.record import run_sha256
+    from airl_mav.flight.episode_record import run_sha256
     from airl_mav.flight.statistics import aggregate
 
     quality = asdict(aggregate(run.episodes))

@@ -15,7 +15,7 @@ from typing import Literal
 from airl_mav.core.clock import Clock, processor_time_us
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.machine import sysfs_text
-from airl_mav.core.power import PowerMeter, PowerSampling, find_power_source
+from airl_mav.core.power_meter import PowerMeter, PowerSampling, find_power_source
 
 BYTES_PER_KIB = 1024
 

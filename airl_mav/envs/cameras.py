@@ -20,15 +20,15 @@ from airl_mav.camera.render import Motion, Mount, camera_pose
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.core.streams import Stream, stream
-from airl_mav.envs.arenas import ArenaBatch, move_obstacles, relief_of
+from airl_mav.envs.arena_batch import ArenaBatch, move_obstacles, relief_of
 from airl_mav.envs.colour_images import ColourImages, LensConstants, Looks, lens_of
 from airl_mav.envs.decision import FrameTimes
 from airl_mav.envs.faults import delays_of, later_us, twin_faults
 from airl_mav.envs.fleet import Fleet, FramePoses
-from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
+from airl_mav.envs.mesh_batch import MeshBatch, MeshesSeen, meshes_in
 from airl_mav.envs.saved_state import Stateful
+from airl_mav.faults.fault import Fault
 from airl_mav.faults.kinds import NOISE_SEED
-from airl_mav.faults.model import Fault
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.conditions import SensorNoise
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import OBSTACLE
+from airl_mav.arena.finishes import OBSTACLE
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.gloss import MATT, Gloss
@@ -19,9 +19,9 @@ from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.camera.textures import atlas
 from airl_mav.core.errors import UsageError
 from airl_mav.core.kernels import kernel
-from airl_mav.envs.arenas import ArenaBatch, copy_rows, move_obstacles, relief_of
+from airl_mav.envs.arena_batch import ArenaBatch, copy_rows, move_obstacles, relief_of
 from airl_mav.envs.fleet import Fleet, FramePoses
-from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
+from airl_mav.envs.mesh_batch import MeshBatch, MeshesSeen, meshes_in
 from airl_mav.profiles.assets import ImageFile
 
 

@@ -14,9 +14,9 @@ from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.arena.placement import zone_radius_m
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.arenas import batch_of, put_arena, with_room
+from airl_mav.envs.arena_batch import batch_of, put_arena, with_room
 from airl_mav.envs.colour_images import Looks
-from airl_mav.envs.meshes import MeshesSeen
+from airl_mav.envs.mesh_batch import MeshesSeen
 from airl_mav.envs.spec import Curriculum, EnvironmentSpec
 from airl_mav.profiles.arena import ArenaSpec
 

@@ -18,7 +18,7 @@ from airl_mav.control.gains import Gains
 from airl_mav.control.memory import MEMORY_SIZE, new_memory, trim_against_torque, trim_for_hover
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
 from airl_mav.core.kernels import borrowing_kernel, kernel
-from airl_mav.envs.arenas import NOTHING
+from airl_mav.envs.arena_batch import NOTHING
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import (
     N_ROTORS,

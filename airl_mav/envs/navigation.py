@@ -18,7 +18,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S, CommandKind
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.streams import Stream, stream
-from airl_mav.envs.arenas import ArenaBatch, move_all_obstacles
+from airl_mav.envs.arena_batch import ArenaBatch, move_all_obstacles
 from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.companions import Companions
 from airl_mav.envs.decision import Timing, begin_decision, new_decision
@@ -40,14 +40,14 @@ from airl_mav.envs.fleet import (
     put_vehicle,
     vehicle_of,
 )
-from airl_mav.envs.flight import fly
+from airl_mav.envs.fleet_step import fly
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.sight import check_conditions, sight_of
 from airl_mav.envs.spec import SHIPPED_REWARDS, EnvironmentSpec
 from airl_mav.envs.stopping import injections_of
 from airl_mav.envs.trace import Trace
 from airl_mav.envs.world import World, decide, status
-from airl_mav.faults.model import Fault, check_twin
+from airl_mav.faults.fault import Fault, check_twin
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import UPRIGHT_S
 from airl_mav.policy.images import Bytes, body_bytes

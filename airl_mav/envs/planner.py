@@ -27,7 +27,7 @@ from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import quats_to_euler
 from airl_mav.core.kernels import kernel
-from airl_mav.envs.arenas import ArenaBatch, relief_of
+from airl_mav.envs.arena_batch import ArenaBatch, relief_of
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import Delay
 from airl_mav.latency.injection import Injection

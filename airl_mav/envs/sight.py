@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from airl_mav.camera.conditions import check_noise, check_twin_imaging
+from airl_mav.camera.imaging_checks import check_noise, check_twin_imaging
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.faults.model import Fault
+from airl_mav.faults.fault import Fault
 from airl_mav.policy.observation_spec import (
     ObservationSpec,
     SeenCamera,

@@ -21,7 +21,7 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, validated
 from airl_mav.core.files import read_json, write_json
 from airl_mav.core.kernels import cache_folder
-from airl_mav.envs.arenas import ArenaBatch, empty_batch
+from airl_mav.envs.arena_batch import ArenaBatch, empty_batch
 from airl_mav.envs.fleet import (
     Fleet,
     FleetConstants,
@@ -31,7 +31,7 @@ from airl_mav.envs.fleet import (
     new_fleet,
     vehicle_of,
 )
-from airl_mav.envs.flight import advance
+from airl_mav.envs.fleet_step import advance
 from airl_mav.envs.spec import Delay, EnvironmentSpec
 from airl_mav.latency.injection import (
     FixedSampler,

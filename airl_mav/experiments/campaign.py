@@ -14,10 +14,10 @@ from airl_mav.core.compiling import COMPILING
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.first_start import compile_first
 from airl_mav.core.progress import Progress
+from airl_mav.experiments.campaign_store import CampaignStore
 from airl_mav.experiments.executors import Executor, Flier, FlyEpisodes, Stop, WorkerError, never
 from airl_mav.experiments.live import Ended
-from airl_mav.experiments.store import CampaignStore
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, locked
 from airl_mav.rehearsal.tally import Tally
@@ -116,7 +116,7 @@ class LockstepFlier:
     def start(self, folder: run_folder.RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (polled between flights)
         """Load simulator and policy once; see `Flier`."""
         # Imported here: only workers need the flight controller and MAVSDK.
-        from airl_mav.lockstep.flight import fly
+        from airl_mav.lockstep.lockstep_flight import fly
         from firmware_sim.warm_up import warm_up
 
         scenario = self.scenario

@@ -9,8 +9,8 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.experiments import experiment
 from airl_mav.experiments.campaign import Cell
-from airl_mav.faults.model import Fault
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.faults.fault import Fault
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.card import MeasuredResult
 from airl_mav.policy.card_writing import add_result

@@ -12,13 +12,18 @@ from typing import Any
 from airl_mav.core.clock import utc_now
 from airl_mav.core.progress import Progress
 from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cells, shared_flights
+from airl_mav.experiments.campaign_store import (
+    CampaignStore,
+    Declaration,
+    DeclaredCell,
+    open_campaign,
+)
 from airl_mav.experiments.live import Ended, fly_live, tell_end
 from airl_mav.experiments.process_executor import open_executor
 from airl_mav.experiments.run import Run, raise_unless_complete, shown
-from airl_mav.experiments.store import CampaignStore, Declaration, DeclaredCell, open_campaign
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.rehearsal.signals import stop_on_signals
-from airl_mav.report.comparison.model import Comparison, Kind, RunEntry
+from airl_mav.report.comparison.comparison_model import Comparison, Kind, RunEntry
 from airl_mav.report.table import count_outcomes
 from airl_mav.scenario.model import Scenario, free_fields
 from airl_mav.scenario.resolve import resolve

@@ -9,7 +9,7 @@ from typing import Any
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
-from airl_mav.envs.arenas import CEILING, FLOOR, WALL
+from airl_mav.envs.arena_batch import CEILING, FLOOR, WALL
 from airl_mav.envs.evaluation import (
     OUTCOMES,
     EpisodeResult,
@@ -24,10 +24,10 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.envs.trace import Trace
 from airl_mav.experiments.executors import FlyEpisodes, Stop
-from airl_mav.faults.model import check_twin
+from airl_mav.faults.fault import check_twin
+from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
-from airl_mav.flight.record import EpisodeRecord, FaultActed
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder

@@ -13,9 +13,9 @@ from airl_mav.core.cpu_quota import remove_left
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.first_start import compile_first
 from airl_mav.core.progress import Progress
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.lockstep.turns import LockstepError
-from airl_mav.rehearsal.progress import LiveObserver, Observer
+from airl_mav.rehearsal.observer import LiveObserver, Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RUN_FILE, locked, open_folder
 from airl_mav.rehearsal.signals import terminated_as_interrupted
@@ -88,7 +88,7 @@ def fly_live(
                 ends, observer = held.enter_context(_watched(scenario, view, live, progress))
             if asked.level == "lockstep":
                 # Imported here: level sitl starts its processes sooner without the simulator.
-                from airl_mav.lockstep.flight import rehearse
+                from airl_mav.lockstep.lockstep_flight import rehearse
 
                 rehearse(scenario, folder, observer, indices, ends)
             else:

@@ -15,7 +15,7 @@ from airl_mav.experiments.campaign import Cell, run_cell
 from airl_mav.experiments.executors import Executor
 from airl_mav.experiments.live import Ended, FlownRun, fly_live, tell_end
 from airl_mav.experiments.process_executor import open_executor
-from airl_mav.flight.record import EpisodeRecord, run_sha256
+from airl_mav.flight.episode_record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import Aggregate, aggregate
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stages import Samples, pool, stage_samples

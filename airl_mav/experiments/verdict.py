@@ -21,8 +21,8 @@ from airl_mav.flight.requirements import Requirement
 from airl_mav.flight.sequential import LOOKS, RequirementDecision
 from airl_mav.flight.statistics import reached_goals
 from airl_mav.rehearsal.run_folder import RUN_FILE, check_folder, load_info
-from airl_mav.report.comparison.model import Comparison, comparison_file
-from airl_mav.report.verdict import OverallVerdict
+from airl_mav.report.comparison.comparison_model import Comparison, comparison_file
+from airl_mav.report.run_verdict import OverallVerdict
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from airl_mav.flight import statistics
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
-from airl_mav.flight.record import EpisodeRecord
 
 Floats = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
-from airl_mav.flight.record import EpisodeRecord
 
 CONFIDENCE = 0.95
 QUANTILE = 1.959963984540054

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_S, US_PER_S, CommandKind
 from airl_mav.core.frames import goal_distance_m, quat_yaw
-from airl_mav.envs.arenas import CEILING, FLOOR, NOTHING, WALL
+from airl_mav.envs.arena_batch import CEILING, FLOOR, NOTHING, WALL
 from airl_mav.envs.fleet import FlightArrays, FlightStatus
 from airl_mav.envs.rendering import PictureContent
 from airl_mav.flight.judge import Outcome, Referee
-from airl_mav.lockstep.flight import LockstepFlight
+from airl_mav.lockstep.lockstep_flight import LockstepFlight
 from airl_mav.policy.actions import Action, AnyAction, BodyRates
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import FlownEpisode

@@ -10,20 +10,20 @@ from types import TracebackType
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
+from airl_mav.faults.fault import Fault
 from airl_mav.faults.kinds import LINKS
-from airl_mav.faults.model import Fault
-from airl_mav.lockstep.camera import MemoryCamera
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.digest import FlightDigest
-from airl_mav.lockstep.link import BOOT_UNIX_US, ConductedVehicle, builtin_vehicle
+from airl_mav.lockstep.lockstep_camera import MemoryCamera
+from airl_mav.lockstep.lockstep_link import BOOT_UNIX_US, ConductedVehicle, builtin_vehicle
 from airl_mav.lockstep.threaded import PATIENCE_S, ThreadPartner
 from airl_mav.lockstep.turns import COMPANION_STARTS_US, LockstepError
 from companion.conducted import ConductedClock
-from companion.interfaces import LinkError
+from companion.link_interface import LinkError
 from companion.mavsdk_connection import RAW_TIMEOUT_S, RAW_URL
 from companion.mavsdk_link import MavsdkLink
 from firmware_sim.autopilot.commander import FlightPhase
-from firmware_sim.faults.timeline import FaultTimeline
+from firmware_sim.faults.fault_timeline import FaultTimeline
 from firmware_sim.firmware import Firmware
 from firmware_sim.simulation import EpisodeSetup, Simulation
 

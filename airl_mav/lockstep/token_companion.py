@@ -10,10 +10,10 @@ from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
 from airl_mav.scenario.piloting import NATIVE_T2_US
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.camera import open_camera
 from companion.conducted import ConductedClock
+from companion.frame_source import open_camera
 from companion.mavsdk_link import MavsdkLink
-from companion.mission import MissionResult, check_camera, fly_mission
+from companion.offboard_mission import MissionResult, check_camera, fly_mission
 from companion.program import MissionSetup
 from companion.signing_proxy import signed
 from companion.tokens import TokenFrameSource, TokenTurns

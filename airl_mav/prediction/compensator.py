@@ -28,7 +28,7 @@ from airl_mav.core.constants import GRAVITY_M_S2, US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Vector, quat_from_euler, quat_to_matrix, quats_to_euler
 from airl_mav.policy.observation import Kinematics
-from airl_mav.prediction.memory import DecisionMemory
+from airl_mav.prediction.decision_memory import DecisionMemory
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.vehicle import Response, VehicleProfile
 

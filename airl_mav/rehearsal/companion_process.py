@@ -19,10 +19,10 @@ from airl_mav.core.files import save_arrays
 from airl_mav.core.process_use import UseMeter
 from airl_mav.rehearsal import channel
 from airl_mav.scenario.resolved import ResolvedScenario
-from companion.camera import open_camera
-from companion.interfaces import LinkError
+from companion.frame_source import open_camera
+from companion.link_interface import LinkError
 from companion.mavsdk_link import MavsdkLink
-from companion.mission import check_camera, fly_mission
+from companion.offboard_mission import check_camera, fly_mission
 from companion.signing_proxy import signed
 from companion.watchdog import ThreadGuard
 

@@ -15,8 +15,8 @@ from airl_mav.core.compiling import heard_compiling
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.signing import StoredSigning
+from airl_mav.faults.fault import Fault, link_fails
 from airl_mav.faults.kinds import PROCESSES
-from airl_mav.faults.model import Fault, link_fails
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
@@ -26,8 +26,8 @@ from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.crash_detector import CrashDetector
 from firmware_sim.external.compose import Wanted, real_firmware
 from firmware_sim.external.parameter_file import KeptParameters
-from firmware_sim.faults.link import FailingEndpoint
-from firmware_sim.faults.timeline import FaultTimeline
+from firmware_sim.faults.fault_timeline import FaultTimeline
+from firmware_sim.faults.faulty_link import FailingEndpoint
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.mavlink.link import LinkConfig

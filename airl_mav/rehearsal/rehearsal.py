@@ -25,6 +25,7 @@ from airl_mav.rehearsal.episode import (
     disturbing,
     join_episode,
 )
+from airl_mav.rehearsal.observer import WARNING, Observer
 from airl_mav.rehearsal.process_pair import (
     COMPANION,
     FIRMWARE,
@@ -34,7 +35,6 @@ from airl_mav.rehearsal.process_pair import (
     ProcessFaults,
     ProcessPair,
 )
-from airl_mav.rehearsal.progress import WARNING, Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view.ends import ViewEnds

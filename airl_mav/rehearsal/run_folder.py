@@ -24,8 +24,8 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.log_file import PARTIAL_SUFFIX
 from airl_mav.core.provenance import describe_machine, git_state, package_versions
-from airl_mav.flight.record import SCHEMA as LINE_SCHEMA
-from airl_mav.flight.record import EpisodeRecord, Setup
+from airl_mav.flight.episode_record import SCHEMA as LINE_SCHEMA
+from airl_mav.flight.episode_record import EpisodeRecord, Setup
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.scenario.model import free_fields
 from airl_mav.scenario.resolved import SCENARIO_FILE, save_scenario

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from airl_mav.core.progress import Event, Progress
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import reached_goals, wilson
 
 FIGURES = ("flight_time_s", "distance_m", "energy_j")

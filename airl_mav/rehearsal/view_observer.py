@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from airl_mav.core.frames import Goal
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.rehearsal.channel import State, Text
-from airl_mav.rehearsal.progress import WARNING, Observer
+from airl_mav.rehearsal.observer import WARNING, Observer
 from airl_mav.view.ends import ViewEnds
 from airl_mav.view.feed import Feed
-from airl_mav.view.messages import Flight, PhaseStart, Said
+from airl_mav.view.view_messages import Flight, PhaseStart, Said
 
 INFO = 6
 """MAV_SEVERITY_INFO."""

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.draw import FLOOR_COLOUR, GOAL_COLOUR, START_COLOUR, draw_arena
 from airl_mav.arena.geometry import Arena, Bounds
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme

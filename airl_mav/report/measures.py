@@ -27,7 +27,7 @@ from airl_mav.latency.stages import (
 )
 from airl_mav.policy.registry import find_policy
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.arenas import vehicle_of
+from airl_mav.report.run_arenas import vehicle_of
 from airl_mav.report.table import NONE, TOO_FEW_CELL, TableView, columns_of
 
 FEW_FLIGHTS = 10

@@ -21,7 +21,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import Arrays
 from airl_mav.core.frames import Goal
 from airl_mav.core.plugins import names_code
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, setpoint_column
 from airl_mav.policy import observation
@@ -31,7 +31,7 @@ from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.policy.registry import find_policy
 from airl_mav.prediction.compensator import Compensator
-from airl_mav.prediction.memory import DecisionMemory
+from airl_mav.prediction.decision_memory import DecisionMemory
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
 from airl_mav.report.forensics.camera_view import PolicyCamera

@@ -15,16 +15,16 @@ from airl_mav.core.constants import UNMEASURED_A, US_PER_S, CommandKind
 from airl_mav.core.files import typed
 from airl_mav.core.frames import Goal, goal_distance_m
 from airl_mav.core.process_use import ProcessUse
+from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
-from airl_mav.flight.record import NO_ARENA, EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP, SETPOINTS, STAMPS
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunInfo, run_info
 from companion.limits import OUT_OF_TIME
 
 NAVIGATING = "navigating"
-"""Phase in which the policy flies (`companion.mission`)."""
+"""Phase in which the policy flies (`companion.offboard_mission`)."""
 
 LEAST_NORM = 0.5
 """Minimum norm of a valid quaternion."""

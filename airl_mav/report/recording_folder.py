@@ -22,8 +22,8 @@ from airl_mav.latency.stamps import SETPOINTS, commanded
 from airl_mav.rehearsal.run_folder import RUN_FILE, FlownEpisode, RunFolder, load_info
 from airl_mav.report.recorded_flight import DIGEST, episode_of, info_of, path_of, stamps_of
 from airl_mav.report.tracking import MOTOR_OUTPUTS, MOTOR_TIMES
-from airl_mav.vehicle_log.alignment import ClockAlignment, align
-from airl_mav.vehicle_log.ulog import VehicleLog
+from airl_mav.vehicle_log.clock_alignment import ClockAlignment, align
+from airl_mav.vehicle_log.ulog_reader import VehicleLog
 
 
 def logged_episode_of(box: BlackBox, log: VehicleLog) -> FlownEpisode:
@@ -98,7 +98,7 @@ def take_in(path: Path, ulg: Path | None = None) -> Path:
     if ulg is not None:
         # Imported here: pyulog is an extra.
         from airl_mav.report.recording_folder import logged_episode_of
-        from airl_mav.vehicle_log.ulog import read_vehicle_log
+        from airl_mav.vehicle_log.ulog_reader import read_vehicle_log
 
         log = read_vehicle_log(ulg)
         digest = hashlib.sha256(f"{digest} {sha256_of(ulg)}".encode()).hexdigest()

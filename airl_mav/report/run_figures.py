@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from airl_mav.arena.draw import draw_arena
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_MS
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.percentiles import Summary
 from airl_mav.latency.stages import Samples, Stage

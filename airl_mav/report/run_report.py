@@ -23,9 +23,8 @@ from airl_mav.flight.statistics import aggregate
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report import document, run_tables
-from airl_mav.report.arenas import arenas_of, vehicle_of
 from airl_mav.report.document import print_place, print_verdict
-from airl_mav.report.energy import (
+from airl_mav.report.energy_section import (
     energy_figure,
     energy_flights_table,
     energy_table,
@@ -34,9 +33,17 @@ from airl_mav.report.energy import (
 from airl_mav.report.flights_above import overview_picture
 from airl_mav.report.forensics.worst import causes_table, examine_worst, worst_table
 from airl_mav.report.measures import RunSummary, conduct_table, rate_digits, summarize_run
+from airl_mav.report.plotly_scene import ALL_FLIGHTS, plotly_script
+from airl_mav.report.run_arenas import arenas_of, vehicle_of
 from airl_mav.report.run_figures import latency_figure
 from airl_mav.report.run_tables import ages_table, estimation_table, faults_table, run_ages
-from airl_mav.report.scene import ALL_FLIGHTS, plotly_script
+from airl_mav.report.run_verdict import (
+    OverallVerdict,
+    judge_run,
+    requirements_of,
+    save_verdict,
+    unchecked,
+)
 from airl_mav.report.shown_flights import (
     BEST,
     ShownFlights,
@@ -53,13 +60,6 @@ from airl_mav.report.timeline import (
     slowest_table,
     timeline_figure,
     timeline_of,
-)
-from airl_mav.report.verdict import (
-    OverallVerdict,
-    judge_run,
-    requirements_of,
-    save_verdict,
-    unchecked,
 )
 
 YOUNG_OBJECTS = 50_000

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.process_use import ProcessUse
+from airl_mav.flight.episode_record import EpisodeRecord, Part, Setup, run_sha256
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord, Part, Setup, run_sha256
 from airl_mav.flight.statistics import NO_ESTIMATE, Estimate
 from airl_mav.latency.coordinated_omission import CommandAges, command_ages
 from airl_mav.latency.percentiles import Summary, summarize

@@ -16,16 +16,16 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import rgb_of
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.files import Arrays
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.latency.stages import STAGES, decision_series
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.forensics.evidence import Cause, ranked
 from airl_mav.report.forensics.worst import flown_path
+from airl_mav.report.plotly_scene import ALL_FLIGHTS, SceneFlight, scene_json, top_speed
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision, policy_again, seen_decisions
 from airl_mav.report.run_figures import map_figure
-from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, scene_json, top_speed
 from airl_mav.report.theme import FigureImage, palette, shades
 from airl_mav.report.tracking import EstimateErrors, TrackedFlight, TrackedMotion, track
 from airl_mav.report.tracking_figure import IMAGES, tracking_figure

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.files import Arrays
 from airl_mav.core.frames import ned_to_heading, quat_multiply, quats_to_euler
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import ATTITUDE, NO_STAMP, RATES, SETPOINT, commanded, setpoint_column
 from airl_mav.rehearsal.run_folder import LoadedRun

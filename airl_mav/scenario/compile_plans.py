@@ -9,7 +9,7 @@ from airl_mav.scenario.aircraft import PlantName
 from airl_mav.scenario.resolved import ResolvedScenario
 
 _FLIGHT = "firmware_sim.warm_up"
-_VECTORIZED = "airl_mav.envs.warm_up"
+_VECTORIZED = "airl_mav.envs.compile_envs"
 
 
 def plan_of(scenario: ResolvedScenario) -> CompilePlan:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from airl_mav.camera.conditions import check_noise, check_renderer
+from airl_mav.camera.imaging_checks import check_noise, check_renderer
 from airl_mav.core.errors import FieldError
 from airl_mav.core.first_start import compile_shown
 from airl_mav.flight.judge import GOAL_RADIUS_M

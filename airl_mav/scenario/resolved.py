@@ -19,8 +19,8 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.core.frames import Goal
 from airl_mav.core.plugins import names_file
+from airl_mav.flight.episode_record import BUILT_IN, EpisodeRecord, Part, Setup
 from airl_mav.flight.judge import Task
-from airl_mav.flight.record import BUILT_IN, EpisodeRecord, Part, Setup
 from airl_mav.latency.injection import FixedSampler, Injection, LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy

@@ -14,7 +14,7 @@ from airl_mav.core.plugins import NETWORKS, part_name
 from airl_mav.envs.spec import EnvironmentSpec, ExpertName
 from airl_mav.policy.action_sets import SHIPPED, ActionSpec, discrete_actions
 from airl_mav.profiles.computer import load_computer
-from airl_mav.training.table import ALGORITHMS, ActionKind, fitting
+from airl_mav.training.algorithm_table import ALGORITHMS, ActionKind, fitting
 
 SELECTION_SEED = 500_000
 """First seed of the selection episodes; training starts at a million, evaluation at one."""

@@ -12,7 +12,7 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import optional, switch
 from airl_mav.core.progress import Event, Progress
 from airl_mav.profiles.loading import load_profile
-from airl_mav.training.store import Evaluation, TrainingProgress
+from airl_mav.training.training_folder import Evaluation, TrainingProgress
 
 if TYPE_CHECKING:
     from airl_mav.training.config import TrainingConfig

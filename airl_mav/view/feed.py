@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.view.ends import ViewEnds
-from airl_mav.view.messages import Image, Message, Steering, Told, from_parts, to_parts
+from airl_mav.view.view_messages import Image, Message, Steering, Told, from_parts, to_parts
 
 QUEUED = 64
 """Queue limit on either side; messages beyond it are dropped."""

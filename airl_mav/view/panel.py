@@ -14,8 +14,8 @@ from viser import uplot
 
 from airl_mav.camera.frame import nearness, rgb_of
 from airl_mav.core.constants import US_PER_S
-from airl_mav.view.messages import Decided, Image
 from airl_mav.view.shown import STRIP_S, Shown
+from airl_mav.view.view_messages import Decided, Image
 
 _COLOURS = """
 44015444025544035745055845065a45085b46095c460b5e460c5f460e61470f62471163471265471466471567471669

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.frames import goal_distance_m
-from airl_mav.view import messages
+from airl_mav.view import view_messages
 
 STRIP_S = 20.0
 """Time span of the latency strip [simulated s]."""
@@ -33,50 +33,50 @@ Point = tuple[float, float, float]
 class Shown:
     """Data of the scene and the panel."""
 
-    flight: messages.Flight | None = None
+    flight: view_messages.Flight | None = None
     phase: str = ""
-    texts: deque[messages.Said] = field(default_factory=lambda: deque(maxlen=TEXTS))
-    episode: messages.Episode | None = None
+    texts: deque[view_messages.Said] = field(default_factory=lambda: deque(maxlen=TEXTS))
+    episode: view_messages.Episode | None = None
     arena: Arena | None = None
     is_surrounded: bool = True
     """True if the surroundings are known; False while an arena is being generated."""
     episodes: int = 0
     """Number of episodes started so far; a new number requires a new scene."""
-    vehicle: messages.VehicleState | None = None
+    vehicle: view_messages.VehicleState | None = None
     trail: list[Point] = field(default_factory=list)
     """Past positions of the vehicle in this episode, NED [m]."""
-    picture: messages.Image | None = None
-    decided: messages.Decided | None = None
-    decided_image: messages.Image | None = None
+    picture: view_messages.Image | None = None
+    decided: view_messages.Decided | None = None
+    decided_image: view_messages.Image | None = None
     """Policy's input image of that decision."""
-    trained: messages.Trained | None = None
+    trained: view_messages.Trained | None = None
     """Result of a training's newest decision; None outside training."""
     decisions: int = 0
     """Number of decisions received in this episode."""
     ages: deque[tuple[float, float, float]] = field(default_factory=deque)
     """Time since the episode's start [s], command age and t2 of its decision [ms]."""
 
-    def take(self, message: messages.Told, image: messages.Image | None) -> None:
+    def take(self, message: view_messages.Told, image: view_messages.Image | None) -> None:
         """Update the state with a message and its image."""
-        if isinstance(message, messages.VehicleState):
+        if isinstance(message, view_messages.VehicleState):
             self._move(message)
-        elif isinstance(message, messages.CameraImage):
+        elif isinstance(message, view_messages.CameraImage):
             self.picture = image
-        elif isinstance(message, messages.Decided):
+        elif isinstance(message, view_messages.Decided):
             self.decided, self.decided_image = message, image
             self.decisions += 1
-        elif isinstance(message, messages.Episode):
+        elif isinstance(message, view_messages.Episode):
             self._begin(message)
-        elif isinstance(message, messages.PhaseStart):
+        elif isinstance(message, view_messages.PhaseStart):
             self.phase = message.phase
-        elif isinstance(message, messages.Said):
+        elif isinstance(message, view_messages.Said):
             self.texts.append(message)
-        elif isinstance(message, messages.Trained):
+        elif isinstance(message, view_messages.Trained):
             self.trained = message
         else:
             self.flight, self.phase = message, "booting"
 
-    def _begin(self, episode: messages.Episode) -> None:
+    def _begin(self, episode: view_messages.Episode) -> None:
         self.episode = episode
         self.arena = episode.arena
         self.episodes += 1
@@ -84,7 +84,7 @@ class Shown:
         self.trail, self.decisions = [], 0
         self.ages.clear()
 
-    def _move(self, vehicle: messages.VehicleState) -> None:
+    def _move(self, vehicle: view_messages.VehicleState) -> None:
         self.vehicle = vehicle
         if not self.trail or math.dist(self.trail[-1], vehicle.position) >= TRAIL_STEP_M:
             self.trail.append(vehicle.position)

@@ -15,7 +15,7 @@ from airl_mav.latency.injection import LatencySampler
 from airl_mav.policy.observation import Kinematics
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.scenario.resolved import ResolvedScenario
-from airl_mav.view import messages
+from airl_mav.view import view_messages as messages
 from airl_mav.view.ends import ViewEnds
 from airl_mav.view.feed import Asked, Feed
 from companion.pilot import SentDecision as Decision

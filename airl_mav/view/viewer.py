@@ -17,7 +17,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view.ends import ViewAnswer, ViewEnds, ViewSettings
 from airl_mav.view.feed import Asked
-from airl_mav.view.messages import Steering
+from airl_mav.view.view_messages import Steering
 
 REAL_TIME = 1.0
 """Default speed of a lockstep flight in a view, in simulated seconds per wall second."""
@@ -90,7 +90,7 @@ class Pace:
         return asked
 
 
-MODULE = "airl_mav.view.server"
+MODULE = "airl_mav.view.view_server"
 
 
 class ViewError(Exception):

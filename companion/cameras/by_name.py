@@ -9,9 +9,9 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock
 from airl_mav.core.errors import FieldError
 from airl_mav.core.plugins import CAMERAS, load_part, reference
-from companion.camera import FrameSource, open_camera
 from companion.cameras.driver import CameraThread, DepthCamera
 from companion.cameras.fitting import Fitting, Lens, check_coverage
+from companion.frame_source import FrameSource, open_camera
 
 REALSENSE, OAK_D, ROS2, ROSBAG = "realsense", "oak-d", "ros2", "rosbag"
 """Names of built-in drivers, before a colon."""

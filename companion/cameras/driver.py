@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
-from companion.camera import ReceivedFrame
 from companion.cameras.fitting import Fitting, Lens
+from companion.frame_source import ReceivedFrame
 
 READ_S = 0.1
 """Timeout of one `read` of a driver [s]; between reads the thread can end."""

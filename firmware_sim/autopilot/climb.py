@@ -14,7 +14,7 @@ from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from firmware_sim.autopilot.error_state import P
-from firmware_sim.autopilot.trajectory import braking_speed
+from firmware_sim.autopilot.smooth_trajectory import braking_speed
 from firmware_sim.engine.record import (
     CLIMB_ENDED,
     NO_CLIMB,

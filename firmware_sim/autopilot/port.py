@@ -8,8 +8,8 @@ from typing import NamedTuple, Protocol
 
 from airl_mav.control.demand import AttitudeDemand, RateDemand
 from airl_mav.core.frames import Geodetic, Vector
+from airl_mav.faults.fault import Fault
 from airl_mav.faults.kinds import Part
-from airl_mav.faults.model import Fault
 from firmware_sim.autopilot.autopilot_state import (
     UNTOLD,
     AutopilotState,

@@ -15,7 +15,12 @@ from firmware_sim.autopilot.autopilot_state import Mode, Severity
 from firmware_sim.autopilot.events import check_events as events
 from firmware_sim.autopilot.events.check_events import CheckEvent
 from firmware_sim.autopilot.events.definition import Level
-from firmware_sim.autopilot.failsafes.conditions import NEEDS, BatteryWarning, Conditions, Need
+from firmware_sim.autopilot.failsafes.failsafe_conditions import (
+    NEEDS,
+    BatteryWarning,
+    Conditions,
+    Need,
+)
 
 SUPPLY_CHECK_OFF = 894281
 """Value of CBRK_SUPPLY_CHK that disables the battery checks."""

@@ -14,19 +14,19 @@ from airl_mav.core.scheduling import ask_for_short_slices
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import GREATEST_INSTANCE, Aircraft, FirmwareName
 from firmware_sim.external import airframe_check
-from firmware_sim.external.ardupilot import program as ardupilot_program
-from firmware_sim.external.ardupilot.program import Links, find_arducopter
-from firmware_sim.external.ardupilot.sitl import ArdupilotBridge
+from firmware_sim.external.ardupilot import ardupilot_program
+from firmware_sim.external.ardupilot.ardupilot_program import Links, find_arducopter
+from firmware_sim.external.ardupilot.ardupilot_sitl import ArdupilotBridge
 from firmware_sim.external.boot_sequence import ExternalFlightStack
 from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import FirmwareObserver
 from firmware_sim.external.process import WorkingFolders
-from firmware_sim.external.px4 import program as px4_program
+from firmware_sim.external.px4 import px4_program
 from firmware_sim.external.px4.board_link import BoardLink
 from firmware_sim.external.px4.hitl import HitlBridge
 from firmware_sim.external.px4.onboard_link import OnboardLink
-from firmware_sim.external.px4.program import check_free, find_px4
-from firmware_sim.external.px4.sitl import Px4Bridge
+from firmware_sim.external.px4.px4_program import check_free, find_px4
+from firmware_sim.external.px4.px4_sitl import Px4Bridge
 from firmware_sim.external.transport.router import Router
 from firmware_sim.mavlink.endpoint import Endpoint, UdpEndpoint
 from firmware_sim.mavlink.udp_links import UdpLinks

@@ -6,10 +6,10 @@ import shlex
 
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, RealFirmware
-from firmware_sim.external.ardupilot import program as ardupilot_program
-from firmware_sim.external.ardupilot.program import find_arducopter
-from firmware_sim.external.px4 import program as px4_program
-from firmware_sim.external.px4.program import find_px4
+from firmware_sim.external.ardupilot import ardupilot_program
+from firmware_sim.external.ardupilot.ardupilot_program import find_arducopter
+from firmware_sim.external.px4 import px4_program
+from firmware_sim.external.px4.px4_program import find_px4
 
 
 def check_program(real: RealFirmware) -> None:

@@ -23,7 +23,7 @@ from firmware_sim.autopilot.snapshot import setpoint_of
 from firmware_sim.engine.dynamics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.engine.record import Record
 from firmware_sim.flight_log.topics import SENSOR_COMBINED, TOPICS, Moment, sensor_combined
-from firmware_sim.flight_log.ulog import UlogWriter, Values
+from firmware_sim.flight_log.ulog_writer import UlogWriter, Values
 from firmware_sim.interfaces import BatterySample, TrueState
 
 

@@ -21,7 +21,7 @@ from firmware_sim.autopilot.optical_flow import (
     GREATEST_RAD_S,
     LEAST_HEIGHT_M,
 )
-from firmware_sim.flight_log.ulog import Topic, Values
+from firmware_sim.flight_log.ulog_writer import Topic, Values
 from firmware_sim.interfaces import PoseFrame, TrueState, VelocityFrame
 
 ON_CHANGE_US = 500 * US_PER_MS

@@ -26,8 +26,8 @@ from firmware_sim.mavlink.codec import (
 )
 from firmware_sim.mavlink.endpoint import Peer, Sender, SharedEndpoint
 from firmware_sim.mavlink.event_buffer import EventSender
-from firmware_sim.mavlink.limits import Allowance, ListeningTime, TickTime
 from firmware_sim.mavlink.link import Link, LinkCounters
+from firmware_sim.mavlink.rate_limits import Allowance, ListeningTime, TickTime
 from firmware_sim.mavlink.services.context import ANY, Context, sender
 
 MAX_CLIENTS = 32

@@ -12,9 +12,9 @@ from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import SYSTEM_ID, Values, WireMessage
-from firmware_sim.mavlink.streams import Builder, information, sensors
+from firmware_sim.mavlink.streams import Builder, information, sensor_streams
 from firmware_sim.mavlink.streams.pose import hil_state_quaternion
-from firmware_sim.mavlink.streams.sensors import VibrationMeter
+from firmware_sim.mavlink.streams.sensor_streams import VibrationMeter
 from firmware_sim.mavlink.streams.status import manual_control
 from firmware_sim.mavlink.streams.units import UINT16_MAX, boot_ms
 
@@ -50,7 +50,7 @@ class OwnStreams:
     def _battery_status(self, state: AutopilotState) -> Values | None:
         if self._port is None:
             return None
-        return sensors.battery_status(state, self._port.parameters)
+        return sensor_streams.battery_status(state, self._port.parameters)
 
     def _hil_state_quaternion(self, _state: AutopilotState) -> Values | None:
         if self._truth is None:
@@ -59,7 +59,11 @@ class OwnStreams:
         return hil_state_quaternion(truth, truth.time_us)
 
     def _mag_cal_report(self, _state: AutopilotState) -> Values | None:
-        return None if self._port is None else sensors.mag_cal_report(self._port.parameters.value)
+        return (
+            None
+            if self._port is None
+            else sensor_streams.mag_cal_report(self._port.parameters.value)
+        )
 
     def _time_estimate(self, state: AutopilotState) -> Values | None:
         if self._port is None:

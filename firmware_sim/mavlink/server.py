@@ -19,9 +19,9 @@ from firmware_sim.mavlink.clients import Client, Clients, Forwarder, Senders
 from firmware_sim.mavlink.codec import COMPONENT_ID, REPLY_IDS, SYSTEM_ID, TextEncoder, WireMessage
 from firmware_sim.mavlink.endpoint import Peer, Sender
 from firmware_sim.mavlink.event_buffer import EventBuffer, EventSender
-from firmware_sim.mavlink.limits import Allowance, Complaints, TickTime
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
 from firmware_sim.mavlink.own_streams import OwnStreams, Radio
+from firmware_sim.mavlink.rate_limits import Allowance, Complaints, TickTime
 from firmware_sim.mavlink.services import handle, peers, send_pending
 from firmware_sim.mavlink.services.context import Context, sender
 from firmware_sim.mavlink.services.transfers import RunningCalibration

@@ -20,7 +20,7 @@ from firmware_sim.engine.dynamics import WIDTH, quaternion, rates, velocity, wri
 from firmware_sim.plant.body import FLOOR, NOTHING, Touch
 from firmware_sim.plant.contacts.box import BREAKING_SHARE, MOST, ROW
 from firmware_sim.plant.contacts.convex import touch_obstacle
-from firmware_sim.plant.contacts.ground import (
+from firmware_sim.plant.contacts.ground_contact import (
     FLOOR_ID,
     KEPT,
     near_ground,

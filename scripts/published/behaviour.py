@@ -29,7 +29,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, validated
 from airl_mav.core.files import read_json, write_json
 from airl_mav.experiments.gym_flier import GymFlier
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.scenario.model import LevelName, Scenario
 from airl_mav.scenario.resolve import resolve

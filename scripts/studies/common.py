@@ -17,12 +17,12 @@ import numpy as np
 from pydantic import BaseModel, Field
 from rich.console import Console
 
-from airl_mav.cli import train
+from airl_mav.cli import train_command
 from airl_mav.cli.experiments import fly_and_show
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.experiments.experiment import Experiment
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.statistics import bootstrap_mean
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.policy.registry import find_policy
@@ -84,7 +84,7 @@ def find_or_train(
     if not (folder / "policy" / "card.json").exists():
         asked = {"config": training, "out": folder, "steps": steps, "name": policy, "resume": True}
         command = f"airl train {training} --name {policy}" + (f" --steps {steps}" if steps else "")
-        if train.run(train.TrainOptions(**asked), console, command_line=command):
+        if train_command.run(train_command.TrainOptions(**asked), console, command_line=command):
             raise KeyboardInterrupt
     return str(folder / "policy")
 

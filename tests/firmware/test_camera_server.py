@@ -29,7 +29,7 @@ from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import load_vehicle
-from companion.camera import MESSAGES_PER_LOOK, ReceivedFrame, ZmqFrameSource
+from companion.frame_source import MESSAGES_PER_LOOK, ReceivedFrame, ZmqFrameSource
 from firmware_sim.plant.camera_server import CameraServer, SimulatedCamera
 from tests.support.flight_rig import quad
 
@@ -347,7 +347,7 @@ def test_malformed_messages_are_counted_and_ignored() -> None:
 
 def test_no_message_larger_than_a_frame_is_taken_in(monkeypatch: pytest.MonkeyPatch) -> None:
     """ZeroMQ ends the connection for good; a new one is made, and frames are heard again."""
-    monkeypatch.setattr("companion.camera.REDIAL_S", 0.3)
+    monkeypatch.setattr("companion.frame_source.REDIAL_S", 0.3)
     with zmq.Context() as context, context.socket(zmq.PUB) as publisher:
         port = publisher.bind_to_random_port("tcp://127.0.0.1")
         source = ZmqFrameSource(f"tcp://127.0.0.1:{port}", SimClock())
@@ -415,7 +415,7 @@ def test_bad_source_endpoint_is_refused(endpoint: str) -> None:
 
 def test_companion_side_needs_no_simulator_package() -> None:
     code = (
-        "import sys, companion.camera\n"
+        "import sys, companion.frame_source\n"
         "heavy = {'numba', 'pybullet', 'scipy', 'torch', 'matplotlib'}\n"
         "print(sorted(heavy & set(sys.modules)))"
     )

@@ -34,9 +34,9 @@ from firmware_sim.autopilot.events.enumerations import (
     ModeGroup,
 )
 from firmware_sim.autopilot.events.health_report import ALL_MODES, HealthReport, health_report
-from firmware_sim.autopilot.failsafes.actions import FailsafeAction as FailsafeAction
-from firmware_sim.autopilot.failsafes.actions import FailsafeReason
-from firmware_sim.autopilot.failsafes.conditions import NEEDS, Conditions, Need
+from firmware_sim.autopilot.failsafes.failsafe_actions import FailsafeAction as FailsafeAction
+from firmware_sim.autopilot.failsafes.failsafe_actions import FailsafeReason
+from firmware_sim.autopilot.failsafes.failsafe_conditions import NEEDS, Conditions, Need
 from firmware_sim.autopilot.failsafes.framework import announcement
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.prearm import ArmingSettings, Readiness, can_arm

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from airl_mav.core.errors import UsageError
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.external.ardupilot.sitl import (
+from firmware_sim.external.ardupilot.ardupilot_sitl import (
     MAX_GARBAGE,
     ArdupilotBridge,
     ServoPacketError,

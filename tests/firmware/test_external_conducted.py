@@ -28,8 +28,8 @@ from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.process import RunningProgram, StartCommand, WorkingFolders, program_at
 from firmware_sim.external.px4 import onboard_link as link_module
 from firmware_sim.external.px4.onboard_link import OnboardLink
-from firmware_sim.external.px4.program import API_LOCAL_PORT, SIMULATOR_PORT, check_free
-from firmware_sim.external.px4.sitl import EPOCH_US, Px4Bridge
+from firmware_sim.external.px4.px4_program import API_LOCAL_PORT, SIMULATOR_PORT, check_free
+from firmware_sim.external.px4.px4_sitl import EPOCH_US, Px4Bridge
 from firmware_sim.interfaces import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.codec import Decoder, Encoder, dialect
 from firmware_sim.plant.plant import Plant

@@ -15,14 +15,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.failsafes.actions import FailsafeAction
-from firmware_sim.autopilot.failsafes.conditions import (
+from firmware_sim.autopilot.failsafes.failsafe_actions import FailsafeAction
+from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     NEEDS,
     BatteryWarning,
     Conditions,
     FailsafeSettings,
     FenceBreach,
     can_run,
+)
+from firmware_sim.autopilot.failsafes.failsafe_table import (
+    MODE_OF_ACTION,
+    TABLE,
+    Situation,
+    Trigger,
+    answers,
+    possible,
 )
 from firmware_sim.autopilot.failsafes.framework import (
     NO_INTERVENTION,
@@ -31,14 +39,6 @@ from firmware_sim.autopilot.failsafes.framework import (
     FailsafeState,
     Intervention,
     update,
-)
-from firmware_sim.autopilot.failsafes.table import (
-    MODE_OF_ACTION,
-    TABLE,
-    Situation,
-    Trigger,
-    answers,
-    possible,
 )
 
 MS, S = 1_000, 1_000_000

@@ -16,13 +16,13 @@ from scipy.spatial.transform import Rotation
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Obstacles
 from airl_mav.arena.ground import Ground
-from airl_mav.envs.arenas import NOTHING, touches
+from airl_mav.envs.arena_batch import NOTHING, touches
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from firmware_sim.interfaces import ActuatorControls
 from firmware_sim.plant.bullet_body import BulletWorld
 from firmware_sim.plant.contacts.box import BREAKING_SHARE, MOST, ROW
-from firmware_sim.plant.contacts.ground import near_ground, touch_ground
+from firmware_sim.plant.contacts.ground_contact import near_ground, touch_ground
 from firmware_sim.plant.downward_sensors import PlantRangefinder
 from firmware_sim.plant.plant import Plant
 from tests.firmware.test_kernel_body import HALF, HEIGHT, both

@@ -15,7 +15,7 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.signing import StoredSigning
 from firmware_sim.autopilot.autopilot_state import Arming
-from firmware_sim.mavlink import clients, codec, limits, server, tlog
+from firmware_sim.mavlink import clients, codec, rate_limits, server, tlog
 from firmware_sim.mavlink.codec import Decoder, WireMessage
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
@@ -123,7 +123,7 @@ def test_one_datagram_full_of_commands_takes_no_more_than_its_part_of_a_tick(
     dispatch = server.MavlinkServer._dispatch
 
     def slow(this: server.MavlinkServer, sender: clients.Client, message: WireMessage) -> bool:
-        clock.advance(limits.LISTEN_US // 10)
+        clock.advance(rate_limits.LISTEN_US // 10)
         return dispatch(this, sender, message)
 
     monkeypatch.setattr(server.MavlinkServer, "_dispatch", slow)

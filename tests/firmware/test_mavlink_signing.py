@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.signing import StoredSigning, read_key, write_key
-from companion.interfaces import LinkError
+from companion.link_interface import LinkError
 from companion.mavsdk_link import MavsdkLink
 from companion.signing_proxy import SigningProxy, signed
 from firmware_sim.autopilot.autopilot_state import Arming

@@ -30,7 +30,7 @@ from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import FlowReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder, layout
-from firmware_sim.mavlink.streams.sensors import optical_flow_rad
+from firmware_sim.mavlink.streams.sensor_streams import optical_flow_rad
 from firmware_sim.mavlink.telemetry import payload
 from firmware_sim.plant.downward_sensors import BEST, INVALID, PlantOpticalFlow
 from tests.support import mavlink_clients

@@ -33,7 +33,8 @@ from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import DOWNWARD, DistanceReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder
-from firmware_sim.mavlink.streams import sensors, status
+from firmware_sim.mavlink.streams import sensor_streams as sensors
+from firmware_sim.mavlink.streams import status
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig, velocity_setpoint
 

@@ -16,8 +16,8 @@ import pytest
 from pymavlink import mavparm
 from pymavlink.dialects.v20 import common as dialect
 
-from airl_mav.cli.parameters import KINDS, ParametersOptions
-from airl_mav.cli.parameters import run as write_parameters
+from airl_mav.cli.parameters_command import KINDS, ParametersOptions
+from airl_mav.cli.parameters_command import run as write_parameters
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.frames import Geodetic
@@ -34,14 +34,14 @@ from firmware_sim.external.airframe_check import (
     differences,
     px4_airframe,
 )
-from firmware_sim.external.ardupilot.program import PARAMETERS, Links, find_arducopter
-from firmware_sim.external.ardupilot.program import start as start_arducopter
+from firmware_sim.external.ardupilot.ardupilot_program import PARAMETERS, Links, find_arducopter
+from firmware_sim.external.ardupilot.ardupilot_program import start as start_arducopter
 from firmware_sim.external.launcher import Bridge, Launcher
 from firmware_sim.external.observer import FirmwareObserver, flight_of
 from firmware_sim.external.parameter_client import ParameterClient, same
 from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
 from firmware_sim.external.programs import how_to_start, load_timeout_s
-from firmware_sim.external.px4.program import find_px4
+from firmware_sim.external.px4.px4_program import find_px4
 from firmware_sim.interfaces import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from tests.support.flight_rig import quad

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_sim.autopilot.trajectory import (
+from firmware_sim.autopilot.smooth_trajectory import (
     Axis,
     PathLimits,
     PathSegment,

@@ -24,16 +24,16 @@ from airl_mav.experiments.campaign import (
     run_cell,
     run_cells,
 )
-from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor
-from airl_mav.experiments.experiment import Experiment, run_experiment
-from airl_mav.experiments.process_executor import open_executor
-from airl_mav.experiments.run import fly_scenario
-from airl_mav.experiments.store import (
+from airl_mav.experiments.campaign_store import (
     Declaration,
     DeclaredCell,
     load_campaign,
     open_campaign,
 )
+from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor
+from airl_mav.experiments.experiment import Experiment, run_experiment
+from airl_mav.experiments.process_executor import open_executor
+from airl_mav.experiments.run import fly_scenario
 from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE, FlownEpisode, load
 from tests.support.campaign_kit import cells, declared, gym_cell, same_runs

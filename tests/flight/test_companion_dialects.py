@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.clock import WallClock
 from companion.dialects import ARDUPILOT, PX4, dialect_of
-from companion.interfaces import STOP, BodyVelocity, LinkError
+from companion.link_interface import STOP, BodyVelocity, LinkError
 from companion.mavsdk_link import MavsdkLink
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from tests.support.ardupilot_copter import BRAKE, GUIDED, LAND, STABILIZE

@@ -51,7 +51,7 @@ from airl_mav.addons.conformance.vehicle import Method, VehicleClock
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.loading import list_profiles
-from companion.interfaces import LinkError
+from companion.link_interface import LinkError
 
 RATE_HZ = 1000.0
 SAMPLE_S = 1.0 / RATE_HZ

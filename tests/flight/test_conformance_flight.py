@@ -36,7 +36,7 @@ def firmware(folder: Path, vehicle: str) -> Iterator[TestPorts]:
     profile = folder / "vehicle.toml"
     profile.write_text(vehicle, encoding="utf-8")
     words = [
-        *("-m", "airl_mav.cli.firmware", "--arena", str(write_arena(folder, 60.0))),
+        *("-m", "airl_mav.cli.firmware_command", "--arena", str(write_arena(folder, 60.0))),
         *("--vehicle", str(profile), "--speed", str(SPEED), *ports.options()),
     ]
     with running(words, folder) as process:

@@ -37,8 +37,8 @@ from airl_mav.profiles.loading import load_profile, profiles_dir
 from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, load
 from airl_mav.report import run_report, shown_flights
-from airl_mav.report.arenas import arena_of
 from airl_mav.report.comparison import show
+from airl_mav.report.run_arenas import arena_of
 from airl_mav.report.run_report import write_report
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
@@ -391,11 +391,12 @@ def test_a_page_alone_loads_what_draws(tmp_path: Path) -> None:
 import sys
 from airl_mav.cli.options import carry_out
 words = ["--arena", "no-obstacles", "--episodes", "4", "--require", "success >= 50 %"]
-assert carry_out("airl evaluate", "airl_mav.cli.evaluate", ["greedy", *words, "--out", "run"]) == 0
+command = "airl_mav.cli.evaluate_command"
+assert carry_out("airl evaluate", command, ["greedy", *words, "--out", "run"]) == 0
 known = {"matplotlib", "plotly", "jinja2", "scipy.stats", "scipy.optimize", "pybullet", "mavsdk"}
 known |= {"torch", "gymnasium"}
 print("loaded:", *sorted(known & set(sys.modules)))
-assert carry_out("airl report", "airl_mav.cli.report", ["run"]) == 0
+assert carry_out("airl report", "airl_mav.cli.report_command", ["run"]) == 0
 print("loaded:", *sorted({"matplotlib", "jinja2"} & set(sys.modules)))
 """
     done = run_alone(program, tmp_path)

@@ -13,7 +13,7 @@ import torch
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import WallClock
 from airl_mav.flight.judge import Outcome
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.action_sets import discrete_actions
 from airl_mav.policy.layouts import boxes
 from airl_mav.scenario.model import Scenario
@@ -21,7 +21,7 @@ from airl_mav.scenario.resolve import resolve
 from airl_mav.training.export import load_module
 from airl_mav.training.export_request import ExportRequest
 from airl_mav.training.onnx_export import random_inputs
-from companion.camera import open_camera
+from companion.frame_source import open_camera
 from tests.support.ports import LOOPBACK, choose_ports
 from tests.support.processes import ROOT, running
 
@@ -168,7 +168,13 @@ def test_conducted_program(tmp_path: Path) -> None:
 @pytest.mark.nightly
 def test_mavsdk_client_flies_a_square(tmp_path: Path) -> None:
     ports = choose_ports()
-    firmware_words = ["-m", "airl_mav.cli.firmware", "--arena", "open-field", *ports.options()]
+    firmware_words = [
+        "-m",
+        "airl_mav.cli.firmware_command",
+        "--arena",
+        "open-field",
+        *ports.options(),
+    ]
     with running([*firmware_words, "--speed", "3"], tmp_path):
         text = output_of("mavsdk_client.py", tmp_path, f"udpin://{LOOPBACK}:{ports.api}")
     assert "landed" in text
@@ -184,11 +190,11 @@ def test_own_camera_flies_to_the_goal(tmp_path: Path, monkeypatch: pytest.Monkey
     """The companion with a driver of the user's, named by its file."""
     ports = choose_ports()
     monkeypatch.setenv("CAMERA", f"tcp://{LOOPBACK}:{ports.camera}")
-    firmware = ["-m", "airl_mav.cli.firmware", "--arena", "open-field", *ports.options()]
+    firmware = ["-m", "airl_mav.cli.firmware_command", "--arena", "open-field", *ports.options()]
     with running([*firmware, "--speed", "3"], tmp_path) as vehicle:
         vehicle.wait_for_text("Ctrl-C ends it")
         companion = [
-            *("-m", "airl_mav.cli.companion", "--policy", "greedy", "--goal", "9", "0"),
+            *("-m", "airl_mav.cli.companion_command", "--policy", "greedy", "--goal", "9", "0"),
             *("--connect", f"udpin://{LOOPBACK}:{ports.api}", "--speed", "3"),
             *("--camera", f"{EXAMPLES / 'own_camera.py'}:SimulatorCamera"),
         ]

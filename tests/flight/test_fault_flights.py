@@ -10,14 +10,14 @@ from mavsdk.plugins.failure import Failure, FailureError, FailureType, FailureUn
 from mavsdk.plugins.param import Param
 from rich.console import Console
 
-from airl_mav.cli import sitl
+from airl_mav.cli import sitl_command
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.experiments.evaluate import check_plain, matrix
-from airl_mav.faults.model import Fault
+from airl_mav.faults.fault import Fault
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.episode import faults_of
@@ -76,7 +76,7 @@ def test_a_run_folder_tells_its_faults_and_flies_them_again(tmp_path: Path) -> N
     console = Console(record=True, width=200)
     fault = "camera stuck at offboard+500ms for 300ms"
     options = {"level": "lockstep", "episodes": 1, "seed": SEED, "out": out, "faults": [fault]}
-    assert sitl.run(sitl.OPTIONS.model_validate(options), console) == 0
+    assert sitl_command.run(sitl_command.OPTIONS.model_validate(options), console) == 0
     run = load(out)
     table = faults_table(run)
     assert table is not None

@@ -27,9 +27,9 @@ from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
-from companion.camera import ZmqFrameSource
+from companion.frame_source import ZmqFrameSource
 from companion.mavsdk_link import MavsdkLink
-from companion.mission import MissionResult, fly_mission
+from companion.offboard_mission import MissionResult, fly_mission
 from companion.watchdog import ThreadGuard
 from tests.support.ports import LOOPBACK, TestPorts, choose_ports, free_ports
 from tests.support.processes import (
@@ -89,7 +89,7 @@ def firmware(
 ) -> Iterator[Running]:
     """airl-firmware alone, with a MAVLink log."""
     words = [
-        *("-m", "airl_mav.cli.firmware", "--arena", str(write_arena(folder, goal_m))),
+        *("-m", "airl_mav.cli.firmware_command", "--arena", str(write_arena(folder, goal_m))),
         *("--speed", str(speed), "--tlog", str(folder / "flight.tlog"), *ports.options()),
         *options,
     ]
@@ -110,7 +110,7 @@ def companion_words(ports: TestPorts, *options: str, goal_m: float = FAR_M) -> l
 @contextmanager
 def companion(folder: Path, ports: TestPorts, *options: str, **more: Any) -> Iterator[Running]:
     """airl-companion alone."""
-    words = ["-m", "airl_mav.cli.companion", *companion_words(ports, *options, **more)]
+    words = ["-m", "airl_mav.cli.companion_command", *companion_words(ports, *options, **more)]
     with running(words, folder) as process:
         yield process
 
@@ -742,7 +742,7 @@ def told_in_one_line(run: Running, port: int, option: str) -> None:
 
 
 def test_a_taken_port_ends_a_firmware(tmp_path: Path) -> None:
-    words = ["-m", "airl_mav.cli.firmware", *choose_ports().options()]
+    words = ["-m", "airl_mav.cli.firmware_command", *choose_ports().options()]
     with (
         occupied(socket.SOCK_STREAM) as port,
         running([*words, "--camera-port", str(port)], tmp_path) as vehicle,

@@ -47,7 +47,7 @@ def interpreter(client: str) -> str:
 def vehicle(folder: Path) -> Iterator[tuple[Running, TestPorts]]:
     """Start the vehicle, in real time."""
     ports = choose_ports()
-    words = ["-m", "airl_mav.cli.firmware", "--arena", "no-obstacles", *ports.options()]
+    words = ["-m", "airl_mav.cli.firmware_command", "--arena", "no-obstacles", *ports.options()]
     with running(words, folder) as firmware:
         wait_until(lambda: "Ctrl-C ends it" in firmware.text(), "the vehicle")
         yield firmware, ports

@@ -15,7 +15,7 @@ from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
 from airl_mav.flight.judge import Outcome
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.actions import Action
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation

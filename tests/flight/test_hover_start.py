@@ -10,17 +10,17 @@ from scipy.stats import binomtest
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
-from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.gym_env import RehearsalEnv
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.rehearsal.episode_setup import episode_setup
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
-from companion.mission import MissionResult
+from companion.offboard_mission import MissionResult
 from tests.support.lockstep_kit import SEED, demo_scenario, fly_as_companion
 
 AHEAD = 22

@@ -15,7 +15,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.experiments.campaign import EpisodeSaver
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.report import shown_flights
-from airl_mav.report.comparison.model import load_comparison
+from airl_mav.report.comparison.comparison_model import load_comparison
 from airl_mav.report.run_report import write_report
 from tests.support.command_line import airl, option_words
 from tests.support.page_alone import page_alone

@@ -8,13 +8,13 @@ import pytest
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.piloting import TRANSPORT_US
-from companion.mission import MissionResult
+from companion.offboard_mission import MissionResult
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import FlightPhase

@@ -25,7 +25,7 @@ from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep import stage as stage_module
 from airl_mav.lockstep.conductor import REPEAT_US, Inbound
 from airl_mav.lockstep.digest import LANES
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.lockstep.threaded import ThreadPartner
 from airl_mav.lockstep.turns import Handle, LockstepError, Turn
@@ -39,8 +39,8 @@ from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettin
 from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.conducted import Poll
-from companion.interfaces import BodyVelocity
-from companion.mission import fly_mission
+from companion.link_interface import BodyVelocity
+from companion.offboard_mission import fly_mission
 from firmware_sim.autopilot.failsafes.supervisor import LOOK_US
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.simulation import EpisodeSetup

@@ -19,8 +19,8 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.experiments.run import rehearse
 from airl_mav.flight.judge import Outcome
-from airl_mav.lockstep.flight import fly
-from airl_mav.lockstep.link import ConductedVehicle, builtin_vehicle
+from airl_mav.lockstep.lockstep_flight import fly
+from airl_mav.lockstep.lockstep_link import ConductedVehicle, builtin_vehicle
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.lockstep.vehicle_end import VehicleEnd, acknowledged

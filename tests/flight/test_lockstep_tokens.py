@@ -29,7 +29,7 @@ from pymavlink import mavutil
 from airl_mav.core.frames import Goal
 from airl_mav.core.signing import StoredSigning, write_key
 from airl_mav.flight.judge import Outcome
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.remote import RemoteStage
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneVehicle
@@ -83,14 +83,14 @@ def reference() -> Reference:
 
 
 def firmware_words(ports: TestPorts, *options: str) -> list[str]:
-    words = ["-m", "airl_mav.cli.firmware", "--lockstep", *ports.options()]
+    words = ["-m", "airl_mav.cli.firmware_command", "--lockstep", *ports.options()]
     return [*words, "--arena", ARENA, "--seed", str(SEED), *options]
 
 
 def companion_words(api: int, camera: int, reference: Reference, *options: str) -> list[str]:
     north, east = reference.goal[:2]
     return [
-        *("-m", "airl_mav.cli.companion", "--lockstep"),
+        *("-m", "airl_mav.cli.companion_command", "--lockstep"),
         *(
             "--policy",
             reference.scenario.scenario.policy,

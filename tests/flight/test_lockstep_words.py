@@ -16,9 +16,9 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import validated
 from airl_mav.core.signing import StoredSigning, write_key
-from airl_mav.lockstep.camera import TokenCamera
 from airl_mav.lockstep.conductor import Inbound
-from airl_mav.lockstep.tokens import TokenPartner
+from airl_mav.lockstep.lockstep_camera import TokenCamera
+from airl_mav.lockstep.token_partner import TokenPartner
 from airl_mav.lockstep.turns import LockstepError, Turn
 from airl_mav.lockstep.wire import Wire
 from airl_mav.rehearsal.episode import Order

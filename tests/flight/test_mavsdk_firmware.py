@@ -118,7 +118,7 @@ def client(
     mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER))
     assert mavsdk.add_any_connection(f"udpin://{LOOPBACK}:{ports.api}") == 0
     words = [
-        *("-m", "airl_mav.cli.firmware", "--arena", str(write_arena(folder, 40.0))),
+        *("-m", "airl_mav.cli.firmware_command", "--arena", str(write_arena(folder, 40.0))),
         *("--speed", str(speed), *ports.options(), *options),
     ]
     companion: Companion | None = None

@@ -10,7 +10,7 @@ import pytest
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion, Mount
-from airl_mav.envs.arenas import batch_of
+from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.colour_images import lens_of
 from airl_mav.envs.encoding import COMPILED
@@ -18,7 +18,7 @@ from airl_mav.envs.evaluation import SinglePilots, fly_seeds
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.actions import Action
 from airl_mav.policy.greedy import GreedyPolicy
 from airl_mav.policy.images import NUMPY

@@ -24,8 +24,8 @@ from airl_mav.latency.injection import FixedSampler, LatencySampler, ReplaySampl
 from airl_mav.policy.actions import ALTITUDE_P, MAX_VERTICAL_M_S, Action
 from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
-from companion.camera import ReceivedFrame
-from companion.interfaces import STOP, BodyVelocity, LinkError, Setpoint, VehicleStatus
+from companion.frame_source import ReceivedFrame
+from companion.link_interface import STOP, BodyVelocity, LinkError, Setpoint, VehicleStatus
 from companion.pilot import Pilot
 from companion.watchdog import ThreadGuard, Watchdog
 

@@ -21,7 +21,7 @@ from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.scenario.model import PilotSettings
 from airl_mav.scenario.piloting import TRANSPORT_US
-from companion.mission import MissionResult
+from companion.offboard_mission import MissionResult
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Result
 from firmware_sim.autopilot.commander import FlightPhase
@@ -211,9 +211,9 @@ def test_the_program_tells_the_ground_station_and_waits_for_the_switch(tmp_path:
     """Run two programs over UDP, with a ground station for the pilot."""
     with ground_station() as ground:
         ports = choose_ports(gcs=ground.port)
-        firmware = ["-m", "airl_mav.cli.firmware", "--arena", "open-field", "--speed", "2"]
+        firmware = ["-m", "airl_mav.cli.firmware_command", "--arena", "open-field", "--speed", "2"]
         companion = [
-            *("-m", "airl_mav.cli.companion", "--policy", "greedy", "--goal", "9", "0"),
+            *("-m", "airl_mav.cli.companion_command", "--policy", "greedy", "--goal", "9", "0"),
             *("--start", "offboard", "--speed", "2"),
             *("--connect", f"udpin://{LOOPBACK}:{ports.api}"),
             *("--camera", f"tcp://{LOOPBACK}:{ports.camera}"),

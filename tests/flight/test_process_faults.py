@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.rehearsal.run_folder import FlownEpisode, load
 from tests.support.lockstep_kit import SEED, demo_scenario
 from tests.support.ports import choose_ports

@@ -36,7 +36,7 @@ from airl_mav.profiles.computer import existing_profile, load_computer, write_pr
 from airl_mav.profiles.loading import list_profiles
 from airl_mav.scenario.model import DEFAULT_POLICY, Lateness
 from airl_mav.scenario.piloting import select_latency
-from companion.mission import MissionResult
+from companion.offboard_mission import MissionResult
 from tests.support.ports import choose_ports
 from tests.support.processes import ROOT, allow_interrupt
 from tests.unit.test_companion_light import BLOCK
@@ -497,17 +497,17 @@ def test_frames_of_yet_another_clock() -> None:
 FIRMWARE_THAT_TELLS_ITS_EPOCH = """
 import sys
 from airl_mav.cli.options import run_command
-from airl_mav.rehearsal import stand_alone
+from airl_mav.rehearsal import stand_alone_vehicle
 
-fly = stand_alone.fly
+fly = stand_alone_vehicle.fly
 
 def told(firmware, *rest):
     fly(firmware, *rest)
     print("epoch_ns", firmware.epoch_ns, flush=True)
     print("slipped_us", firmware.slipped_us, flush=True)
 
-stand_alone.fly = told
-run_command("airl-firmware", "airl_mav.cli.firmware")
+stand_alone_vehicle.fly = told
+run_command("airl-firmware", "airl_mav.cli.firmware_command")
 """
 
 

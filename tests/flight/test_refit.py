@@ -27,8 +27,8 @@ from airl_mav.addons.refit.refly import (
 )
 from airl_mav.black_box.mcap_file import read_black_box
 from airl_mav.cli.main import main
-from airl_mav.cli.report import ReportOptions
-from airl_mav.cli.report import run as report
+from airl_mav.cli.report_command import ReportOptions
+from airl_mav.cli.report_command import run as report
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.experiments.run import load_run
 from airl_mav.latency.injection import parse_latency
@@ -40,8 +40,8 @@ from airl_mav.report.recording_folder import take_in
 from airl_mav.report.tracking import track
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolved import read_scenario_file
-from airl_mav.vehicle_log.alignment import align
-from airl_mav.vehicle_log.ulog import Series, VehicleLog, read_vehicle_log
+from airl_mav.vehicle_log.clock_alignment import align
+from airl_mav.vehicle_log.ulog_reader import Series, VehicleLog, read_vehicle_log
 from tests.support.recorded_flights import RecordedFlight
 from tests.support.refit_truths import Truth, drawn_truth, errors_of, true_dead_time_s, uplink_s
 

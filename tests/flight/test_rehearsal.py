@@ -18,7 +18,7 @@ import pytest
 
 from airl_mav.core.child_process import Exited
 from airl_mav.core.errors import UsageError
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.rehearsal import process_pair, rehearsal
 from airl_mav.rehearsal.channel import (
@@ -38,14 +38,14 @@ from airl_mav.rehearsal.channel import (
     State,
     Text,
 )
+from airl_mav.rehearsal.observer import Observer
 from airl_mav.rehearsal.process_pair import COMPANION, FIRMWARE
-from airl_mav.rehearsal.progress import Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load, open_folder
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
-from firmware_sim.faults.timeline import Acted
+from firmware_sim.faults.fault_timeline import Acted
 from firmware_sim.recording import fault_arrays
 from tests.support.run_demo import demo_arena, demo_episode
 

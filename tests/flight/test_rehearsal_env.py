@@ -27,8 +27,8 @@ from airl_mav.envs.registration import NAVIGATION, REHEARSAL
 from airl_mav.envs.single import NavigationEnv
 from airl_mav.experiments.gym_flier import environment_of
 from airl_mav.lockstep.asked_flight import AskedFlight
-from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.gym_env import RehearsalEnv
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve

@@ -16,16 +16,16 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.envs.arenas import batch_of
+from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.colour_images import Looks
 from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.fleet import new_fleet
-from airl_mav.envs.meshes import MeshesSeen
+from airl_mav.envs.mesh_batch import MeshesSeen
 from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned

@@ -19,12 +19,12 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from airl_mav.cli import sitl
+from airl_mav.cli import sitl_command as sitl
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments import live
 from airl_mav.experiments.live import FlownRun
 from airl_mav.rehearsal import run_folder
-from airl_mav.rehearsal.progress import LiveObserver
+from airl_mav.rehearsal.observer import LiveObserver
 from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load
 from airl_mav.scenario.aircraft import Ports

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame, FurtherImage, depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.cli.video import video_words
+from airl_mav.cli.video_command import video_words
 from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.profiles.vehicle import load_vehicle
@@ -263,7 +263,7 @@ def ground_station(port: int) -> Iterator[Camera]:
 
 @contextlib.contextmanager
 def shown(folder: Path, ports: TestPorts, port: int, *more: str) -> Iterator[Running]:
-    words = ["-m", "airl_mav.cli.video", "--camera", f"tcp://127.0.0.1:{ports.camera}"]
+    words = ["-m", "airl_mav.cli.video_command", "--camera", f"tcp://127.0.0.1:{ports.camera}"]
     words += ["--to", f"127.0.0.1:{port}", "--connect", f"udpout://127.0.0.1:{ports.gcs_local}"]
     with running([*words, *more], folder) as video:
         yield video
@@ -317,7 +317,7 @@ def test_a_ground_station_finds_the_camera_and_its_video(tmp_path: Path, instanc
     vehicle, watcher = tmp_path / "vehicle", tmp_path / "watcher"
     vehicle.mkdir()
     watcher.mkdir()
-    words = ["-m", "airl_mav.cli.firmware", "--arena", "static-obstacles", *ports.options()]
+    words = ["-m", "airl_mav.cli.firmware_command", "--arena", "static-obstacles", *ports.options()]
     with running([*words, "--instance", str(instance)], vehicle) as firmware:
         wait_until(lambda: "Ctrl-C ends it" in firmware.text(), "the vehicle")
         with (

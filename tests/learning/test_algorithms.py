@@ -10,10 +10,10 @@ import pytest
 from stable_baselines3 import DQN, PPO
 
 from airl_mav.core.errors import UsageError
+from airl_mav.training.algorithm_table import ALGORITHMS
 from airl_mav.training.algorithms import ROLLOUT, make_model
 from airl_mav.training.config import AlgorithmSpec, NetworkSpec, TrainingConfig
 from airl_mav.training.dqn import DoubleDQN
-from airl_mav.training.table import ALGORITHMS
 from tests.support.toy_fleet import ToyFleet
 
 SHORT: dict[str, dict[str, Any]] = {

@@ -18,7 +18,7 @@ from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.single import NavigationEnv
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
-from airl_mav.faults.model import Fault
+from airl_mav.faults.fault import Fault
 from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.learned import load_learned

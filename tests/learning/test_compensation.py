@@ -20,13 +20,13 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.arenas import batch_of
+from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.fleet import Rules, hover, new_fleet, vehicle_of
-from airl_mav.envs.flight import advance
+from airl_mav.envs.fleet_step import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.latency.injection import FixedSampler
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.prediction.compensator import Compensator
@@ -38,8 +38,8 @@ from airl_mav.report.comparison import show
 from airl_mav.scenario.model import LevelName, PilotSettings, Scenario, WatchdogSettings
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.camera import ReceivedFrame
-from companion.interfaces import BodyVelocity, Setpoint, VehicleStatus
+from companion.frame_source import ReceivedFrame
+from companion.link_interface import BodyVelocity, Setpoint, VehicleStatus
 from companion.pilot import Pilot
 from companion.program import prepare
 from companion.watchdog import Watchdog

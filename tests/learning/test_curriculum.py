@@ -15,10 +15,10 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import Curriculum, EnvironmentSpec, spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.training import run
+from airl_mav.training import training_run
 from airl_mav.training.checkpoint import _read
 from airl_mav.training.config import TrainingConfig
-from airl_mav.training.store import TrainingProgress
+from airl_mav.training.training_folder import TrainingProgress
 
 
 def state(window: int, threshold: float = 0.5, zones: int = 3) -> CurriculumState:
@@ -206,10 +206,10 @@ def test_what_was_learned_in_a_zone_is_kept_and_the_same_after_a_kill(tmp_path: 
             "selection": {"every": 400, "episodes": 2},
         }
     )
-    run.train(config, tmp_path / "straight", name="any")
+    training_run.train(config, tmp_path / "straight", name="any")
     with pytest.raises(KeyboardInterrupt):
-        run.train(config, tmp_path / "killed", name="any", progress=Dies(60))
-    run.train(config, tmp_path / "killed", name="any", resume=True)
+        training_run.train(config, tmp_path / "killed", name="any", progress=Dies(60))
+    training_run.train(config, tmp_path / "killed", name="any", resume=True)
     for zone in range(3):
         kept = [tmp_path / each / "zones" / f"zone-{zone}" for each in ("straight", "killed")]
         assert (kept[0] / "model.zip").exists()

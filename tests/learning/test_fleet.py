@@ -15,7 +15,7 @@ from airl_mav.control.demand import Demand
 from airl_mav.control.memory import new_memory, trim_for_hover
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US
 from airl_mav.core.frames import heading_to_ned, quat_yaw
-from airl_mav.envs.arenas import (
+from airl_mav.envs.arena_batch import (
     FLOOR,
     NOTHING,
     WALL,
@@ -36,7 +36,7 @@ from airl_mav.envs.fleet import (
     new_fleet,
     vehicle_of,
 )
-from airl_mav.envs.flight import REPEAT_US, advance
+from airl_mav.envs.fleet_step import REPEAT_US, advance
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile

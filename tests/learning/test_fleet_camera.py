@@ -14,7 +14,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.projection import bent_of
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.frames import quat_from_euler
-from airl_mav.envs.arenas import batch_of
+from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.colour_images import LensConstants, lens_of
 from airl_mav.envs.fleet import FramePoses

@@ -16,11 +16,11 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.frames import quat_from_euler
-from airl_mav.envs.arenas import batch_of
+from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.colour_images import ColourImages, Looks, lens_of
 from airl_mav.envs.fleet import FramePoses
-from airl_mav.envs.meshes import MeshesSeen
+from airl_mav.envs.mesh_batch import MeshesSeen
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.support.command_line import airl

@@ -16,12 +16,12 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.frames import quat_from_euler
-from airl_mav.envs.arenas import batch_of, put_arena, relief_of, with_room
+from airl_mav.envs.arena_batch import batch_of, put_arena, relief_of, with_room
 from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.colour_images import ColourImages, Looks, lens_of
 from airl_mav.envs.experts import Expert
 from airl_mav.envs.fleet import FlightStatus, FramePoses
-from airl_mav.envs.meshes import MeshesSeen
+from airl_mav.envs.mesh_batch import MeshesSeen
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.planner import OVER_M, PlannerBody, map_of
 from airl_mav.envs.spec import EnvironmentSpec

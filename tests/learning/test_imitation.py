@@ -30,7 +30,7 @@ from airl_mav.policy.observation import Observation
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
 from airl_mav.training.config import TrainingConfig
-from airl_mav.training.run import nominal, train
+from airl_mav.training.training_run import nominal, train
 
 SMALL = {"image_width_px": 16, "image_height_px": 12}
 

@@ -10,9 +10,9 @@ import torch
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from airl_mav.core.errors import UsageError
-from airl_mav.training import run
+from airl_mav.training import training_run
 from airl_mav.training.config import TrainingConfig
-from airl_mav.training.store import TrainingFolder
+from airl_mav.training.training_folder import TrainingFolder
 
 TINY: dict[str, Any] = {
     "description": "any",
@@ -33,7 +33,7 @@ TINY: dict[str, Any] = {
 def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that has ended."""
     out = tmp_path_factory.mktemp("initial") / "before"
-    run.train(TrainingConfig.model_validate(TINY), out, name="before")
+    training_run.train(TrainingConfig.model_validate(TINY), out, name="before")
     return out
 
 
@@ -47,7 +47,9 @@ def test_begins_with_the_best_weights_of_a_run(before: Path, tmp_path: Path) -> 
     # Training ends before its first update: its weights are still the initial weights.
     for name, initial, same in (("on", before, True), ("afresh", None, False)):
         changes = {"seed": 2, "steps": 20, "initial": None if initial is None else str(initial)}
-        run.train(TrainingConfig.model_validate(TINY | changes), tmp_path / name, name=name)
+        training_run.train(
+            TrainingConfig.model_validate(TINY | changes), tmp_path / name, name=name
+        )
         ours, theirs = weights(tmp_path / name), weights(before)
         assert all(ours[key].equal(theirs[key]) for key in theirs) is same
     noted = TrainingFolder(tmp_path / "on").about()["config"]["initial"]
@@ -59,12 +61,12 @@ def test_ppo_goes_on_from_what_an_expert_has_taught(tmp_path: Path) -> None:
     """The mean of its actions is the pupil's; how widely it explores is its own."""
     environment = TINY["environment"] | {"actions": "velocity"}
     taught = TINY | {"environment": environment, "algorithm": {"name": "bc", "expert": "greedy"}}
-    run.train(TrainingConfig.model_validate(taught), tmp_path / "taught", name="taught")
+    training_run.train(TrainingConfig.model_validate(taught), tmp_path / "taught", name="taught")
     # Rollouts no longer than the training.
     options = {"log_std_init": -1.7, "n_steps": 20, "n_epochs": 2}
     algorithm = {"name": "ppo", "learning_rate": 1e-12, "batch_size": 20, "options": options}
     changes = {"algorithm": algorithm, "initial": str(tmp_path / "taught")}
-    run.train(TrainingConfig.model_validate(taught | changes), tmp_path / "on", name="on")
+    training_run.train(TrainingConfig.model_validate(taught | changes), tmp_path / "on", name="on")
     ours, theirs = weights(tmp_path / "on"), weights(tmp_path / "taught")
     assert torch.allclose(ours["action_net.weight"], theirs["action_net.weight"], atol=1e-6)
     assert ours["log_std"].tolist() == pytest.approx([-1.7, -1.7], abs=1e-4)
@@ -86,5 +88,5 @@ def test_what_cannot_be_begun_with_gets_one_line(
 ) -> None:
     config = TrainingConfig.model_validate(TINY | {"initial": str(before)} | changes)
     with pytest.raises(UsageError, match=told) as error:
-        run.train(config, tmp_path / "run", name="any")
+        training_run.train(config, tmp_path / "run", name="any")
     assert "\n" not in str(error.value)

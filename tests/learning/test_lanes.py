@@ -15,9 +15,9 @@ from airl_mav.control.demand import Demand, RateDemand
 from airl_mav.control.gains import Gains
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.kernels import kernel
-from airl_mav.envs.arenas import ArenaBatch, batch_of
+from airl_mav.envs.arena_batch import ArenaBatch, batch_of
 from airl_mav.envs.fleet import LANES, Fleet, FlightStatus, Rules, hover, new_fleet, vehicle_of
-from airl_mav.envs.flight import NAN3, REPEAT_US, advance
+from airl_mav.envs.fleet_step import NAN3, REPEAT_US, advance
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import Spread
 from airl_mav.profiles.loading import load_profile

@@ -17,10 +17,10 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.arenas import batch_of
+from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.draws import BLOCK, DelayDraws
 from airl_mav.envs.fleet import Fleet, FlightStatus, Rules, hover, new_fleet, vehicle_of
-from airl_mav.envs.flight import advance
+from airl_mav.envs.fleet_step import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.latency.injection import choose_injection, parse_latency
@@ -32,8 +32,8 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import parameter_values
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
-from companion.camera import ReceivedFrame
-from companion.interfaces import Setpoint, VehicleStatus
+from companion.frame_source import ReceivedFrame
+from companion.link_interface import Setpoint, VehicleStatus
 from companion.pilot import Pilot
 from companion.watchdog import Watchdog
 

@@ -12,7 +12,7 @@ from airl_mav.core.fields import validated
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import load_card
 from airl_mav.training.config import TrainingConfig
-from airl_mav.training.run import train
+from airl_mav.training.training_run import train
 
 PARTS = '''
 import torch

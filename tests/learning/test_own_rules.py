@@ -9,7 +9,7 @@ import pytest
 
 from airl_mav import Scenario, rehearse
 from airl_mav.arena.generate import generate
-from airl_mav.cli import report
+from airl_mav.cli import report_command
 from airl_mav.core import plugins
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
@@ -19,7 +19,7 @@ from airl_mav.policy.learned import load_learned
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profile_digest
 from airl_mav.training.config import TrainingConfig
-from airl_mav.training.run import train
+from airl_mav.training.training_run import train
 
 PARTS = '''
 import numpy as np
@@ -245,8 +245,8 @@ def test_the_user_s_arena_is_flown_in_and_drawn(
     monkeypatch.setattr(plugins, "_loaded", set())
     with pytest.raises(UsageError, match=r"its generator '.*:wall' is code that would run on this"):
         run.report()
-    trusted = report.ReportOptions(runs=(run.path,), trust=True)
-    assert report.run(trusted) == 0
+    trusted = report_command.ReportOptions(runs=(run.path,), trust=True)
+    assert report_command.run(trusted) == 0
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from airl_mav.addons.sweep.summary import (
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.provenance import provenance
-from airl_mav.experiments.store import load_campaign, open_campaign
+from airl_mav.experiments.campaign_store import load_campaign, open_campaign
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.observation_spec import ObservationSpec

@@ -24,11 +24,11 @@ from airl_mav.policy.observation_spec import Encoded
 from airl_mav.profiles.loading import list_profiles, load_profile
 from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.training import run
+from airl_mav.training import training_run
 from airl_mav.training.config import TrainingConfig, check_fields
 from airl_mav.training.request import TrainingBar, TrainRequest
-from airl_mav.training.run import nominal
-from airl_mav.training.store import Evaluation, TrainingFolder
+from airl_mav.training.training_folder import Evaluation, TrainingFolder
+from airl_mav.training.training_run import nominal
 from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here
 from tests.support.processes import ROOT, SITL_WITHOUT_REPORT, allow_interrupt, wait_until
@@ -267,7 +267,7 @@ def test_the_curves_of_a_learner_with_rollouts_have_a_point_for_each(tmp_path: P
             "selection": {"every": 10_000, "episodes": 2},
         }
     )
-    done = run.train(config, tmp_path / "run", name="curves")
+    done = training_run.train(config, tmp_path / "run", name="curves")
     found = events.EventAccumulator(str(done.folder.tensorboard))
     found.Reload()
     for name in ("rollout/ep_rew_mean", "rollout/ep_len_mean", "rollout/success_rate"):
@@ -286,7 +286,7 @@ def test_two_do_not_train_in_one_folder(tmp_path: Path, monkeypatch: pytest.Monk
         run_folder.locked(tmp_path / "run", lambda _: None),
         pytest.raises(UsageError, match="another run"),
     ):
-        run.train(config, tmp_path / "run", name="one")
+        training_run.train(config, tmp_path / "run", name="one")
 
 
 @pytest.mark.nightly  # test_programs_read_lines flies the export of a short training.

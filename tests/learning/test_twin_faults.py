@@ -9,24 +9,24 @@ import pytest
 
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.envs.arenas import batch_of
+from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.decision import frame_age_us
 from airl_mav.envs.draws import Winds
 from airl_mav.envs.faults import gusts, twin_faults
 from airl_mav.envs.fleet import hover, new_fleet
-from airl_mav.envs.flight import advance
+from airl_mav.envs.fleet_step import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.trace import Trace
 from airl_mav.experiments.gym_flier import GymFlier
-from airl_mav.faults.model import Fault, check_twin
+from airl_mav.faults.fault import Fault, check_twin
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.rehearsal.run_folder import RunFolder
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from firmware_sim.faults.controller import gust_at
-from firmware_sim.faults.timeline import Acting
+from firmware_sim.faults.fault_timeline import Acting
+from firmware_sim.faults.faulty_controller import gust_at
 from tests.learning.test_fleet import ENDLESS, OPEN, VEHICLE, PlantPilot, command
 from tests.support.blown import fly_blown
 
@@ -86,7 +86,7 @@ def test_a_gust_rises_and_falls_as_one_minus_the_cosine() -> None:
 
 @pytest.mark.parametrize("words", ["at offboard+1s for 1s", "at offboard+700ms", ""])
 def test_late_frames_come_in_order(words: str) -> None:
-    """Check that frames never overtake, as in a queue (`firmware_sim.faults.camera`)."""
+    """Check that frames never overtake, as in a queue (`firmware_sim.faults.faulty_camera`)."""
     cameras = navigation(f"camera delay 250ms {words}").cameras
     cameras.begin(0, 5)
     failing = cameras._late[0]

@@ -18,13 +18,14 @@ from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.profiles.loading import load_profile
-from airl_mav.training import run
+from airl_mav.training import training_run
 from airl_mav.training.config import TrainingConfig
-from airl_mav.training.store import TrainingProgress
-from airl_mav.training.watched import EpisodeReplay, Taped, WatchedTraining
+from airl_mav.training.training_folder import TrainingProgress
+from airl_mav.training.watched_training import EpisodeReplay, Taped, WatchedTraining
 from airl_mav.view.ends import ViewEnds
 from airl_mav.view.feed import Ends
-from airl_mav.view.messages import (
+from airl_mav.view.shown import Shown
+from airl_mav.view.view_messages import (
     CameraImage,
     Decided,
     Episode,
@@ -36,7 +37,6 @@ from airl_mav.view.messages import (
     Trained,
     VehicleState,
 )
-from airl_mav.view.shown import Shown
 from tests.support.browser import CHROMIUM, browser
 from tests.support.processes import running, wait_until
 from tests.support.scene import has_drawn
@@ -112,9 +112,9 @@ def test_a_watched_training_learns_the_same(tmp_path: Path) -> None:
     """Compare weights bit by bit, while a viewer follows at unlimited speed."""
     (tmp_path / "short.toml").write_text(SHORT, encoding="utf-8")
     config = load_profile("training", str(tmp_path / "short.toml"), TrainingConfig)
-    run.train(config, tmp_path / "alone", name="one")
+    training_run.train(config, tmp_path / "alone", name="one")
     with Watchers(Steering(speed=None)).watching() as watchers:
-        run.train(config, tmp_path / "watched", name="one", view=watchers.ends)
+        training_run.train(config, tmp_path / "watched", name="one", view=watchers.ends)
         wait_until(lambda: watchers.shown.trained is not None, "a decision")
     alone = weights(tmp_path / "alone")
     assert len(alone) >= 2

@@ -15,12 +15,12 @@ from PIL import Image
 from rich.console import Console
 
 from airl_mav import Scenario, rehearse
-from airl_mav.cli import report
+from airl_mav.cli import report_command
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.paired import tango
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder
+from airl_mav.report.comparison.comparison_model import Comparison
 from airl_mav.report.comparison.figures import cumulated, flight_panels
-from airl_mav.report.comparison.model import Comparison
 from airl_mav.report.comparison.runs import compare_folders
 from airl_mav.report.comparison.show import write_comparison
 from airl_mav.report.comparison.tables import (
@@ -248,7 +248,7 @@ def test_it_is_the_same_when_it_is_made_again(
 def ask(*paths: Path, **options: Any) -> str:
     console = Console(record=True, width=100, file=io.StringIO())
     with page_alone():
-        assert report.run(report.ReportOptions(runs=paths, **options), console) == 0
+        assert report_command.run(report_command.ReportOptions(runs=paths, **options), console) == 0
     return console.export_text()
 
 

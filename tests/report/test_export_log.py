@@ -32,7 +32,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.recorded_flight import episode_of
-from airl_mav.report.replay.flight import ReplayedRun
+from airl_mav.report.replay.replayed_flight import ReplayedRun
 from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here
 from tests.support.lenses import angles

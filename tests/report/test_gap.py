@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import (
     Change,
@@ -21,7 +22,6 @@ from airl_mav.flight.paired import (
     percent_change,
 )
 from airl_mav.flight.quality import Leg, Quality
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import BOOTSTRAP_SEED, RESAMPLES, Estimate
 from airl_mav.profiles.published import PublishedRun, load_published, published_gap
 

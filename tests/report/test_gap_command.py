@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from airl_mav.cli.gap import OPTIONS
+from airl_mav.cli.gap_command import OPTIONS
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments import gap as gap_experiment
 from airl_mav.experiments.campaign import EpisodeSaver
@@ -37,8 +37,8 @@ from airl_mav.profiles.loading import profiles_dir
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.report.comparison import show
 from airl_mav.report.comparison.build import worst_seeds
-from airl_mav.report.comparison.gap import gaps_table, runs_table
-from airl_mav.report.comparison.model import load_comparison, save_comparison
+from airl_mav.report.comparison.comparison_model import load_comparison, save_comparison
+from airl_mav.report.comparison.gap_page import gaps_table, runs_table
 from airl_mav.report.comparison.show import build_comparison, rebuild_comparison
 from airl_mav.report.comparison.tables import contrast_table
 from airl_mav.report.measures import ALL_MEASURES

@@ -31,9 +31,9 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import tango
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load
 from airl_mav.report.comparison import show
+from airl_mav.report.comparison.comparison_model import Comparison, RunEntry, load_comparison
 from airl_mav.report.comparison.figures import contrast_pictures
-from airl_mav.report.comparison.ladder import other_differences, split_table
-from airl_mav.report.comparison.model import Comparison, RunEntry, load_comparison
+from airl_mav.report.comparison.ladder_page import other_differences, split_table
 from airl_mav.report.comparison.show import build_comparison, write_comparison
 from airl_mav.report.comparison.tables import contrast_table, runs_table
 from airl_mav.report.measures import MEASURES

@@ -14,7 +14,7 @@ import pytest
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE
-from airl_mav.report.replay.flight import (
+from airl_mav.report.replay.replayed_flight import (
     ReplayedFlight,
     ReplayedRun,
     ReplayedRuns,
@@ -107,7 +107,7 @@ def test_flights_part_at_the_first_other_decision(flight: ReplayedFlight) -> Non
 
 def test_a_flight_outside_of_all_arenas_has_its_goal(flight: ReplayedFlight) -> None:
     viser = pytest.importorskip("viser")
-    from airl_mav.view.scene import FlightScene
+    from airl_mav.view.viser_scene import FlightScene
 
     outside, shown = replace(flight, arena=None), Shown()
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)

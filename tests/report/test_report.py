@@ -20,9 +20,10 @@ from airl_mav.latency.injection import NOTHING_INJECTED
 from airl_mav.latency.stages import SHOWN_STAGES
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder, load
-from airl_mav.report.energy import energy_flights_table, energy_table, flight_energies
+from airl_mav.report.energy_section import energy_flights_table, energy_table, flight_energies
 from airl_mav.report.forensics.worst import examine_worst
 from airl_mav.report.measures import conduct_table, summarize_run
+from airl_mav.report.plotly_scene import plotly_script
 from airl_mav.report.run_report import build_page, print_report, verdict_of
 from airl_mav.report.run_tables import (
     ages_table,
@@ -32,7 +33,6 @@ from airl_mav.report.run_tables import (
     real_time_table,
     run_ages,
 )
-from airl_mav.report.scene import plotly_script
 from airl_mav.report.shown_flights import MAX_PICTURED
 from airl_mav.report.table import TableView
 from airl_mav.report.theme import DARK

@@ -10,7 +10,7 @@ import pytest
 
 from airl_mav.cli import main
 from airl_mav.core.errors import UsageError
-from airl_mav.flight.record import Part
+from airl_mav.flight.episode_record import Part
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.comparison.runs import compare_folders
 from airl_mav.report.run_report import write_report

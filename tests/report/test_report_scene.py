@@ -19,9 +19,8 @@ from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.report import scene
-from airl_mav.report.run_figures import coloured_pieces
-from airl_mav.report.scene import (
+from airl_mav.report import plotly_scene
+from airl_mav.report.plotly_scene import (
     POINTS,
     SceneFlight,
     body_mesh,
@@ -29,6 +28,7 @@ from airl_mav.report.scene import (
     plotly_script,
     scene_json,
 )
+from airl_mav.report.run_figures import coloured_pieces
 from airl_mav.report.table import OUTCOME_LABELS
 from tests.support.run_demo import demo_arena, write_demo_run
 
@@ -217,7 +217,7 @@ def test_the_slider_moves_obstacles_along_their_tours(demo: Demo) -> None:
 
 def test_all_flights_together_are_coloured_by_how_they_ended(demo: Demo) -> None:
     run, arenas = demo
-    view = scene.all_flights_view(run, run.episodes, arenas[0], shared=False)
+    view = plotly_scene.all_flights_view(run, run.episodes, arenas[0], shared=False)
     names = [each["name"] for each in view["figure"]["data"]]
     assert "obstacle" not in names
     for outcome in {episode.outcome for episode in run.episodes}:

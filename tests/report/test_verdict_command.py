@@ -125,7 +125,7 @@ def test_the_same_folder_answers_other_questions(whole: tuple[Path, str]) -> Non
     assert (code, said(out)["status"]) == (0, "met")
     assert "\nmeets: success >= 50 %" in text
     # The interval alone would decide this: it was not made to be looked at again and again.
-    with patch("airl_mav.cli.verdict.leave"):
+    with patch("airl_mav.cli.verdict_command.leave"):
         code, text = verdict(out, require="success >= 92 %", episodes=n)
     (finding,) = said(out)["findings"]
     assert finding["estimate"]["high"] < 92.0

@@ -12,7 +12,7 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.commander import CommanderState
-from firmware_sim.external.ardupilot.sitl import ArdupilotBridge
+from firmware_sim.external.ardupilot.ardupilot_sitl import ArdupilotBridge
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.ardupilot_peer import ArdupilotPeer
 from tests.support.flight_rig import quad

@@ -9,15 +9,15 @@ from typing import Any
 
 from airl_mav.core.frames import Goal
 from airl_mav.latency.injection import FixedSampler
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.policy.actions import Policy
-from airl_mav.rehearsal.progress import Observer
+from airl_mav.rehearsal.observer import Observer
 from airl_mav.scenario.model import LimitSettings, PilotSettings, Scenario, WatchdogSettings
 from airl_mav.scenario.piloting import NATIVE_T2_US
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
-from companion.mission import MissionResult, Start, fly_mission
+from companion.offboard_mission import MissionResult, Start, fly_mission
 from companion.pilot import SentDecision
 
 SEED = 11

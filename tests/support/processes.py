@@ -27,13 +27,13 @@ OFFBOARD, HOLD, POSITION, LAND = 6 << 16, 3 << 24 | 4 << 16, 3 << 16, 6 << 24 | 
 """PX4 custom modes."""
 
 NO_REPORT = """
-from airl_mav.cli import sitl
+from airl_mav.cli import sitl_command as sitl
 sitl.conclude = lambda *_: 0
 """
 """Before airl-sitl: pictures take longer than flights."""
 
 # Several suites share two cores, at many times real time: the tests do not judge the host.
-SITL = ("-m", "airl_mav.cli.sitl", "--no-validity")
+SITL = ("-m", "airl_mav.cli.sitl_command", "--no-validity")
 SITL_WITHOUT_REPORT = (
     "-c",
     f"{NO_REPORT}\nfrom airl_mav.cli import entry\nentry.sitl()",

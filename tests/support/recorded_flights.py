@@ -23,9 +23,9 @@ from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.black_box import SAMPLE_US, open_recorder
-from companion.interfaces import BatteryState, VehicleStatus
+from companion.link_interface import BatteryState, VehicleStatus
 from companion.mavsdk_link import MavsdkLink
-from companion.mission import fly_mission
+from companion.offboard_mission import fly_mission
 from companion.program import prepare, run_of
 from firmware_sim.simulation import EpisodeSetup, Simulation
 

@@ -19,8 +19,8 @@ from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.policy.observation import Kinematics
 from companion.black_box import BlackBoxRecorder
-from companion.camera import ReceivedFrame
-from companion.interfaces import BatteryState, BodyVelocity, VehicleStatus
+from companion.frame_source import ReceivedFrame
+from companion.link_interface import BatteryState, BodyVelocity, VehicleStatus
 from companion.pilot import SentDecision
 
 LENS = Intrinsics.from_fov(64, 48, 1.0)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from scipy.integrate import quad
 
-from airl_mav.arena.appearance import FLOOR, OBSTACLE, TEXTURES, WALLS, linear_of, srgb_of
+from airl_mav.arena.finishes import FLOOR, OBSTACLE, TEXTURES, WALLS, linear_of, srgb_of
 from airl_mav.arena.generate import generate, local_bounds
 from airl_mav.arena.geometry import Arena, Obstacles
 from airl_mav.core.plugins import GENERATORS

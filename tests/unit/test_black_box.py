@@ -40,8 +40,8 @@ from airl_mav.core.errors import UsageError
 from airl_mav.report.recorded_flight import episode_of
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.black_box import BlackBoxRecorder
-from companion.camera import ReceivedFrame
-from companion.interfaces import BodyVelocity
+from companion.frame_source import ReceivedFrame
+from companion.link_interface import BodyVelocity
 from companion.pilot import SentDecision
 from companion.program import prepare, run_of
 from tests.support.full_disk import largest_file

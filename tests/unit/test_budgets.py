@@ -71,7 +71,7 @@ def test_what_fits_passes_in_silence(house: Path, capsys: pytest.CaptureFixture[
     [
         ("companion/pilot.py", "X = 1\n", ["companion.lines: 12", "companion.modules: 2"]),
         (
-            "companion/camera.py",
+            "companion/frame_source.py",
             MODULE.replace("math\n", "math, os\nimport re\n"),
             ["import_lines"],
         ),

@@ -11,7 +11,7 @@ import pytest
 
 from airl_mav import __version__
 from airl_mav.cli import entry
-from airl_mav.cli.listing import KINDS
+from airl_mav.cli.list_command import KINDS
 from airl_mav.cli.main import main, subcommands
 from airl_mav.policy.registry import policy_names
 from airl_mav.profiles.loading import list_profiles
@@ -138,7 +138,7 @@ def test_help_loads_no_simulator_and_no_figures(words: list[str], heavy: set[str
 
 def test_help_into_a_pipe_that_nobody_reads_is_quiet() -> None:
     """`airl-firmware --help | head -1`."""
-    command = [sys.executable, "-m", "airl_mav.cli.firmware", "--help"]
+    command = [sys.executable, "-m", "airl_mav.cli.firmware_command", "--help"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as child:
         assert child.stdout is not None
         assert child.stderr is not None

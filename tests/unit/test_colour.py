@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import FLOOR, OBSTACLE, TEXTURES, linear_of, srgb_of
+from airl_mav.arena.finishes import FLOOR, OBSTACLE, TEXTURES, linear_of, srgb_of
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera import primitives

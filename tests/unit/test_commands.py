@@ -26,7 +26,7 @@ from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.scenario.model import Scenario, WatchdogSettings
 from airl_mav.scenario.piloting import check_commands, check_compensated, decide_piloting
-from companion.interfaces import STOP, BodyVelocity, Setpoint, VehicleStatus
+from companion.link_interface import STOP, BodyVelocity, Setpoint, VehicleStatus
 from companion.watchdog import Watchdog
 from firmware_sim.recording import SetpointLog
 from tests.support.processes import ROOT

@@ -57,7 +57,7 @@ for name in names:
 """
 
 COMMAND = """
-import airl_mav.cli.companion as cli
+import airl_mav.cli.companion_command as cli
 from companion.program import prepare
 asked = cli.OPTIONS(policy="greedy", computer="ras-pi-4", workload="template-5x32")
 mission = prepare(asked)

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from airl_mav.cli import sitl
+from airl_mav.cli import sitl_command
 from airl_mav.cli.options import read_options, scenario_of
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
+from airl_mav.faults.fault import FOREVER_US, Fault, active, gust_share, next_change_us, window_us
 from airl_mav.faults.kinds import KINDS, Part, Phase
-from airl_mav.faults.model import FOREVER_US, Fault, active, gust_share, next_change_us, window_us
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import read_scenario_file, save_scenario
@@ -121,14 +121,14 @@ ASKED = ("gps off at 8s for 5s", "motor 2 weak 60% at hold")
 
 def test_faults_of_a_command_line_come_back_from_its_file(tmp_path: Path) -> None:
     words = [word for fault in ASKED for word in ("--fault", fault)]
-    asked = scenario_of(read_options(sitl.OPTIONS, "airl-sitl", words))
+    asked = scenario_of(read_options(sitl_command.OPTIONS, "airl-sitl", words))
     assert [str(fault) for fault in asked.faults] == [ASKED[0], "motor2 weak 0.6 at hold"]
     file = tmp_path / "scenario.toml"
     save_scenario(asked, file)
     assert "[[faults]]" in file.read_text()
     assert Scenario.model_validate(read_scenario_file(file)).faults == asked.faults
     # More of them on the command line come on top of those in the file.
-    more = read_options(sitl.OPTIONS, "airl-sitl", [str(file), "--fault", "baro off"])
+    more = read_options(sitl_command.OPTIONS, "airl-sitl", [str(file), "--fault", "baro off"])
     assert [fault.part for fault in scenario_of(more).faults] == ["gps", "motor2", "baro"]
 
 
@@ -143,7 +143,7 @@ def test_a_fault_in_words_is_as_good_as_a_table(tmp_path: Path) -> None:
 
 def test_what_is_wrong_on_a_command_line_names_the_option() -> None:
     with pytest.raises(UsageError, match=r"^--fault: 'gps of': no such fault of gps"):
-        read_options(sitl.OPTIONS, "airl-sitl", ["--fault", "gps of"])
+        read_options(sitl_command.OPTIONS, "airl-sitl", ["--fault", "gps of"])
 
 
 @pytest.mark.parametrize(

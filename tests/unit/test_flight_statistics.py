@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import scipy
 
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import (
     BOOTSTRAP_SEED,
     RESAMPLES,

@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from airl_mav.arena.generate import generate
-from airl_mav.camera.conditions import check_noise, check_renderer, check_twin_imaging
 from airl_mav.camera.frame import Frame
+from airl_mav.camera.imaging_checks import check_noise, check_renderer, check_twin_imaging
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion, Mount, camera_pose
 from airl_mav.core.errors import FieldError, UsageError

@@ -19,10 +19,10 @@ from airl_mav.arena.gates import openings_of, over_openings
 from airl_mav.arena.generate import free_area_fraction, generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.arena.placement import bounding_boxes
-from airl_mav.cli.arena import arena_table
+from airl_mav.cli.arena_command import arena_table
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import goal_distance_m
-from airl_mav.envs.arenas import NOTHING, batch_of, touches
+from airl_mav.envs.arena_batch import NOTHING, batch_of, touches
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile

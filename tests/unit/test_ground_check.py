@@ -15,7 +15,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
-from companion.camera import ReceivedFrame
+from companion.frame_source import ReceivedFrame
 from companion.ground_check import DECISIONS, CheckResult, check_on_ground, time_decisions
 from companion.program import prepare
 from tests.support.ports import LOOPBACK, free_ports

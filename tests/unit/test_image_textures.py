@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import TypeAdapter
 
-from airl_mav.arena.appearance import OBSTACLE, TEXTURES, linear_of
+from airl_mav.arena.finishes import OBSTACLE, TEXTURES, linear_of
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics

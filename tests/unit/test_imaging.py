@@ -15,7 +15,6 @@ from pydantic import ValidationError
 from scipy import stats
 
 from airl_mav.arena.geometry import Arena, Shape, Tour
-from airl_mav.camera.conditions import check_renderer
 from airl_mav.camera.exposure import expose
 from airl_mav.camera.frame import Frame, FrameError, image_of, jpeg_of
 from airl_mav.camera.imaging import (
@@ -27,6 +26,7 @@ from airl_mav.camera.imaging import (
     noisy,
     vignette,
 )
+from airl_mav.camera.imaging_checks import check_renderer
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion
 from airl_mav.core.errors import FieldError

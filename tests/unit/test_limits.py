@@ -21,8 +21,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.observation import Kinematics
 from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.scenario.model import LimitSettings, PilotSettings
-from companion.camera import ReceivedFrame
-from companion.interfaces import FRAMES_LATE, TELEMETRY_FROZEN, VehicleStatus
+from companion.frame_source import ReceivedFrame
 from companion.limits import (
     BATTERY_LOW,
     CAMERA_FROZEN,
@@ -37,6 +36,7 @@ from companion.limits import (
     VehicleLimits,
     ground_in_view,
 )
+from companion.link_interface import FRAMES_LATE, TELEMETRY_FROZEN, VehicleStatus
 
 LENS = Intrinsics.from_fov(8, 6, math.radians(90.0))
 OURS = VehicleStatus(armed=True, offboard=True, mode="offboard")

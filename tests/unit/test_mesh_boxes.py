@@ -233,7 +233,7 @@ def test_a_mesh_that_has_changed_or_gone_is_told_in_one_line(tmp_path: Path) -> 
 def test_too_many_triangles_are_refused_unless_boxes_are_seen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("airl_mav.cli.asset.MOST_TRIANGLES", 23)
+    monkeypatch.setattr("airl_mav.cli.asset_command.MOST_TRIANGLES", 23)
     path = export(bracket(), tmp_path / "bracket.stl")
     with pytest.raises(SystemExit) as ended:
         main(["asset", str(path), "--out", str(tmp_path / "x.toml")])

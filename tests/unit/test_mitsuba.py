@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from airl_mav.arena.appearance import linear_of, srgb_of
+from airl_mav.arena.finishes import linear_of, srgb_of
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.cube_faces import cube_of, resampled

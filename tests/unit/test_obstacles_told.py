@@ -20,7 +20,7 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import FieldError
 from airl_mav.policy.observation import Kinematics
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.camera import ReceivedFrame, SharedFrames
+from companion.frame_source import ReceivedFrame, SharedFrames
 from companion.presence import UNKNOWN_CM, obstacle_distance, obstacles_told
 from companion.program import prepare
 from firmware_sim.autopilot.modes.collision_prevention import ObstacleMap

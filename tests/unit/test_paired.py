@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import optimize, stats
 
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import (
     Agreement,
@@ -21,7 +22,6 @@ from airl_mav.flight.paired import (
     relative_difference,
     tango,
 )
-from airl_mav.flight.record import EpisodeRecord
 from tests.support.run_demo import demo_arena, demo_episode
 
 Z = 1.959963984540054

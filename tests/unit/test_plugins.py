@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from airl_mav.cli import listing
+from airl_mav.cli import list_command
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.plugins import DOORS, POLICIES, load_part, names_code
@@ -78,7 +78,7 @@ def test_a_policy_by_the_name_that_its_package_announces(installed: str) -> None
     assert known.sha256 == find_policy("their_parts.policy:Hover").sha256
     assert type(load_policy(installed, 0.5)) is load_part(POLICIES, "their_parts.policy:Hover")
     console = Console(width=120, file=StringIO())
-    assert listing.run(listing.ListOptions(kind="policies"), console) == 0
+    assert list_command.run(list_command.ListOptions(kind="policies"), console) == 0
     printed = console.file.getvalue()  # type: ignore[attr-defined]
     assert "their-hover" in printed
     assert "installed: their_parts.policy:Hover" in printed

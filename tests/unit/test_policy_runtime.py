@@ -40,8 +40,8 @@ from airl_mav.scenario.model import DEFAULT_POLICY, Decisions, PilotSettings, Sc
 from airl_mav.scenario.piloting import decide_piloting, select_latency
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.camera import ReceivedFrame
-from companion.mission import check_camera
+from companion.frame_source import ReceivedFrame
+from companion.offboard_mission import check_camera
 from tests.support.policy_kit import SPEC, export_tiny, noise
 from tests.support.processes import SITL_WITHOUT_REPORT, run_alone, running
 
@@ -524,7 +524,7 @@ sys.meta_path.insert(0, Absent())
 
 import math
 import numpy as np
-import companion.mission, companion.pilot, airl_mav.cli.companion as cli
+import companion.offboard_mission, companion.pilot, airl_mav.cli.companion_command as cli
 from companion.program import prepare
 assert "onnxruntime" not in sys.modules, "nobody asked for a network yet"
 policy = prepare(cli.OPTIONS(policy={folder!r})).policy

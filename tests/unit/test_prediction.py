@@ -27,7 +27,7 @@ from airl_mav.prediction.compensator import (
     flown_on,
     leaning,
 )
-from airl_mav.prediction.memory import REMEMBERED, ExpectedLatency
+from airl_mav.prediction.decision_memory import REMEMBERED, ExpectedLatency
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import Response, load_vehicle

@@ -18,18 +18,18 @@ from rich.console import Console
 from scipy import ndimage, stats
 
 from airl_mav.addons.render.camera_pictures import ROOM, coloured_segmentation
-from airl_mav.arena.appearance import srgb_of
 from airl_mav.arena.draw import OPENING_COLOUR, draw_arena
+from airl_mav.arena.finishes import srgb_of
 from airl_mav.arena.generate import generate, local_bounds
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, seen_across
 from airl_mav.arena.placement import bounding_boxes
-from airl_mav.arena.rooms import Plan, draw_plan, over_doors
+from airl_mav.arena.room_plan import Plan, draw_plan, over_doors
 from airl_mav.camera import primitives
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
-from airl_mav.cli.arena import arena_table
+from airl_mav.cli.arena_command import arena_table
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.arenas import CEILING, FLOOR, NOTHING, WALL, batch_of, clearance, touches
+from airl_mav.envs.arena_batch import CEILING, FLOOR, NOTHING, WALL, batch_of, clearance, touches
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profile_digest
 
@@ -245,7 +245,7 @@ def test_walls_fill_what_is_no_room_and_no_door(
     floor = (bounds.north_max - bounds.north_min) * (bounds.east_max - bounds.east_min)
     rooms = sum(room.side(0) * room.side(1) for room in plan.rooms)
     doors = sum(door.height * (door.high - door.low) for door in plan.doors)
-    from airl_mav.arena.rooms import room_walls
+    from airl_mav.arena.room_plan import room_walls
 
     boxes, things = room_walls(plan, bounds)
     volume = np.prod(2.0 * boxes.half_size, axis=1).sum()

@@ -13,8 +13,8 @@ from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 from rich.console import Console
 
-from airl_mav.cli import entry, sitl
-from airl_mav.cli.companion import CompanionOptions
+from airl_mav.cli import entry, sitl_command
+from airl_mav.cli.companion_command import CompanionOptions
 from airl_mav.cli.options import read_options
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import unit_of, validated
@@ -115,7 +115,7 @@ def note(event, arguments):
             opened["/".join(path.parts[-2:])] += 1
 
 sys.addaudithook(note)
-from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 
@@ -207,8 +207,8 @@ def test_options_that_contradict_each_other_are_named(
 # --- files
 
 
-def options(*words: str) -> sitl.SitlOptions:
-    return read_options(sitl.SitlOptions, "airl-sitl", words)
+def options(*words: str) -> sitl_command.SitlOptions:
+    return read_options(sitl_command.SitlOptions, "airl-sitl", words)
 
 
 def read_file(path: Path) -> Scenario:
@@ -343,11 +343,15 @@ def test_contradictions_in_a_file_name_it(
 def test_the_scenario_of_a_run_flies_it_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sitl, "conclude", lambda *_: 0)
+    monkeypatch.setattr(sitl_command, "conclude", lambda *_: 0)
     out, console = [tmp_path / "first", tmp_path / "again"], Console(quiet=True)
     words = ("--level", "lockstep", "--episodes", "1", "--seed", "11", "--time-limit-s", "5")
-    assert sitl.run(options(*words, "--latency", "80ms", "--out", str(out[0])), console) == 0
-    assert sitl.run(options(str(out[0] / "scenario.toml"), "--out", str(out[1])), console) == 0
+    assert (
+        sitl_command.run(options(*words, "--latency", "80ms", "--out", str(out[0])), console) == 0
+    )
+    assert (
+        sitl_command.run(options(str(out[0] / "scenario.toml"), "--out", str(out[1])), console) == 0
+    )
     first, again = (load(path) for path in out)
     assert first.episodes[0].sha256 is not None
     assert first.episodes == again.episodes

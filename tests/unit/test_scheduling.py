@@ -82,7 +82,7 @@ def test_a_view_gives_way() -> None:
         (view,) = (
             child
             for child in psutil.Process().children()
-            if "airl_mav.view.server" in child.cmdline()
+            if "airl_mav.view.view_server" in child.cmdline()
         )
         assert os.getsid(view.pid) == view.pid
         assert view.nice() > psutil.Process().nice()

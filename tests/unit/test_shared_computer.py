@@ -12,8 +12,8 @@ from rich.console import Console
 from airl_mav.addons.profiling.measurement import share
 from airl_mav.addons.profiling.profile import profile
 from airl_mav.addons.profiling.request import ProfileRequest
-from airl_mav.cli.computers import ComputersOptions
-from airl_mav.cli.computers import run as computers
+from airl_mav.cli.computers_command import ComputersOptions
+from airl_mav.cli.computers_command import run as computers
 from airl_mav.cli.main import main
 from airl_mav.core.errors import UsageError
 from airl_mav.latency.injection import select_injection

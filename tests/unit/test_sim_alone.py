@@ -28,15 +28,15 @@ sys.meta_path.insert(0, Absent())
 FLY = """
 from airl_mav.cli.options import carry_out
 words = ["--arena", "no-obstacles", "--episodes", "1", "--out", "run"]
-assert carry_out("airl evaluate", "airl_mav.cli.evaluate", ["greedy", *words]) == 0
-raise SystemExit(carry_out("airl report", "airl_mav.cli.report", ["run"]))
+assert carry_out("airl evaluate", "airl_mav.cli.evaluate_command", ["greedy", *words]) == 0
+raise SystemExit(carry_out("airl report", "airl_mav.cli.report_command", ["run"]))
 """
 
 COMPARE = """
 from airl_mav.cli.options import carry_out
 words = ["greedy", "--arena", "no-obstacles", "--episodes", "1", "--out", "run"]
 more = ["--latencies", "1ms", "50ms", "--workers", "1"]
-raise SystemExit(carry_out("airl degrade", "airl_mav.cli.degrade", words + more))
+raise SystemExit(carry_out("airl degrade", "airl_mav.cli.degrade_command", words + more))
 """
 
 

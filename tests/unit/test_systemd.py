@@ -118,7 +118,7 @@ def test_the_program_says_that_it_is_ready_and_alive(manager: Listener, tmp_path
     manager.listen()
     ports = choose_ports()
     words = [
-        *("-m", "airl_mav.cli.companion", "--policy", "greedy", "--connect-timeout", "1.5"),
+        *("-m", "airl_mav.cli.companion_command", "--policy", "greedy", "--connect-timeout", "1.5"),
         *("--connect", f"udpin://{LOOPBACK}:{ports.api}"),
         *("--camera", f"tcp://{LOOPBACK}:{ports.camera}"),
     ]

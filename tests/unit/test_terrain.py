@@ -14,11 +14,11 @@ import scipy
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 from numpy.typing import NDArray
 
-from airl_mav.arena.assets import _problem
 from airl_mav.arena.generate import generate, local_bounds
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.arena.ground import Ground, no_relief
 from airl_mav.arena.passage import Hills, raster_passage
+from airl_mav.arena.placed_assets import _problem
 from airl_mav.arena.placement import Boxes, bounding_half
 from airl_mav.arena.relief import draw_ground, extreme_within, plane_at, stand_on
 from airl_mav.camera.intrinsics import Intrinsics
@@ -26,8 +26,8 @@ from airl_mav.camera.picture import render_picture
 from airl_mav.camera.primitives import FLOOR, OBSTACLE, SKY
 from airl_mav.camera.render import render
 from airl_mav.core.frames import quat_from_euler
-from airl_mav.envs.arenas import FLOOR as TOUCHED_FLOOR
-from airl_mav.envs.arenas import NOTHING, clearance, touches
+from airl_mav.envs.arena_batch import FLOOR as TOUCHED_FLOOR
+from airl_mav.envs.arena_batch import NOTHING, clearance, touches
 from airl_mav.profiles.arena import MOST_CELLS, ArenaSpec, Terrain
 from airl_mav.profiles.camera_kind import Projection
 from airl_mav.profiles.loading import load_profile

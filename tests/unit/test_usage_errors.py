@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from airl_mav.cli import entry, listing
+from airl_mav.cli import entry, list_command
 from airl_mav.profiles.loading import Kind, list_profiles, profiles_dir
 from tests.support.ports import LOOPBACK, choose_ports
 from tests.support.processes import ROOT
@@ -261,7 +261,7 @@ def test_a_full_disk_is_the_machines_failure(
     def full(_: object) -> int:
         raise OSError(errno.ENOSPC, "No space left on device", "run/latency.npz")
 
-    monkeypatch.setattr(listing, "run", full)
+    monkeypatch.setattr(list_command, "run", full)
     monkeypatch.setattr(sys, "argv", ["airl", "list"])
     with pytest.raises(SystemExit) as end:
         entry.airl()

@@ -97,7 +97,7 @@ def test_the_base_install_is_light(unpacked: Path) -> None:
 @pytest.mark.nightly
 def test_it_flies_from_anywhere(unpacked: Path, tmp_path: Path) -> None:
     """Only the wheel on the path, another working folder, the shipped profiles."""
-    words = ["-m", "airl_mav.cli.sitl", "--episodes", "1", "--speed", "3", "--no-validity"]
+    words = ["-m", "airl_mav.cli.sitl_command", "--episodes", "1", "--speed", "3", "--no-validity"]
     with running([*words, *choose_ports().options()], tmp_path, path=unpacked) as process:
         # A fresh install compiles its kernels.
         assert process.wait(300.0) == 0, process.text()

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
-from companion.interfaces import LinkError
+from companion.link_interface import LinkError
 
 
 class MavCommand(IntEnum):

@@ -38,7 +38,7 @@ from airl_mav.addons.conformance.steps import (
 from airl_mav.addons.conformance.vehicle import SetpointStream, VehicleConnection
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
-from companion.interfaces import LinkError
+from companion.link_interface import LinkError
 
 FACE_NORTH_S = 5.0  # Time before the first step, to turn north and stop [s]
 RESCUE_S = 300.0  # Landing timeout after a failure [s]

@@ -33,7 +33,7 @@ from airl_mav.addons.conformance.telemetry import AUTOPILOT_COMPONENT, Telemetry
 from airl_mav.core.clock import NS_PER_US, WallClock
 from airl_mav.core.constants import MS_PER_S, US_PER_S
 from airl_mav.core.errors import FieldError
-from companion.interfaces import LinkError
+from companion.link_interface import LinkError
 from companion.mavsdk_connection import first_autopilot, open_connection
 
 POLL_S = 0.02  # Polling interval of a condition [wall s]

@@ -17,8 +17,8 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.progress import RichProgress
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.arenas import trust_arenas
-from airl_mav.report.replay.flight import ReplayedRun
+from airl_mav.report.replay.replayed_flight import ReplayedRun
+from airl_mav.report.run_arenas import trust_arenas
 from airl_mav.scenario.aircraft import GREATEST_PORT
 
 FOXGLOVE_PORT = 8765

@@ -22,7 +22,7 @@ from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.files import replacing
 from airl_mav.rehearsal.run_folder import info_data
-from airl_mav.report.replay.flight import ReplayedRun
+from airl_mav.report.replay.replayed_flight import ReplayedRun
 from firmware_sim.flight_log.flight_log import ULOG_SUFFIX
 
 PAUSE_US = 2_000_000

@@ -14,7 +14,7 @@ from airl_mav.core.frames import goal_distance_m
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, SETPOINTS, STAMPS, setpoint_column
 from airl_mav.rehearsal.run_folder import RunInfo
-from airl_mav.report.replay.flight import ReplayedFlight
+from airl_mav.report.replay.replayed_flight import ReplayedFlight
 from airl_mav.vehicle.power import drain, open_circuit, terminal_voltage
 
 RECORDED_LEVEL = "flight"

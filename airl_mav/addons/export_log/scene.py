@@ -22,7 +22,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Goal, goal_height_m
 from airl_mav.profiles.vehicle import CORNERS
 from airl_mav.view import style
-from airl_mav.view.messages import VehicleShape
+from airl_mav.view.view_messages import VehicleShape
 
 Floats = NDArray[np.float64]
 

@@ -55,10 +55,10 @@ from airl_mav.latency.stamps import NO_STAMP, SETPOINT
 from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.recorded_flight import NAVIGATING
-from airl_mav.report.replay.flight import STANDING_M
-from airl_mav.view.messages import VehicleShape
+from airl_mav.report.replay.replayed_flight import STANDING_M
 from airl_mav.view.shown import OFFBOARD
 from airl_mav.view.style import FIRST, OTHER
+from airl_mav.view.view_messages import VehicleShape
 
 ENDED = "ended"
 """Phase after navigation."""

@@ -23,9 +23,9 @@ from airl_mav.policy.actions import AnyAction, Policy
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.signals import signal_handlers
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.interfaces import LinkError
+from companion.link_interface import LinkError
 from companion.mavsdk_link import MavsdkLink
-from companion.mission import MissionResult, check_camera, fly_mission
+from companion.offboard_mission import MissionResult, check_camera, fly_mission
 from companion.presence import every
 from companion.program import mission_camera, prepare
 from companion.watchdog import ThreadGuard

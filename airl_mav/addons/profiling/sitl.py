@@ -16,7 +16,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.progress import Bar, Progress
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.rehearsal.channel import State
-from airl_mav.rehearsal.progress import LiveObserver
+from airl_mav.rehearsal.observer import LiveObserver
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RunFolder, load
 from airl_mav.rehearsal.signals import terminated_as_interrupted

@@ -25,7 +25,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.flight.trajectory import pose_at
 from airl_mav.report.forensics.camera_view import PolicyCamera
-from airl_mav.report.replay.flight import ReplayedFlight
+from airl_mav.report.replay.replayed_flight import ReplayedFlight
 from airl_mav.report.theme import coloured
 
 ROOM = {

@@ -33,8 +33,8 @@ from airl_mav.profiles.distortion import UNDISTORTED, check_distortion
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.arenas import trust_arenas
-from airl_mav.report.replay.flight import ReplayedRun
+from airl_mav.report.replay.replayed_flight import ReplayedRun
+from airl_mav.report.run_arenas import trust_arenas
 from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED
 
 SAMPLES = {"raycast": 16, "mitsuba": 64}

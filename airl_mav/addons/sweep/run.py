@@ -38,8 +38,8 @@ from airl_mav.core.fields import optional, quantity, switch, validated
 from airl_mav.core.progress import Bar, Progress
 from airl_mav.envs.evaluation import SLOTS, EpisodeResult, LearnedPilots, fly_seeds
 from airl_mav.envs.navigation import Navigation
+from airl_mav.experiments.campaign_store import open_campaign
 from airl_mav.experiments.executors import Executor, ExecutorSettings, Stop, WorkerError, never
-from airl_mav.experiments.store import open_campaign
 from airl_mav.policy.learned import load_learned
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
@@ -47,8 +47,8 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import locked
 from airl_mav.scenario.model import Workers
 from airl_mav.training.config import TrainingConfig
-from airl_mav.training.run import export_best, fit, nominal
-from airl_mav.training.store import TrainingFolder, TrainingProgress
+from airl_mav.training.training_folder import TrainingFolder, TrainingProgress
+from airl_mav.training.training_run import export_best, fit, nominal
 
 
 def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> TrialResult:

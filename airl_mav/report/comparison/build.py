@@ -12,15 +12,15 @@ import numpy as np
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import Goal
+from airl_mav.flight.episode_record import EpisodeRecord, run_sha256
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import compare_pairs, pair_by_seed, percent_change
-from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import aggregate
 from airl_mav.latency.percentiles import summarize
 from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.comparison import model
-from airl_mav.report.comparison.model import Comparison
+from airl_mav.report.comparison import comparison_model
+from airl_mav.report.comparison.comparison_model import Comparison
 from airl_mav.report.document import Document, Facts, Section, provenance_facts, run_link
 from airl_mav.report.run_tables import setup_rows
 
@@ -39,32 +39,35 @@ MACHINE_TERMS = ("cpu", "os")
 
 def compare(
     runs: Mapping[str, LoadedRun],
-    contrasts: Sequence[model.ContrastEntry] | None = None,
+    contrasts: Sequence[comparison_model.ContrastEntry] | None = None,
     *,
-    kind: model.Kind = "compare",
+    kind: comparison_model.Kind = "compare",
     title: str = "",
     facts: Mapping[str, Any] | None = None,
-    entries: Sequence[model.RunEntry] = (),
-) -> model.Comparison:
+    entries: Sequence[comparison_model.RunEntry] = (),
+) -> comparison_model.Comparison:
     """Compare runs in the order of the tables; by default, each with the first."""
     if not runs:
         raise UsageError(f"no run here; accepted: a {kind} of one run or more")
     by_name = {entry.name: entry for entry in entries}
-    given = [by_name.get(name) or model.RunEntry(name, str(run.path)) for name, run in runs.items()]
+    given = [
+        by_name.get(name) or comparison_model.RunEntry(name, str(run.path))
+        for name, run in runs.items()
+    ]
     for run in runs.values():
         if not run.episodes:
             raise UsageError(f"{run.path}: no flight was finished: nothing to compare")
     if contrasts is None:
         first = next(iter(runs))
         contrasts = [
-            model.ContrastEntry(name, first, title=f"{name} against {first}")
+            comparison_model.ContrastEntry(name, first, title=f"{name} against {first}")
             for name in runs
             if name != first
         ]
     marks = _marks(given)
     compared = tuple(_compared_run(entry, marks[entry.name], runs[entry.name]) for entry in given)
     figures = {run.name: run for run in compared}
-    return model.Comparison(
+    return comparison_model.Comparison(
         kind=kind,
         title=title,
         facts=dict(facts or {}),
@@ -90,11 +93,11 @@ def letter(index: int) -> str:
     return ("" if not rest else letter(rest - 1)) + chr(ord("A") + last)
 
 
-def _marks(entries: Sequence[model.RunEntry]) -> dict[str, str]:
+def _marks(entries: Sequence[comparison_model.RunEntry]) -> dict[str, str]:
     """Return the mark of each run: a short name, its role in the comparison, or a letter."""
     if all(len(entry.label or entry.name) <= SHORT_NAME for entry in entries):
         return {entry.name: entry.label or entry.name for entry in entries}
-    parts = {entry.name: model.part_of(entry) for entry in entries}
+    parts = {entry.name: comparison_model.part_of(entry) for entry in entries}
     if all(entry.role for entry in entries) and max(map(len, parts.values())) <= LONGEST_PART:
         return parts
     counts: dict[str, int] = {}
@@ -105,11 +108,13 @@ def _marks(entries: Sequence[model.RunEntry]) -> dict[str, str]:
     return marks
 
 
-def _compared_run(entry: model.RunEntry, mark: str, run: LoadedRun) -> model.ComparedRun:
+def _compared_run(
+    entry: comparison_model.RunEntry, mark: str, run: LoadedRun
+) -> comparison_model.ComparedRun:
     tests = tests_of(run)
     samples = samples_of(run)
     planned = len(run.info.seeds) if entry.planned is None else entry.planned
-    return model.ComparedRun(
+    return comparison_model.ComparedRun(
         entry=entry,
         mark=mark,
         setup=run.info.setup,
@@ -126,10 +131,10 @@ def _compared_run(entry: model.RunEntry, mark: str, run: LoadedRun) -> model.Com
 
 
 def _contrast(
-    entry: model.ContrastEntry,
+    entry: comparison_model.ContrastEntry,
     runs: Mapping[str, LoadedRun],
-    figures: Mapping[str, model.ComparedRun],
-) -> model.Contrast:
+    figures: Mapping[str, comparison_model.ComparedRun],
+) -> comparison_model.Contrast:
     reference, target = runs[entry.reference], runs[entry.target]
     flown = {episode.seed: _task(episode) for episode in reference.episodes}
     known = [episode for episode in target.episodes if episode.seed in flown]
@@ -139,7 +144,7 @@ def _contrast(
     except ValueError as error:
         raise UsageError(f"{reference.path} and {target.path}: {error}") from None
     early, late = (figures[name].stages["t2"].mean for name in (entry.reference, entry.target))
-    return model.Contrast(
+    return comparison_model.Contrast(
         entry=entry,
         paired=paired,
         unmatched=len(known) - len(same),
@@ -190,7 +195,7 @@ def _hold(config: Mapping[str, Any]) -> float | None:
 
 def _navigation_start(
     run: LoadedRun, tests: Sequence[EpisodeRecord]
-) -> model.NavigationStart | None:
+) -> comparison_model.NavigationStart | None:
     rows = []
     energies: list[float] = []
     for episode in tests:
@@ -208,7 +213,7 @@ def _navigation_start(
         return None
     time_s, distance_m, *place = (float(mean) for mean in np.mean(rows, axis=0))
     energy_j = float(np.mean(energies)) if len(energies) == len(rows) else None
-    return model.NavigationStart(len(rows), time_s, distance_m, energy_j, *place)
+    return comparison_model.NavigationStart(len(rows), time_s, distance_m, energy_j, *place)
 
 
 def _position_error(run: LoadedRun, tests: Sequence[EpisodeRecord]) -> float | None:

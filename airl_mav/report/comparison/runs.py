@@ -10,7 +10,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.comparison import figures, tables
 from airl_mav.report.comparison.build import compare, comparison_document
-from airl_mav.report.comparison.model import Comparison, RunEntry, kind_of, load_entries
+from airl_mav.report.comparison.comparison_model import Comparison, RunEntry, kind_of, load_entries
 from airl_mav.report.document import Document, Section
 from airl_mav.report.flights_above import flight_pictures
 

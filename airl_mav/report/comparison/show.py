@@ -14,9 +14,16 @@ from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.requirements import Requirement, find, settle
 from airl_mav.flight.statistics import reached_goals
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.report.comparison import degradation, gap, ladder, matrix, model, runs
+from airl_mav.report.comparison import (
+    comparison_model,
+    degradation_page,
+    gap_page,
+    ladder_page,
+    matrix_page,
+    runs,
+)
 from airl_mav.report.document import Document, print_document, print_place, write_document
-from airl_mav.report.verdict import (
+from airl_mav.report.run_verdict import (
     OverallVerdict,
     invalid_flights,
     join_verdicts,
@@ -33,43 +40,51 @@ FLOWN_UNTIL = "flown_until"
 same test judges the rate."""
 
 _BUILD: dict[
-    model.Kind, Callable[[Mapping[str, Any], Sequence[model.RunEntry], Runs], model.Comparison]
+    comparison_model.Kind,
+    Callable[
+        [Mapping[str, Any], Sequence[comparison_model.RunEntry], Runs], comparison_model.Comparison
+    ],
 ] = {
     "compare": runs.build_runs,
-    "gap": gap.build_gap,
-    "ladder": ladder.build_ladder,
-    "matrix": matrix.build_matrix,
-    "degradation": degradation.build_degradation,
+    "gap": gap_page.build_gap,
+    "ladder": ladder_page.build_ladder,
+    "matrix": matrix_page.build_matrix,
+    "degradation": degradation_page.build_degradation,
 }
 
-_DOCUMENT: dict[model.Kind, Callable[[model.Comparison, Runs, Path], Document]] = {
+_DOCUMENT: dict[
+    comparison_model.Kind, Callable[[comparison_model.Comparison, Runs, Path], Document]
+] = {
     "compare": runs.document_of,
-    "gap": gap.document_of,
-    "ladder": ladder.document_of,
-    "matrix": matrix.document_of,
-    "degradation": degradation.document_of,
+    "gap": gap_page.document_of,
+    "ladder": ladder_page.document_of,
+    "matrix": matrix_page.document_of,
+    "degradation": degradation_page.document_of,
 }
 
 
 def build_comparison(
-    folder: Path, kind: model.Kind, facts: Mapping[str, Any], entries: Sequence[model.RunEntry]
-) -> tuple[model.Comparison, dict[str, LoadedRun]]:
+    folder: Path,
+    kind: comparison_model.Kind,
+    facts: Mapping[str, Any],
+    entries: Sequence[comparison_model.RunEntry],
+) -> tuple[comparison_model.Comparison, dict[str, LoadedRun]]:
     """Read the runs of a folder and compare them; the kind's module documents its facts."""
     loaded = {entry.name: load(folder / entry.folder) for entry in entries}
     return _BUILD[kind](facts, entries, loaded), loaded
 
 
-def rebuild_comparison(folder: Path) -> tuple[model.Comparison, dict[str, LoadedRun]]:
+def rebuild_comparison(folder: Path) -> tuple[comparison_model.Comparison, dict[str, LoadedRun]]:
     """Recompute the comparison of a folder from its runs. Raises UsageError."""
-    kind = model.kind_of(folder)
+    kind = comparison_model.kind_of(folder)
     if kind is None:
-        accepted = ", ".join(model.KIND_NAMES.values())
+        accepted = ", ".join(comparison_model.KIND_NAMES.values())
         raise UsageError(f"{folder}: no comparison here; accepted: the folder of a {accepted}")
-    return build_comparison(folder, kind, *model.load_entries(folder, kind))
+    return build_comparison(folder, kind, *comparison_model.load_entries(folder, kind))
 
 
 def judge_comparison(
-    comparison: model.Comparison, loaded: Runs, requirements: Sequence[Requirement] = ()
+    comparison: comparison_model.Comparison, loaded: Runs, requirements: Sequence[Requirement] = ()
 ) -> OverallVerdict:
     """Return the verdict of a comparison; raise FieldError for a required gap without a reference.
 
@@ -105,7 +120,7 @@ def judge_comparison(
     return replace(verdict, sentences=sentences, invalid=lines)
 
 
-def _judged(comparison: model.Comparison) -> tuple[model.ComparedRun, ...]:
+def _judged(comparison: comparison_model.Comparison) -> tuple[comparison_model.ComparedRun, ...]:
     if comparison.kind != "gap":
         return comparison.runs
     judged = []
@@ -117,7 +132,7 @@ def _judged(comparison: model.Comparison) -> tuple[model.ComparedRun, ...]:
 
 
 def write_comparison(
-    comparison: model.Comparison,
+    comparison: comparison_model.Comparison,
     loaded: Runs,
     folder: Path,
     verdict: OverallVerdict | None = None,
@@ -127,12 +142,15 @@ def write_comparison(
 
 
 def _saved(
-    comparison: model.Comparison, loaded: Runs, folder: Path, verdict: OverallVerdict | None
+    comparison: comparison_model.Comparison,
+    loaded: Runs,
+    folder: Path,
+    verdict: OverallVerdict | None,
 ) -> Document:
     """Write the data and the verdict of a comparison; return its document."""
     verdict = verdict or judge_comparison(comparison, loaded, requirements_of(folder))
     try:
-        model.save_comparison(comparison, folder)
+        comparison_model.save_comparison(comparison, folder)
         save_verdict(verdict, folder)
     except OSError as error:
         raise UsageError(f"{folder}: {error.strerror}") from None
@@ -140,7 +158,7 @@ def _saved(
 
 
 def comparison_to_document(
-    comparison: model.Comparison, loaded: Runs, folder: Path, verdict: OverallVerdict
+    comparison: comparison_model.Comparison, loaded: Runs, folder: Path, verdict: OverallVerdict
 ) -> Document:
     """Return the document of a comparison without drawing its pictures."""
     document = _DOCUMENT[comparison.kind](comparison, loaded, folder)
@@ -148,7 +166,7 @@ def comparison_to_document(
 
 
 def show_comparison(
-    comparison: model.Comparison,
+    comparison: comparison_model.Comparison,
     loaded: Runs,
     folder: Path,
     console: Console,

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from airl_mav.latency.stages import SETPOINT_TO_MOTOR, SHOWN_STAGES
 from airl_mav.report import table
-from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast
+from airl_mav.report.comparison.comparison_model import ComparedRun, Comparison, Contrast
 from airl_mav.report.document import Facts, Headline, estimate_headline
 from airl_mav.report.measures import (
     COMPUTER_ENERGY,

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun
 

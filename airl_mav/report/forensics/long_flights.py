@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from airl_mav.arena.placement import bounding_boxes, segments_clear
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import goal_distance_m
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.report.forensics.camera_view import headings

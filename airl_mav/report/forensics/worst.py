@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
 from airl_mav.envs.stopping import braking_of
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_leg
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile

@@ -10,12 +10,17 @@ import viser
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.flight.record import EpisodeRecord
-from airl_mav.report.replay.flight import ReplayedFlight, ReplayedRun, ReplayedRuns, parting_s
+from airl_mav.flight.episode_record import EpisodeRecord
+from airl_mav.report.replay.replayed_flight import (
+    ReplayedFlight,
+    ReplayedRun,
+    ReplayedRuns,
+    parting_s,
+)
 from airl_mav.view.panel import Panel
-from airl_mav.view.scene import FlightScene
 from airl_mav.view.shown import Shown
 from airl_mav.view.style import OTHER
+from airl_mav.view.viser_scene import FlightScene
 from airl_mav.view.watchers import Watchers
 
 DRAW_US = 33_000

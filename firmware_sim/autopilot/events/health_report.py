@@ -16,7 +16,7 @@ from firmware_sim.autopilot.commander import STATE_BITS
 from firmware_sim.autopilot.events.check_events import ARMING_SUMMARY, HEALTH_SUMMARY
 from firmware_sim.autopilot.events.definition import Level, MavlinkEvent
 from firmware_sim.autopilot.events.enumerations import Component
-from firmware_sim.autopilot.failsafes.conditions import NEEDS, Need, lacking
+from firmware_sim.autopilot.failsafes.failsafe_conditions import NEEDS, Need, lacking
 from firmware_sim.autopilot.prearm import CHECKS, SUPPLY_CHECK_OFF, PrearmCheck, Readiness
 
 ALL_MODES = 0xFFFFFFFF

@@ -15,20 +15,20 @@ from firmware_sim.autopilot.commander import custom_mode
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import MavlinkEvent
 from firmware_sim.autopilot.events.enumerations import FailsafeCause
-from firmware_sim.autopilot.failsafes.actions import (
+from firmware_sim.autopilot.failsafes.failsafe_actions import (
     Clear,
     FailsafeAction,
     FailsafeReason,
     Options,
     Takeover,
 )
-from firmware_sim.autopilot.failsafes.conditions import (
+from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
     Conditions,
     FailsafeSettings,
     can_run,
 )
-from firmware_sim.autopilot.failsafes.table import (
+from firmware_sim.autopilot.failsafes.failsafe_table import (
     Situation,
     Trigger,
     answers,

@@ -7,9 +7,19 @@ from collections.abc import Iterable, Sequence
 from airl_mav.profiles.parameters import SPEC_BY_NAME
 from firmware_sim.autopilot import prearm
 from firmware_sim.autopilot.autopilot_state import MODE_NAMES, Mode
-from firmware_sim.autopilot.failsafes.actions import Clear, FailsafeAction, Options, Takeover
-from firmware_sim.autopilot.failsafes.conditions import NEEDS
-from firmware_sim.autopilot.failsafes.table import MODE_OF_ACTION, OFFBOARD_LOSS, TABLE, Row
+from firmware_sim.autopilot.failsafes.failsafe_actions import (
+    Clear,
+    FailsafeAction,
+    Options,
+    Takeover,
+)
+from firmware_sim.autopilot.failsafes.failsafe_conditions import NEEDS
+from firmware_sim.autopilot.failsafes.failsafe_table import (
+    MODE_OF_ACTION,
+    OFFBOARD_LOSS,
+    TABLE,
+    Row,
+)
 
 ACTION_NAMES = {
     FailsafeAction.NONE: "nothing",

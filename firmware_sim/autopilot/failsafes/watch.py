@@ -18,12 +18,6 @@ from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.error_state import SIGMA, Q
 from firmware_sim.autopilot.estimator import GPS_GONE_US, Estimator
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.failsafes.conditions import (
-    NO_BREACH,
-    BatteryWarning,
-    Conditions,
-    FenceBreach,
-)
 from firmware_sim.autopilot.failsafes.detectors import (
     HYSTERESIS,
     AttitudeFailure,
@@ -32,6 +26,12 @@ from firmware_sim.autopilot.failsafes.detectors import (
     Undercurrent,
     Validity,
     roll_and_pitch,
+)
+from firmware_sim.autopilot.failsafes.failsafe_conditions import (
+    NO_BREACH,
+    BatteryWarning,
+    Conditions,
+    FenceBreach,
 )
 from firmware_sim.autopilot.sensor_monitor import CALM_US, SensorMonitor
 from firmware_sim.engine.record import (

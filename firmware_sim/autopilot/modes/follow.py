@@ -15,7 +15,7 @@ from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.modes.hold import Hold
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
 from firmware_sim.autopilot.requests import ModeRequest
-from firmware_sim.autopilot.trajectory import PathSegment
+from firmware_sim.autopilot.smooth_trajectory import PathSegment
 
 LOST_US = 3 * US_PER_S
 """Target timeout [µs], after which the vehicle waits at its position."""

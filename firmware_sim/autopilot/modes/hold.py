@@ -19,7 +19,7 @@ from firmware_sim.autopilot.modes.interface import (
 )
 from firmware_sim.autopilot.modes.takeoff import aim
 from firmware_sim.autopilot.requests import ClimbOn, ModeRequest, PositionYaw, Reposition
-from firmware_sim.autopilot.trajectory import PathSegment, stopping_place
+from firmware_sim.autopilot.smooth_trajectory import PathSegment, stopping_place
 from firmware_sim.engine.record import SETTLING
 
 STANDING_M_S = 0.3

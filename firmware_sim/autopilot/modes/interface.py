@@ -23,7 +23,7 @@ from firmware_sim.autopilot.requests import (
     ObstacleBins,
     PositionYaw,
 )
-from firmware_sim.autopilot.trajectory import Travel
+from firmware_sim.autopilot.smooth_trajectory import Travel
 
 NAN: float = math.nan
 FREE: Vec = (NAN, NAN, NAN)

@@ -14,7 +14,7 @@ from firmware_sim.autopilot.modes.precision_land import PrecisionLand
 from firmware_sim.autopilot.modes.takeoff import gentle, leave_ground
 from firmware_sim.autopilot.navigation.plan import Triplet, TripletKind
 from firmware_sim.autopilot.requests import ModeRequest
-from firmware_sim.autopilot.trajectory import PathLimits, PathSegment
+from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment
 
 _TAKEOFF, _LAND, _IDLE = TripletKind.TAKEOFF, TripletKind.LAND, TripletKind.IDLE
 

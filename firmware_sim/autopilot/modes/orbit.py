@@ -23,7 +23,7 @@ from firmware_sim.autopilot.modes.interface import (
     triple,
 )
 from firmware_sim.autopilot.requests import ModeRequest, OrbitRequest
-from firmware_sim.autopilot.trajectory import PathSegment
+from firmware_sim.autopilot.smooth_trajectory import PathSegment
 
 LEAST_RADIUS_M = 1.0
 FASTEST_M_S = 10.0

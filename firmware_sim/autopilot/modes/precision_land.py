@@ -16,7 +16,7 @@ from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
 from firmware_sim.autopilot.modes.land import landing_speed
 from firmware_sim.autopilot.requests import LandingTarget, ModeRequest
-from firmware_sim.autopilot.trajectory import PathSegment
+from firmware_sim.autopilot.smooth_trajectory import PathSegment
 
 PERIOD_US = 50_000
 """Period of target checks [µs]: PX4's navigator runs at 20 Hz."""

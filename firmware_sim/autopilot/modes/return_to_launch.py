@@ -21,7 +21,7 @@ from firmware_sim.autopilot.modes.mission import Mission
 from firmware_sim.autopilot.modes.precision_land import PrecisionLand
 from firmware_sim.autopilot.navigation.return_path import return_height
 from firmware_sim.autopilot.requests import ModeRequest, PositionYaw
-from firmware_sim.autopilot.trajectory import PathSegment
+from firmware_sim.autopilot.smooth_trajectory import PathSegment
 
 _REQUIRED = 2
 """RTL_PLD_MD: 1 lands on a target that is visible at once, 2 searches for the target."""

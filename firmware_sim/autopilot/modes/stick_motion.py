@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from airl_mav.core.constants import DEG, GRAVITY_M_S2
 from airl_mav.core.frames import wrap_pi
-from firmware_sim.autopilot.trajectory import Axis
+from firmware_sim.autopilot.smooth_trajectory import Axis
 
 NAN = math.nan
 

@@ -16,7 +16,7 @@ from firmware_sim.autopilot.modes.interface import (
     over,
 )
 from firmware_sim.autopilot.requests import ClimbOn, ModeRequest, PositionYaw, Reposition
-from firmware_sim.autopilot.trajectory import PathLimits, PathSegment
+from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment
 from firmware_sim.engine.record import RISING
 
 LEAST_CLIMB_M = 0.1

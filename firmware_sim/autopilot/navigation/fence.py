@@ -27,7 +27,7 @@ from firmware_sim.autopilot.navigation.plan import (
     Plans,
     distance_m,
 )
-from firmware_sim.autopilot.trajectory import Axis
+from firmware_sim.autopilot.smooth_trajectory import Axis
 
 _POLYGONS = {
     NavCommand.FENCE_POLYGON_VERTEX_INCLUSION: True,

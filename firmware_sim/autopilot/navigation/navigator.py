@@ -12,7 +12,7 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.failsafes.conditions import FenceBreach
+from firmware_sim.autopilot.failsafes.failsafe_conditions import FenceBreach
 from firmware_sim.autopilot.failsafes.watch import Reports
 from firmware_sim.autopilot.modes.interface import FlightContext
 from firmware_sim.autopilot.navigation.executor import PERIOD_US, Crew, MissionExecutor

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from airl_mav.core.clock import Patience
 from airl_mav.core.constants import LOOPBACK
 from firmware_sim.external.observer import SYSTEM_ID
-from firmware_sim.external.px4.program import API_LOCAL_PORT, API_PORT
+from firmware_sim.external.px4.px4_program import API_LOCAL_PORT, API_PORT
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.mavlink.codec import Encoder, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint

@@ -17,8 +17,8 @@ from dataclasses import replace
 from operator import attrgetter
 
 from airl_mav.core.frames import Geodetic, geodetic_to_local
+from airl_mav.faults.fault import Fault
 from airl_mav.faults.kinds import MOTORS, Part
-from airl_mav.faults.model import Fault
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Arming, Mode, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events

@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.mavlink.codec import Values
-from firmware_sim.mavlink.streams import information, pose, sensors, status
+from firmware_sim.mavlink.streams import information, pose, sensor_streams, status
 
 Builder = Callable[[AutopilotState], "Values | None"]
 """Returns one message's fields, in order of definition, from a snapshot; None = no content yet.
@@ -55,9 +55,9 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "EXTENDED_SYS_STATE": status.extended_sys_state,
         "SYS_STATUS": None,
         "ESTIMATOR_STATUS": status.estimator_status,
-        "SCALED_PRESSURE": sensors.scaled_pressure,
+        "SCALED_PRESSURE": sensor_streams.scaled_pressure,
         # PX4's simulator sends one measurement to two barometers.
-        "SCALED_PRESSURE2": sensors.scaled_pressure,
+        "SCALED_PRESSURE2": sensor_streams.scaled_pressure,
         "MISSION_CURRENT": status.mission_current,
         "FENCE_STATUS": status.fence_status,
         "HOME_POSITION": pose.home_position,
@@ -68,15 +68,15 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "CURRENT_MODE": information.current_mode,
         "ESC_INFO": None,
         "ESC_STATUS": None,
-        "ACTUATOR_OUTPUT_STATUS": sensors.actuator_output_status,
-        "HIL_ACTUATOR_CONTROLS": sensors.hil_actuator_controls,
-        "SCALED_IMU": sensors.scaled_imu,
+        "ACTUATOR_OUTPUT_STATUS": sensor_streams.actuator_output_status,
+        "HIL_ACTUATOR_CONTROLS": sensor_streams.hil_actuator_controls,
+        "SCALED_IMU": sensor_streams.scaled_imu,
         "FLIGHT_INFORMATION": information.flight_information,
         "PROTOCOL_VERSION": information.protocol_version,
         "HIGH_LATENCY2": status.high_latency2,
         # Last, because start times of streams depend on their order.
-        "DISTANCE_SENSOR": sensors.distance_sensor,
-        "OPTICAL_FLOW_RAD": sensors.optical_flow_rad,
+        "DISTANCE_SENSOR": sensor_streams.distance_sensor,
+        "OPTICAL_FLOW_RAD": sensor_streams.optical_flow_rad,
     }
 )
 """Streams that need only the snapshot; the server adds the others. None = packed by compiled code

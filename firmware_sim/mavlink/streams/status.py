@@ -15,7 +15,7 @@ from firmware_sim.autopilot.commander import custom_mode
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.px4_custom_mode import base_mode, system_status
 from firmware_sim.mavlink.streams import units
-from firmware_sim.mavlink.streams.sensors import percent
+from firmware_sim.mavlink.streams.sensor_streams import percent
 
 CAPABILITIES: int = (
     dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT

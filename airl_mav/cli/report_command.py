@@ -1,0 +1,106 @@
+"""`airl report`: rebuild a run's report, or compare runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+from rich.console import Console
+
+from airl_mav.black_box.messages import SUFFIX
+from airl_mav.cli.options import POSITIONAL
+from airl_mav.cli.shared_options import TrustArenas, folder_of
+from airl_mav.core.clock import utc_now
+from airl_mav.core.console import new_console
+from airl_mav.core.errors import FieldError
+from airl_mav.core.fields import ProfileModel
+from airl_mav.rehearsal.run_folder import RUN_FILE, load
+from airl_mav.report.comparison.comparison_model import comparison_file, kind_of
+from airl_mav.report.run_arenas import trust_arenas
+
+
+class ReportOptions(ProfileModel):
+    """Print the tables of a run, a gap or a ladder and rewrite its page; or compare runs.
+
+    Two or more runs are compared: settings, quality of flight with intervals, paired differences on
+    shared seeds, latencies, paths, energy. The first run is the reference.
+
+    Examples:
+        airl report runs/20261122T101530Z-sitl-static-obstacles
+        airl report runs/A runs/B --names before after --out runs/before-after
+        airl report flights/20261123T101530.123456Z.mcap
+        airl report flights/20261123T101530.123456Z.mcap --ulg log_12.ulg
+    """
+
+    runs: Annotated[tuple[Path, ...], POSITIONAL] = Field(
+        default=(),
+        description="run folders, black boxes of flights (.mcap), or the folder of a gap, a ladder,"
+        " a curve or a table",
+    )
+    names: tuple[str, ...] = Field(
+        default=(),
+        description="labels of the compared runs, in order; default: their differences",
+    )
+    out: Path | None = Field(
+        default=None,
+        description="folder of a comparison; by default runs/<UTC time>-compare. A report goes into"
+        " its run's own folder",
+    )
+    ulg: Path | None = Field(
+        default=None,
+        description="with one black box: the flight controller's own log of that flight (.ulg),"
+        " used for path, power and motor outputs",
+    )
+    trust: TrustArenas = False
+
+
+OPTIONS = ReportOptions
+
+
+def run(options: ReportOptions, console: Console | None = None) -> int:
+    """Build the report; return 0."""
+    console = console or new_console()
+    if not options.runs:
+        raise FieldError("runs", accepted="one run folder or more")
+    recorded = [path for path in options.runs if path.suffix == SUFFIX and not path.is_dir()]
+    if options.ulg is not None and len(recorded) != 1:
+        raise FieldError("ulg", f"{options.ulg}", "with one black box of a flight (.mcap)")
+    folders = [folder_of(path, options.ulg if path in recorded else None) for path in options.runs]
+    options = options.model_copy(update={"runs": tuple(folders)})
+    first = options.runs[0]
+    if options.trust:
+        for folder in options.runs:
+            if kind_of(folder) is None:
+                trust_arenas(load(folder))
+    if len(options.runs) > 1 or kind_of(first) == "matrix":
+        return _compare(options, console)
+    for field, value in (("out", options.out), ("names", " ".join(options.names))):
+        if value:
+            raise FieldError(field, f"{value}", "with two runs or more")
+    if kind_of(first) is None:
+        # Imported here and below: options do not need the figures.
+        from airl_mav.report.run_report import show_report, verdict_of
+
+        loaded = load(first)
+        show_report(loaded, verdict_of(loaded), console)
+    else:
+        from airl_mav.report.comparison.show import rebuild_comparison, show_comparison
+
+        show_comparison(*rebuild_comparison(first), first, console)
+    return 0
+
+
+def _compare(options: ReportOptions, console: Console) -> int:
+    from airl_mav.report.comparison.runs import compare_folders
+    from airl_mav.report.comparison.show import show_comparison
+
+    out = options.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-compare"
+    if (out / RUN_FILE).exists():
+        raise FieldError("out", f"{out}", "another folder: it holds a run")
+    held = comparison_file(out, "compare").exists()
+    if out.is_dir() and any(out.iterdir()) and not held:
+        raise FieldError("out", f"{out}", "a new or empty folder: it holds something else")
+    comparison, runs = compare_folders(list(options.runs), options.names)
+    show_comparison(comparison, runs, out, console)
+    return 0

@@ -1,0 +1,139 @@
+"""`airl-sitl`, `airl sitl`: rehearse a policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+from rich.console import Console
+
+from airl_mav.cli.options import check_installed, run_command, scenario_of
+from airl_mav.cli.shared_options import Gate, Viewing, leave, requirements_of, view_of
+from airl_mav.cli.telling import Telling, Voice
+from airl_mav.cli.video_command import video_shown, video_words, watcher_of
+from airl_mav.core.constants import LOOPBACK
+from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
+from airl_mav.profiles.camera_kind import SLOW
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
+from airl_mav.scenario.resolved import ResolvedScenario
+from firmware_sim.external.programs import how_to_start
+
+if TYPE_CHECKING:
+    from airl_mav.flight.requirements import Requirement
+
+
+class SitlOptions(Gate, Viewing, Telling, Scenario):
+    """Rehearse a policy: firmware and companion as two processes, seeded episodes, a report.
+
+    If the first word ends in .toml, it is a scenario file; options override its values. A run
+    folder contains scenario.toml, which repeats the run.
+
+    Examples:
+        airl-sitl --vehicle quad
+        airl-sitl --computer ras-pi-4 --workload template-5x32 --episodes 10
+        airl-sitl --level lockstep --policy dynamic-obstacles --arena crowded
+        airl-sitl --level lockstep --arena dynamic-obstacles --view
+        airl-sitl rehearsal.toml --latency 150ms --require "success >= 90 %"
+    """
+
+    out: Path | None = Field(
+        default=None,
+        description="run folder; an incomplete folder of the same run is completed; default:"
+        " runs/<UTC time>-<level>-<policy>",
+    )
+
+    video: str | None = Field(
+        default=None,
+        description="show what the camera sees as a video, to HOST:PORT; 127.0.0.1:5600 is where"
+        " QGroundControl on this machine listens",
+    )
+
+
+OPTIONS = SitlOptions
+
+
+def run(options: SitlOptions, console: Console | None = None) -> int:
+    """Fly the rest, write the report; return 0, 1 (lost), 3 to 5 (verdict) or 130 (Ctrl-C)."""
+    voice = Voice(options, "airl-sitl", console)
+    requirements = requirements_of(options, reference=False)
+    view = view_of(options)
+    scenario = resolve(scenario_of(options))
+    film = video_of(options, scenario.scenario, partial(_say, voice.console))
+    with voice, film:
+        flown = fly_live(
+            scenario,
+            options.out,
+            voice.progress,
+            announce=partial(_announce, scenario, voice.console),
+            view=view,
+        )
+        judged = conclude(flown, options, requirements, voice)
+    return EXIT_CODES[flown.ended] or judged
+
+
+def video_of(
+    options: SitlOptions, asked: Scenario, say: Callable[[str], None]
+) -> AbstractContextManager[None]:
+    """Return a context that shows the camera's video, if requested."""
+    if options.video is None:
+        return nullcontext()
+    check_installed("film")
+    watcher_of(options.video, "video")
+    return video_shown(video_words(asked, options.video), say)
+
+
+def conclude(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voice: Voice) -> int:
+    """Print the tables and write the report of the flights; return the verdict's exit status."""
+    if not flown.episodes:
+        _say(voice.console, f"no episode was finished; logs in {flown.path}")
+        voice.finish(EXIT_CODES[flown.ended], flown.ended, flown.path)
+        return 0
+    # Imported here: the figures take seconds to load, which flights do not need.
+    from airl_mav.rehearsal.run_folder import load
+    from airl_mav.report.run_report import show_report, verdict_of
+
+    run = load(flown.path)
+    verdict = verdict_of(run, requirements)
+    if flown.ended == "complete":
+        leave(gate, verdict, "airl-sitl")
+    page = show_report(run, verdict, voice.console, voice.progress)
+    voice.finish(
+        EXIT_CODES[flown.ended] or verdict.exit_code,
+        flown.ended,
+        flown.path,
+        verdict=verdict,
+        page=page,
+        runs={flown.path.name: run},
+    )
+    return verdict.exit_code
+
+
+def _announce(scenario: ResolvedScenario, console: Console) -> None:
+    asked, setup = scenario.scenario, scenario.setup
+    _say(console, f"airl-sitl  {asked.vehicle} in {asked.arena}, policy {scenario.policy.name}")
+    if asked.level != "sitl":
+        _say(console, "lockstep   one process, one simulated clock, MAVSDK on raw bytes")
+        if setup.level != "firmware":
+            return
+    else:
+        _say(console, f"MAVSDK     udpin://{LOOPBACK}:{asked.companion_port} (the companion's)")
+        if asked.renderer in SLOW:
+            _say(console, "camera     path traced in real time: images are as late as they take")
+    _say(console, f"QGC        UDP port {asked.ports.gcs_port} (connects by itself)")
+    if setup.level == "firmware":
+        _say(console, f"firmware   {setup.firmware}")
+        if (hint := how_to_start(asked, scenario.vehicle)) is not None:
+            _say(console, f"           start one for every flight: {hint}")
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, soft_wrap=True, highlight=False)
+
+
+if __name__ == "__main__":
+    run_command("airl-sitl", "airl_mav.cli.sitl_command")

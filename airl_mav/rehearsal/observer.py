@@ -1,0 +1,125 @@
+"""Live display of a rehearsal: a line per episode, and the vehicle's state."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Goal, goal_distance_m
+from airl_mav.core.progress import Progress
+from airl_mav.flight.episode_record import EpisodeRecord
+from airl_mav.flight.judge import Outcome
+from airl_mav.rehearsal.channel import State, Text
+from airl_mav.rehearsal.tally import Tally
+
+WARNING = 4
+"""MAV_SEVERITY_WARNING: shows texts of this severity or worse."""
+
+OUTCOME_STYLES = {
+    Outcome.SUCCESS: "green",
+    Outcome.COLLISION: "red",
+    Outcome.TIMEOUT: "yellow",
+    Outcome.BATTERY: "magenta",
+    Outcome.ABORTED: "red",
+}
+
+
+class Observer:
+    """Base class of observers of episodes; called from one thread at a time, does nothing."""
+
+    def waiting(self, what: str) -> None:
+        """Called when the rehearsal waits for something."""
+
+    def episode(self, index: int, seed: int, goal: Goal) -> None:
+        """Called when an episode begins; its goal is (north, east) [m]."""
+
+    def phase(self, phase: str, time_us: int) -> None:
+        """Called when the companion enters a phase, at a simulated time [µs]."""
+
+    def state(self, state: State, started_us: int) -> None:
+        """Called with the vehicle's true state, and the start of the episode [µs]."""
+
+    def text(self, text: Text) -> None:
+        """Called for a text of the autopilot."""
+
+    def finished(self, record: EpisodeRecord) -> None:
+        """Called when an episode has been saved."""
+
+    def lost(self, what: str) -> None:
+        """Called when an episode was lost and begins again."""
+
+
+class LiveObserver(Observer):
+    """Shows a rehearsal on the terminal."""
+
+    def __init__(
+        self, progress: Progress, folder: Path, done: tuple[EpisodeRecord, ...], episodes: int
+    ) -> None:
+        """Begin with the episodes in a run folder, out of `episodes` in total."""
+        self.finished_records: list[EpisodeRecord] = []
+        """Records of episodes finished since the start, in that order."""
+        self._progress = progress
+        self._tally = Tally(progress, "flights", folder, done, episodes)
+        self._flight = ""
+        self._goal: Goal = (0.0, 0.0)
+        self._phase = ""
+
+    def waiting(self, what: str) -> None:
+        """Show the reason of a wait."""
+        self._progress.status(what)
+
+    def episode(self, index: int, seed: int, goal: Goal) -> None:
+        """Show that an episode begins."""
+        self._goal = goal
+        self._phase = "booting"
+        self._flight = f"flight {index:03d}"
+        self._progress.status(f"{self._flight}, seed {seed}")
+
+    def phase(self, phase: str, time_us: int) -> None:
+        """Show the phase."""
+        self._phase = phase
+        self._progress.status(f"{self._flight}: {phase} at {time_us / US_PER_S:.1f} s")
+
+    def state(self, state: State, started_us: int) -> None:
+        """Show the vehicle's true state."""
+        away = goal_distance_m(self._goal, state.position)
+        self._progress.watch(
+            f"{self._flight}: {self._phase:<10} {(state.time_us - started_us) / US_PER_S:5.1f} s "
+            f"{away:5.1f} m to goal {state.speed_m_s:4.1f} m/s "
+            f"{-state.position[2]:4.1f} m high {100 * state.battery:3.0f} %"
+        )
+
+    def text(self, text: Text) -> None:
+        """Print an autopilot text of severity warning or worse."""
+        if text.severity <= WARNING:
+            self._progress.note(f"  autopilot: {text.text}", "yellow")
+
+    def finished(self, record: EpisodeRecord) -> None:
+        """Print an episode's line and advance the bar."""
+        self.finished_records.append(record)
+        quality = record.quality
+        figures = ""
+        if quality is not None:
+            figures = f"{quality.flight_time_s:6.1f} s {quality.distance_m:6.1f} m "
+            if quality.energy_j is not None:
+                figures += f"{quality.energy_j / 1e3:6.2f} kJ "
+            figures += " "
+        self._progress.note(
+            f"  flight {record.index:03d}  seed {record.seed:<5} "
+            f"{record.outcome.value:<10}{figures}{record.reason}",
+            OUTCOME_STYLES[record.outcome],
+        )
+        for note in record.notes:
+            self._progress.note(f"    {note}", "yellow")
+        if record.sha256 is not None:
+            self._progress.note(f"    sha256 {record.sha256['flight']}", "dim")
+        self._tally.add(record)
+
+    def lost(self, what: str) -> None:
+        """Print the loss of an episode that begins again."""
+        self._progress.note(f"  {what}", "yellow")
+
+    def close(self) -> None:
+        """Remove the bar."""
+        self._progress.status(None)
+        self._tally.close()

@@ -1,0 +1,250 @@
+"""Clock alignment of a companion and a flight controller from their recordings of one flight.
+
+Downlink: telemetry repeats the log's velocity and attitude with a delay. The best matching shift is
+the clock offset plus the age of telemetry: the link delay plus the age of the newest message.
+Uplink: a setpoint appears in the log between two samples. Each setpoint thus bounds the clock
+offset plus its delay. Marzullo's algorithm finds the shift within most of these bounds
+(K. Marzullo, Maintaining the time in a distributed system, 1984).
+
+Neither shift alone separates the offset from the link delay. The offset cancels in their sum, which
+is the round trip from sending a setpoint to the first telemetry that can reflect it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.signal import correlate, correlation_lags
+
+from airl_mav.core.constants import US_PER_S, CommandKind
+from airl_mav.core.errors import UsageError
+from airl_mav.core.frames import quat_from_euler
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.vehicle_log.ulog_reader import Series, VehicleLog
+
+GRID_US = 40_000
+"""Step of the search over all shifts [µs]: the period of the companion's recording."""
+
+FINE_US = 100_000
+"""Half-width of the refinement around the coarse shift [µs]."""
+
+LEAST_CORRELATION = 0.8
+"""Minimum correlation of the velocities; below it, the recordings are of different flights."""
+
+LEAST_SPEED_M_S = 0.5
+"""Minimum top speed of a flight [m/s]; slower motion is indistinguishable from noise."""
+
+LEAST_SETPOINTS = 3
+"""Minimum number of matched setpoints for an uplink delay."""
+
+SAME_SPEED_M_S, SAME_RATE_RAD_S = 0.02, 0.01
+"""Tolerances for equal setpoints: speed and yaw rate, which do not depend on the heading."""
+
+SAME_TURN, SAME_THRUST = 0.001, 0.001
+"""Tolerances for equal body rates [rad/s], components of `_down_and_nose`, and thrusts. Unlike yaw
+rates, they reach the log unfiltered."""
+
+LONGEST_LINK_US = US_PER_S
+"""Maximum uplink delay of a setpoint [µs]."""
+
+
+@dataclass(frozen=True)
+class ClockAlignment:
+    """Relation of the clocks of a recording and a log of the same flight."""
+
+    told_us: float
+    """Downlink shift: companion's telemetry time minus the flight controller's time [µs]."""
+    correlation: float
+    """Correlation of the velocities at that shift, 0 to 1."""
+    error_m_s: float
+    """Root mean square difference of the velocities at that shift [m/s]."""
+    accepted_us: float | None
+    """Uplink shift: flight controller's time of accepting a setpoint minus the companion's send
+    time [µs]; None = fewer than `LEAST_SETPOINTS` matched setpoints."""
+    accepted_range_us: tuple[float, float] | None
+    """Bounds of the uplink shift that most setpoints agree on [µs]."""
+    setpoints: int
+
+    @property
+    def round_trip_us(self) -> float | None:
+        """Time from sending a setpoint to its telemetry [µs], without the vehicle's response."""
+        return None if self.accepted_us is None else self.told_us + self.accepted_us
+
+
+def align(
+    path: Trajectory,
+    log: VehicleLog,
+    sent_us: NDArray[np.int64],
+    setpoints: NDArray[np.float64],
+    commands: CommandKind = "velocity",
+) -> ClockAlignment:
+    """Return the clock relation of a recorded flight and its vehicle's log, or raise UsageError."""
+    told_us = _refined(path, log, _coarse(path, log))
+    flown, logged = path.velocity[:, :2], log.motion.at(path.time_us - told_us)[:, 3:5]
+    inside = _inside(path, log, told_us)
+    error = flown[inside] - logged[inside]
+    correlation = _correlation(flown[inside], logged[inside])
+    if correlation < LEAST_CORRELATION:
+        raise UsageError(
+            f"{log.path}: its velocities agree with those of the recording by {correlation:.2f} at "
+            f"best; accepted: the log of the same flight, {LEAST_CORRELATION:g} or more"
+        )
+    low_us, high_us, count = _accepted(sent_us, setpoints, commands, log, told_us)
+    known = count >= LEAST_SETPOINTS
+    return ClockAlignment(
+        told_us=told_us,
+        correlation=correlation,
+        error_m_s=float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
+        accepted_us=0.5 * (low_us + high_us) if known else None,
+        accepted_range_us=(low_us, high_us) if known else None,
+        setpoints=count,
+    )
+
+
+def _coarse(path: Trajectory, log: VehicleLog) -> float:
+    """Return the shift [µs] of maximum velocity correlation, rounded to the grid."""
+    times = [
+        np.arange(int(each[0]), int(each[-1]), GRID_US)
+        for each in (path.time_us, log.motion.time_us)
+    ]
+    told = np.stack([np.interp(times[0], path.time_us, each) for each in path.velocity.T])
+    logged = log.motion.at(times[1])[:, 3:].T
+    if min(len(each) for each in times) < 2 or np.abs(told).max() < LEAST_SPEED_M_S:
+        raise UsageError(
+            f"{log.path}: the clocks cannot be aligned; accepted: a flight with motion of "
+            f"{LEAST_SPEED_M_S:g} m/s or more"
+        )
+    score = sum(correlate(a, b) for a, b in zip(told, logged, strict=True))
+    lag = correlation_lags(len(times[0]), len(times[1]))[int(np.argmax(score))]
+    return float(times[0][0] - times[1][0] + lag * GRID_US)
+
+
+def _refined(path: Trajectory, log: VehicleLog, coarse_us: float) -> float:
+    """Return the best shift [µs] for attitude and velocity near a coarse shift."""
+
+    def cost(shift_us: float) -> float:
+        inside = _inside(path, log, shift_us)
+        times = path.time_us[inside] - shift_us
+        leaning = _down_and_nose(path.quaternion[inside])
+        logged = _down_and_nose(log.attitude.at(times))
+        moved = path.velocity[inside] - log.motion.at(times)[:, 3:]
+        turned = (leaning - logged) / max(float(leaning.std()), 1e-3)
+        return float(np.mean(turned**2) + np.mean((moved / path.velocity[inside].std()) ** 2))
+
+    bounds = (coarse_us - FINE_US, coarse_us + FINE_US)
+    return float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 50.0}).x)
+
+
+def _down_and_nose(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the horizontal parts of the body's down and nose axes (n, 4), equal for q and -q."""
+    w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
+    return np.stack(
+        [
+            2.0 * (x * z + w * y),
+            2.0 * (y * z - w * x),
+            1.0 - 2.0 * (y * y + z * z),
+            2.0 * (x * y + w * z),
+        ],
+        axis=1,
+    )
+
+
+def _inside(path: Trajectory, log: VehicleLog, shift_us: float) -> NDArray[np.bool_]:
+    """Return a mask (n,) of the samples within the log's time range."""
+    times = path.time_us - shift_us
+    first = max(log.motion.time_us[0], log.attitude.time_us[0])
+    last = min(log.motion.time_us[-1], log.attitude.time_us[-1])
+    inside: NDArray[np.bool_] = (times >= first) & (times <= last)
+    if not inside.any():
+        raise UsageError(f"{log.path}: accepted: the log of the same flight")
+    return inside
+
+
+def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    power = float(np.sum(a * a) * np.sum(b * b))
+    return float(np.sum(a * b) / np.sqrt(power)) if power > 0.0 else 0.0
+
+
+def _accepted(
+    sent_us: NDArray[np.int64],
+    setpoints: NDArray[np.float64],
+    commands: CommandKind,
+    log: VehicleLog,
+    told_us: float,
+) -> tuple[float, float, int]:
+    """Return the bounds [µs] of the uplink shift and the number of setpoints that agree."""
+    expected_us = np.asarray(sent_us - told_us, np.float64)
+    bounds = [
+        bound
+        for sent, seen, near in _looked_for(setpoints, commands, log)
+        for bound in _bounds(expected_us, sent, seen, np.array(near))
+    ]
+    if not bounds:
+        return 0.0, 0.0, 0
+    low_us, high_us, count = marzullo(np.array(bounds, np.float64))
+    return low_us - told_us, high_us - told_us, count
+
+
+def _looked_for(
+    setpoints: NDArray[np.float64], commands: CommandKind, log: VehicleLog
+) -> Iterator[tuple[NDArray[np.float64], Series, tuple[float, ...]]]:
+    """Yield sent setpoints (k, m), their series (n, m) in the log and match tolerances (m,)."""
+    if commands == "body_rates":
+        yield setpoints, log.rates_setpoint, (*3 * (SAME_TURN,), SAME_THRUST)
+        return
+    if commands == "attitude":
+        turned = [quat_from_euler(*angles) for angles in setpoints[:, :3].tolist()]
+        sent = _down_and_nose(np.array(turned).reshape(-1, 4))
+        seen = log.attitude_setpoint
+        attitude = _down_and_nose(seen.values[:, :4])
+        yield (
+            np.column_stack([sent, setpoints[:, 3]]),
+            Series(seen.time_us, np.column_stack([attitude, seen.values[:, 4]])),
+            (*4 * (SAME_TURN,), SAME_THRUST),
+        )
+        return
+    level = log.setpoint.values
+    # Speed and yaw rate do not depend on the heading, so they are equal at both ends.
+    sent = np.stack([np.hypot(setpoints[:, 0], setpoints[:, 1]), setpoints[:, 3]], axis=1)
+    seen_level = np.stack([np.hypot(level[:, 0], level[:, 1]), level[:, 3]], axis=1)
+    yield sent, Series(log.setpoint.time_us, seen_level), (SAME_SPEED_M_S, SAME_RATE_RAD_S)
+    yield sent[:, 1:], log.yaw_rate_setpoint, (SAME_RATE_RAD_S,)
+
+
+def _bounds(
+    expected_us: NDArray[np.float64],
+    sent: NDArray[np.float64],
+    seen: Series,
+    near: NDArray[np.float64],
+) -> list[tuple[float, float]]:
+    """Return intervals [µs] after the expected times (k,) in which setpoints enter the log."""
+    bounds = []
+    for k in range(1, len(sent)):
+        if (np.abs(sent[k] - sent[k - 1]) < 2.0 * near).all():
+            continue  # The log shows no change.
+        window = slice(
+            int(np.searchsorted(seen.time_us, expected_us[k] - FINE_US)),
+            int(np.searchsorted(seen.time_us, expected_us[k] + LONGEST_LINK_US)),
+        )
+        same = (np.abs(seen.values[window] - sent[k]) < near).all(axis=1)
+        first = int(np.argmax(same)) if same.any() else 0
+        if first > 0:
+            times = seen.time_us[window][first - 1 : first + 1] - expected_us[k]
+            bounds.append((float(times[0]), float(times[1])))
+    return bounds
+
+
+def marzullo(bounds: NDArray[np.float64]) -> tuple[float, float, int]:
+    """Return the interval covered by most of the intervals (n, 2), and their number."""
+    edges = [(low, -1) for low in bounds[:, 0]] + [(high, 1) for high in bounds[:, 1]]
+    edges.sort()
+    open_now, best, found = 0, 0, (0.0, 0.0)
+    for i, (at, kind) in enumerate(edges):
+        open_now -= kind
+        if kind == -1 and open_now > best:
+            best, found = open_now, (float(at), float(edges[i + 1][0]))
+    return found[0], found[1], best

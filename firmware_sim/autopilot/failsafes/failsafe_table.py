@@ -1,0 +1,482 @@
+"""Table of failsafes: condition, parameter, action. One row per failsafe, pure.
+
+Source: PX4 1.16, commander/failsafe/failsafe.cpp (checkStateAndMode and its callees). Not
+applicable to this vehicle and omitted: VTOL transitions, ESC arming failure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import NamedTuple
+
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.failsafes.failsafe_actions import (
+    Clear,
+    FailsafeAction,
+    FailsafeReason,
+    Options,
+    Takeover,
+)
+from firmware_sim.autopilot.failsafes.failsafe_conditions import (
+    FLIGHT_TERMINATION_OFF,
+    NEEDS,
+    BatteryWarning,
+    Conditions,
+    FailsafeSettings,
+    Need,
+    can_run,
+)
+
+MODE_OF_ACTION = {
+    FailsafeAction.FALLBACK_POSITION: Mode.POSITION,
+    FailsafeAction.FALLBACK_ALTITUDE: Mode.ALTITUDE,
+    FailsafeAction.FALLBACK_STABILIZED: Mode.STABILIZED,
+    FailsafeAction.HOLD: Mode.HOLD,
+    FailsafeAction.RETURN: Mode.RETURN,
+    FailsafeAction.LAND: Mode.LAND,
+    FailsafeAction.DESCEND: Mode.DESCEND,
+    FailsafeAction.TERMINATE: Mode.TERMINATION,
+}
+"""Mode of each action; other actions keep the intended mode. In ascending order: if a mode cannot
+run, the next action replaces it."""
+
+OFFBOARD_LOSS: dict[int, tuple[FailsafeAction, Mode | None]] = {
+    0: (FailsafeAction.FALLBACK_POSITION, Mode.POSITION),
+    1: (FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+    2: (FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
+    3: (FailsafeAction.RETURN, Mode.RETURN),
+    4: (FailsafeAction.LAND, Mode.LAND),
+    5: (FailsafeAction.HOLD, Mode.HOLD),
+    6: (FailsafeAction.TERMINATE, Mode.TERMINATION),
+    7: (FailsafeAction.DISARM, None),
+}
+"""COM_OBL_RC_ACT: action, and the mode whose requirements apply from there on."""
+
+
+def mode_of(action: FailsafeAction, intended: Mode) -> Mode:
+    """Return the action's mode, or the intended mode if the action has none."""
+    return MODE_OF_ACTION.get(action, intended)
+
+
+def possible(action: FailsafeAction, conditions: Conditions) -> FailsafeAction:
+    """Return the action, or the next possible one in the chain, which ends at Terminate."""
+    if action not in MODE_OF_ACTION:
+        return action
+    chain = (a for a in MODE_OF_ACTION if a >= action)
+    return next(
+        (a for a in chain if can_run(MODE_OF_ACTION[a], conditions)), FailsafeAction.TERMINATE
+    )
+
+
+def mode_fallback(
+    conditions: Conditions, settings: FailsafeSettings, intended: Mode
+) -> FailsafeAction:
+    """Return the replacement of an intended mode that cannot run; NONE = it can."""
+    action, mode = FailsafeAction.NONE, intended
+    if conditions.offboard_control_signal_lost and NEEDS[mode] & Need.OFFBOARD_SIGNAL:
+        action, next_mode = OFFBOARD_LOSS.get(settings.com_obl_rc_act, OFFBOARD_LOSS[0])
+        if next_mode is None:
+            return action
+        mode = next_mode
+    if settings.com_posctl_navl == 0:
+        if mode is Mode.POSITION and not can_run(mode, conditions):
+            action, mode = FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE
+        if mode is Mode.ALTITUDE and not can_run(mode, conditions):
+            action, mode = FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED
+    elif settings.com_posctl_navl == 1 and mode is Mode.POSITION and not can_run(mode, conditions):
+        action, mode = FailsafeAction.LAND, Mode.LAND
+        if not can_run(mode, conditions):
+            action, mode = FailsafeAction.DESCEND, Mode.DESCEND
+    return action if can_run(mode, conditions) else FailsafeAction.RETURN
+
+
+NOTHING = Options(FailsafeAction.NONE)
+
+
+class Situation(NamedTuple):
+    """Input of a table row."""
+
+    time_us: int
+    conditions: Conditions
+    settings: FailsafeSettings
+    intended: Mode
+    """Mode requested by the user."""
+    mission_finished: bool = False
+    armed_us: int | None = None
+    """Time of arming; None = disarmed."""
+    manual_control_lost_at_arming: bool = False
+    """Manual control was lost at arming and has not returned: it is optional."""
+    battery_at_arming: BatteryWarning = BatteryWarning.NONE
+
+
+class Trigger(Enum):
+    """Cause of a failsafe; one action is held per trigger."""
+
+    MANUAL_CONTROL = auto()
+    GCS = auto()
+    MISSION = auto()
+    MISSION_WITHOUT_LINKS = auto()
+    WIND = auto()
+    FLIGHT_TIME = auto()
+    POSITION_ACCURACY = auto()
+    NAVIGATOR = auto()
+    GEOFENCE = auto()
+    REMAINING_TIME = auto()
+    BATTERY_UNHEALTHY = auto()
+    BATTERY_LOW = auto()
+    BATTERY_CRITICAL = auto()
+    BATTERY_EMERGENCY = auto()
+    ATTITUDE = auto()
+    PROPELLER = auto()
+    MOTOR = auto()
+    MODE_FALLBACK = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Failsafe."""
+
+    trigger: Trigger
+    title: str
+    when: str
+    """Condition, for the manual."""
+    occurs: Callable[[Situation], bool]
+    answers: Mapping[int, Options]
+    """Responses by parameter value; a row without a parameter has key 0 only."""
+    parameter: str | None = None
+    otherwise: Options = NOTHING
+    """Response to an undefined parameter value."""
+    related: tuple[str, ...] = ()
+    """Other parameters of the condition."""
+    value: Callable[[Situation], int] | None = None
+    """Key into `answers` if it differs from the parameter's value."""
+
+    def options(self, situation: Situation) -> Options:
+        """Return the response if the failsafe is triggered in a situation."""
+        if self.value is not None:
+            chosen = self.value(situation)
+        elif self.parameter is not None:
+            chosen = getattr(situation.settings, self.parameter.lower())
+        else:
+            chosen = 0
+        return self.answers.get(chosen, self.otherwise)
+
+
+_STICKS_OFF = 4
+"""COM_RC_IN_MODE: stick input disabled."""
+_EXCEPT_MISSION, _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 1, 2, 4
+"""Bits of COM_RCL_EXCEPT."""
+
+_NONE, _WARN, _HOLD = NOTHING, Options(FailsafeAction.WARN), Options(FailsafeAction.HOLD)
+_RETURN = Options(FailsafeAction.RETURN, Clear.ON_MODE_CHANGE)
+_LAND = Options(FailsafeAction.LAND, Clear.ON_MODE_CHANGE)
+_LASTING_HOLD = Options(FailsafeAction.HOLD, Clear.ON_MODE_CHANGE)
+_TERMINATE = Options(FailsafeAction.TERMINATE, Clear.NEVER, Takeover.NEVER)
+_DISARM = Options(FailsafeAction.DISARM, takeover=Takeover.NEVER)
+
+
+def _caused(answers: Mapping[int, Options], cause: FailsafeReason) -> dict[int, Options]:
+    return {value: options._replace(cause=cause) for value, options in answers.items()}
+
+
+_LANDING = (Mode.LAND, Mode.PRECISION_LAND)
+_LINK_LOSS = {0: _NONE, 1: _HOLD, 2: _RETURN, 3: _LAND, 5: _TERMINATE, 6: _DISARM}
+"""Responses of NAV_RCL_ACT and NAV_DLL_ACT."""
+
+_ESCAPABLE_HOLD = _LASTING_HOLD._replace(takeover=Takeover.MODE_SWITCH)
+_LIMITS = {0: _NONE, 1: _WARN, 2: _ESCAPABLE_HOLD, 3: _RETURN, 4: _TERMINATE, 5: _LAND}
+"""Responses of GF_ACTION and COM_WIND_MAX_ACT."""
+
+_POSITION_LOW = {
+    value: Options(action, takeover=Takeover.MODE_SWITCH)
+    for value, action in enumerate(
+        (
+            FailsafeAction.NONE,
+            FailsafeAction.WARN,
+            FailsafeAction.HOLD,
+            FailsafeAction.RETURN,
+            FailsafeAction.TERMINATE,
+            FailsafeAction.LAND,
+        )
+    )
+} | {4: _TERMINATE}
+
+_ACTUATOR = {
+    0: _WARN,
+    1: _HOLD,
+    2: _LAND,
+    3: _RETURN,
+    4: Options(FailsafeAction.TERMINATE, Clear.NEVER),
+}
+
+
+def ignores_manual_control(s: Situation) -> bool:
+    """Return whether the loss of manual control is exempt in this mode (COM_RCL_EXCEPT)."""
+    mode, bits = s.intended, s.settings.com_rcl_except
+    return (
+        s.manual_control_lost_at_arming
+        or (mode is Mode.MISSION and bool(bits & _EXCEPT_MISSION))
+        or (mode in (Mode.HOLD, Mode.TAKEOFF) and bool(bits & _EXCEPT_HOLD))
+        or (mode is Mode.OFFBOARD and bool(bits & _EXCEPT_OFFBOARD))
+    )
+
+
+def _manual_control(s: Situation) -> bool:
+    lost = s.conditions.manual_control_signal_lost and s.settings.com_rc_in_mode != _STICKS_OFF
+    return lost and not ignores_manual_control(s)
+
+
+def _links_lost_after_mission(s: Situation) -> bool:
+    """Return whether a finished mission has no link and no link failsafe applies."""
+    unwatched = s.settings.com_rc_in_mode == _STICKS_OFF or bool(
+        s.settings.com_rcl_except & _EXCEPT_MISSION
+    )
+    return (
+        s.intended is Mode.MISSION
+        and s.mission_finished
+        and unwatched
+        and s.settings.nav_dll_act == 0
+        and s.conditions.gcs_connection_lost
+    )
+
+
+def _in_first(s: Situation, seconds: float) -> bool:
+    return s.armed_us is not None and s.time_us < s.armed_us + seconds * US_PER_S
+
+
+def _spooling(s: Situation) -> bool:
+    return _in_first(s, s.settings.com_spoolup_time)
+
+
+def _taking_off(s: Situation) -> bool:
+    return _in_first(s, s.settings.com_lkdown_tko + s.settings.com_spoolup_time)
+
+
+def _terminates(s: Situation) -> bool:
+    return s.settings.cbrk_flightterm != FLIGHT_TERMINATION_OFF
+
+
+def _battery_action(s: Situation) -> int:
+    """Return COM_LOW_BAT_ACT; 0 unless the battery warning is worse than at arming."""
+    worse = s.conditions.battery_warning > s.battery_at_arming
+    return s.settings.com_low_bat_act if worse else 0
+
+
+def _battery_row(
+    trigger: Trigger,
+    level: BatteryWarning,
+    title: str,
+    cause: FailsafeReason,
+    actions: tuple[FailsafeAction, ...],
+) -> Row:
+    threshold = ("", "BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")[level]
+    return Row(
+        trigger,
+        title,
+        "the charge is below its limit, and was not at arming",
+        lambda s: s.conditions.battery_warning is level,
+        {value: Options(action, cause=cause) for value, action in enumerate(actions)},
+        "COM_LOW_BAT_ACT",
+        Options(FailsafeAction.WARN, cause=cause),
+        related=(threshold,),
+        value=_battery_action,
+    )
+
+
+_W, _R, _L = FailsafeAction.WARN, FailsafeAction.RETURN, FailsafeAction.LAND
+
+TABLE: tuple[Row, ...] = (
+    Row(
+        Trigger.MANUAL_CONTROL,
+        "Manual control lost",
+        "no pilot's input for so long, unless there was none at arming",
+        _manual_control,
+        _caused(_LINK_LOSS, FailsafeReason.MANUAL_CONTROL_LOSS),
+        "NAV_RCL_ACT",
+        related=("COM_RC_LOSS_T", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
+    ),
+    Row(
+        Trigger.GCS,
+        "Ground station lost",
+        "no ground station's HEARTBEAT for so long; not in Land or Precision Landing",
+        lambda s: s.conditions.gcs_connection_lost and s.intended not in _LANDING,
+        _caused(_LINK_LOSS, FailsafeReason.GCS_LOSS),
+        "NAV_DLL_ACT",
+        related=("COM_DL_LOSS_T",),
+    ),
+    Row(
+        Trigger.MISSION,
+        "Mission cannot be completed",
+        "the mission has become infeasible, in Mission",
+        lambda s: s.intended is Mode.MISSION and s.conditions.mission_failure,
+        {0: Options(FailsafeAction.RETURN)},
+    ),
+    Row(
+        Trigger.MISSION_WITHOUT_LINKS,
+        "No link after the mission",
+        "the mission is finished, the ground station lost and NAV_DLL_ACT 0, manual control unused",
+        _links_lost_after_mission,
+        {0: Options(FailsafeAction.RETURN)},
+        related=("NAV_DLL_ACT", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
+    ),
+    Row(
+        Trigger.WIND,
+        "Wind above its limit",
+        "the estimated wind exceeds its limit",
+        lambda s: s.conditions.wind_limit_exceeded,
+        _LIMITS,
+        "COM_WIND_MAX_ACT",
+        Options(FailsafeAction.WARN),
+        related=("COM_WIND_MAX",),
+    ),
+    Row(
+        Trigger.FLIGHT_TIME,
+        "Flight time over",
+        "so long since take-off",
+        lambda s: s.conditions.flight_time_limit_exceeded,
+        {0: Options(FailsafeAction.RETURN)},
+        related=("COM_FLT_TIME_MAX",),
+    ),
+    Row(
+        Trigger.POSITION_ACCURACY,
+        "Position accuracy low",
+        "the position is valid, but less accurate than asked for, in Mission and Hold",
+        lambda s: (
+            s.intended in (Mode.MISSION, Mode.HOLD) and s.conditions.local_position_accuracy_low
+        ),
+        _POSITION_LOW,
+        "COM_POS_LOW_ACT",
+        Options(FailsafeAction.WARN, takeover=Takeover.MODE_SWITCH),
+        related=("COM_POS_LOW_EPH",),
+    ),
+    Row(
+        Trigger.NAVIGATOR,
+        "Mode failed in Takeoff or Return",
+        "what the mode flies to cannot be reached",
+        lambda s: s.conditions.navigator_failure and s.intended in (Mode.TAKEOFF, Mode.RETURN),
+        {0: _LAND},
+    ),
+    Row(
+        Trigger.NAVIGATOR,
+        "Mode failed otherwise",
+        "what the mode flies to cannot be reached",
+        lambda s: s.conditions.navigator_failure and s.intended not in (Mode.TAKEOFF, Mode.RETURN),
+        {0: _LASTING_HOLD},
+    ),
+    Row(
+        Trigger.GEOFENCE,
+        "Geofence breached",
+        "too far from home, too high above it, or outside the uploaded fence",
+        lambda s: any(s.conditions.geofence),
+        _LIMITS,
+        "GF_ACTION",
+        Options(FailsafeAction.WARN),
+        related=("GF_MAX_HOR_DIST", "GF_MAX_VER_DIST"),
+    ),
+    Row(
+        Trigger.REMAINING_TIME,
+        "Remaining flight time low",
+        "the battery lasts no longer than a return takes",
+        lambda s: s.conditions.battery_low_remaining_time,
+        _caused({0: _NONE, 1: _WARN, 3: _RETURN}, FailsafeReason.FLIGHT_TIME_LOW),
+        "COM_FLTT_LOW_ACT",
+        related=("BAT1_CAPACITY", "RTL_TIME_FACTOR", "RTL_TIME_MARGIN"),
+    ),
+    Row(
+        Trigger.BATTERY_UNHEALTHY,
+        "Battery unhealthy at arming",
+        "the battery reports nothing, within COM_SPOOLUP_TIME of arming",
+        lambda s: s.conditions.battery_unhealthy and _spooling(s),
+        {0: Options(FailsafeAction.DISARM)},
+    ),
+    Row(
+        Trigger.BATTERY_UNHEALTHY,
+        "Battery unhealthy",
+        "the battery reports nothing for 5 s",
+        lambda s: s.conditions.battery_unhealthy and not _spooling(s),
+        {0: _WARN},
+    ),
+    _battery_row(
+        Trigger.BATTERY_LOW,
+        BatteryWarning.LOW,
+        "Battery low",
+        FailsafeReason.BATTERY_LOW,
+        (_W, _W, _W, _W),
+    ),
+    _battery_row(
+        Trigger.BATTERY_CRITICAL,
+        BatteryWarning.CRITICAL,
+        "Battery critical",
+        FailsafeReason.BATTERY_CRITICAL,
+        (_W, _R, _L, _R),
+    ),
+    _battery_row(
+        Trigger.BATTERY_EMERGENCY,
+        BatteryWarning.EMERGENCY,
+        "Battery empty",
+        FailsafeReason.BATTERY_EMERGENCY,
+        (_W, _R, _L, _L),
+    ),
+    Row(
+        Trigger.ATTITUDE,
+        "Attitude failure at take-off",
+        "roll or pitch out of limits, within COM_SPOOLUP_TIME + COM_LKDOWN_TKO of arming",
+        lambda s: s.conditions.fd_critical_failure and _taking_off(s),
+        {0: Options(FailsafeAction.DISARM)},
+        related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "COM_LKDOWN_TKO"),
+    ),
+    Row(
+        Trigger.ATTITUDE,
+        "Attitude failure in flight, CBRK_FLIGHTTERM 0",
+        "roll or pitch out of limits",
+        lambda s: s.conditions.fd_critical_failure and not _taking_off(s) and _terminates(s),
+        {0: Options(FailsafeAction.TERMINATE)},
+        related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "CBRK_FLIGHTTERM"),
+    ),
+    Row(
+        Trigger.ATTITUDE,
+        "Attitude failure in flight",
+        "roll or pitch out of limits",
+        lambda s: s.conditions.fd_critical_failure and not _taking_off(s) and not _terminates(s),
+        {0: _WARN},
+        related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "CBRK_FLIGHTTERM"),
+    ),
+    Row(
+        Trigger.PROPELLER,
+        "Imbalanced propeller",
+        "the vibration exceeds its limit",
+        lambda s: s.conditions.fd_imbalanced_prop,
+        {-1: _NONE, 0: _WARN, 1: _RETURN, 2: _LAND},
+        "COM_IMB_PROP_ACT",
+        related=("FD_IMB_PROP_THR",),
+    ),
+    Row(
+        Trigger.MOTOR,
+        "Motor failure",
+        "a motor draws too little current for what it is told",
+        lambda s: s.conditions.fd_motor_failure,
+        _ACTUATOR,
+        "COM_ACT_FAIL_ACT",
+        _WARN,
+        related=("FD_ACT_EN", "FD_ACT_MOT_THR", "FD_ACT_MOT_C2T", "FD_ACT_MOT_TOUT"),
+    ),
+)
+"""All failsafes except the last, added by `answers`: the fallback of a mode that cannot run."""
+
+
+def answers(situation: Situation) -> list[tuple[Trigger, Options]]:
+    """Return the triggered failsafes with their responses in table order, without NONE."""
+    found = [(row.trigger, row.options(situation)) for row in TABLE if row.occurs(situation)]
+    found = [
+        (trigger, options)
+        for trigger, options in found
+        if options.action is not FailsafeAction.NONE
+    ]
+    fallback = mode_fallback(situation.conditions, situation.settings, situation.intended)
+    if fallback is not FailsafeAction.NONE:
+        options = Options(fallback, takeover=Takeover.ALWAYS)
+        found.append((Trigger.MODE_FALLBACK, options))
+    return found
