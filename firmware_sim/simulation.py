@@ -1,4 +1,4 @@
-"""Simulation of one vehicle in one arena: plant, autopilot and flight recorder."""
+"""Simulation of one vehicle in one arena: plant, autopilot, recorder and hover start."""
 
 from __future__ import annotations
 

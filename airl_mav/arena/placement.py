@@ -1,4 +1,4 @@
-"""Placement of obstacles by bounded rejection sampling."""
+"""Placement of obstacles by bounded rejection sampling, and their footprints."""
 
 from __future__ import annotations
 

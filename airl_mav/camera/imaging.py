@@ -5,7 +5,7 @@ is the timestamp; velocity and angular rates are constant. A rolling shutter exp
 the top; the timestamp is the middle of the middle row's exposure.
 
 The gain scales the scene's light before rendering, which preserves the shades of dark scenes. Each
-shorter exposure clips light beyond white. Then follow lens and sensor (`image_sensor`), and JPEG. A
+shorter exposure clips light beyond white. Then follow lens, sensor and JPEG. A
 grey pixel's light follows from its sRGB code.
 """
 

@@ -1,4 +1,4 @@
-"""Camera models (pinhole, 360 degree cylinder, fisheye) and their pixel formats."""
+"""Camera models (pinhole, cylinder, fisheye): pixel formats and rays."""
 
 from __future__ import annotations
 

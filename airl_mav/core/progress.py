@@ -1,7 +1,7 @@
 """Progress of long tasks: bars and lines on a terminal, or nothing for callers of the Python API.
 
 Tasks report to a `Progress`: a `Bar` for countable work, the current status, notes for people, and
-events for programs. `RichProgress` draws; `json_progress` writes for programs.
+events for programs. `RichProgress` draws; `JsonProgress` writes for programs.
 """
 
 from __future__ import annotations

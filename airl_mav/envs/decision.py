@@ -3,7 +3,7 @@
 Sequential, as in the paper: observe, infer, act, hold, and observe again. Pipelined: the next
 decision starts with the newest frame as soon as the last one is ready; no action is held.
 
-A decision is a list of events, each at a tick relative to the observation. `flight.advance`
+A decision is a list of events, each at a tick relative to the observation. `fleet_step.advance`
 simulates from event to event without Python. With body rate commands, the flight controller only
 changes the setpoint type when it publishes its control mode, twice a second
 (`control.demand.KIND_US`). If a decision is overdue, the companion's watchdog stops the vehicle

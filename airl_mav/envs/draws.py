@@ -81,7 +81,7 @@ class DelayDraws(DrawnAhead):
             n: Number of slots.
             injections: One or more; each episode draws one of them.
             native_us: t2 without injection [µs].
-            draw: See `samplers.latency_generator`.
+            draw: See `injection.latency_generator`.
         """
         super().__init__(n)
         self._injections = tuple(injections)
@@ -129,7 +129,7 @@ class Winds(DrawnAhead):
         self.gusty = settings.gust_m_s > 0.0 or bool(self._faults)
         self._winds: list[Wind | None] = [None] * n
         self.air = np.zeros((n, WIND_BLOCK if self.gusty else 0 if self.calm else 1, 3))
-        """(n, k, 3) present blocks, as an argument of `flight.advance`."""
+        """(n, k, 3) present blocks, as an argument of `fleet_step.advance`."""
 
     def begin(self, i: int, seed: int) -> Vector:
         """Start the episode of slot i; return its steady wind (3,) NED [m/s]."""

@@ -1,6 +1,6 @@
 """Vehicles of the batch twin: their state as arrays, and shared constants.
 
-`flight.advance` simulates them.
+`fleet_step.advance` simulates them.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class FlightArrays(NamedTuple):
     verdict: NDArray[np.int64]
     """`FlightStatus` of each flight."""
     touched: NDArray[np.int64]
-    """Index of the touched obstacle, or `arenas.FLOOR`, `CEILING`, `WALL`, `NOTHING`."""
+    """Index of the touched obstacle, or `arena_batch.FLOOR`, `CEILING`, `WALL`, `NOTHING`."""
     time_s: NDArray[np.float64]
     distance_m: NDArray[np.float64]
     """Path length so far [m]."""

@@ -1,4 +1,4 @@
-"""Python API of a run: episodes, quality of flight, latencies, paths and report."""
+"""Python API of a run: fly a scenario; read episodes, quality, latencies, paths and report."""
 
 from __future__ import annotations
 

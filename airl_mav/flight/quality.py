@@ -54,7 +54,7 @@ class Quality:
     or never (`latency.stages`), 0 to 1. This and the following: None without data and in older
     records."""
     jerk_rms_m_s3: float | None = None
-    """RMS jerk of the flown velocity, at the bandwidth of `flight.smoothness` [m/s³]."""
+    """RMS jerk of the flown velocity, at the bandwidth of `jerk_of` [m/s³]."""
     jerk_peak_m_s3: float | None = None
     command_jerk_rms_m_s3: float | None = None
     """RMS jerk of the commanded velocity, at the same bandwidth [m/s³]."""

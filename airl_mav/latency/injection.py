@@ -1,4 +1,4 @@
-"""Selection of a rehearsal's decision latency, and its label in reports."""
+"""Decision latency of a rehearsal: source, samplers, and label in reports."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ BOOT_UNIX_US = 1_767_225_600 * US_PER_S
 
 MAVSDK_HZ = {"EXTENDED_SYS_STATE": 1.0}
 """Rates that MAVSDK requests automatically, at a wall-clock dependent time [Hz]. They are set from
-the start, so the request has no effect (`inbound`)."""
+the start, so the request has no effect (`conductor`)."""
 
 
 SLOW_EVERY_US = US_PER_S // 10

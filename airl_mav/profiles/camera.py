@@ -1,4 +1,4 @@
-"""Camera of a vehicle profile: image, mount and depth matching."""
+"""Camera of a vehicle profile: image, mount, depth matching and image formation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measures for the comparison of runs, and their estimates as text."""
+"""Measures for the comparison of runs, their estimates as text, deadlines and smoothness."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Resolved scenario with all referenced content loaded."""
+"""Resolved scenario with all referenced content loaded, and scenario files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Airframe constants as one typed row for kernels, and their domain randomization."""
+"""Airframe and rotor model: constants as one typed row for kernels, randomization."""
 
 from __future__ import annotations
 

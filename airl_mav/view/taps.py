@@ -54,7 +54,7 @@ class Hand:
 
 
 class HandLatency:
-    """Latency that viewers may override. Implements `latency.samplers.LatencySampler`."""
+    """Latency that viewers may override. Implements `latency.injection.LatencySampler`."""
 
     def __init__(self, hand: Hand, sampler: LatencySampler | None) -> None:
         """Store the settings and the scenario's t2 sampler; None = no injected latency."""

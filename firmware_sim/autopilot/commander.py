@@ -1,7 +1,7 @@
 """Commander: an explicit transition table by phase and event. Pure: no clock, no I/O.
 
 Arming rules, mode changes, rejections and their texts follow PX4 (measured on PX4 1.16 with MAVSDK
-4.1). `failsafes/` holds the failsafe decisions, `auto_disarm` the disarm timeouts, and `modes/` the
+4.1). `failsafes/` holds the failsafe decisions, `AutoDisarm` the disarm timeouts, and `modes/` the
 behaviour of each mode.
 """
 

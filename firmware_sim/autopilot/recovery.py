@@ -1,6 +1,6 @@
 """Recovery of the estimator from inertial sensor and heading faults.
 
-`consistency` distinguishes faults from noise, and `emergency_yaw` identifies a heading fault. This
+`consistency` distinguishes faults from noise, and `EmergencyYaw` identifies a heading fault. This
 module restarts the filter's variances, or resets the heading to the yaw estimator's.
 """
 

@@ -165,7 +165,7 @@ def actuate(
         row: (16,) motion of the vehicle.
         wind: (3,) NED [m/s].
         airframe: (15,) fields of `Airframe`.
-        left: Fraction of a speed error that remains after a tick (`rotor.lag`).
+        left: Fraction of a speed error that remains after a tick (`airframe.lag`).
 
     Returns:
         Rotor speeds after the tick; in NED the centre of mass [m], the force without gravity [N]

@@ -1,4 +1,4 @@
-"""ULog flight log of one vehicle, written after each tick."""
+"""ULog flight log of one vehicle, and the folder of its logs."""
 
 # ruff: noqa: D102 (`AutopilotState` documents the properties of `FlownState`)
 

@@ -53,7 +53,7 @@ class PlantBody(Protocol):
             moving_us: Time since the moving obstacles started, at the end of the tick [µs].
 
         Returns:
-            (16,) motion after the tick, see `engine.kinematics`; a new array.
+            (16,) motion after the tick, see `engine.dynamics`; a new array.
         """
 
     def follow(self, motion: Vector) -> None:

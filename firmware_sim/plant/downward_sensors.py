@@ -1,4 +1,4 @@
-"""Rangefinder with noise and limits, along a ray straight down in body axes."""
+"""Rangefinder and optical flow sensor along a ray straight down in body axes."""
 
 from __future__ import annotations
 

@@ -204,7 +204,7 @@ class Plant:
 
     @property
     def motion(self) -> Vector:
-        """Copy of the motion (16,), see `engine.kinematics`."""
+        """Copy of the motion (16,), see `engine.dynamics`."""
         return self._motion.copy()
 
     @property

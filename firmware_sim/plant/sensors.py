@@ -217,7 +217,7 @@ class SensorSuite:
                 self.noise[i], used[i] = rng.standard_normal((BLOCK, _WIDTHS[i])), 0
 
     def sample(self, time_us: int, row: Vector, battery: BatterySample) -> SensorSample:
-        """Return the sample at `time_us` [µs] in motion `row` (16,), see `engine.kinematics`."""
+        """Return the sample at `time_us` [µs] in motion `row` (16,), see `engine.dynamics`."""
         record = self._record
         record["time_us"], record["motion"] = time_us, row
         self.measure()

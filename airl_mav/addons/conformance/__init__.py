@@ -4,7 +4,7 @@ Checks a flight controller over MAVSDK against the assumptions of a rehearsal, f
 and compares them with PX4's. Always lands.
 
 Command: `airl conformance`. From Python: `conformance.run.check_conformance`.
-Depends on: MAVSDK, the `vehicle_clock` of this folder, `airl_mav.report` for the page.
+Depends on: MAVSDK; needs no other add-on.
 Guide: docs/conformance.md.
 """
 

@@ -1,4 +1,4 @@
-"""Transcript of a run, and its checks with their outcomes."""
+"""Transcript and checks of a run, and the expected reactions of each autopilot."""
 
 from __future__ import annotations
 

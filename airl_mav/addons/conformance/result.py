@@ -1,4 +1,4 @@
-"""Result of a conformance run."""
+"""Result of a conformance run, with its deviations from the stored reference."""
 
 from __future__ import annotations
 

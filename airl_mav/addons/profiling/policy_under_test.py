@@ -1,4 +1,4 @@
-"""Policy whose decisions are timed: an existing one, or a random network."""
+"""Policy under test, existing or random, and its decisions without a flight."""
 
 from __future__ import annotations
 

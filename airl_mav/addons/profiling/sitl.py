@@ -55,7 +55,7 @@ class DecisionEstimate(LiveObserver):
 
 
 def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recording:
-    """Fly until there are enough decisions; arguments as `bare.measure`."""
+    """Fly until there are enough decisions; arguments as `policy_under_test.measure`."""
     # Before the network is opened elsewhere.
     load_us, first_us, later_us = cold_start(request, policy)
     scenario = resolve(

@@ -1,4 +1,4 @@
-"""Fit of a vehicle and a computer profile to a recorded flight."""
+"""Fit of a vehicle and a computer profile to one or several recorded flights."""
 
 from __future__ import annotations
 

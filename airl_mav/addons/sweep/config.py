@@ -1,4 +1,4 @@
-"""Sweep configuration as a TOML file: networks, arenas, training and evaluation."""
+"""Sweep configuration as a TOML file, and the trials that it lists."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Construction of a comparison from run folders."""
+"""Construction of a comparison from run folders, and the frame of its page."""
 
 from __future__ import annotations
 

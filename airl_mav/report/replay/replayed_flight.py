@@ -1,4 +1,4 @@
-"""State of a recorded flight at any time, as a live view shows it."""
+"""Recorded flights of runs, and the state of a flight at any time."""
 
 from __future__ import annotations
 

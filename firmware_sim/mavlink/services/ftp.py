@@ -1,7 +1,6 @@
-"""MAVLink FTP: requests, replies and bursts.
+"""MAVLink FTP: requests, replies, bursts and file operations within the vehicle's storage.
 
-Source: https://mavlink.io/en/services/ftp.html and PX4 1.16, MavlinkFTP. File operations are in
-`ftp_files`; access is limited to the vehicle's storage.
+Source: https://mavlink.io/en/services/ftp.html and PX4 1.16, MavlinkFTP.
 """
 
 from __future__ import annotations
