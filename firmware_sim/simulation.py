@@ -1,4 +1,4 @@
-"""Simulation of one vehicle in one arena: plant, autopilot, recorder and hover start."""
+"""Simulation of one vehicle in one arena."""
 
 from __future__ import annotations
 

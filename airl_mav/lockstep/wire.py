@@ -33,7 +33,7 @@ STATES = frozenset(
     if rate_hz > 1.0 and name not in _PER_INSTANCE
 )
 """Messages that replace older ones: state streams, and TIMESYNC, whose answer is not sent to the
-vehicle (`conductor`). Answers, events, texts and slow streams such as HEARTBEAT are not included."""
+vehicle (`conductor`). Answers, events, texts and slow streams such as HEARTBEAT are excluded."""
 
 
 UNREAD = frozenset(

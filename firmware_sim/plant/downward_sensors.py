@@ -1,4 +1,4 @@
-"""Rangefinder and optical flow sensor along a ray straight down in body axes."""
+"""Rangefinder and optical flow sensor. Both look down."""
 
 from __future__ import annotations
 

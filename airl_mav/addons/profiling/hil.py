@@ -74,7 +74,7 @@ class DecisionLimit:
 
 
 def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recording:
-    """Fly until there are enough decisions; Ctrl-C lands. Arguments as `policy_under_test.measure`."""
+    """Fly until there are enough decisions; Ctrl-C lands. Arguments as `sitl.measure`."""
     load_us, first_us, _ = cold_start(request, policy)
     interrupted, stop = threading.Event(), threading.Event()
 
