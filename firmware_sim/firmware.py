@@ -50,6 +50,11 @@ class FrameServer(Protocol):
         """True if a client waits for the next frame, which must then be on time."""
         ...
 
+    @property
+    def transport_us(self) -> int | None:
+        """Time from exposure to a client that reads between ticks [µs]; None = read at any time."""
+        ...
+
     def publish(self, frame: Frame) -> None:
         """Offer a frame without blocking."""
         ...
@@ -372,6 +377,9 @@ class Firmware:
             until_us = min(until_us, flight_stack.next_send_us())
         simulation.advance(until_us, self._pacing.arrivals)
         if camera is not None and len(simulation.truths) > 1:
+            transport_us = None if self.on_frame is not None else camera.transport_us
+            if transport_us is not None:
+                simulation.skip_unread(simulation.time_us - transport_us)
             simulation.capture_due(simulation.time_us - TICK_US, publish)
         if log is not None and internals is not None:
             log.after_ticks(simulation.flown, simulation.truths, internals.state())

@@ -131,26 +131,10 @@ class TrajectoryRecorder:
         """Add n ticks with states (n, >= 10); return the indices (m,) of the sampled ticks."""
         kept, mean_w = np.empty(len(times_us), np.int64), np.empty(len(times_us))
         m = _sample(times_us, powers_w, self._memory, kept, mean_w)
-        self._add(times_us[kept[:m]], mean_w[:m], states[kept[:m], :10])
+        self._times.append(times_us[kept[:m]])
+        self._powers.append(mean_w[:m])
+        self._states.append(states[kept[:m], :10])
         return kept[:m]
-
-    def keep(self, state: Vector) -> None:
-        """Sample the newest tick, as at the end of an episode.
-
-        `state` (10,) is position NED [m], velocity NED [m/s] and quaternion [w, x, y, z] body ->
-        world. It is not copied: do not change it afterwards.
-        """
-        last_us, kept_us, energy, power_w = self._memory.tolist()
-        if last_us < 0.0:
-            raise ValueError("no tick yet: a sample has the time of the newest one")
-        mean_w = power_w if kept_us < 0.0 else energy / (last_us - kept_us)
-        self._add(np.array([int(last_us)]), np.array([mean_w]), state[None])
-        self._memory[1:3] = last_us, 0.0
-
-    def _add(self, times_us: Ints, mean_w: Vector, states: Vector) -> None:
-        self._times.append(times_us)
-        self._powers.append(mean_w)
-        self._states.append(states)
 
     def trajectory(self) -> Trajectory:
         """Return the recorded trajectory."""

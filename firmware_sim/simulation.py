@@ -402,6 +402,11 @@ class Simulation:
             motion = Motion(row[POSITION], row[QUATERNION], row[VELOCITY], row[RATES])
             camera.offer(time_us, motion, publish)
 
+    def skip_unread(self, read_us: int) -> None:
+        """Skip due frames that newer ones replace before simulated `read_us` [µs], if possible."""
+        if self._camera is not None:
+            self._camera.skip_unread(read_us)
+
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the recorded arrays by name in the episode file (docs/run-folder.md)."""
         self._record()

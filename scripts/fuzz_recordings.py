@@ -27,6 +27,7 @@ import trimesh
 import tyro
 from fuzz_inputs import damaged
 
+from airl_mav.cli.main import subcommands
 from airl_mav.cli.options import carry_out
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
@@ -178,7 +179,7 @@ def read_damaged(what: str, number: int) -> str:
     said = io.StringIO()
     try:
         with redirect_stdout(said), redirect_stderr(said):
-            code = carry_out("airl", f"airl_mav.cli.{command}", words)
+            code = carry_out("airl", subcommands()[command][1], words)
         assert code == 0, f"exit status {code}"
     except UsageError as error:
         assert str(error).strip(), "refused without a word"

@@ -63,6 +63,7 @@ class MemoryCamera:
         """Set the transport latency [µs]: from exposure to the decoded frame in the companion."""
         self.clock: Clock | None = None
         """Clock of the companion; None = not connected yet."""
+        self.transport_us = transport_us
         self._under_way = UnderWay(transport_us)
         self.publish = self._under_way.send
         self._newest: ReceivedFrame | None = None
@@ -114,6 +115,7 @@ class TokenCamera:
 
     def __init__(self, server: FrameServer, transport_us: int) -> None:
         """Set the frame server and the transport latency from exposure to arrival [µs]."""
+        self.transport_us = transport_us
         self.under_way = UnderWay(transport_us)
         self.endpoint = server.endpoint
         self._server = server

@@ -300,7 +300,7 @@ class LockstepFlight:
         if self._watched is not None:
             self._watched.tick(simulation, self._judge.hit)
         shown, self._ticks = self._ticks // SHOW_EVERY, self._ticks + len(simulation.truths)
-        if self._ticks // SHOW_EVERY > shown:
+        if self._observer.shows_states and self._ticks // SHOW_EVERY > shown:
             self._observer.state(state_of(simulation, self._judge.hit), simulation.start_us)
 
     def _order(self, order: Order) -> None:

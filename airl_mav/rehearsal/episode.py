@@ -395,12 +395,14 @@ def match_setpoints(
     index = np.full(len(sent), UNMATCHED, np.int64)
     first = np.searchsorted(accepted, sent, side="left")
     end = np.append(np.searchsorted(accepted, sent[1:], side="left"), len(accepted))
-    for i, (start, stop) in enumerate(zip(first, end, strict=False)):
-        window = accepted_rows[start:stop]
-        same = np.isclose(window, sent_rows[i], rtol=0.0, atol=SAME_WITHIN, equal_nan=True)
-        hits = np.flatnonzero(same.all(axis=1))
-        if hits.size:
-            index[i] = start + hits[0]
+    # All pairs of a sent setpoint and a row accepted before the next one, compared at once.
+    counts = np.maximum(end[: len(sent)] - first, 0)
+    owner = np.repeat(np.arange(len(sent)), counts)
+    row = np.arange(len(owner)) + np.repeat(first - np.cumsum(counts) + counts, counts)
+    pairs = accepted_rows[row], sent_rows[owner]
+    same = np.isclose(*pairs, rtol=0.0, atol=SAME_WITHIN, equal_nan=True).all(axis=1)
+    owners, hits = np.unique(owner[same], return_index=True)
+    index[owners] = row[same][hits]
     return index
 
 

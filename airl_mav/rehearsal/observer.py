@@ -27,6 +27,9 @@ OUTCOME_STYLES = {
 class Observer:
     """Base class of observers of episodes; called from one thread at a time, does nothing."""
 
+    shows_states = False
+    """True if `state` has an effect. Creating a state takes longer than a tick."""
+
     def waiting(self, what: str) -> None:
         """Called when the rehearsal waits for something."""
 
@@ -51,6 +54,8 @@ class Observer:
 
 class LiveObserver(Observer):
     """Shows a rehearsal on the terminal."""
+
+    shows_states = True
 
     def __init__(
         self, progress: Progress, folder: Path, done: tuple[EpisodeRecord, ...], episodes: int

@@ -21,6 +21,7 @@ class ViewObserver(Observer):
         """Connect to a view."""
         self._feed = Feed(ends)
         self._onwards = onwards
+        self.shows_states = onwards.shows_states
 
     def waiting(self, what: str) -> None:
         """Forward the reason of a wait."""

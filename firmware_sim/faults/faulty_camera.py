@@ -49,6 +49,9 @@ class FailingCamera:
         while self._late and self._late[0][0] <= time_us:
             publish(self._late.popleft()[1])
 
+    def skip_unread(self, read_us: int) -> None:
+        """Skip nothing: a delayed or frozen frame may be read later."""
+
     def _take(self, frame: Frame, publish: Callable[[Frame], None]) -> None:
         delay_us = 0
         for each in self._acting:

@@ -195,6 +195,9 @@ class SlowCamera:
             self._process.send(_Take(time_us, motion))
             self._busy, self._taken_us = True, time_us
 
+    def skip_unread(self, read_us: int) -> None:
+        """Skip nothing: the time to render decides which frames exist."""
+
 
 def main(number: int) -> None:
     """Process requests until the connection closes.

@@ -18,6 +18,7 @@ from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import noise_of, noisy_frame
 from airl_mav.camera.render import Motion, Mount, camera_pose
+from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import Vector
 from airl_mav.profiles.camera import Camera
@@ -167,6 +168,20 @@ class SimulatedCamera:
         """Take a due frame and pass it to `publish`; see `take`."""
         publish(self.take(time_us, motion))
 
+    def skip_unread(self, read_us: int) -> None:
+        """Skip due frames that newer ones replace before `read_us`; see `OnboardCamera`."""
+        # The next frame is exposed at the first tick after its slot.
+        last_us = read_us - self._rate.period_us - TICK_US
+        while self.next_us < last_us and not self._in_order:
+            self._schedule_next(self.next_us)
+
+    def _schedule_next(self, time_us: int) -> int:
+        """Number the frame due at `time_us` [µs] and schedule the next; return the number."""
+        self._rate.due(time_us - self._start_us)
+        self.next_us = self._start_us + math.ceil(self._rate.next_us)
+        self._sequence += 1
+        return self._sequence - 1
+
     def capture(self, time_us: int, position: Vector, quaternion: Vector) -> Frame:
         """Take a due frame of a vehicle at rest; see `take`."""
         return self.take(time_us, Motion.at_rest(position, quaternion))
@@ -181,18 +196,15 @@ class SimulatedCamera:
         vehicle's pose at that time; `motion` is kept, not copied. The images are rendered on
         access, unless an image depends on the previous one.
         """
-        elapsed_us = time_us - self._start_us
-        self._rate.due(elapsed_us)
-        self.next_us = self._start_us + math.ceil(self._rate.next_us)
-        seen = elapsed_us, motion, self._seed, self._rate.period
+        number = self._schedule_next(time_us)
+        seen = time_us - self._start_us, motion, self._seed, self._rate.period
 
         def draw() -> Mapping[str, FurtherImage]:
             return {name: each.take(*seen) for name, each in self._eyes.items()}
 
-        frame = ExposedFrame(self._sequence, time_us, self._intrinsics, draw)
+        frame = ExposedFrame(number, time_us, self._intrinsics, draw)
         if self._in_order:
             _ = frame.images
-        self._sequence += 1
         return frame
 
 
@@ -203,6 +215,7 @@ class CameraServer:
     """
 
     awaited = True
+    transport_us = None
 
     def __init__(
         self, endpoint: str, context: zmq.Context[zmq.Socket[bytes]] | None = None

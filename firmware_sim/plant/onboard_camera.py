@@ -29,6 +29,9 @@ class OnboardCamera(Protocol):
         """Take the frame due at `time_us` [µs] in a motion, and publish completed frames."""
         ...
 
+    def skip_unread(self, read_us: int) -> None:
+        """Skip due frames that newer ones replace before simulated `read_us` [µs], if possible."""
+
 
 class CameraMaker(Protocol):
     """Factory of cameras; see `camera_server.SimulatedCamera`."""

@@ -37,6 +37,8 @@ class Rate:
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
+        self.period_us = US_PER_S / rate_hz
+        """Time between two samples [µs]."""
         self.next_us = 0.0
         """Simulated time of the next sample [µs]."""
         self.period = 0

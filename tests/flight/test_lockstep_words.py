@@ -85,6 +85,8 @@ def test_other_texts_are_no_words(text: str) -> None:
 class NoCamera:
     """Implements FrameServer."""
 
+    transport_us = None
+
     awaited = True
 
     endpoint = ""

@@ -24,8 +24,7 @@ from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.actions import Action
 from airl_mav.policy.greedy import GreedyPolicy
 from airl_mav.policy.observation import Observation
-from firmware_sim.recording import TrajectoryRecorder
-from tests.support.recording import record_tick
+from tests.support.recording import TestRecorder, record_tick
 
 SEEDS = range(1, 13)
 
@@ -85,7 +84,7 @@ class TickByTick(Trace):
 
     def __init__(self) -> None:
         super().__init__(1)
-        self.recorder = TrajectoryRecorder()
+        self.recorder = TestRecorder()
         self.poses: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._energy_j = 0.0
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from typing import Any
 
+from airl_mav.cli.main import subcommands
 from airl_mav.cli.options import carry_out
 from airl_mav.core.console import new_console
 
@@ -16,7 +17,7 @@ def airl(name: str, *words: str, width: int | None = None) -> tuple[int, str]:
     """
     out = io.StringIO()
     console = new_console(file=out, width=width or 200, soft_wrap=width is None)
-    code = carry_out(f"airl {name}", f"airl_mav.cli.{name}", words, console=console)
+    code = carry_out(f"airl {name}", subcommands()[name][1], words, console=console)
     return code, out.getvalue()
 
 

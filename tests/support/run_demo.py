@@ -19,8 +19,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
-from firmware_sim.recording import TrajectoryRecorder
-from tests.support.recording import record_tick
+from tests.support.recording import TestRecorder, record_tick
 
 TICK_US = 20_000
 TAKEOFF_US = 5_000_000
@@ -60,7 +59,7 @@ def demo_episode(
     started_us = index * 100_000_000
     navigation_us = started_us + TAKEOFF_US
     referee = Referee(Task((float(arena.goal[0]), float(arena.goal[1])), 2.0, time_limit_s))
-    recorder, log = TrajectoryRecorder(), DecisionLog(capacity=8)
+    recorder, log = TestRecorder(), DecisionLog(capacity=8)
     position, velocity, command = np.zeros(3), np.zeros(3), np.zeros(3)
     decide_us, charge, now, setpoints = navigation_us, 0.9, started_us, []
     while referee.verdict is None:

@@ -10,8 +10,7 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import PowerModel, flight_power_w, level_power_w
-from firmware_sim.recording import TrajectoryRecorder
-from tests.support.recording import record_tick
+from tests.support.recording import TestRecorder, record_tick
 from tests.support.solo import SOLO
 
 QUAD = load_vehicle("quad")
@@ -26,7 +25,7 @@ def swinging_flight(
     vehicle: VehicleProfile, seconds: float = 12.0
 ) -> tuple[Trajectory, dict[str, float]]:
     """Fly a known velocity at 250 Hz; return the recording, and each part of the energy [J]."""
-    recorder = TrajectoryRecorder()
+    recorder = TestRecorder()
     airframe, model = Airframe.from_profile(vehicle), PowerModel.from_profile(vehicle)
     dt = TICK_US / 1e6
     parts = dict.fromkeys(("hover", "motion", "manoeuvre"), 0.0)

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from airl_mav.flight.quality import measure_leg, measure_quality
 from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
-from firmware_sim.recording import TrajectoryRecorder
-from tests.support.recording import record_tick
+from tests.support.recording import TestRecorder, record_tick
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -90,7 +89,7 @@ def test_between_makes_nothing_up() -> None:
     flight = helix(1.0)
     assert flight.between(-5, 3_000_000).time_us[[0, -1]].tolist() == [0, 1_000_000]
     assert len(flight.between(2_000_000, 3_000_000)) == 0
-    assert len(TrajectoryRecorder().trajectory().between(0, 1)) == 0
+    assert len(TestRecorder().trajectory().between(0, 1)) == 0
 
 
 def test_attitude_between_samples_is_near_slerp_even_across_a_sign_flip() -> None:
@@ -108,7 +107,7 @@ def test_attitude_between_samples_is_near_slerp_even_across_a_sign_flip() -> Non
 
 @given(st.lists(st.floats(0.0, 2000.0), min_size=2, max_size=200), st.sampled_from([4_000, 7_000]))
 def test_no_energy_is_lost_between_ticks_and_samples(powers: list[float], tick_us: int) -> None:
-    recorder = TrajectoryRecorder()
+    recorder = TestRecorder()
     for i, power in enumerate(powers):
         last = i == len(powers) - 1
         record_tick(recorder, i * tick_us, [0, 0, 0], [0, 0, 0], LEVEL, power, keep=last)
@@ -123,18 +122,13 @@ def test_no_energy_is_lost_between_ticks_and_samples(powers: list[float], tick_u
 
 
 def test_a_recorder_at_250_hz_keeps_50() -> None:
-    recorder = TrajectoryRecorder()
+    recorder = TestRecorder()
     for i in range(251):
         record_tick(recorder, i * 4_000, [i, 0, 0], [1, 2, 3], LEVEL, 100.0)
     flight = recorder.trajectory()
     assert len(flight) == 51
     assert flight.position[:, 0].tolist() == list(range(0, 251, 5))
     assert flight.velocity[-1].tolist() == [1.0, 2.0, 3.0]
-
-
-def test_a_sample_needs_a_tick() -> None:
-    with pytest.raises(ValueError, match="no tick yet"):
-        TrajectoryRecorder().keep(np.zeros(10))
 
 
 def test_time_must_advance() -> None:

@@ -272,7 +272,7 @@ def test_a_full_disk_is_the_machines_failure(
 @pytest.mark.parametrize("command", ["sitl", "firmware", "companion"])
 def test_real_process_says_one_line(tmp_path: Path, command: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", f"airl_mav.cli.{command}", "--speed", str(math.nan)],
+        [sys.executable, "-m", f"airl_mav.cli.{command}_command", "--speed", str(math.nan)],
         cwd=tmp_path,
         env={"PYTHONPATH": str(ROOT), "PATH": "", "HOME": str(tmp_path)},
         capture_output=True,
