@@ -1,7 +1,7 @@
 """Plausibility limits of telemetry, camera and mode, and limits of the flight.
 
 A learned policy acts on any input: with a frozen position it overshoots the goal, with a frozen
-image it hits obstacles. The first broken rule ends the flight: see `mission.py`. The bounds are
+image it hits obstacles. The first broken rule ends the flight: see `offboard_mission.py`. The bounds are
 wide; sensor quality is the estimator's task.
 """
 

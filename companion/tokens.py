@@ -249,7 +249,7 @@ class TokenTurns:
 
 @dataclass
 class TokenFrameSource:
-    """Source of the frame named by the turn. Implements `camera.FrameSource`."""
+    """Source of the frame named by the turn. Implements `companion.frame_source.FrameSource`."""
 
     frames: FrameSource
     turns: TokenTurns
@@ -266,7 +266,7 @@ class TokenFrameSource:
         return self.newest
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a new frame, see `camera.FrameSource`, with a timeout in simulated time."""
+        """Wait for a new frame, see `companion.frame_source.FrameSource`, with a timeout in simulated time."""
         clock, arrived = self.clock, self.turns.frame_arrived
         deadline_us = clock.time_us() + int(timeout_s * US_PER_S)
         while True:

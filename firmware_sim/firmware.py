@@ -377,10 +377,10 @@ class Firmware:
             until_us = min(until_us, flight_stack.next_send_us())
         simulation.advance(until_us, self._pacing.arrivals)
         if camera is not None and len(simulation.truths) > 1:
-            transport_us = None if self.on_frame is not None else camera.transport_us
-            if transport_us is not None:
-                simulation.skip_unread(simulation.time_us - transport_us)
-            simulation.capture_due(simulation.time_us - TICK_US, publish)
+            now_us, transport_us = simulation.time_us, camera.transport_us
+            if transport_us is None or self.on_frame is not None:
+                transport_us = now_us  # every frame is read
+            simulation.capture_due(now_us - TICK_US, publish, now_us - transport_us)
         if log is not None and internals is not None:
             log.after_ticks(simulation.flown, simulation.truths, internals.state())
         flight_stack.send(simulation.time_us, simulation.flown)

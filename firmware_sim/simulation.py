@@ -386,12 +386,16 @@ class Simulation:
         """Simulated time of the camera's next exposure [µs]; inf on an endless floor."""
         return math.inf if self._camera is None else self._camera.next_us
 
-    def capture_due(self, until_us: int, publish: Callable[[Frame], None]) -> None:
+    def capture_due(
+        self, until_us: int, publish: Callable[[Frame], None], read_us: int = 0
+    ) -> None:
         """Publish the frames that are due by simulated `until_us` [µs], now or in the newest ticks.
 
-        Publishes no frames on an endless floor.
+        Frames that newer ones replace before `read_us` may be skipped. An endless floor has none.
         """
         camera, truths = self._camera, self.truths
+        if camera is not None and read_us > camera.next_us:
+            camera.skip_unread(read_us)
         while camera is not None and camera.next_us <= until_us:
             time_us, row = self.time_us, self.plant.motion
             if time_us > until_us:
@@ -401,11 +405,6 @@ class Simulation:
                     break
             motion = Motion(row[POSITION], row[QUATERNION], row[VELOCITY], row[RATES])
             camera.offer(time_us, motion, publish)
-
-    def skip_unread(self, read_us: int) -> None:
-        """Skip due frames that newer ones replace before simulated `read_us` [µs], if possible."""
-        if self._camera is not None:
-            self._camera.skip_unread(read_us)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the recorded arrays by name in the episode file (docs/run-folder.md)."""

@@ -173,7 +173,7 @@ class Tour:
 
 @dataclass(frozen=True)
 class Building:
-    """Summary of the rooms in an arena (`arena.rooms`)."""
+    """Summary of the rooms in an arena (`arena.room_plan`)."""
 
     rooms: int
     """Number of rooms, including a corridor."""

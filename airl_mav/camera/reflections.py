@@ -106,7 +106,7 @@ def draw_reflections(
             continue
         n, e, d = float(rays.north[u]), float(rays.east[u]), float(rays.down[u])
         per = 1.0 / math.sqrt(n * n + e * e + d * d)
-        # Per path length along oblique rays; `Look.pixel2` is per depth.
+        # Per path length along oblique rays; `SceneLook.pixel2` is per depth.
         pixel2 = shading.F32(look.pixel2 * per * per * per)
         _wait(tree, 0, camera, (per * n, per * e, per * d), (1.0, 1.0, 1.0), 0.0, 0, 0.0)
         _follow(colour, tree, nodes, bodies, meshes, look, pixel2)

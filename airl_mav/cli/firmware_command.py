@@ -14,8 +14,10 @@ from airl_mav.core.first_start import compile_shown
 from airl_mav.core.frames import Goal
 from airl_mav.lockstep.remote import fly_vehicle_in_lockstep
 from airl_mav.lockstep.turns import LockstepError
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.stand_alone_vehicle import Listener, aircraft_of, fly_vehicle
-from airl_mav.scenario.compile_plans import flight_plan
+from airl_mav.scenario.resolve import flight_plan
 from airl_mav.scenario.resolved import FIRMWARE_TITLES
 from airl_mav.scenario.stand_alone import StandAloneVehicle
 from firmware_sim.autopilot.autopilot_state import OperatorText
@@ -40,6 +42,7 @@ def run(options: FirmwareOptions, console: Console | None = None) -> int:
     """Fly until Ctrl-C or, in lockstep, the companion's end; return 1 for a lost connection."""
     console = console or new_console(soft_wrap=True)
     vehicle, _ = aircraft_of(options)
+    load_profile("arenas", options.arena, ArenaSpec)  # refused before kernels compile
     compile_shown([flight_plan(vehicle, options.plant)])
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

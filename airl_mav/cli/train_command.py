@@ -59,7 +59,7 @@ def run(
     vehicle = load_vehicle(config.environment.vehicle)
     kind = config.environment.camera.of(vehicle.camera).kind
     # Imported late: needs an arena, which `--help` and a light installation do not have.
-    from airl_mav.scenario.compile_plans import vectorized_plan
+    from airl_mav.scenario.resolve import vectorized_plan
 
     compile_shown([vectorized_plan(kind)])
     bound, injections = speed_bound(config.environment), injections_of(config.environment.delay)

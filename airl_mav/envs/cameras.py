@@ -73,7 +73,7 @@ class Eyes:
             self._colour = ColourImages(self.intrinsics, self._mount, looks, self._meshes)
         self._formed: ImageFormation | None = None
         """Image formation for single images, as in the rehearsal; None without a table `imaging`.
-        It keeps no state between images (`conditions.check_twin_imaging`), so it serves all
+        It keeps no state between images (`imaging_checks.check_twin_imaging`), so it serves all
         vehicles."""
         if camera.imaging is not None and looks is not None:
             self._formed, self._looks = ImageFormation(camera, name), looks

@@ -72,7 +72,7 @@ class Fleet(NamedTuple):
     battery: NDArray[np.float64]  # (n,) state of charge, 1 full to 0 empty
     room: NDArray[np.float64]  # (n,) lower bound of the combined motion to a contact; 0 = check [m]
     touched: NDArray[np.int64]  # (n,) first contact: obstacle, FLOOR, ..., or NOTHING
-    verdict: NDArray[np.int64]  # (n,) Verdict
+    verdict: NDArray[np.int64]  # (n,) FlightStatus
     airframe: NDArray[np.float64]  # (n, fields of Airframe) parameters of each vehicle
 
 

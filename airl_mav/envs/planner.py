@@ -297,7 +297,7 @@ class PlannerTiming(NamedTuple):
 
 
 class Planner:
-    """Planner for the flights of a batch twin. Implements `experts.Expert`."""
+    """Planner for the flights of a batch twin. Implements `experts.Chooser`."""
 
     def __init__(self, navigation: Navigation, commands: NDArray[np.float64]) -> None:
         """Store the flights and the candidate commands (c, 3).

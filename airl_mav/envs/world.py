@@ -91,7 +91,7 @@ def decide(
         world: The vehicles.
         commands: (n, 3) or (n, 4) as in `Navigation.fly`.
         resumed: True to continue decisions after a pause for Python.
-        numbers: (7, n) written: the float fields of `Flights` in order, and the rewards.
+        numbers: (7, n) written: the float fields of `FlightArrays` in order, and the rewards.
         whole: (3, n) written: verdict, touched object, and end of flight in the decision.
         seen: Encoded observations; written unless empty.
 

@@ -55,7 +55,7 @@ class UnderWay:
 
 
 class MemoryCamera:
-    """In-process camera: `firmware.FrameServer` and, with `latest`, `camera.FrameSource`."""
+    """In-process camera: `firmware.FrameServer` and, with `latest`, `companion.frame_source.FrameSource`."""
 
     endpoint = "memory"
 

@@ -150,7 +150,7 @@ Coefficients = Annotated[Distortion, Each(-MOST_COEFFICIENT, MOST_COEFFICIENT)]
 
 
 class Stereo(ProfileModel):
-    """Stereo matching of a depth camera with two imagers; see `camera.stereo`."""
+    """Stereo matching of a depth camera with two imagers; see `camera.noise`."""
 
     baseline_m: float = quantity("distance between the imagers", "m", ge=0.01, le=1)
     focal_px: float = quantity(

@@ -94,7 +94,7 @@ class NetworkSpec(ProfileModel):
 
 
 class AlgorithmSpec(ProfileModel):
-    """The learner and its hyperparameters (`table.ALGORITHMS`), specific ones in `options`."""
+    """The learner and its hyperparameters (`algorithm_table`), specific ones in `options`."""
 
     name: str = Field(default="dqn", description=", ".join(ALGORITHMS))
     learning_rate: float = quantity("step of the optimiser", "1", gt=0, le=1, default=3e-4)

@@ -1,7 +1,7 @@
 """Vertical trajectory of a take-off.
 
-Source: PX4 1.16, `PositionSmoothing` on the vertical axis (`trajectory`). The jerk limit of the
-speed is omitted; it delays a speed change by 0.1 s.
+Source: PX4 1.16, `PositionSmoothing` on the vertical axis (`smooth_trajectory`). The jerk limit of
+the speed is omitted; it delays a speed change by 0.1 s.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from firmware_sim.autopilot.error_state import N_STATES, gate_ratio, inject, pro
 
 
 class FilterpyFilter:
-    """Implementation of `error_filter.ErrorFilter` with filterpy."""
+    """Implementation of `fusion_horizon.ErrorFilter` with filterpy."""
 
     def __init__(self, covariance: Vector, noise: Vector) -> None:
         """Start with a covariance (16, 16); variances `noise` (16,) are added in every tick."""

@@ -106,7 +106,7 @@ def spread(p: Vector, row: Vector, out: Vector) -> float:
 
 
 class KernelFilter:
-    """Implementation of `error_filter.ErrorFilter` in compiled code."""
+    """Implementation of `fusion_horizon.ErrorFilter` in compiled code."""
 
     def __init__(self, covariance: Vector, noise: Vector) -> None:
         """Start with a covariance (16, 16); variances `noise` (16,) are added in every tick."""

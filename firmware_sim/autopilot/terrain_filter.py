@@ -2,9 +2,9 @@
 
 PX4's EKF always has a terrain state. Here it is added with the first range, at no cost before. An
 inner filter (`ErrorFilter`) carries the 16 errors; this class carries the terrain height, its
-variance and its covariance with the 16 errors. Only ranges measure the ground, so all other
-measurements correct the 16 errors as without it. The result equals one filter of 17 states (Simon,
-Optimal State Estimation, ch. 5 and 7). Source of the process noise and of the range fusion: PX4
+variance and its covariance with the 16 errors. Only ranges and optical flow measure the ground. All
+other measurements correct the 16 errors as without it. The result equals one filter of 17 states
+(Simon, Optimal State Estimation, ch. 5 and 7). Source of the process noise and of the range fusion: PX4
 1.16, EKF/covariance.cpp, terrain_control.cpp and range_height_fusion.cpp.
 """
 
@@ -34,7 +34,7 @@ _OF_RANGE.setflags(write=False)
 
 
 class TerrainFilter:
-    """Implementation of `error_filter.ErrorFilter` with a terrain estimate."""
+    """Implementation of `fusion_horizon.ErrorFilter` with a terrain estimate."""
 
     def __init__(self, inner: ErrorFilter) -> None:
         """Start with the terrain at z = 0; see `put`."""

@@ -471,7 +471,7 @@ class YawEstimator:
     def explained(self, yaw: float) -> float:
         """Return the share of the disagreement of GPS and a heading [rad] that another explains.
 
-        The range is 0 to 1; see `turned_motion`.
+        The range is 0 to 1; see `TurnedMotion`.
         """
         along = self.models.item(0, YAW) - self._shared.item(TURNED)
         return self._motion.explained(yaw - along)

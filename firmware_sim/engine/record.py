@@ -177,7 +177,7 @@ CONTROLLER = np.dtype(
         ("velocity_before", _F, 3),  # deviations of the newest fix; NaN = none yet
         ("accelerations", _F, (LOOK_BACK, 3)),  # of the newest fixes
         ("fixes", _I),
-        ("felt_motion", _F, (WINDOW, 2)),  # see `turned_motion`
+        ("felt_motion", _F, (WINDOW, 2)),  # see `yaw_estimator`
         ("seen_motion", _F, (WINDOW, 2)),
         ("motions", _I),
         ("motion_variance", _F),

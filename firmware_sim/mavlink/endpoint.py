@@ -105,16 +105,12 @@ class MemoryEndpoint:
 
     def receive(self) -> list[bytes]:
         """Return all chunks in `inbox`, oldest first."""
-        chunks: list[bytes] = []
-        inbox = self.inbox
-        while inbox:  # one by one: another thread may append
-            chunks.append(inbox.popleft())
-        return chunks
+        return [chunk for _, chunk in self.arrivals()]
 
     def arrivals(self) -> Iterator[tuple[Peer, bytes]]:
         """Yield the chunks in `inbox`, oldest first."""
         inbox = self.inbox
-        while inbox:
+        while inbox:  # one by one: another thread may append
             yield None, inbox.popleft()
 
     def towards(self, peer: Peer) -> Sender | None:

@@ -334,7 +334,7 @@ class BulletBody:
     def __init__(
         self, arena: Arena | None, body: BodyProfile, airframe: Airframe, tick_s: float
     ) -> None:
-        """Place the body at rest on the floor at the start, facing north; see `bodies.new_body`."""
+        """Place the body at rest on the floor at the start, facing north; see `plant.new_body`."""
         self._made_of = arena, body, airframe, tick_s
         diagonal_m = math.hypot(body.width_m, body.width_m, body.height_m)
         self.world = BulletWorld(arena, 0.5 * diagonal_m, tick_s)
@@ -362,7 +362,7 @@ class BulletBody:
         self.world.restore(world)
 
     def move(self, at: Vec, force: Vec, torque: Vec, before: Vector, moving_us: int) -> Vector:
-        """Move the body by one tick; see `Body`."""
+        """Move the body by one tick; see `PlantBody`."""
         world, number = self.world, self.number
         client = world.number
         here = (at[1], at[0], -at[2])
@@ -389,7 +389,7 @@ class BulletBody:
         quaternion: Quat = _LEVEL,
         rates: Vec = _STILL,
     ) -> Vector:
-        """Place the body in a motion; see `Body`."""
+        """Place the body in a motion; see `PlantBody`."""
         self.follow(np.array([*position, *velocity, *quaternion, *rates]))
         return self.rest()
 
@@ -397,7 +397,7 @@ class BulletBody:
         """Do nothing: every `move` updates the moving obstacles."""
 
     def follow(self, motion: Vector) -> None:
-        """Set the motion (>= 13,) of the body; see `Body`."""
+        """Set the motion (>= 13,) of the body; see `PlantBody`."""
         client, number = self.world.client, self.number
         quaternion = motion[QUATERNION]
         attitude = quat_wxyz_to_xyzw(quat_ned_frd_to_enu_flu(quaternion))

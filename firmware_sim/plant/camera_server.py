@@ -20,7 +20,6 @@ from airl_mav.camera.noise import noise_of, noisy_frame
 from airl_mav.camera.render import Motion, Mount, camera_pose
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
-from airl_mav.core.frames import Vector
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import SensorNoise
@@ -181,10 +180,6 @@ class SimulatedCamera:
         self.next_us = self._start_us + math.ceil(self._rate.next_us)
         self._sequence += 1
         return self._sequence - 1
-
-    def capture(self, time_us: int, position: Vector, quaternion: Vector) -> Frame:
-        """Take a due frame of a vehicle at rest; see `take`."""
-        return self.take(time_us, Motion.at_rest(position, quaternion))
 
     def take(self, time_us: int, motion: Motion) -> Frame:
         """Take a due frame; the next is due one period after the slot of this one.

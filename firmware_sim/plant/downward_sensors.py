@@ -131,7 +131,7 @@ class PlantRangefinder:
 
 
 BEST = 255
-"""Quality of a measurement within the limits, and of all others."""
+"""Quality of a measurement within the limits."""
 
 # Sums between two measurements: body rotation about x and y [rad], sensor displacement along x and
 # y [m], and time [s].

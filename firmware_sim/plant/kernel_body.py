@@ -18,8 +18,7 @@ from airl_mav.vehicle.rigid_body import accelerate, drift
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
 from firmware_sim.engine.dynamics import WIDTH, quaternion, rates, velocity, write
 from firmware_sim.plant.body import FLOOR, NOTHING, Touch
-from firmware_sim.plant.contacts.box import BREAKING_SHARE, MOST, ROW
-from firmware_sim.plant.contacts.convex import touch_obstacle
+from firmware_sim.plant.contacts.convex import BREAKING_SHARE, MOST, ROW, touch_obstacle
 from firmware_sim.plant.contacts.ground_contact import (
     FLOOR_ID,
     KEPT,
@@ -151,7 +150,7 @@ class KernelBody:
     def __init__(
         self, arena: Arena | None, body: BodyProfile, airframe: Airframe, tick_s: float
     ) -> None:
-        """Place the body at rest on the floor at the start, facing north; see `bodies.new_body`."""
+        """Place the body at rest on the floor at the start, facing north; see `plant.new_body`."""
         self._solids, names = solids_of(arena)
         self.names: Mapping[int, str] = dict(enumerate([FLOOR, *names], start=FLOOR_ID))
         self._half = np.array([0.5 * body.width_m, 0.5 * body.width_m, 0.5 * body.height_m])
@@ -178,7 +177,7 @@ class KernelBody:
         return self.put((0.0, 0.0, -float(self._half[2])))
 
     def move(self, at: Vec, force: Vec, torque: Vec, before: Vector, moving_us: int) -> Vector:
-        """Move the body by one tick; see `Body`."""
+        """Move the body by one tick; see `PlantBody`."""
         row = np.empty(WIDTH)
         state = self._state
         count = advance(
@@ -208,11 +207,11 @@ class KernelBody:
         return row
 
     def look_around(self) -> None:
-        """Update the moving obstacles; see `Body`."""
+        """Update the moving obstacles; see `PlantBody`."""
         self._state.room[0] = -math.inf
 
     def follow(self, motion: Vector) -> None:
-        """Reset the contacts for a new motion; see `Body`."""
+        """Reset the contacts for a new motion; see `PlantBody`."""
         del motion  # `move` receives it
         self._state.many[0], self._state.room[0] = 0, -math.inf
 
@@ -223,7 +222,7 @@ class KernelBody:
         quaternion: Quat = (1.0, 0.0, 0.0, 0.0),
         rates: Vec = (0.0, 0.0, 0.0),
     ) -> Vector:
-        """Place the body in a motion; see `Body`."""
+        """Place the body in a motion; see `PlantBody`."""
         state = self._state
         state.many[0], state.room[0] = 0, -math.inf
         self.touch = NOTHING

@@ -49,7 +49,7 @@ from firmware_sim.engine.ticks import (
 )
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, TrueState
 from firmware_sim.plant.body import FLOOR, PlantBody, Touch
-from firmware_sim.plant.contacts.box import BREAKING_SHARE
+from firmware_sim.plant.contacts.convex import BREAKING_SHARE
 from firmware_sim.plant.downward_sensors import PlantOpticalFlow, PlantRangefinder
 from firmware_sim.plant.sensors import SensorSuite
 from firmware_sim.plant.solids import Room

@@ -17,7 +17,7 @@ from airl_mav.profiles.vehicle import BodyProfile
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.engine.dynamics import quaternion
 from firmware_sim.plant.body import walls_of
-from firmware_sim.plant.contacts.box import reach_along
+from firmware_sim.plant.contacts.convex import reach_along
 
 
 def tour_arrays(arena: Arena) -> tuple[Vector, Vector]:

@@ -22,6 +22,7 @@ from airl_mav.camera.exposure import expose
 from airl_mav.camera.frame import MOST_BYTES, Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
+from airl_mav.camera.render import Motion
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
@@ -60,7 +61,7 @@ def camera(
 
 
 def take(cam: SimulatedCamera, time_us: int = 0, yaw: float = 0.0) -> Frame:
-    return cam.capture(time_us, np.array([0.0, 0, -2]), quat_from_euler(0, 0, yaw))
+    return cam.take(time_us, Motion.at_rest(np.array([0.0, 0, -2]), quat_from_euler(0, 0, yaw)))
 
 
 def frame(sequence: int) -> Frame:
@@ -85,7 +86,7 @@ def test_images_are_drawn_when_they_are_read(monkeypatch: pytest.MonkeyPatch) ->
     times_us = range(0, 400_000, 100_000)
     at_once = []
     for at_us in times_us:
-        exposed = cams[0].capture(at_us, north + at_us * 1e-6, turned)
+        exposed = cams[0].take(at_us, Motion.at_rest(north + at_us * 1e-6, turned))
         at_once.append((exposed.image.copy(), exposed.capture_time_us, exposed.sequence))
     drawn: list[object] = []
 
@@ -94,7 +95,9 @@ def test_images_are_drawn_when_they_are_read(monkeypatch: pytest.MonkeyPatch) ->
         return expose(*seen)
 
     monkeypatch.setattr(cams[1]._eyes[""], "_expose", drawing)
-    frames = [cams[1].capture(at_us, north + at_us * 1e-6, turned) for at_us in times_us]
+    frames = [
+        cams[1].take(at_us, Motion.at_rest(north + at_us * 1e-6, turned)) for at_us in times_us
+    ]
     assert not drawn
     assert len({image.tobytes() for image, *_ in at_once}) == len(at_once)
     for (image, *stamps), late in reversed(list(zip(at_once, frames, strict=True))):

@@ -21,7 +21,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from firmware_sim.interfaces import ActuatorControls
 from firmware_sim.plant.bullet_body import BulletWorld
-from firmware_sim.plant.contacts.box import BREAKING_SHARE, MOST, ROW
+from firmware_sim.plant.contacts.convex import BREAKING_SHARE, MOST, ROW
 from firmware_sim.plant.contacts.ground_contact import near_ground, touch_ground
 from firmware_sim.plant.downward_sensors import PlantRangefinder
 from firmware_sim.plant.plant import Plant

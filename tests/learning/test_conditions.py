@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from airl_mav.camera.render import Motion
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_US
 from airl_mav.core.errors import UsageError
@@ -226,9 +227,11 @@ def test_the_plant_s_camera_has_the_twin_s_pixels() -> None:
     frames: list[np.ndarray] = []
     while len(frames) < 80:
         at_us = math.ceil(camera.next_us / TICK_US) * TICK_US
-        frames.append(camera.capture(at_us, pose.position[0], pose.quaternion[0]).depth_mm)
+        frames.append(
+            camera.take(at_us, Motion.at_rest(pose.position[0], pose.quaternion[0])).depth_mm
+        )
     camera.restart(0)
-    again = camera.capture(0, pose.position[0], pose.quaternion[0]).depth_mm
+    again = camera.take(0, Motion.at_rest(pose.position[0], pose.quaternion[0])).depth_mm
     assert np.array_equal(again, frames[0])
     assert not np.array_equal(frames[0], frames[1])
     seen = []

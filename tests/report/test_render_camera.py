@@ -157,7 +157,9 @@ def test_a_further_camera_is_named(tmp_path: Path) -> None:
     rig = load_vehicle("quad-rig")
     cameras = SimulatedCamera(rig.camera, arena, further=rig.cameras)
     level = np.array([1.0, 0.0, 0.0, 0.0])
-    wanted = cameras.capture(0, np.array([0.0, 0.0, -3.0]), level).further["down"].image
+    wanted = (
+        cameras.take(0, Motion.at_rest(np.array([0.0, 0.0, -3.0]), level)).further["down"].image
+    )
     with Image.open(out) as image:
         np.testing.assert_array_equal(np.asarray(image), wanted[..., 0])
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from airl_mav.latency.coordinated_omission import (
+from airl_mav.latency.percentiles import (
     CommandAges,
     ages_in_closed_loop,
+    autocorrelation,
     command_ages,
     corrected,
+    integrated_time,
 )
-from airl_mav.latency.percentiles import autocorrelation, integrated_time
 
 MS = 1_000
 

@@ -137,8 +137,8 @@ def test_a_camera_that_looks_right_sees_what_a_turned_vehicle_sees_ahead() -> No
     right = RIG.camera.model_copy(update=centre | {"yaw_deg": 90.0})
     at, level = np.array([0.0, 0.0, -2.0]), np.array([1.0, 0.0, 0.0, 0.0])
     turned = np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
-    seen = SimulatedCamera(right, arena).capture(0, at, level).depth_mm.astype(int)
-    wanted = SimulatedCamera(ahead, arena).capture(0, at, turned).depth_mm.astype(int)
+    seen = SimulatedCamera(right, arena).take(0, Motion.at_rest(at, level)).depth_mm.astype(int)
+    wanted = SimulatedCamera(ahead, arena).take(0, Motion.at_rest(at, turned)).depth_mm.astype(int)
     assert (wanted > 0).mean() > 0.3
     # To rounding: a ray at an edge may fall to either side.
     assert (np.abs(seen - wanted) <= 1).mean() > 0.98

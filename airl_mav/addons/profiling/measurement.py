@@ -19,8 +19,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import save_arrays, write_json
 from airl_mav.core.machine import MachineState
 from airl_mav.core.provenance import package_versions
-from airl_mav.latency.coordinated_omission import CommandAges, ages_in_closed_loop, command_ages
-from airl_mav.latency.percentiles import summarize
+from airl_mav.latency.percentiles import CommandAges, ages_in_closed_loop, command_ages, summarize
 from airl_mav.latency.stages import Samples, pool, stage_samples
 from airl_mav.policy.card import PolicyCard
 from airl_mav.profiles.computer import (

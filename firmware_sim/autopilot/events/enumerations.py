@@ -117,7 +117,7 @@ FailsafeAction = IntEnum(
     "DISARM TERMINATE",
     start=0,
 )
-"""Actions of a failsafe, numbered as in `failsafes.actions.FailsafeAction`."""
+"""Actions of a failsafe, numbered as in `failsafe_actions.FailsafeAction`."""
 
 
 SensorType = IntEnum("SensorType", "ACCEL GYRO MAG", start=0)
@@ -140,7 +140,7 @@ FailsafeCause = IntEnum(
     "EMERGENCY_BATTERY_LEVEL LOW_REMAINING_FLIGHT_TIME",
     start=0,
 )
-"""Causes in a failsafe's text, in the order of `failsafes.actions.FailsafeReason`."""
+"""Causes in a failsafe's text, in the order of `failsafe_actions.FailsafeReason`."""
 
 
 class Enumeration(NamedTuple):
