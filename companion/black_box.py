@@ -68,6 +68,7 @@ class BlackBoxRecorder:
         self.failure: str | None = None
         """Reason for an early end of the file; None = no failure."""
         self._file, self._link, self._clock, self._goal = file, link, clock, goal
+        # 0 disables images: they would be due at infinity.
         self._image_us = math.inf if images_hz == 0.0 else US_PER_S / images_hz
         self._next_image_us = -math.inf
         self._unix_us = utc_us() - clock.time_us()
@@ -102,6 +103,7 @@ class BlackBoxRecorder:
     def end(self, reason: str, notes: Sequence[str]) -> None:
         """Write the end of the mission and close the file."""
         self._stop()
+        # The notes come after the last sample, and the end comes last.
         now_us = self._clock.time_us()
         for note in notes:
             said = messages.text(note, "companion", self._unix_us + now_us, messages.WARNING)
@@ -123,6 +125,7 @@ class BlackBoxRecorder:
         next_us = self._clock.time_us()
         while not self._ended.is_set() and self.failure is None:
             self.record(self._clock.time_us())
+            # A late thread skips samples instead of catching up.
             next_us = max(next_us + SAMPLE_US, self._clock.time_us())
             self._clock.sleep_until(next_us, self._ended)
 
@@ -134,11 +137,13 @@ class BlackBoxRecorder:
             self._write_news(now_us)
             if last:
                 self._file.finish()
+        # A full disk ends the file, not the flight.
         except OSError as error:
             self.failure = f"the black box ends early: {self._file.path}: {error.strerror}"
             self._file.abandon()
 
     def _write_news(self, now_us: int) -> None:
+        # popleft is atomic: the pilot's thread appends at the same time.
         while self._told:
             told = self._told.popleft()
             if isinstance(told, SentDecision):
@@ -151,6 +156,7 @@ class BlackBoxRecorder:
             self._next_status_us = now_us + STATUS_US
             self._write(self._status(now_us), now_us)
             self._write(self._resources(now_us), now_us)
+        # fsync bounds what a power failure can lose.
         if now_us >= self._next_sync_us:
             self._next_sync_us = now_us + SYNC_US
             self._file.sync()
@@ -177,11 +183,13 @@ class BlackBoxRecorder:
             _finite(told.setpoint),
         )
         self._write(decision, told.sent_us)
+        # Images are the bulk of the file, so their rate is limited separately.
         if told.started_us >= self._next_image_us:
             self._next_image_us = told.started_us + self._image_us
             seen_us = told.seen.received_us
             taken_us, sent_us = self._unix_us + seen_us, told.sent_us
             self._write(messages.image_message(frame.image, taken_us), sent_us)
+            # Images of additional cameras have topics of their own, named after the camera.
             for name, each in frame.further.items():
                 channel, data = encoded(messages.image_message(each.image, taken_us, name))
                 channel = channel._replace(topic=f"{channel.topic}/{name}")
@@ -193,6 +201,7 @@ class BlackBoxRecorder:
 
     def _resources(self, now_us: int) -> messages.Resources:
         used_us, passed_us = processor_time_us() - self._used_us, now_us - self._used_at_us
+        # Share of one processor since the last sample.
         self._used_us, self._used_at_us = self._used_us + used_us, now_us
         return messages.Resources(
             now_us,
@@ -229,6 +238,8 @@ def open_recorder(
         "git": git_state(),
     }
     try:
+        # The file is created and synced before take-off: an unwritable folder must fail on the
+        # ground.
         folder.mkdir(parents=True, exist_ok=True)
         file = BlackBoxFile(folder / f"{now:%Y%m%dT%H%M%S.%fZ}{messages.SUFFIX}", {**run, **made})
         file.sync()
@@ -244,4 +255,5 @@ def recording(recorder: BlackBoxRecorder) -> Iterator[BlackBoxRecorder]:
     try:
         yield recorder
     finally:
+        # After `end` the file is closed already, and this has no effect.
         recorder.break_off()

@@ -48,6 +48,7 @@ class ConductedClock:
 
     def sleep_until(self, time_us: int, interrupt: threading.Event | None = None) -> None:
         """Sleep until simulated `time_us` [µs], or until `interrupt` is set."""
+        # Each pass may end early at the watchdog's time.
         while self.time_us() < time_us and not (interrupt is not None and interrupt.is_set()):
             watchdog = self._watchdog
             due_us = None if watchdog is None else watchdog.due_us
@@ -55,11 +56,14 @@ class ConductedClock:
             if wake_us > self.time_us():
                 self._sleep(wake_us, interrupt)
             if watchdog is not None and due_us is not None and self.time_us() >= due_us:
+                # The watchdog has no thread in lockstep: it runs here, at its exact simulated
+                # time.
                 watchdog.look()
 
     def poll(self, every_us: int, due: Due, quiet_us: Quiet) -> None:
         """Sleep for one interval [µs] or several, until a condition must be checked."""
         wake_us = self.time_us() + every_us
+        # With a watchdog, its times limit each sleep, so one interval at a time.
         if self._watchdog is None:
             self._sleep(wake_us, None, Poll(every_us, due, quiet_us))
         else:

@@ -68,8 +68,10 @@ class ZmqFrameSource:
         self._owns_context = context is None
         self._context = zmq.Context() if context is None else context
         self._socket = self._context.socket(zmq.SUB)
+        # CONFLATE keeps only the newest message.
         self._socket.setsockopt(zmq.CONFLATE, 1)
         self._socket.setsockopt(zmq.LINGER, 0)
+        # ZeroMQ closes the connection at an oversized message.
         self._socket.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)
         self._socket.subscribe(b"")
         self._endpoint = endpoint
@@ -84,11 +86,13 @@ class ZmqFrameSource:
 
     def latest(self) -> ReceivedFrame | None:
         """Return the newest frame without waiting; None before the first frame."""
+        # Bounded: a fast publisher must not hold the caller here.
         for _ in range(MESSAGES_PER_LOOK):
             if not self._socket.poll(0):
                 if self._silent.time_us() >= REDIAL_S * US_PER_S:
                     self._redial()
                 break
+            # Any message proves the connection, even an invalid one.
             self._silent = WallClock()
             # Message parts are read as messages; publishers of this format send no parts.
             data = self._socket.recv()
@@ -110,6 +114,7 @@ class ZmqFrameSource:
         """Return a frame, or raise FrameError if its size differs from the first frame's."""
         if self._newest is not None:
             known = self._newest.frame
+            # A camera that changes in flight would not match the policy's input.
             if (frame.intrinsics, frame.lenses) != (known.intrinsics, known.lenses):
                 raise FrameError("another camera's frame")
         return frame
@@ -124,6 +129,7 @@ class ZmqFrameSource:
             left_ms = 1e3 * timeout_s - 1e-3 * stopwatch.time_us()
             if left_ms <= 0.0:
                 return None
+            # The wait ends in time for a reconnection.
             self._socket.poll(math.ceil(min(left_ms, 1e3 * REDIAL_S)))
 
     def close(self) -> None:
@@ -151,6 +157,7 @@ class SharedFrames:
         stopwatch = WallClock()
         while True:
             left_s = timeout_s - stopwatch.time_us() / US_PER_S
+            # The lock is released between slices, so that the other thread can read.
             with self._one_at_a_time:
                 found = self._frames.wait(newer_than_sequence, min(max(left_s, 0.0), SHARE_S))
             if found is not None or left_s <= SHARE_S:

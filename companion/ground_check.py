@@ -51,6 +51,7 @@ def check_on_ground(
     """Check a flight's requirements one by one, skipping absent parts, until `stop` is set."""
     clock = WallClock(asked.speed)
     yield CheckResult("policy", True, f"{asked.policy}, holds an action {mission.pilot.hold_s:g} s")
+    # CPU quota as in flight, so that the timed decisions are representative.
     with held_to(asked.cpu_quota):
         try:
             camera = mission_camera(asked, mission, clock)
@@ -59,6 +60,7 @@ def check_on_ground(
             return
         with closing(camera):
             yield from look_at_camera(mission, camera, clock, stop)
+            # The newest frame serves as input for the timed decisions.
             seen = camera.latest()
             try:
                 with (
@@ -88,9 +90,11 @@ def look_at_camera(
         return
     # Frames are not stored: a driver may send thousands of large frames.
     watch, last, frozen, ages_us = WallClock(), first, True, []
+    # The loop counts changes of frames in wall time: rates of real devices.
     while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
         newer = camera.wait(last.frame.sequence, 0.5)
         if newer is not None:
+            # Equality with the first frame throughout means a frozen image.
             frozen = frozen and np.array_equal(first.frame.image, newer.frame.image)
             last = newer
             ages_us.append(age_of(newer, clock.time_us()))
@@ -119,6 +123,7 @@ def look_at_vehicle(
     while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
         watch.sleep_until(watch.time_us() + int(POLL_S * US_PER_S))
         now = link.kinematics()
+        # A changed position is the sign of new telemetry.
         changes += not np.array_equal(now.position, last.position)
         last = now
     rate_hz = changes / LOOK_S
@@ -129,7 +134,9 @@ def look_at_vehicle(
         f"{link.dialect.name}, {'armed' if status.armed else 'disarmed'}, mode {status.mode}",
     )
     asked = f"position {rate_hz:.0f} times a second, {RATE_HZ:.0f} were asked for"
+    # At least half of the requested rate must arrive.
     yield CheckResult("telemetry", rate_hz >= LEAST_SHARE * RATE_HZ, asked)
+    # With an external origin, GPS health is not required.
     missing = link.missing_health(by_gps=mission.pilot.origin is None)
     charge, least = status.battery, mission.limits.battery
     yield CheckResult(
@@ -150,12 +157,14 @@ def look_at_vehicle(
 def time_decisions(mission: MissionSetup, seen: ReceivedFrame, state: Kinematics) -> CheckResult:
     """Measure the policy's inference time (t2) on a received frame."""
     frame, watch, took_us = seen.frame, WallClock(), []
+    # The same observation each time: only the duration matters.
     observation = observe(
         *(frame.image, frame.intrinsics, state, np.asarray(mission.goal, np.float64)),
         InFlight.of_first_decisions(1).rows(0),
         further=views_of(frame),
     )
     try:
+        # One extra call: the first is dropped below.
         for _ in range(DECISIONS + 1):
             begun_us = watch.time_us()
             mission.policy.act(observation)

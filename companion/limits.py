@@ -1,8 +1,8 @@
 """Plausibility limits of telemetry, camera and mode, and limits of the flight.
 
 A learned policy acts on any input: with a frozen position it overshoots the goal, with a frozen
-image it hits obstacles. The first broken rule ends the flight: see `offboard_mission.py`. The bounds are
-wide; sensor quality is the estimator's task.
+image it hits obstacles. The first broken rule ends the flight (`offboard_mission`). The bounds
+are wide; sensor quality is the estimator's task.
 """
 
 from __future__ import annotations
@@ -138,6 +138,7 @@ class Limits:
         now_us: int,
     ) -> Ending | None:
         """Return the broken limit at `now_us` [µs], or None; `seen` is a new frame, if any."""
+        # A vehicle under a pilot's control is not judged: its motion is not the policy's.
         if self.not_ours(status, now_us) is None:
             self.ending = self._vehicle.broken(status, state, now_us)
         if self.ending is None and seen is not None:
@@ -159,6 +160,7 @@ class VehicleLimits:
         """Start of navigation [µs]."""
         self._silence_us = round(settings.silence_s * US_PER_S)
         radius_m, height_m = settings.radius_m, settings.height_m
+        # The default radius leaves room for detours around obstacles.
         self.radius_m = 2.0 * math.hypot(*goal[:2]) + CLEARANCE_M if radius_m is None else radius_m
         """Maximum horizontal distance from the start [m]."""
         highest_m = max(pilot.altitude_m, goal_height_m(goal) or 0.0)
@@ -177,6 +179,7 @@ class VehicleLimits:
         self._offboard |= status.offboard
         self._armed |= status.armed
         # After the acknowledged switch to offboard, the heartbeat that shows it may be delayed.
+        # Before the first report of the mode, only a timeout proves a takeover.
         late = now_us - self.begun_us > MODE_KNOWN_S * US_PER_S
         if not status.armed and (self._armed or late):
             return Ending(DISARMED, "the heartbeat says that the motors are off")
@@ -186,6 +189,7 @@ class VehicleLimits:
 
     def broken(self, status: VehicleStatus, state: Kinematics, now_us: int) -> Ending | None:
         """Return the rule that telemetry breaks; None = telemetry is plausible."""
+        # Frozen telemetry is bit-identical; a real estimator always has noise.
         values = (state.position, state.velocity, state.quaternion)
         for name, unchanged, value in zip(TOLD, self._unchanged, values, strict=True):
             if not np.isfinite(value).all():
@@ -195,6 +199,7 @@ class VehicleLimits:
                 return Ending(
                     TELEMETRY_FROZEN, f"{name} has not changed for {silent_us / US_PER_S:.1f} s"
                 )
+        # A wrong quaternion would turn every velocity command.
         norm = float(np.linalg.norm(state.quaternion))
         if abs(norm - 1.0) > NORM:
             return Ending(TELEMETRY_WRONG, f"the attitude quaternion has norm {norm:.2f}")
@@ -204,11 +209,13 @@ class VehicleLimits:
                 TELEMETRY_WRONG,
                 f"velocity {speed:.1f} m/s; believed: up to {self._fastest_m_s:g} m/s",
             )
+        # The order decides the reported reason.
         return self._moved(state, now_us) or self._outside(state, now_us) or self._drained(status)
 
     def _drained(self, status: VehicleStatus) -> Ending | None:
         if self._battery is None:
             return None
+        # A limit that cannot be checked ends the flight.
         if status.battery is None:
             return Ending(BATTERY_LOW, "the flight controller does not tell its charge")
         if status.battery < self._battery:
@@ -226,6 +233,7 @@ class VehicleLimits:
             return None  # without new telemetry; frozen telemetry is detected elsewhere
         self._before = state, now_us
         dt_s = (now_us - last_us) / US_PER_S
+        # Trapezoidal integral of velocity between the two samples.
         explained = 0.5 * (last.velocity + state.velocity) * dt_s
         rest = (state.position - last.position - explained)[:2]
         jump_m = float(np.linalg.norm(rest))
@@ -233,6 +241,7 @@ class VehicleLimits:
         speeds = np.linalg.norm(last.velocity), np.linalg.norm(state.velocity)
         if jump_m > STEP_M + max(speeds) * dt_s:
             return Ending(TELEMETRY_WRONG, f"the position jumped by {jump_m:.1f} m")
+        # Leaky sum of unexplained motion: a slow drift adds up, single errors decay.
         self._drift_m = self._drift_m * math.exp(-dt_s / DRIFT_S) + rest
         drift_m = float(np.linalg.norm(self._drift_m))
         if drift_m > DRIFT_M:
@@ -240,6 +249,7 @@ class VehicleLimits:
         return None
 
     def _outside(self, state: Kinematics, now_us: int) -> Ending | None:
+        # NED: height above the start is -down.
         north, east, down = state.position
         away_m = math.hypot(north, east)
         if away_m > self.radius_m:
@@ -285,14 +295,18 @@ class CameraLimits:
     def _stamped(self, seen: ReceivedFrame) -> Ending | None:
         last, self._last = self._last, seen
         behind_us = seen.received_us - seen.frame.capture_time_us
+        # A lower sequence means that the camera restarted, with new stamps.
         if last is None or last.frame.sequence > seen.frame.sequence:
             # The first frame, or a restart of the camera.
+            # Stamps of another clock have an arbitrary offset: later ages are relative to it.
             own = 0 <= behind_us <= OWN_CLOCK_S * US_PER_S
             self._least_us = 0 if own else behind_us
             return None
+        # Change of the latency between two frames.
         changed_us = behind_us - (last.received_us - last.frame.capture_time_us)
         if abs(changed_us) > self._silence_us:
             return Ending(CAMERA_WRONG, f"stamps jumped by {-changed_us / US_PER_S:+.1f} s")
+        # The smallest latency is the reference for late frames.
         self._least_us = min(self._least_us, behind_us)
         late_us = behind_us - self._least_us
         if late_us > self._silence_us:
@@ -304,6 +318,7 @@ class CameraLimits:
         image = frame.image
         even = bool((image == image[0, 0]).all())
         silent_us = self._image.for_us(image, now_us)
+        # An even image cannot show that it is frozen: it counts as blank below.
         if silent_us > self._same_us and not even:
             return Ending(
                 CAMERA_FROZEN, f"the image has not changed for {silent_us / US_PER_S:.1f} s"
@@ -312,6 +327,7 @@ class CameraLimits:
         if not blank or not ground_in_view(frame, state, *self._mount_rad):
             self._blank_since_us = None
         elif self._blank_since_us is None:
+            # The blank time starts with the first blank image over ground.
             self._blank_since_us = now_us
         elif now_us - self._blank_since_us > self._silence_us:
             return Ending(
@@ -336,6 +352,7 @@ def ground_in_view(
 ) -> bool:
     """Return True if flat ground must be in view: the lowest middle ray hits within `GROUND_M`."""
     lens = frame.intrinsics
+    # Angle below the optical axis of the lowest middle pixel.
     below_rad = math.atan2(lens.height - 1 - lens.cy, lens.focal)
     if lens.projection == "fisheye":
         edge = np.array(max(lens.height - 1 - lens.cy, 0.0) / lens.focal)
@@ -346,6 +363,8 @@ def ground_in_view(
     ahead, aside = 2.0 * (w * y - z * x), -2.0 * (y * z + w * x)
     rise = ahead * math.cos(mount_yaw_rad) + aside * math.sin(mount_yaw_rad)
     pitch_rad = math.asin(min(1.0, max(-1.0, rise)))
+    # Angle below the horizon of that ray: camera mount and vehicle pitch raise it.
     down_rad = below_rad - pitch_rad - mount_pitch_up_rad
     height_m = -float(state.position[2])
+    # The ray's length to flat ground is height / sin(angle).
     return down_rad > GRAZING_RAD and 0.0 < height_m < GROUND_M * math.sin(down_rad)

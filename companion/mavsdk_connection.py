@@ -38,6 +38,7 @@ def open_connection(url: str, kind: ComponentType, system_id: int | None = None)
     # MAVSDK logs to standard output by default; errors are returned as results.
     log_subscribe(lambda *_: True)
     configuration = Configuration.create_with_component_type(kind)
+    # A component on board has the system id of its vehicle.
     if system_id is not None:
         configuration.system_id = system_id
     mavsdk = Mavsdk(configuration)
@@ -47,6 +48,7 @@ def open_connection(url: str, kind: ComponentType, system_id: int | None = None)
     mavsdk.destroy()
     name = result.name.lower().replace("_", " ")
     problem = f"{name}; accepted: udpin://HOST:PORT, serial://DEVICE:BAUD"
+    # A second companion on this host is the usual cause.
     if result == ConnectionResult.BIND_ERROR:
         problem = "the port is taken (another companion?): choose another (airl-sitl: --api-port)"
     raise UsageError(f"--connect {url}: {problem}")
@@ -74,6 +76,7 @@ def exchange_raw(mavsdk: Mavsdk, sent: Callable[[bytes], None]) -> Callable[[byt
     set_timeout(mavsdk, RAW_TIMEOUT_S)
     mavsdk.subscribe_raw_bytes_to_be_sent(sent)
     # MAVSDK-Python's function creates a ctypes array type for every length of `data`: 0.1 ms.
+    # One buffer, allocated once, avoids that.
     buffer = (ctypes.c_uint8 * RAW_CHUNK)()
     handle, pass_bytes = mavsdk._handle, mavsdk._lib.mavsdk_pass_received_raw_bytes
 

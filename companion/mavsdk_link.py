@@ -111,6 +111,7 @@ class MavsdkLink:
             raise link_interface.LinkError(
                 f"no flight controller heard on {self.url} in {timeout_s:g} s"
             )
+        # A second `connect` replaces the plugins of an earlier system.
         self._release_plugins()
         self._system = system
         self._telemetry = Telemetry(system)
@@ -126,6 +127,7 @@ class MavsdkLink:
         streams are requested again, unless right after `connect`. Raises LinkError after a timeout
         [wall s], without streams, or on `stop`.
         """
+        # Streams requested by `connect` a moment ago are not requested twice.
         if self._asked:
             self._asked = False
             return
@@ -136,6 +138,7 @@ class MavsdkLink:
                     f"no flight controller heard on {self.url} in {timeout_s:g} s"
                 )
             self._pause_wall(stop)
+        # `release` has destroyed the offboard plugin.
         if self._offboard is None:
             self._offboard = Offboard(self._system)
         # A new Telemetry plugin has no cached values.
@@ -146,6 +149,7 @@ class MavsdkLink:
     def _ask_for_streams(self, stop: threading.Event | None) -> None:
         self.dialect = dialect_of(self._system.autopilot_type())
         stopwatch = WallClock()
+        # The flight controller may reject requests while it boots, so each is repeated.
         for name, rate_hz in self.dialect.streams:
             while True:
                 try:
@@ -230,6 +234,7 @@ class MavsdkLink:
 
     def kinematics(self) -> Kinematics:
         """Return the newest position, velocity, attitude and body rates."""
+        # MAVSDK caches the newest values, so these calls do not wait.
         pv = self._telemetry.position_velocity_ned()
         q = self._telemetry.attitude_quaternion()
         w = self._telemetry.attitude_angular_velocity_body()
@@ -277,9 +282,11 @@ class MavsdkLink:
         `HEALTH_SETTLE_S`, and a rejected request is repeated. `origin` (latitude, longitude [deg],
         altitude [m]) is sent to a flight controller without a position.
         """
+        # The timeout covers health and arming together.
         deadline_us = self._deadline(timeout_s)
         good_since_us, tell_us = self._clock.time_us(), self._clock.time_us()
         missing: list[str] = []
+        # The loop ends once health was good without interruption for HEALTH_SETTLE_S.
         while self._clock.time_us() < good_since_us + int(HEALTH_SETTLE_S * constants.US_PER_S):
             lacking = f" ({', '.join(missing)})" if missing else ""
             late = f"not healthy after {timeout_s:g} s: it refuses to arm{lacking}"
@@ -302,6 +309,7 @@ class MavsdkLink:
     def _tell_origin(self, origin: tuple[float, float, float], due_us: int) -> int:
         """Send the origin if due; return the next due time [µs]. There is no acknowledgement."""
         now_us = self._clock.time_us()
+        # The origin is repeated, because SET_GPS_GLOBAL_ORIGIN has no acknowledgement.
         if now_us < due_us:
             return due_us
         self._call("origin", lambda: self._action.set_gps_global_origin(*origin))
@@ -309,6 +317,7 @@ class MavsdkLink:
 
     def takeoff(self, altitude_m: float, timeout_s: float, stop: threading.Event) -> None:
         """Take off and wait until an altitude above the start is reached, or `stop` is set."""
+        # Height counts from the start, since the local origin need not be at the ground.
         start_down = float(self.kinematics().position[2])
         self._call("take-off", lambda: self._action.set_takeoff_altitude(altitude_m))
         self._call("take-off", self._action.takeoff)
@@ -335,6 +344,7 @@ class MavsdkLink:
         while True:
             state = self.kinematics()
             height, speed = start_down - float(state.position[2]), abs(float(state.velocity[2]))
+            # Height and speed must both settle before offboard.
             if height > least_m and speed < constants.TAKEOFF_REACHED_M_S:
                 return
             self._check(deadline_us, f"take-off: {height:.1f} m after {timeout_s:g} s", stop)
@@ -399,6 +409,7 @@ class MavsdkLink:
                 *velocity, yaw_rate = setpoint
                 offboard.set_velocity_body(VelocityBodyYawspeed(*velocity, math.degrees(yaw_rate)))
                 return
+            # Three angles or rates in radians, and a thrust that needs no conversion.
             *angles, thrust = setpoint
             degrees = map(math.degrees, angles)
             if isinstance(setpoint, Attitude):
@@ -446,6 +457,7 @@ class MavsdkLink:
         self, deadline_us: int | None, message: str = "", stop: threading.Event | None = None
     ) -> str | None:
         """Return the reason to end a wait; None = continue."""
+        # Order matters: a lost link explains the other conditions.
         if not self.connected:
             return "the flight controller is no longer heard"
         if self._abandon.is_set():
@@ -504,6 +516,7 @@ def _known(value: float) -> float | None:
 
 
 def _refusal(error: TelemetryError) -> str:
+    # Only a timeout needs the hint; other results carry their reason.
     if error.args[0] != TelemetryResult.TIMEOUT:
         return _reason(error)
     return (

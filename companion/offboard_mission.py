@@ -97,9 +97,11 @@ def fly_mission(
         limits=limits,
         decided=decided,
     )
+    # From here on the vehicle may fly: every way out passes through the landing below.
     try:
         _begin(link, start, pilot_settings, stop, progress)
         progress("navigating")
+        # The watchdog starts before its guard, so that the first deadline counts from here.
         watchdog.begin()
         guard.start(watchdog)
         navigating = True
@@ -120,6 +122,7 @@ def fly_mission(
         reason = LINK_LOST
     elif reason == "watchdog" and watchdog.culprit == WAITING:
         reason = CAMERA_SILENT
+    # The mode decides whether commands may still be sent.
     if navigating and not (watchdog.left_offboard or abandon.is_set()):
         # A pilot may have taken over in the meantime.
         limits.not_ours(link.status(), clock.time_us())
@@ -128,6 +131,7 @@ def fly_mission(
         notes.append(str(limits.ending))
     taken = limits.ending is not None and limits.ending.reason in NOT_OURS
     try:
+        # The pilot has the vehicle: the companion only stops sending.
         if taken or (start != "arm" and not navigating):
             # Repeated setpoints must not take effect in a later switch to offboard.
             link.release()
@@ -135,6 +139,8 @@ def fly_mission(
             # A link may be lost in one direction only: MAVSDK must stop repeating the last
             # setpoint to a vehicle that still receives it.
             link.leave_offboard()
+        # With a working link the vehicle lands, or is handed back where a pilot started the
+        # mission.
         if not (taken or abandon.is_set() or lost):
             left = watchdog.left_offboard or reason == TELEMETRY_FROZEN
             if start == "arm":
@@ -162,6 +168,7 @@ def _begin(
     """Wait until the vehicle flies the companion's setpoints. Raises LinkError."""
     progress(FIRST_PHASE[start])
     link.prepare(PREPARE_TIMEOUT_S, stop)
+    # Checked after `prepare`, which detects the kind of flight controller.
     if settings.commands != "velocity" and link.dialect is ARDUPILOT:
         # GUIDED mode interprets thrust as climb rate, unless changed by GUID_OPTIONS.
         words = settings.commands.replace("_", " ")
@@ -170,6 +177,7 @@ def _begin(
         link.await_offboard(stop)
         return
     if start == "hover":
+        # A hovering vehicle has its position and height: arming and take-off are skipped.
         link.await_hover(settings.altitude_m, HOVER_TIMEOUT_S, stop)
         link.enter_offboard()
         return
@@ -193,8 +201,10 @@ def check_camera(
     compensator: Compensator | None = None,
 ) -> None:
     """Check the first frame, if any before `stop`; UsageError if the policy cannot use it."""
+    # Only policies bound to a camera, and compensation, depend on the frame's size.
     if not isinstance(policy, CameraBound) and compensator is None:
         return
+    # Short waits, so that `stop` ends the check early.
     for _ in range(math.ceil(FRAME_TIMEOUT_S / FRAME_WAIT_S)):
         received = frames.wait(newer_than_sequence=-1, timeout_s=FRAME_WAIT_S)
         if received is None:

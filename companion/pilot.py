@@ -103,10 +103,12 @@ class Pilot:
     def fly(self, goal: Goal, stop: Event) -> str:
         """Decide until the goal is reached or the flight ends; return the reason as text."""
         sequence = -1
+        # Limits count from the start of navigation.
         if self.limits is not None:
             self.limits.begin(self.clock.time_us())
         self.earlier.clear()
         self.further.clear()
+        # Compensation has its own memory of sent setpoints.
         if self.compensator is not None:
             self.compensator.begin(0)
         else:
@@ -116,14 +118,17 @@ class Pilot:
                 return "link lost"
             if self.watchdog.left_offboard:
                 return "watchdog"
+            # The watchdog names this stage if no frame arrives.
             self.watchdog.doing(WAITING)
             received = self.frames.wait(newer_than_sequence=sequence, timeout_s=FRAME_WAIT_S)
             state = self.link.kinematics()
+            # Check limits without a new frame too: telemetry may be wrong between frames.
             if (reason := self._broken(state, received)) is not None:
                 return reason
             if received is None:
                 continue
             sequence = received.frame.sequence
+            # The goal is checked per frame, at the rate of decisions.
             if goal_distance_m(goal, state.position) < self.settings.goal_radius_m:
                 return "goal reached"
             if (reason := self._decide(received, state, goal, stop)) is not None:
@@ -154,6 +159,7 @@ class Pilot:
             # Not interruptible, like a real computation.
             clock.sleep_until(started_us + lasts_us)
         ready_us = clock.time_us()
+        # The vertical speed uses the newest position, not that of the frame.
         setpoint = self._setpoint(action)
         hold_us = int(settings.hold_s * US_PER_S)
         sent_us = clock.time_us()
@@ -165,16 +171,19 @@ class Pilot:
         limits = self.limits
         if limits is not None and (ending := limits.not_ours(self.link.status(), sent_us)):
             return ending.reason
+        # `command` sends and feeds the watchdog under one lock.
         if not self.watchdog.command(setpoint, hold_us):
             return "watchdog"
         hover_s = self.watchdog.hover_after_s
         expires_us = None if hover_s is None else sent_us + hold_us + hover_s * US_PER_S
         if self.decided is not None:
+            # A pipelined decision has no hold: the next one starts at once.
             held_us = sent_us + (hold_us if settings.decisions == "sequential" else 0)
             times = started_us, ready_us, sent_us, held_us, self.held_us
             until_us = None if expires_us is None else int(expires_us)
             self.decided(SentDecision(seen, state, setpoint, *times, until_us, observation.image))
         t2_us = np.array([ready_us - started_us])
+        # Exactly one of the two memories records the setpoint.
         if self.compensator is None:
             self.memory.decided(ONE, np.array([setpoint]), t2_us)
         else:
@@ -185,6 +194,7 @@ class Pilot:
                 np.array([sent_us]),
                 None if expires_us is None else np.array([expires_us]),
             )
+        # Interruptible by `stop`, unlike the inference.
         if settings.decisions == "sequential":
             self.watchdog.doing("holding an action")
             clock.sleep_until(sent_us + hold_us, stop)
@@ -215,12 +225,14 @@ class Pilot:
     ) -> Observation:
         frame, image = seen.frame, seen.frame.image
         age_us = np.array([age_of(seen, now_us)])
+        # Compensation replaces image and state by those predicted for the time of the action.
         if self.compensator is not None:
             images, states = self.compensator.foresee(
                 ONE, image[None], age_us, np.array([now_us]), state.rows(None)
             )
             image, state = images[0], states.rows(0)
         told = self.memory.in_flight(age_us).rows(0)
+        # Copied before the current image joins the queue.
         earlier = tuple(self.earlier)
         views = views_of(frame, self.further)
         self.earlier.appendleft((image, state))

@@ -35,6 +35,7 @@ def every(period_us: int, act: Callable[[], object], clock: Clock, name: str) ->
         due_us = clock.time_us()
         while not ended.is_set():
             act()
+            # A late call moves the schedule instead of causing a burst.
             due_us = max(due_us + period_us, clock.time_us())
             clock.sleep_until(due_us, ended)
 
@@ -77,7 +78,9 @@ def computer_status(
 
     The loads of the first 8 cores are sent. `ram_bytes` is used and total memory [bytes].
     """
+    # The message has room for 8 cores; more are dropped.
     cores = [round(percent) for percent in cores_percent[:CORES]]
+    # 127 means unknown, so the maximum is 126.
     temperature = NO_TEMPERATURE if celsius is None else max(-128, min(126, round(celsius)))
     return {
         "time_usec": now_us,
@@ -154,12 +157,15 @@ def obstacle_distance(
     vehicle's attitude, body to NED; `pitch_up_rad` is the mounting angle of the camera; `now_us` is
     the time since the start.
     """
+    # Bins are at least 5 degrees wide; the tolerance keeps an exact multiple.
     fov_rad = camera.horizontal_fov_rad
     count = min(BINS, max(1, int(fov_rad / BIN_RAD + 1e-6)))
     width_deg = math.degrees(fov_rad) / count
+    # Level scan: tilt of vehicle and mount is removed from the rays.
     roll, pitch, _ = quats_to_euler(quaternion[None])
     tilt = tilt_of(roll, pitch + pitch_up_rad)
     (ranges,) = level_scan(depth_mm[None], rays_of(camera), tilt, count)
+    # MAVLink: max_distance + 1 means free.
     free_cm = round(100.0 * range_m) + 1
     told = [free_cm if r > range_m else round(100.0 * max(r, NEAREST_M)) for r in ranges.tolist()]
     return {
@@ -170,6 +176,7 @@ def obstacle_distance(
         "min_distance": round(100.0 * NEAREST_M),
         "max_distance": free_cm - 1,
         "increment_f": width_deg,
+        # The message's angle refers to the middle of the first bin.
         "angle_offset": 0.5 * (width_deg - math.degrees(fov_rad)),
         "frame": FRAME_BODY_FRD,
     }
@@ -182,6 +189,7 @@ def obstacles_told(
 
     def tell() -> None:
         received, now_us = frames.latest(), clock.time_us()
+        # An old image would mark free space where an obstacle has come close.
         if received is None or now_us - received.received_us > OLDEST_US:
             return
         frame, attitude = received.frame, link.kinematics().quaternion

@@ -84,6 +84,7 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
     piloting.check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
     loaded = piloting.load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
     sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
+    # Obstacle messages need depth along the heading; other cameras are rejected before the flight.
     vehicle, compensator = load_vehicle(asked.vehicle), None
     needs = {
         "gives depth": vehicle.camera.kind == "depth",
@@ -102,13 +103,16 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
     piloting.check_goal_height(
         policy, asked.goal, "goal", " ".join(f"{metres:g}" for metres in asked.goal)
     )
+    # Checked before the compensator is created.
     piloting.check_compensated(pilot, policy, vehicle)
     if pilot.compensate:
         compensator = Compensator(1, vehicle, Intrinsics.of(vehicle.camera))
     limits = asked.limits
+    # A stand-alone flight always has a time limit.
     if limits.flight_s is None:
         limits = limits.model_copy(update={"flight_s": FLIGHT_S})
     computer = Part(asked.computer, load_computer(asked.computer).description)
+    # Without injection the inference runs at this computer's speed.
     if injection.latency is None:
         computer = Part("this computer", f"{describe_machine()['cpu']}")
     setup = Setup(
@@ -141,6 +145,7 @@ def mission_camera(asked: StandAloneCompanion, mission: MissionSetup, clock: Clo
     """Open the requested camera. Raises FieldError if it is unusable."""
     vehicle = mission.vehicle
     policy, cameras = mission.policy, vehicle.cameras
+    # Only images that the policy reads are converted.
     if isinstance(policy, LearnedPolicy):
         cameras = {k: v for k, v in cameras.items() if k in policy.card.observation.cameras}
     further = {name: Intrinsics.of(each) for name, each in cameras.items()}
@@ -211,6 +216,7 @@ def fly_alone(
         if phase != "done":
             link.tell(f"airl: {phase}")
 
+    # The order of contexts is the order of closing: the link closes before proxy and camera.
     with (
         held_to(asked.cpu_quota),
         closing(mission_camera(asked, mission, clock)) as camera,
@@ -219,6 +225,7 @@ def fly_alone(
     ):
         waiting()
         link.connect(asked.connect_timeout, stop)
+        # The camera is checked before the status messages start, and before take-off.
         check_camera(mission.policy, camera, stop, mission.compensator)
         with (
             present(link, clock),
@@ -239,6 +246,7 @@ def fly_alone(
                 decided=None if box is None else box.decided,
             )
             link.tell(f"airl: {result.reason}")
+            # Losses are notes of the result: they need not end the flight.
             if camera.failure is not None:
                 result = replace(result, notes=(*result.notes, camera.failure))
             if camera.dropped:

@@ -35,6 +35,7 @@ def signed(url: str, key: Path | None) -> Iterator[str]:
         try:
             yield proxy.url
         except LinkError as error:
+            # Error messages name the URL that the user has given.
             told = str(error).replace(proxy.url, url)
             refused = proxy.refused
             hint = f" ({refused} frames refused: bad signature)" if refused else ""
@@ -46,6 +47,7 @@ class SigningProxy:
 
     def __init__(self, url: str, key: Path) -> None:
         """Bind and start the proxy of udpin://HOST:PORT; the default host is this machine."""
+        # Signing works on datagrams, so serial connections are not supported.
         found = _URL.fullmatch(url)
         if found is None:
             raise UsageError(f"--connect {url}: with a signing key: udpin://HOST:PORT")
@@ -54,9 +56,11 @@ class SigningProxy:
         self._outer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._inner = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
+            # Outer socket: the vehicle's port. Inner socket: a free port towards MAVSDK.
             self._outer.bind((found["host"] or LOOPBACK, int(found["port"])))
             self._inner.bind((LOOPBACK, 0))
             # A free port for MAVSDK to listen on; MAVSDK replies to the sender.
+            # The probe closes at once; MAVSDK binds the port a moment later.
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
                 probe.bind((LOOPBACK, 0))
                 self._mavsdk: tuple[str, int] = probe.getsockname()
@@ -77,6 +81,7 @@ class SigningProxy:
 
     def close(self) -> None:
         """Stop the proxy and store the newest time stamp. Idempotent."""
+        # The stamp is stored last: a reused time stamp would be rejected after a restart.
         if not self._stop.is_set():
             self._stop.set()
             self._thread.join()
@@ -86,6 +91,7 @@ class SigningProxy:
 
     def _run(self) -> None:
         while not self._stop.is_set():
+            # A finite timeout lets the loop see `_stop`.
             ready, _, _ = select.select((self._outer, self._inner), (), (), POLL_S)
             for end in ready:
                 try:
@@ -101,6 +107,7 @@ class SigningProxy:
 
     def _from_vehicle(self, data: bytes, address: tuple[str, int]) -> None:
         accepted = [frame for frame in frames_of(data) if self._stored.signing.accepts(frame)]
+        # Byte 2 holds the incompatibility flags; bit 0 marks a signed frame.
         if any(frame[2] & 1 for frame in accepted):
             self._vehicle = address  # an unsigned heartbeat does not set the address
         if accepted:

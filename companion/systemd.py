@@ -23,6 +23,7 @@ class ServiceManager:
         self._socket: socket.socket | None = None
         address = environment.get("NOTIFY_SOCKET", "")
         if address[:1] in ("/", "@"):
+            # CLOEXEC: child processes must not notify the manager.
             found = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
             try:
                 # "@" marks a name in Linux's abstract namespace.
@@ -37,6 +38,7 @@ class ServiceManager:
     def tell(self, **facts: str) -> None:
         """Send facts by names of sd_notify(3), such as STATUS; lost facts are not an error."""
         if self._socket is not None:
+            # One fact per line: a newline within a value would start another.
             lines = (f"{name}={value}".replace("\n", " ") for name, value in facts.items())
             try:
                 self._socket.send("\n".join(lines).encode())
@@ -66,6 +68,7 @@ def service(environment: Mapping[str, str] = os.environ) -> Iterator[ServiceMana
     """Yield the service manager, with watchdog pings from a thread while the context is active."""
     with closing(ServiceManager(environment)) as manager, ExitStack() as alive:
         if manager.watchdog_us is not None:
+            # Half the timeout leaves room for one missed ping.
             period_us = int(ALIVE_SHARE * manager.watchdog_us)
             sign = every(period_us, lambda: manager.tell(WATCHDOG="1"), WallClock(), "systemd")
             alive.enter_context(sign)

@@ -52,6 +52,7 @@ class TurnGiven:
     @classmethod
     def parse(cls, text: str) -> TurnGiven | None:
         """Parse a text; return None for any other text."""
+        # The whole text must match: other texts of the vehicle may contain similar words.
         match = _GIVEN.fullmatch(text)
         if match is None:
             return None
@@ -153,6 +154,7 @@ class TokenTurns:
         self._await_turn()
         try:
             yield
+        # The turn is lost already; only other endings return it.
         except Abandoned:
             raise
         except BaseException:
@@ -175,6 +177,7 @@ class TokenTurns:
 
     def _end(self) -> None:
         self._give_back(TurnBack(self._number, ended=True))
+        # The last text is repeated on request, since it may be lost.
         for _ in range(FAREWELL_S):
             given = self._next_given(1.0)
             if given is not None and given.order == "end":
@@ -225,6 +228,7 @@ class TokenTurns:
             given = self._next_given(1.0)
             if given is None:
                 waited_s += 1
+            # A higher number is the next turn; the same number means that the reply was lost.
             elif given.number > self._number:
                 self._take(given)
                 return
@@ -235,6 +239,7 @@ class TokenTurns:
     def _take(self, given: TurnGiven) -> None:
         if given.order == "end":
             raise Abandoned("the flight controller has ended the flight")
+        # New turn: earlier texts need no retransmission.
         self._number = given.number
         self._sent.clear()
         self.clock.sleep_until(given.time_us)
@@ -242,6 +247,7 @@ class TokenTurns:
             self._abandon.set()
         if given.order:
             self._stop.set()
+        # The event wakes a wait for the frame, see TokenFrameSource.
         if given.frame != self.frame:
             self.frame = given.frame
             self.frame_arrived.set()
@@ -261,12 +267,13 @@ class TokenFrameSource:
         wanted = self.turns.frame
         if wanted == NO_FRAME:
             return None
+        # The turn names the frame; a newer one may already be decoded but does not count.
         if self.newest is None or self.newest.frame.sequence != wanted:
             self.newest = self._await(wanted)
         return self.newest
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a new frame, see `companion.frame_source.FrameSource`, with a timeout in simulated time."""
+        """Wait for a new frame, see `FrameSource`, with a timeout in simulated time."""
         clock, arrived = self.clock, self.turns.frame_arrived
         deadline_us = clock.time_us() + int(timeout_s * US_PER_S)
         while True:
@@ -275,6 +282,7 @@ class TokenFrameSource:
                 return newest
             if clock.time_us() >= deadline_us:
                 return None
+            # Cleared before the sleep, so that a frame during the sleep wakes it.
             arrived.clear()
             clock.sleep_until(deadline_us, arrived)
 

@@ -44,11 +44,13 @@ class VideoReceiver(NamedTuple):
 def picture_of(frame: Frame | FurtherImage, range_m: float) -> NDArray[np.uint8]:
     """Return an image as a picture (h, w, 3) with even sides; near = bright, no return = black."""
     if frame.intrinsics.kind == "depth":
+        # The shade is linear in nearness from DARKEST to white.
         shade = DARKEST + (255.0 - DARKEST) * nearness(frame.image, range_m)
         grey = np.where(frame.image == 0, 0.0, shade).astype(np.uint8)
         picture = rgb_of(grey[..., None])
     else:
         picture = rgb_of(frame.image)
+    # Small images are enlarged by repetition, which keeps pixels visible.
     times = enlargement(frame.intrinsics)
     larger = picture.repeat(times, axis=0).repeat(times, axis=1)
     # H.264 with subsampled colour requires even sides.
@@ -81,6 +83,7 @@ class RtpVideo:
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
         self._stream.codec_context.time_base = Fraction(1, _CLOCK_HZ)
+        # A viewer that joins late waits for the next keyframe.
         self._stream.codec_context.gop_size = max(1, round(KEYFRAME_S * rate_hz))
         # One slice per picture and no buffering, so that each picture is sent at once.
         self._stream.options = {"preset": "ultrafast", "tune": "zerolatency", "crf": f"{CRF}"}
@@ -92,6 +95,7 @@ class RtpVideo:
         """Send a picture (h, w, 3) at a time [µs], unless older than the last; raises OSError."""
         if self._first_us is None:
             self._first_us = time_us
+        # The stream starts at 0 and uses RTP's 90 kHz clock.
         pts = (time_us - self._first_us) * _CLOCK_HZ // US_PER_S
         if pts <= self._last_pts:
             return

@@ -195,6 +195,7 @@ class CameraComponent:
         }
         self._server = MavlinkDirectServer(mavsdk.server_component(0))
         streaming = (VIDEO_START_STREAMING, VIDEO_STOP_STREAMING)
+        # MAVSDK answers only commands with a subscription.
         for command in (REQUEST_MESSAGE, *OLD_REQUESTS, *streaming, *WITHOUT_EFFECT):
             self._server.subscribe_command(command, self._asked)
 
@@ -224,6 +225,7 @@ class CameraComponent:
     def _carried_out(self, command: int, one: int, two: int) -> tuple[int, tuple[int, ...]]:
         """Return the result of a command with its parameters, and the requested messages."""
         if command in (VIDEO_START_STREAMING, VIDEO_STOP_STREAMING):
+            # Stream id 0 addresses all streams.
             if one not in (0, STREAM_ID):
                 return DENIED, ()
             self.running = command == VIDEO_START_STREAMING
@@ -235,6 +237,7 @@ class CameraComponent:
             # MAVSDK requests the stream only 20 s later.
             return ACCEPTED, (CAMERA_INFORMATION, VIDEO_STREAM_INFORMATION)
         if asked in (VIDEO_STREAM_INFORMATION, VIDEO_STREAM_STATUS):
+            # REQUEST_MESSAGE has the stream id in parameter 2, the older commands in parameter 1.
             which = two if command == REQUEST_MESSAGE else one
             if which not in (0, STREAM_ID):
                 return DENIED, ()
@@ -273,6 +276,7 @@ class OnNetwork:
         """Join the vehicle if it is received; return True if joined by this call."""
         if self._component is not None:
             return False
+        # The vehicle's system id is known only once a vehicle is heard.
         system = next((each for each in self._mavsdk.get_systems() if each.has_autopilot()), None)
         if system is None:
             return False
@@ -340,6 +344,7 @@ def show_video(
     own = camera.own
     with closing(camera.open(clock)) as source:
         say(f"waiting for images of {camera.camera}")
+        # The first image decides size and kind of the stream.
         first = _next(source, None, stop)
         if first is None:
             return 0
@@ -358,6 +363,7 @@ def show_video(
         )
 
         def is_wanted() -> bool:
+            # The component joins as soon as a vehicle is heard, even during the video.
             if network is None:
                 return True
             if network.join(stream):
@@ -386,6 +392,7 @@ def _send(
         if wanted():
             try:
                 show(seen)
+            # One line per outage, not one per frame.
             except OSError as error:
                 if not failing:
                     say(f"the video cannot be sent: {error.strerror}; it goes on when it can")

@@ -53,12 +53,14 @@ class Watchdog:
     def command(self, setpoint: Setpoint, hold_us: int) -> bool:
         """Send a setpoint with its hold time [µs]; return False if offboard was left before."""
         with self._lock:
+            # A setpoint after leaving offboard would have no effect, or a late one.
             if self.left_offboard:
                 return False
             self._link.send_setpoint(setpoint)
             self._last = setpoint
             self._fed_us = self._clock.time_us()
             self._stopped = False
+            # The velocity is zeroed when the hold and `hover_after_s` are over.
             hover_s = self._settings.hover_after_s
             self._hover_us = None
             if hover_s is not None:
@@ -88,6 +90,7 @@ class Watchdog:
         with self._lock:
             now_us = self._clock.time_us()
             try:
+                # The most severe action comes first.
                 if now_us >= self._leave_us and not self.left_offboard:
                     self.left_offboard = True
                     self.culprit = self._activity
@@ -101,6 +104,7 @@ class Watchdog:
                     self._stopped = True
                     self._hover_us = None
                     self._note("velocity zeroed", now_us)
+                    # The note comes before the command, which may fail.
                     self._stop()
                 elif self._hover_us is not None and now_us >= self._hover_us:
                     self._hover_us = None
@@ -187,7 +191,9 @@ class ThreadGuard:
     def _run(self, watchdog: Watchdog) -> None:
         try:
             while not self._done.is_set():
+                # Turning setpoints leave less time, see TURNING_STARVED_S.
                 starved_s = STARVED_S if watchdog.by_velocity else TURNING_STARVED_S
+                # faulthandler's timer runs in C, without the interpreter lock.
                 faulthandler.dump_traceback_later(starved_s, exit=True, file=STDERR)
                 for _ in range(CHECKS_PER_RESTART):
                     if self._done.is_set():

@@ -74,8 +74,7 @@ class Prose:
         self.docs += [doc.strip() for doc in docs]
         for doc in docs:
             self.add(_paragraphs(re.sub(r"^\s+", "", doc, flags=re.MULTILINE)))
-        comments = filter(None, _STRING_OR_COMMENT.findall(text))
-        self.add([" ".join(comment.lstrip("# ") for comment in comments)])
+        self.add(_comments(text))
 
     def measures(self) -> dict[str, float]:
         """Return words per sentence, relatives and banned words per 1,000 words, clauses [%]."""
@@ -109,6 +108,19 @@ def read_prose(path: Path) -> Prose:
         else:
             prose.add_python(text, ast.parse(text))
     return prose
+
+
+def _comments(text: str) -> Iterator[str]:
+    """Yield the comments of a module, consecutive lines joined."""
+    block, end = "", 0
+    for match in _STRING_OR_COMMENT.finditer(text):
+        if not match[1]:
+            continue
+        if text[end : match.start()].strip() and block:
+            yield block
+            block = ""
+        block, end = f"{block} {match[1].lstrip('# ')}".strip(), match.end()
+    yield block
 
 
 def _paragraphs(text: str) -> list[str]:

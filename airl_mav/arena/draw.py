@@ -95,6 +95,7 @@ def save_png(
     """Write a picture of the arena; arguments as in `draw_arena`."""
     b = arena.bounds
     tall = (b.north_max - b.north_min) / (b.east_max - b.east_min)
+    # Tall arenas get a narrower figure.
     width = 6.4 / max(1.0, tall / 1.4)
     figure = Figure(figsize=(max(width, 4.2), 1.3 + 0.88 * width * tall), layout="constrained")
     ax = figure.add_subplot()
@@ -120,6 +121,7 @@ def _draw_floor(arena: Arena, ax: Axes) -> None:
     length, width = b.north_max - b.north_min, b.east_max - b.east_min
     thick = WALL_SHARE * max(length, width)
     colour = tuple(channel / 255.0 for channel in arena.wall_colour)
+    # Walls are drawn outside the floor.
     outer = (b.east_min - thick, b.north_min - thick), width + 2.0 * thick, length + 2.0 * thick
     ax.add_patch(Rectangle(*outer, facecolor=colour, zorder=0.1))
     ax.add_patch(Rectangle(*_floor(arena), facecolor=FLOOR_COLOUR, zorder=0.2))
@@ -179,6 +181,7 @@ def _draw_zones(arena: Arena, ax: Axes, radii_m: Sequence[float]) -> None:
         )
         ax.add_patch(ring)
         ring.set_clip_path(floor)
+        # The first bearing, clockwise from north, at which the label fits.
         bearing = next((a for a in range(0, 180, 3) if _holds(arena, radius, a)), None)
         if bearing is not None:
             ax.text(
@@ -250,6 +253,7 @@ def _draw_arrow(ax: Axes, center: NDArray[np.float64], tour: Tour, time_us: int)
     t = (time_us / US_PER_S) % tour.times_s[-1]
     k = int(np.searchsorted(tour.times_s, t, side="right")) - 1
     step = np.diff(tour.points, axis=0)
+    # During a stop the arrow shows the next leg.
     k = k if step[k].any() else (k + 1) % len(step)
     velocity = step[k] / (tour.times_s[k + 1] - tour.times_s[k])
     tip = center[:2] + velocity * ARROW_S

@@ -172,10 +172,12 @@ def _surfaces(
     All values are drawn for every surface, used or not, so that settings and counts do not change
     other draws. The parts of a group share draws.
     """
+    # Per surface: material, brightness, three tints, two offsets of the pattern.
     draws = rng.random((n, 7))
     materials = [appearance.material(name, wall_colour) for name in kind.materials]
     chosen = (draws[:, 0] * len(materials)).astype(np.intp)
     if statics is not None:
+        # Parts of one asset share the draws of their owner.
         draws, chosen = draws[statics.of], chosen[statics.of]
         for part, name in enumerate(statics.materials):
             if name is not None:
@@ -230,11 +232,14 @@ def _light(appearance: Appearance, draw: int) -> Light:
     sun_irradiance = rng.uniform(*sun.irradiance)
     sky_irradiance = stream(draw, Stream.APPEARANCE, _Part.SKY).uniform(*sky.irradiance)
     rng = stream(draw, Stream.APPEARANCE, _Part.FOG)
+    # Always two draws, so that the fog's settings do not change each other.
     extinction = rng.uniform(*appearance.fog.extinction_1_m)
     extinction = extinction if rng.random() < appearance.fog.share else 0.0
     level = math.cos(elevation)
+    # NED: the sun above the horizon has a negative down component.
     to_sun = (level * math.cos(azimuth), level * math.sin(azimuth), -math.sin(elevation))
     zenith, horizon = (linear_of(np.array(c) / 255.0) for c in (sky.zenith, sky.horizon))
+    # Scale the sky's colours to the drawn irradiance, by luminance.
     whole = float(LUMINANCE @ (horizon + 2.0 * zenith) / 3.0)
     scale = sky_irradiance / whole if whole > 0.0 else 0.0
     colour = linear_of(np.array(sun.colour) / 255.0)
@@ -254,6 +259,7 @@ def linear_of(encoded: Floats) -> Floats:
     Bit-identical on every processor, as seeds require; numpy's power differs with AVX-512. Slow:
     use a table for images.
     """
+    # Python's power, not numpy's: the result must have the same bits on every processor.
     raised = [x**2.4 for x in ((encoded + 0.055) / 1.055).ravel().tolist()]
     return np.where(encoded <= 0.04045, encoded / 12.92, np.reshape(raised, encoded.shape))
 

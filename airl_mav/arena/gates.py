@@ -46,6 +46,7 @@ def draw_openings(rng: np.random.Generator, spec: ArenaSpec) -> Openings:
         return scaled
 
     step = within(0, gates.spacing_m)
+    # The first gate is measured from the start, later ones from the gate before.
     step[:1] = within(0, gates.first_m)[:1]
     east, middle = within(1, gates.lateral_m), within(2, gates.middle_m)
     width, height = within(3, gates.width_m), within(4, gates.height_m)
@@ -61,6 +62,7 @@ def frames(openings: Openings, bounds: Bounds) -> Obstacles:
     west_edge, east_edge, bottom, top = east - wide, east + wide, -down - tall, -down + tall
     low, high = np.full(k, bounds.east_min), np.full(k, bounds.east_max)
     floor, ceiling = np.zeros(k), np.full(k, bounds.height)
+    # The parts in the order of PARTS.
     sides = [
         (low, west_edge, floor, ceiling),
         (east_edge, high, floor, ceiling),
@@ -90,6 +92,7 @@ def with_gates(statics: Statics | None, standing: Obstacles, k: int) -> Statics 
 def with_walls(statics: Statics | None, standing: Obstacles, walls: Statics) -> Statics:
     """Return the groups of static primitives with groups of walls appended."""
     if statics is None:
+        # Without groups every primitive is its own owner.
         names = tuple(Shape(int(shape)).name.lower() for shape in standing.shape)
         statics = Statics(names, np.arange(len(names)), (None,) * len(names))
     return Statics(
@@ -103,6 +106,7 @@ def openings_of(arena: Arena) -> Openings:
     """Return the openings of an arena's gates, from its obstacles."""
     first = np.flatnonzero(_part_of_gate(arena) == 0)
     center, half = arena.obstacles.center, arena.obstacles.half_size
+    # Offsets of the parts behind the west box, in the order of PARTS.
     west, below, above = first, first + 2, first + 3
     bottom = center[below, 2] - half[below, 2]
     top = center[above, 2] + half[above, 2]
@@ -121,6 +125,7 @@ def over_openings(arena: Arena) -> NDArray[np.bool_]:
 def _part_of_gate(arena: Arena) -> NDArray[np.int64]:
     """Return the part of a gate (n_static,) of each primitive, 0 to PARTS - 1; -1 = no gate."""
     parts = np.full(arena.n_static, -1, np.int64)
+    # The boxes of gates are the last static obstacles.
     boxes = PARTS * arena.n_gates
     parts[arena.n_static - boxes :] = np.arange(boxes) % PARTS
     return parts

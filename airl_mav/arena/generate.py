@@ -142,10 +142,12 @@ def generate(
         ring_m=(spec.goal.min_distance_m, zone_radius_m(spec, zone)),
         vehicle_width_m=vehicle_width_m,
     )
+    # A fixed goal outside the zone fails in every layout, so test it once.
     _check_fixed_goal(request, zone)
     static_rng, goal_rng, moving_rng = (
         _rng(seed, stream) for stream in (_Stream.STATIC, _Stream.GOAL, _Stream.MOVING)
     )
+    # The failure with the most progress explains best what is missing.
     failure = NoRoomError("", -1)
     for _ in range(LAYOUTS):
         try:
@@ -201,6 +203,7 @@ def _rng(seed: int, stream: _Stream) -> np.random.Generator:
 
 def _draw_counts(spec: ArenaSpec, seed: int) -> tuple[int, int]:
     """Return the numbers of static and moving obstacles, shared within a count period."""
+    # Counts depend on the period, not on the seed, so consecutive seeds share them.
     rng = _rng(seed // spec.count_period, _Stream.COUNT)
     static = rng.integers(*spec.static.count, endpoint=True)
     moving = rng.integers(*spec.moving.count, endpoint=True)
@@ -225,6 +228,7 @@ def _draw_rooms(
     """Draw the rooms; None = no rooms. Raises UsageError for narrow doors or if no plan fits."""
     if not spec.rooms.drawn:
         return None
+    # The passage search works on a raster, so a door needs more than the vehicle's width.
     least = least_gap_m(bounds, vehicle_width_m)
     if spec.rooms.door_width_m[0] < least:
         raise UsageError(
@@ -273,6 +277,7 @@ def _draw_static(
         statics: Statics | None = things.statics
     else:
         bodies, statics = draw_bodies(rng, n, spec.static, spec.flight_altitude_m), None
+    # Obstacles keep off start, goal, walls and doors.
     keep_off = request.start_box
     if spec.goal.fixed is not None:
         keep_off = join(keep_off, _around(np.array(spec.goal.fixed), spec.goal.clearance_m))
@@ -310,12 +315,15 @@ def _draw_reachable_goal(
     keep_off = standing.grown(spec.goal.clearance_m)
     boxes: Boxes | None = standing
     clearance_m = spec.goal.clearance_m
+    # Behind the last gate, so that the flight passes all gates.
     if len(request.openings):
         keep_off = join(keep_off, behind(request.openings, request.bounds, clearance_m))
+        # The vehicle passes through openings: only boxes of full height block it.
         static, boxes = _concatenate(static, closed_from_above(request.walls)), None
     elif request.plan is not None:
         around = join(bounding_boxes(request.walls), request.plan.passages())
         keep_off = join(keep_off, around.grown(clearance_m))
+        # Lintels hang above the doors, so they do not block the passage.
         static, boxes = _concatenate(static, standing_on_the_floor(request.walls)), None
     for _ in range(GOALS_PER_LAYOUT):
         goal = (
@@ -355,6 +363,7 @@ def _draw_moving(
     if request.plan is not None:  # Moving obstacles stay in their rooms.
         always = join(always, request.plan.grown_passages(spec.rooms.door_clearance_m))
     on_the_way = join(always, standing.grown(walking_gap))
+    # The gap at time 0 may be larger than the gap on the way.
     at_first = on_the_way
     if gap > walking_gap:
         at_first = join(always, standing.grown(gap))

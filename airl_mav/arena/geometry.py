@@ -54,7 +54,9 @@ def indoors(look: Drawn, floor_m2: float, walls: tuple[tuple[int, float], ...]) 
     of_walls = areas @ albedo[[row for row, _ in walls]] / areas.sum()
     floor, upright = _irradiances(albedo[FLOOR], of_walls, floor_m2, float(areas.sum()))
     luminance = float(LUMINANCE @ light.sky)
+    # Without sky light the ceiling is white.
     colour = light.sky / luminance if luminance > 0.0 else np.ones(3)
+    # The brightness of the ceiling that gives the floor its outdoor luminance.
     glow = colour * luminance / float(LUMINANCE @ (colour * floor))
     inside = Light(
         to_sun=light.to_sun,
@@ -72,7 +74,9 @@ def _irradiances(
 ) -> tuple[Floats, Floats]:
     """Return mean irradiance (3,) of floor and walls for a ceiling of radiosity 1."""
     across = seen_across(4.0 * floor_m2 / walls_m2)
+    # Reciprocity of view factors: floor area times factor equals wall area times factor.
     to_floor = (1.0 - across) * floor_m2 / walls_m2
+    # A wall sees floor and ceiling alike; the rest of its view is walls.
     among = 1.0 - 2.0 * to_floor
     # floor = across + (1 - across) wall_albedo walls
     # walls = to_floor + to_floor floor_albedo floor + among wall_albedo walls
@@ -233,6 +237,7 @@ class Arena:
     def clear(self) -> NDArray[np.bool_] | None:
         """Mask (n,) of glass obstacles, which depth cameras see through; None = no glass."""
         parts = () if self.statics is None else self.statics.materials
+        # The appearance is drawn only if a material can be glass.
         if not self.appearance.may_have("glass", (name for name in parts if name is not None)):
             return None
         glass = self.look.finish.surface[OBSTACLE:] == SURFACES.index("glass")
@@ -271,6 +276,7 @@ class Arena:
         """Return all obstacle centres (n, 3) NED [m], `time_us` [us] after the episode's start."""
         centers = self.obstacles.center.copy()
         for i, tour in enumerate(self.tours, start=self.n_static):
+            # Tours are cyclic.
             t = (time_us / US_PER_S) % tour.times_s[-1]
             centers[i, 0] = np.interp(t, tour.times_s, tour.points[:, 0])
             centers[i, 1] = np.interp(t, tour.times_s, tour.points[:, 1])

@@ -87,9 +87,11 @@ class Ground:
         """Triangles (m, 3) of `points` above the floor, clockwise from above, north to east."""
         r, c = self.heights.shape
         first = (np.arange(r - 1)[:, None] * c + np.arange(c - 1)).ravel()
+        # Corner numbers of each cell, counted from its south-west corner.
         north, east, both = first + c, first + 1, first + c + 1
         split = [np.stack([first, north, both], axis=1), np.stack([first, both, east], axis=1)]
         every = np.stack(split, axis=1).reshape(-1, 3).astype(np.int32)
+        # Level triangles at the floor belong to the floor.
         rising: NDArray[np.int32] = every[(self.heights.ravel()[every] > 0.0).any(axis=1)]
         return rising
 
@@ -110,6 +112,7 @@ class Ground:
             return self
         share = math.sqrt(most / (rows * columns))
         fewer_n, fewer_e = max(1, math.floor(share * rows)), max(1, math.floor(share * columns))
+        # The total size stays; only the steps grow.
         step_n, step_e = self.step_north * rows / fewer_n, self.step_east * columns / fewer_e
         north = self.south + step_n * np.arange(fewer_n + 1, dtype=np.float64)
         east = self.west + step_e * np.arange(fewer_e + 1, dtype=np.float64)
@@ -119,6 +122,7 @@ class Ground:
         """Return the ground's minimum height within a radius [m] of a position on the floor."""
         from airl_mav.arena.relief import extreme_within
 
+        # The minimum is the negative maximum of the negative height.
         return -float(extreme_within(self.relief, north, east, radius, -1.0))
 
     def sampled(self, north: Floats, east: Floats) -> Floats:

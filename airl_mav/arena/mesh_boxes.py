@@ -92,6 +92,7 @@ def boxes_of_mesh(
         raise FieldError(
             "mesh", str(path), f"at most {GREATEST_M:g} m a side, not {sides} m (see --scale)"
         )
+    # Origin: middle of the footprint, lowest point at the floor.
     mesh.apply_translation((*-0.5 * (low + high)[:2], -low[2]))
     closed = bool(mesh.is_watertight)
     cell_m, parts = _finest(mesh, float(size.max()), closed, most)
@@ -102,6 +103,7 @@ def boxes_of_mesh(
 
 def _surface(mesh: trimesh.Trimesh) -> Triangles:
     """Return the triangles of a mesh in its pose, without degenerate ones."""
+    # Triangles have down, boxes have heights.
     vertices = (np.asarray(mesh.vertices, np.float64) * [1.0, 1.0, -1.0]).astype(np.float32)
     faces = np.asarray(mesh.faces, np.int32)
     return Triangles(vertices, faces[areas(vertices[faces]) > 0.0])
@@ -144,6 +146,7 @@ def joined(cells: Cells, most: int) -> list[tuple[NDArray[np.int64], NDArray[np.
         if len(boxes) >= most:
             return None
         first = np.array(np.unravel_index(int(left.argmax()), left.shape), np.int64)
+        # The greedy growth depends on the order of axes, so try all six.
         ends = [_grown(left, first, order) for order in permutations(range(3))]
         end = max(ends, key=lambda each: int(np.prod(each - first)))
         left[tuple(map(slice, first, end))] = False
@@ -157,6 +160,7 @@ def _grown(left: Cells, first: NDArray[np.int64], order: tuple[int, ...]) -> NDA
     for axis in order:
         begin = first.copy()
         while end[axis] < left.shape[axis]:
+            # Only the new layer of cells needs a test.
             begin[axis] = end[axis]
             further = end.copy()
             further[axis] += 1
@@ -202,6 +206,7 @@ def _cells(
     first = corners.min(axis=0) - reach_m
     size = np.ptp(corners, axis=0) + 2.0 * reach_m
     cells = np.zeros(np.ceil(size / cell_m).astype(np.int64), np.bool_)
+    # The eight corners of a cube around each point mark all cells that it may reach.
     for sides in product((-reach_m, reach_m), repeat=3):
         at = np.floor((corners + sides - first) / cell_m).astype(np.int64)
         at = np.clip(at, 0, np.array(cells.shape) - 1)  # rounding at the last face
@@ -211,6 +216,7 @@ def _cells(
 
 def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> BoxPart:
     least, most = low.copy(), high.copy()
+    # Parts are not below the floor and have a minimum size.
     least[2], most[2] = max(float(least[2]), 0.0), max(float(most[2]), LEAST_M)
     middle, size = 0.5 * (least + most), np.maximum(most - least, LEAST_M)
     return BoxPart(

@@ -41,8 +41,10 @@ def passage_exists(
     `boxes` bound all obstacles, with one box per group; None = one per obstacle. The passage leads
     around hills.
     """
+    # All hills can be overflown.
     if hills is not None and hills.ground.top_m <= hills.most_m:
         hills = None
+    # The exact test of gaps is cheap and usually succeeds.
     if hills is None and gaps_suffice(bounds, obstacles, goal, width_m, boxes):
         return True
     return raster_passage(bounds, obstacles, goal, width_m, hills)
@@ -79,6 +81,7 @@ def _gaps_suffice(
                 return False
         for j in range(i):
             close = True
+            # Two boxes leave a gap if they are apart along one axis.
             for axis in range(2):
                 apart = abs(center[i, axis] - center[j, axis])
                 close &= apart - half[i, axis] - half[j, axis] <= width_m
@@ -126,6 +129,7 @@ def raster_passage(
         rows = _window(north, boxes.center[i, 0], reach[0])
         columns = _window(east, boxes.center[i, 1], reach[1])
         free[rows, columns] &= _distance(obstacles, i, north[rows], east[columns]) > margin
+    # Connected regions of free cells, with steps along the axes.
     label, _ = scipy.ndimage.label(free)
     start = label[-south, -west]
     end = label[round(float(goal[0]) / cell) - south, round(float(goal[1]) / cell) - west]
@@ -142,6 +146,7 @@ def _to_hills(hills: Hills, north: Floats, east: Floats, cell: float) -> Floats:
     high = hills.ground.sampled(north, east) > low
     if not high.any():
         return np.full(high.shape, math.inf)
+    # Between cell centres, so half a diagonal must be subtracted.
     away: Floats = scipy.ndimage.distance_transform_edt(~high, sampling=cell)
     return away - half_diagonal
 

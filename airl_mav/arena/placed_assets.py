@@ -101,6 +101,7 @@ def _size(
         elif shape[i] == _SPHERE:
             offset = -SPHERE_OFFSET + 2.0 * SPHERE_OFFSET * numbers[4 * n + i]
             half_size[i, 2] = radius
+            # A sphere near the floor rests on it instead of sinking in.
             center_height[i] = max(radius, altitude_m + offset * radius)
 
 
@@ -161,6 +162,7 @@ def _problem(arena: Arena) -> str | None:
     if len(arena.tours) > n:
         return f"{len(arena.tours)} tours; accepted: at most one an obstacle, {n}"
     for mesh in arena.meshes:
+        # Meshes must own static obstacles of the arena.
         if not 0 <= mesh.first < mesh.first + mesh.count <= arena.n_static or mesh.scale <= 0.0:
             return f"meshes: accepted: each with obstacles that stand, and a scale > 0; not {mesh}"
     if (ground := arena.ground) is not None:
@@ -226,6 +228,7 @@ class _Thing:
     seen: _Seen | None = None
 
     @property
+    # The position is the asset's origin, so parts may extend further to one side.
     def reach(self) -> Floats:
         """Half extents (2,) north, east about its position [m]."""
         reach: Floats = (np.abs(self.offset) + self.parts.bounding_half).max(axis=0)
@@ -253,9 +256,11 @@ def draw_things(rng: np.random.Generator, n: int, spec: ArenaSpec) -> Things:
             )
             things.append(_Thing(name, body, np.zeros((1, 2)), (None,)))
         else:
+            # The numbers that a primitive uses for heading and offset serve heading and scale here.
             yaw = -math.pi + math.tau * float(numbers[3 * n + i])
             scale = least + (greatest - least) * float(numbers[4 * n + i])
             things.append(_turned(name, asset, yaw, scale))
+    # Wide obstacles are hardest to place, so they come first.
     things.sort(key=lambda thing: -float(thing.reach.max()))
     return _joined(things)
 

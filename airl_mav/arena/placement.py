@@ -64,6 +64,7 @@ def _bounding_half(
     for i in range(len(shape)):
         along, across = half_size[i, 0], half_size[i, 1]
         half[i, 0], half[i, 1] = along, across
+        # The bounding box of a turned rectangle.
         if shape[i] == _BOX:
             c, s = abs(cos[i]), abs(sin[i])
             half[i, 0], half[i, 1] = c * along + s * across, s * along + c * across
@@ -114,6 +115,7 @@ def segment_clear(start: Floats, end: Floats, center: Floats, half: Floats) -> b
             low = (center[j, axis] - half[j, axis] - start[axis]) / step
             high = (center[j, axis] + half[j, axis] - start[axis]) / step
             enter, leave = max(enter, min(low, high)), min(leave, max(low, high))
+        # The segment is inside both slabs within its length.
         if enter <= leave and leave >= 0.0 and enter <= 1.0:
             return False
     return True
@@ -174,6 +176,7 @@ def draw_place(
     keeps `gap_m` to the walls of the floor `low`..`high`. All are north, east [m]. `half` and
     `taken` are half extents. `place` (2,) is written.
     """
+    # Shrink the floor by the box, and grow the other boxes by it: then test a point.
     lowest = low + (half + gap_m)
     span, grown = high - (half + gap_m) - lowest, taken + half
     if span.min() < 0.0:
@@ -223,6 +226,7 @@ def place_all(
             batches, halves, boxes.center, boxes.half, low, high, gap_m, placed, tried
         )
         if used < len(batches):
+            # Unused numbers return, so that later draws do not depend on the batch size.
             _give_back(rng, batches[used:].size)
     if placed < n:
         raise NoRoomError(f"{placed} of {n} placed", placed)
@@ -255,6 +259,7 @@ def _place_all(
         i, at = placed, len(center) - n + placed
         lowest = low + (halves[i] + gap_m)
         span, grown = high - (halves[i] + gap_m) - lowest, half[:at] + halves[i]
+        # The floor is too small for the box: no number of tries helps.
         if span.min() < 0.0:
             return placed, BATCHES, used
         used += 1
@@ -302,6 +307,7 @@ def draw_goal(
     """Draw a goal (2,) [m] on the free floor at a distance `ring_m`; None if none is found."""
     nearest, farthest = ring_m
     low, high = inner(bounds, gap_m)
+    # Sample only the square around the ring.
     low, high = np.maximum(low, -farthest), np.minimum(high, farthest)
     if (low > high).any():
         return None

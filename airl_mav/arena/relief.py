@@ -73,10 +73,12 @@ def stand_on(
     else:
         kinds, owner = statics.names, statics.of
     lifts = np.zeros(len(kinds))
+    # Spheres keep their height.
     for k, kind in enumerate(kinds):
         if kind == "sphere":
             continue
         (north, east), half = standing.center[k].tolist(), standing.half[k].tolist()
+        # The bounding circle covers every heading.
         radius = half[0] if kind == "cylinder" else math.hypot(*half)
         lifts[k] = ground.lowest_within(north, east, radius)
     center = static.center.copy()
@@ -96,7 +98,9 @@ def _noise(rng: np.random.Generator, north: Floats, east: Floats, lattice_m: flo
     """Draw smooth noise around 0 at positions north (r,) by east (c,) [m], both from 0 on."""
     n_index, n_weights = _spline(north / lattice_m + float(rng.random()))
     e_index, e_weights = _spline(east / lattice_m + float(rng.random()))
+    # Four knots influence each position, so three more than the last index are needed.
     values = rng.random((int(n_index[-1]) + 4, int(e_index[-1]) + 4)) - 0.5
+    # Tensor product: first along north, then along east.
     rows = np.zeros((len(north), values.shape[1]))
     for k in range(4):
         rows += n_weights[k][:, None] * values[n_index + k]
@@ -134,6 +138,7 @@ def plane_at(relief: Relief, north: float, east: float) -> tuple[float, float, f
     i, j = min(max(int(x), 0), rows - 2), min(max(int(y), 0), columns - 2)
     u, v = x - i, y - j
     at = i * columns + j
+    # The diagonal runs from south-west to north-east; `u >= v` is its north-west side.
     low, high = heights[at], heights[at + columns + 1]
     if u >= v:
         side = heights[at + columns]
@@ -168,6 +173,7 @@ def extreme_within(relief: Relief, north: float, east: float, radius: float, sig
     x, y = north - grid[0], east - grid[1]
     first_row, last_row = math.floor((x - radius) / step_n), math.floor((x + radius) / step_n)
     first_column, last_column = math.floor((y - radius) / step_e), math.floor((y + radius) / step_e)
+    # Only cells that the disc may touch.
     for i in range(max(int(first_row), 0), min(int(last_row), rows - 2) + 1):
         for j in range(max(int(first_column), 0), min(int(last_column), columns - 2) + 1):
             # From the disc's centre to the cell's south-west corner.
@@ -183,6 +189,7 @@ def extreme_within(relief: Relief, north: float, east: float, radius: float, sig
             best = _on_edge(s, w, h00, s, e, h01, radius, best)
             best = _on_edge(n, w, h10, n, e, h11, radius, best)
             best = _on_edge(s, e, h01, n, e, h11, radius, best)
+            # The slopes of both triangles of the cell.
             up, across = (h10 - h00) / step_n, (h11 - h10) / step_e
             best = _in_middle(s, w, h00, up, across, step_n, step_e, True, radius, best)
             up, across = (h11 - h01) / step_n, (h01 - h00) / step_e
@@ -197,6 +204,7 @@ def _on_edge(
     """Return the maximum height of an edge within a radius of the origin, or `best`."""
     dx, dy = x1 - x0, y1 - y0
     a, b = dx * dx + dy * dy, x0 * dx + y0 * dy
+    # Intersection of the edge's line with the circle.
     root = b * b - a * (x0 * x0 + y0 * y0 - radius * radius)
     if root < 0.0:
         return best
@@ -226,6 +234,7 @@ def _in_middle(
     of height `low` and sides `step_n`, `step_e`; `up` and `across` are the slopes north and east.
     """
     steep = math.sqrt(up * up + across * across)
+    # A plane is highest on the circle in the direction of its slope.
     x, y = 0.0, 0.0
     if steep > 0.0:
         x, y = radius * up / steep, radius * across / steep

@@ -126,6 +126,7 @@ def _divided(rng: np.random.Generator, rooms: Rooms, floor: Rect, count: int) ->
         if n == 1:
             done.append(part)
             continue
+        # Cut across the longer side, unless only the shorter one has room for two.
         axis = 0 if part.side(0) > part.side(1) else 1
         if rooms.slots(part.side(axis)) < 2:
             axis = 1 - axis
@@ -144,6 +145,7 @@ def _cut(
     length, low = part.side(axis), part.low[axis]
     rows = rooms.slots(part.side(1 - axis))
     share = MIDDLE[0] + (MIDDLE[1] - MIDDLE[0]) * float(rng.random())
+    # At least one room fits on each side.
     cut = min(
         max(share * (length - rooms.thickness_m), rooms.least_side_m),
         length - rooms.thickness_m - rooms.least_side_m,
@@ -157,6 +159,7 @@ def _cut(
         slack = length + rooms.thickness_m - fit * step
         cut = fit // 2 * step - rooms.thickness_m + share * slack
         before, behind = rows * (fit // 2), rows * (fit - fit // 2)
+    # Rooms in proportion to the area, within what fits on either side.
     wanted = round(n * cut / (length - rooms.thickness_m))
     return low + cut, min(max(wanted, n - behind, 1), before, n - 1)
 
@@ -172,6 +175,7 @@ def _on_a_corridor(
     begin = floor.low[across] + depth + thick
     end = begin + width_m
     slots = rooms.slots(floor.side(along))
+    # Each side has at least one room and at most `slots`.
     least, most = max(1, count - slots), min(slots, count - 1)
     first = int(rng.integers(least, most, endpoint=True))
     done = [floor.between(across, begin, end)]
@@ -194,9 +198,11 @@ def _row(
 ) -> list[tuple[float, float, bool]]:
     """Return begin and end [m] of n rooms in a row, and whether each is the last."""
     slack = length - n * rooms.least_side_m - (n - 1) * rooms.thickness_m
+    # Random marks divide the slack between the rooms.
     marks = np.concatenate([[0.0], np.sort(rng.random(n - 1)), [1.0]])
     sides = rooms.least_side_m + max(slack, 0.0) * np.diff(marks)
     ends = low + np.cumsum(sides) + rooms.thickness_m * np.arange(n)
+    # Rounding must not leave a gap at the last wall.
     ends[-1] = low + length
     begins = np.concatenate([[low], ends[:-1] + rooms.thickness_m])
     return [
@@ -214,12 +220,14 @@ def _draw_doors(
     """Draw doors of a random spanning tree (Kruskal) of the rooms, corridors first, and more."""
     pairs = [pair for k in range(len(walls)) for pair in _neighbours(rooms, parts, walls, k)]
     order = [pairs[i] for i in rng.permutation(len(pairs)).tolist()]
+    # Rooms along a corridor get their door to it first; the sort is stable.
     if rooms.corridor_width_m is not None:
         order.sort(key=lambda pair: 0 not in pair[1])
     tree, others = [], []
     group = list(range(len(parts)))
     for pair in order:
         one, other = (group[room] for room in pair[1])
+        # Both rooms are already connected.
         if one == other:
             others.append(pair)
             continue
@@ -227,6 +235,7 @@ def _draw_doors(
         group = [one if each == other else each for each in group]
     chosen = tree + others[: round(rooms.extra_doors * len(others))]
     doors = []
+    # Three numbers per door, used or not, so that settings do not change other draws.
     for (wall, joined, low, high), numbers in zip(
         chosen, rng.random((len(chosen), 3)), strict=True
     ):
@@ -256,6 +265,7 @@ def _neighbours(
         for j in behind:
             low = max(parts[i].low[along], parts[j].low[along])
             high = min(parts[i].high[along], parts[j].high[along])
+            # A door needs space for its width and both edges.
             if high - low >= rooms.door_width_m[0] + 2.0 * EDGE_M - _LEAST_M:
                 found.append((k, (i, j), low, high))
     return found
@@ -281,6 +291,7 @@ def room_walls(plan: Plan, bounds: Bounds) -> tuple[Obstacles, Statics]:
                 parts.append((k, wall.between(along, door.low, door.high), door.height))
             here = door.high
         parts.append((k, wall.between(along, here, wall.high[along]), 0.0))
+    # Doors at the end of a wall leave pieces of length 0.
     parts = [part for part in parts if part[1].side(1 - plan.walls[part[0]][0]) > _LEAST_M]
     statics = Statics(
         names=(ROOM_WALL,) * len(plan.walls),

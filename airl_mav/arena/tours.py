@@ -76,6 +76,7 @@ def draw_tours(
         float(kind.dwell_s),
         float(kind.tour_min_s),
     )
+    # `math.dist` of Python lists has the same bits on every platform.
     way = points.tolist()
     # One extra leg between two tours. The last bit of the kernel's hypot depends on the platform.
     legs = np.fromiter(map(math.dist, way, way[1:]), np.float64)
@@ -113,6 +114,7 @@ def _walk_all(
         for _ in range(STARTS_PER_TOUR):
             if not draw_place(rng, halves[i], center[:at], half[:at], low, high, gap_m, start):
                 return points, counts[:i], speeds[:i]
+            # The speed is drawn once per obstacle.
             speeds[i] = slowest + (fastest - slowest) * rng.random()
             walk = _walk(
                 rng,
@@ -154,6 +156,7 @@ def _walk(
     while homing < HOMING_LEGS:
         here = points[count - 1]
         home = math.hypot(here[0] - start[0], here[1] - start[1])
+        # The tour is long enough: return to the start if the way is free.
         if count > 1 and elapsed + home / speed + dwell_s >= least_s:
             homing += 1
             if LEG_MIN_M <= home <= leg_max_m and segment_clear(here, start, center, half):
@@ -168,6 +171,7 @@ def _walk(
             return points[:1]
         elapsed += math.hypot(there[0] - here[0], there[1] - here[1]) / speed + dwell_s
         count += 1
+    # No free way home: walk the same way-points back.
     return np.concatenate((points[:count], points[:count][-2::-1]))
 
 
@@ -177,6 +181,7 @@ def set_out_later(arena: Arena, later_s: float) -> Arena:
         return arena
     tours = tuple(_begun_at(tour, -later_s % float(tour.times_s[-1])) for tour in arena.tours)
     center = arena.obstacles.center.copy()
+    # The arrays of obstacles hold the positions at time 0.
     center[arena.n_static :, :2] = [tour.points[0] for tour in tours]
     return replace(arena, obstacles=replace(arena.obstacles, center=center), tours=tours)
 
@@ -235,6 +240,7 @@ def _timed(
         times[at], places[at, 0], places[at, 1] = 0.0, points[first, 0], points[first, 1]
         for k in range(first + 1, first + counts[i]):
             for stop in range(1 + stops):
+                # A way-point has two times with a stop: arrival and departure.
                 times[at + 1] = times[at] + (dwell_s if stop else legs[k - 1] / speeds[i])
                 places[at + 1, 0], places[at + 1, 1] = points[k, 0], points[k, 1]
                 at += 1

@@ -92,6 +92,7 @@ def decoded(data: bytes, source: str) -> Triangles:
     if (problem := _problem(vertices, faces)) is not None:
         raise UsageError(f"{source}: {problem}")
     for each in (vertices, faces):
+        # The cache shares the arrays between callers.
         each.setflags(write=False)
     return Triangles(vertices, faces)
 

@@ -58,11 +58,13 @@ def build_bvh(triangles: Triangles) -> Bvh:
     corners = triangles.corners.astype(np.float64)
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(across, axis=1)
+    # Triangles of zero area have no normal and no hit.
     keep = area > 0.0
     corners, normals = corners[keep], across[keep] / area[keep, None]
     low, high = corners.min(axis=1), corners.max(axis=1)
     m = len(corners)
     order = np.arange(m, dtype=np.int32)
+    # A binary tree with at most m leaves has at most 2 m - 1 nodes.
     room = max(2 * m - 1, 1)
     bounds, links = np.zeros((room, 6)), np.zeros((room, 2), np.int32)
     count = _build(low, high, order, bounds, links)
@@ -101,6 +103,7 @@ def _build(
         begin, end, parent, level = waiting[tops]
         node = count
         count += 1
+        # A right child gets its index only when it is popped.
         if parent >= 0:
             links[parent, 0] = node
         bounds[node, :3], bounds[node, 3:] = math.inf, -math.inf
@@ -119,12 +122,15 @@ def _build(
         axis, place = -1, 0
         if level < DEEPEST:
             axis, place = _best_split(low, high, order, begin, end, from_low, from_high)
+        # Without a useful split, halves bound the depth of the tree.
         middle = (begin + end) // 2
         if axis >= 0:
+            # Partition `order` in place: boxes of bins up to `place` go left.
             per = BINS / (from_high[axis] - from_low[axis])
             first, last = begin, end - 1
             while first <= last:
                 i = order[first]
+                # The same expression as in `_best_split`, so that a box falls into the same bin.
                 at = min(int((low[i, axis] + high[i, axis] - from_low[axis]) * per), BINS - 1)
                 if at <= place:
                     first += 1
@@ -133,6 +139,7 @@ def _build(
                     last -= 1
             middle = first
         waiting[tops] = (middle, end, node, level + 1)
+        # Pushed last, the left child is popped first and becomes node + 1, as `Bvh` assumes.
         waiting[tops + 1] = (begin, middle, -1, level + 1)
         tops += 2
     return count
@@ -171,17 +178,20 @@ def _best_split(
             for each in range(3):
                 bin_low[at, each] = min(bin_low[at, each], low[i, each])
                 bin_high[at, each] = max(bin_high[at, each], high[i, each])
+        # Sweep from the right: cost of the boxes in bin `at` and above.
         side_low[:], side_high[:] = math.inf, -math.inf
         number = 0
         for at in range(BINS - 1, 0, -1):
             number += filled[at]
             right_area[at] = number * _grown_area(side_low, side_high, bin_low, bin_high, at)
+        # Sweep from the left. The cost of a side is its number of boxes times its surface area.
         side_low[:], side_high[:] = math.inf, -math.inf
         number = 0
         for at in range(BINS - 1):
             number += filled[at]
             cost = number * _grown_area(side_low, side_high, bin_low, bin_high, at)
             cost += right_area[at + 1]
+            # An empty side would split nothing.
             if number > 0 and number < end - begin and cost < best:
                 best, best_axis, best_bin = cost, axis, at
     return best_axis, best_bin
@@ -254,6 +264,7 @@ def forest_of(files: tuple[MeshFile, ...], ground: Ground | None = None) -> Fore
     links = []
     for tree, node, face in zip(trees, nodes, faces, strict=False):
         moved = tree.links.copy()
+        # A leaf's link points into the triangles, an inner node's link to a node.
         moved[:, 0] += np.where(moved[:, 1] > 0, face, node).astype(np.int32)
         links.append(moved)
     bvh = Bvh(
@@ -307,6 +318,7 @@ def raised(meshes: Meshes | None, position: Vec | NDArray[np.float64]) -> Vec:
     lowest = -MIN_DEPTH_M
     if meshes is not None:
         lowest -= plane_at(meshes.relief, position[0], position[1])[0]
+    # Down is positive, so the minimum is the higher position.
     return (position[0], position[1], min(position[2], lowest))
 
 
@@ -329,6 +341,7 @@ def meshes_of(
     """
     if not placed and ground is None and clear is None:
         return None
+    # Meshes of the same file share one tree.
     forest = forest_of(tuple(dict.fromkeys(each.file for each in placed)), ground)
     rows = placed_in(forest.roots, placed, n_obstacles, clear)
     return Meshes(forest.bvh, *rows, no_relief() if ground is None else ground.relief)

@@ -74,6 +74,7 @@ class Work(NamedTuple):
     def of(cls, width: int, height: int, cylindrical: bool) -> Work:
         """Return buffers for an image size; lines are rows, or columns of a cylinder."""
         n, m = (width, height) if cylindrical else (height, width)
+        # A block has at least one whole line.
         block = max(surfaces.BLOCK, m)
 
         def floats(*shape: int) -> Plane:
@@ -134,6 +135,7 @@ def render_colour(
     camera = raised(meshes, position)
     lines, xs = work.lines, work.xs
     view, axes = aim(lines, xs, quaternion, focal, cx, cy, cylindrical, RANGE_M)
+    # A cylinder is drawn by columns into work buffers, and transposed at the end.
     far, ids = (work.far, work.ids) if cylindrical else (depth, seen)
     rectangles = np.zeros((len(shape) + count_of(meshes), 3, 4), np.int32)
     faces = None if meshes is None else np.empty(far.shape, np.int32)
@@ -200,6 +202,7 @@ def _show(
         canvas, camera, scene.bounds, to_sun, float(light.extinction), let_through(gloss, WALLS_ROW)
     )
     shadows = Shaded(lit, far, ids, work.corners)
+    # Without sunlight `lit` has no effect, so bodies need no shadows.
     sunny = max(max(light.sun[0], light.sun[1]), light.sun[2]) > ZERO
     for i in range(len(scene.shape)):
         if sunny:
@@ -218,8 +221,10 @@ def _show(
         if is_owned(meshes, i):
             continue
         body = body_of(scene, optics.axes, camera, i)
+        # A cylinder may show a body at three turns, as in `raycast._draw_obstacle`.
         for k in range(3 if view.cylindrical else 1):
             surfaces.shade_obstacle(canvas, look, optics, body, rectangles[i, k])
+    # Reflections replace the pixels of surfaces that are not matt.
     if gloss is not None:
         draw_reflections(out, canvas.ids, rays, camera, scene, meshes, look)
     _blacken(out, optics.bent)

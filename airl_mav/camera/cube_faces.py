@@ -58,6 +58,7 @@ class Cube(NamedTuple):
 def side_for(camera: Intrinsics, samples: int) -> int:
     """Return the samples along each side of a pixel for a total number of samples."""
     side = min(MOST_SIDE, math.isqrt(samples))
+    # Large images get fewer samples, because the search holds all of them in memory.
     while side > 1 and side * side * camera.width * camera.height > MOST_PLACES:
         side -= 1
     return side
@@ -75,7 +76,9 @@ def cube_of(camera: Intrinsics, side: int) -> Cube:
     blind = ~rays_of(k).any(axis=0)
     rays[:, np.repeat(np.repeat(blind, side, axis=0), side, axis=1)] = 0.0
     rays = rays.reshape(3, -1)
+    # A pinhole of 90 degrees is two focal lengths wide.
     pixels = 2 * math.ceil(fine.focal * _finest(k))
+    # A ray leaves the cube through the face of its largest component.
     across = np.abs(rays).argmax(axis=0)
     sees = rays.any(axis=0)
     faces = []
@@ -106,6 +109,7 @@ def _finest(k: Intrinsics) -> float:
     """Return the maximum pixels per angle of an image, relative to the focal length."""
     if k.projection != "fisheye":
         return 1.0
+    # The slope of the lens polynomial is sampled over half the field of view.
     angles = np.linspace(0.0, min(0.5 * k.horizontal_fov_rad, sees_to(k.distortion)), 65)
     return float(np.max(steepness(angles, k.distortion)))
 
@@ -118,6 +122,7 @@ def _face(rays: Floats, places: NDArray[np.intp], axis: int, sign: float, pixels
     right[(axis + 1) % 3] = 1.0
     axes = np.stack([forward, right, np.cross(forward, right)])
     ahead, aside, below = axes @ rays
+    # The ratios are in -1..1 on a face; the clip catches rays on its edge.
     column, row = (
         np.clip(((0.5 + 0.5 * part / ahead) * pixels).astype(np.intp), 0, pixels - 1)
         for part in (aside, below)

@@ -27,6 +27,7 @@ Floats = NDArray[np.float64]
 MOVED_OVER_US = 1_000
 """Half interval of the central difference for velocities of moving obstacles [µs]."""
 
+# Distance from the optical axis below which 1 / z replaces theta_d / aside.
 _ON_AXIS = 1e-9
 
 
@@ -69,11 +70,13 @@ def optical_flow(
     rays = rays_of(camera)
     axes = quat_to_matrix(motion.quaternion)
     depth = picture.depth_m.astype(np.float64)
+    # Depth 0 is infinitely distant. Such points only turn, for which any depth will do.
     far = depth <= 0.0
     points = rays * np.where(far, 1.0, depth)
     number = picture.seen - OBSTACLE
     moves = np.zeros((*depth.shape, 3))
     if len(velocities):
+        # Only obstacles move; room and sky have numbers below OBSTACLE.
         moves = np.where((number >= 0)[..., None], velocities[np.maximum(number, 0)], 0.0)
     apart = (moves - motion.velocity) @ axes
     apart[far] = 0.0
@@ -86,10 +89,12 @@ def optical_flow(
 def _pushed(camera: Intrinsics, points: Floats, moves: Floats) -> tuple[Any, Any]:
     """Return the image velocity [px/s] of points (3, h, w) with velocities `moves` (3, h, w)."""
     (z, x, y), (dz, dx, dy), f = points, moves, camera.focal
+    # On the optical axis `aside` is 0; `np.where` selects the limit there.
     with np.errstate(invalid="ignore", divide="ignore"):
         if camera.projection == "pinhole":
             return f * (dx - x / z * dz) / z, f * (dy - y / z * dz) / z
         if camera.cylindrical:
+            # Derivatives of focal * atan2(x, z) and focal * y / hypot(x, z).
             square = x * x + z * z
             away = np.sqrt(square)
             receding = (x * dx + z * dz) / square

@@ -25,6 +25,7 @@ def jpeg_of(image: NDArray[np.uint8], quality: int) -> bytes:
     from PIL import Image
 
     written = io.BytesIO()
+    # Pillow requires (h, w) for grey.
     pixels = image[..., 0] if image.shape[2] == 1 else image
     Image.fromarray(pixels).save(written, "JPEG", quality=quality, subsampling="4:2:0")
     return written.getvalue()
@@ -44,6 +45,7 @@ def image_of(data: bytes, height: int, width: int, channels: int) -> NDArray[np.
             "the camera sends JPEG, and Pillow is not installed: pip install 'airl-mav[jpeg]'"
         ) from None
     try:
+        # Received data reaches no other decoder of Pillow.
         found = Image.open(io.BytesIO(data), formats=("JPEG",))
         mode = _MODES[channels]
         if found.size != (width, height) or found.mode != mode:
@@ -129,6 +131,7 @@ MOST_BYTES = _RIG_HEADER.size + MOST_IMAGES * _MOST_ADDED + 3 * MOST_PIXELS
 """Maximum size of a frame, 50 MB; bounds a receiver's buffer."""
 
 MM_PER_M = 1000.0
+# Maximum of uint16.
 MAX_MM = 65_535
 
 LEAST_PX, MOST_PX = 1e-3, 1e6
@@ -188,8 +191,10 @@ class Frame:
         """Return the wire form; a single image uses the format without additional cameras."""
         if not self.further:
             return self._message()
+        # The main image comes first with an empty name, as `_of_several` requires.
         parts = [("", self._message())]
         for name, each in self.further.items():
+            # Each part is a complete frame with its own header.
             alone = Frame(
                 self.sequence, self.capture_time_us, each.image, each.intrinsics, each.jpeg
             )
@@ -258,6 +263,7 @@ class Frame:
             except ValueError as error:
                 raise FrameError(str(error)) from None
             return cls(sequence, time_us, decoded, lens, jpeg)
+        # A read-only view of the message, without a copy.
         pixels = np.frombuffer(data, number, offset=begins)
         return cls(sequence, time_us, pixels.reshape(shape_of(kind, height, width)), lens)
 
@@ -290,12 +296,15 @@ def _of_several(kind: type[Frame], data: bytes) -> Frame:
         if len(data) < at:
             raise FrameError(f"{len(data)} bytes are too short for {count} images")
         message = data[begins : begins + size]
+        # Nesting would allow unbounded recursion.
         if message[: len(RIG_MAGIC)] == RIG_MAGIC:
             raise FrameError("a frame of several cameras within one")
+        # latin-1 decodes every byte, so a damaged name raises no UnicodeDecodeError.
         name = data[begins - named : begins].decode("latin-1")
         if name in taken or (not taken) != (name == ""):
             raise FrameError(f"camera {name!r}: accepted: first one without a name, then others")
         taken[name] = frame = kind.from_bytes(message)
+        # The sum is limited too, so that many images cannot exceed MOST_BYTES.
         pixels += frame.intrinsics.width * frame.intrinsics.height
         if pixels > MOST_PIXELS:
             raise FrameError(f"{pixels} pixels of several cameras: accepted: 1..{MOST_PIXELS}")

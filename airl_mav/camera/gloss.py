@@ -68,6 +68,7 @@ def let_through(gloss: Gloss | None, row: int) -> np.float32:
 @kernel
 def fresnel(cosine: float) -> float:
     """Return the reflected share of unpolarised light by the cosine of ray and normal, 0 to 1."""
+    # Cosine inside the medium by Snell's law, then the reflectance of each polarisation.
     inner = math.sqrt(1.0 - (1.0 - cosine * cosine) / (INDEX * INDEX))
     across = (cosine - INDEX * inner) / (cosine + INDEX * inner)
     along = (INDEX * cosine - inner) / (INDEX * cosine + inner)
@@ -78,6 +79,7 @@ def fresnel(cosine: float) -> float:
 def pane_reflects(cosine: float) -> float:
     """Return the reflectance of a thin pane, including multiple internal reflections."""
     once = fresnel(cosine)
+    # Sum of the series r + (1 - r)² r / (1 - r²).
     return 2.0 * once / (1.0 + once)
 
 
@@ -105,11 +107,13 @@ def highlight(alpha: float, normal: Vec, ray: Vec, to_sun: Vec) -> tuple[float, 
     if sun <= 0.0 or eye <= 0.0:
         return 0.0, 1.0
     h = (to_sun[0] - ray[0], to_sun[1] - ray[1], to_sun[2] - ray[2])
+    # GGX distribution at the half vector.
     per = 1.0 / max(math.sqrt(dot(h, h)), 1e-12)
     half = per * dot(normal, h)
     spread = half * half * (alpha * alpha - 1.0) + 1.0
     # The distribution's 1/pi cancels with the radiance of a white matt surface, also 1/pi.
     facets = alpha * alpha / (spread * spread)
+    # The cosine of the sun cancels with the irradiance of the surface.
     value = facets * _visible(alpha, sun) * _visible(alpha, eye) / (4.0 * eye)
     return value, -per * dot(h, ray)
 
@@ -130,6 +134,7 @@ def mirrored(ray: Vec, normal: Vec) -> Vec:
 @kernel
 def spread(number: int) -> tuple[float, float]:
     """Return one of `SAMPLES` evenly distributed points in the unit square (Hammersley)."""
+    # Bit reversal of a number of three bits.
     mirrored_bits = 4 * (number & 1) + (number & 2) + ((number & 4) >> 2)
     return (number + 0.5) / SAMPLES, (mirrored_bits + 0.5) / SAMPLES
 
@@ -143,6 +148,7 @@ def facet(alpha: float, normal: Vec, ray: Vec, u: float, v: float) -> Vec:
     b = normal[0] * normal[1] * a
     first = (1.0 + sign * normal[0] * normal[0] * a, sign * b, -sign * normal[0])
     second = (b, sign + normal[1] * normal[1] * a, -normal[1])
+    # Stretched by alpha, the visible facets form a hemisphere (Heitz, 2018).
     x, y, z = -alpha * dot(first, ray), -alpha * dot(second, ray), -dot(normal, ray)
     per = 1.0 / math.sqrt(x * x + y * y + z * z)
     x, y, z = per * x, per * y, per * z
@@ -150,12 +156,14 @@ def facet(alpha: float, normal: Vec, ray: Vec, u: float, v: float) -> Vec:
     p0, p1 = (-y / level, x / level) if level > 1e-9 else (1.0, 0.0)
     # Third axis: (x, y, z) times (p0, p1, 0).
     q0, q1, q2 = -z * p1, z * p0, x * p1 - y * p0
+    # Sample its projection: a disk, one half compressed by the tilt of the view.
     radius, angle = math.sqrt(u), 2.0 * math.pi * v
     s, t = radius * math.cos(angle), radius * math.sin(angle)
     share = 0.5 * (1.0 + z)
     t = (1.0 - share) * math.sqrt(max(1.0 - s * s, 0.0)) + share * t
     w = math.sqrt(max(1.0 - s * s - t * t, 0.0))
     m0, m1, m2 = s * p0 + t * q0 + w * x, s * p1 + t * q1 + w * y, t * q2 + w * z
+    # Undo the stretch.
     m0, m1, m2 = alpha * m0, alpha * m1, max(m2, 0.0)
     per = 1.0 / max(math.sqrt(m0 * m0 + m1 * m1 + m2 * m2), 1e-12)
     return (

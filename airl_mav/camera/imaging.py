@@ -145,6 +145,7 @@ class ImageFormation:
         """Return the gain for the target's mean light, times `off`; extremes saturate."""
         settles = self.gain is None or auto.time_constant_s == 0.0
         gain = 1.0 if settles or self.gain is None else self.gain
+        # Clipped pixels hide part of the light, so a settled gain needs several images.
         for _ in range(MOST_METERED if settles else 1):
             mean = _mean_light(self._codes(arena, elapsed_us, motion, 0, gain))
             due = min(
@@ -152,6 +153,7 @@ class ImageFormation:
                 auto.most_gain,
             )
             if not settles:
+                # First-order lag of log(gain) over the time since the previous image.
                 passed_s = (frame - self._frame) * self._period_s
                 share = -math.expm1(-passed_s / auto.time_constant_s)
                 return float(gain * (due / gain) ** share)
@@ -164,6 +166,7 @@ class ImageFormation:
     def _formed(self, light: Light, gain: float, seed: int, frame: int) -> FormedImage:
         """Return the image of light (h, w, channels) after lens and sensor."""
         asked, channels = self._imaging, light.shape[2]
+        # The order of a camera: lens, Bayer filter, photons and readout, demosaicing, sRGB, JPEG.
         if self._through is not None:
             light = light * self._through
         if asked.bayer:
@@ -172,11 +175,13 @@ class ImageFormation:
             rng = stream(seed, Stream.PHOTONS, frame, *self._own)
             light = noisy(light, gain, asked.full_well_e, asked.read_noise_e, rng)
         if asked.bayer:
+            # The sensor saturates before the interpolation.
             light = demosaiced(np.minimum(light, np.float32(1.0)))
         image: NDArray[Any] = codes_of(light)
         if asked.jpeg_quality is None:
             return FormedImage(image, None)
         jpeg = jpeg_of(image, asked.jpeg_quality)
+        # The decoded JPEG is the image, so that the image has the compression errors.
         return FormedImage(image_of(jpeg, image.shape[0], image.shape[1], channels), jpeg)
 
 
@@ -184,6 +189,7 @@ def _off_by(asked: Imaging, seed: int, own: tuple[int, ...]) -> float:
     """Return the random gain factor of an episode; `own` as in `streams.words_of`."""
     if not asked.gain_spread_ev:
         return 1.0
+    # Uniform in exposure values, that is in powers of two.
     share = 2.0 * stream(seed, Stream.EXPOSURE, *own).random() - 1.0
     return float(2.0 ** (asked.gain_spread_ev * share))
 
@@ -193,6 +199,7 @@ def _mean_light(codes: NDArray[np.uint8]) -> float:
     weights = LUMINANCE if codes.shape[2] == 3 else np.ones(1)
     mean = 0.0
     for channel, weight in enumerate(weights.tolist()):
+        # A histogram replaces one table look-up per pixel.
         counts = np.bincount(codes[..., channel].ravel(), minlength=256)
         mean += weight * float(counts @ LIGHT_OF.astype(np.float64)) / counts.sum()
     return mean
@@ -259,9 +266,11 @@ def demosaiced(raw: Light) -> Light:
     """Return RGB light (h, w, 3) of a mosaic (h, w) by bilinear interpolation."""
     height, width = raw.shape
     red, blue = np.zeros_like(raw), np.zeros_like(raw)
+    # Positions of red and blue in RGGB.
     red[::2, ::2] = blue[1::2, 1::2] = 1.0
     found = np.empty((height, width, 3), np.float32)
     for channel, here in enumerate((red, 1.0 - red - blue, blue)):
+        # Green neighbours lie beside, above and below; red and blue ones at the corners too.
         cross = channel == 1
         total, weight = _around(raw * here, cross=cross), _around(here, cross=cross)
         between = total / np.maximum(weight, np.float32(1e-6))

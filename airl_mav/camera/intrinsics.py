@@ -69,6 +69,7 @@ class Intrinsics:
             focal = width / (2.0 * distorted(0.5 * horizontal_fov, distortion))
         else:
             focal = 0.5 * width / math.tan(0.5 * horizontal_fov)
+        # Pixel centres are integers, so the middle of the image is (n - 1) / 2.
         cx, cy = 0.5 * (width - 1), 0.5 * (height - 1)
         return cls(width, height, focal, cx, cy, projection, kind, distortion)
 
@@ -132,6 +133,7 @@ def finer(camera: Intrinsics, side: int) -> Intrinsics:
         width=side * k.width,
         height=side * k.height,
         focal=side * k.focal,
+        # Pixel centres are integers, so the edge of the image is half a pixel off.
         cx=side * (k.cx + 0.5) - 0.5,
         cy=side * (k.cy + 0.5) - 0.5,
     )
@@ -143,6 +145,7 @@ def fisheye_rays(camera: Intrinsics) -> NDArray[np.float64]:
     down = ((np.arange(camera.height) - camera.cy) / camera.focal)[:, None]
     out = np.hypot(across, down)
     off = undistorted(out, camera.distortion)
+    # `undistorted` returns infinity beyond the valid angle.
     outside = np.isinf(off)
     off[outside] = 0.0
     # sin(off) / out, which is 1 in the middle.

@@ -62,6 +62,7 @@ def part_of(
     f, r, d = pose.forward, pose.along, pose.across
     z, deep = dot(f, middle), _reach(f, half)
     near, far = z - deep, z + deep
+    # Behind the image plane, or beyond the range.
     if far <= 0.0 or near * view.s_min > 1.0:
         return near, NOWHERE
     x, y, wide, high = dot(r, middle), dot(d, middle), _reach(r, half), _reach(d, half)
@@ -96,6 +97,7 @@ def between(
     outer: Rectangle,
 ) -> Rectangle:
     """Return the pixels that see a box along the camera's axes, in front of the image plane."""
+    # A side off the axis has its extreme slope at the near depth, otherwise at the far depth.
     per_near, per_far = 1.0 / max(near, NEAR), 1.0 / max(far, NEAR)
     return pixels(
         view,
@@ -204,6 +206,7 @@ def draw_triangle(
         near, far = min(min(z0, z1), z2), max(max(z0, z1), z2)
         if far <= 0.0:
             return
+        # With all corners in front the projection is exact; otherwise the depth range bounds it.
         if near > NEAR:
             g0, g1, g2 = 1.0 / z0, 1.0 / z1, 1.0 / z2
             least, most = min(min(g0, g1), g2), max(max(g0, g1), g2)
@@ -235,6 +238,7 @@ def draw_triangle(
     sides = _sides(p0, p1, p2)
     if sides.gain == 0.0:
         return
+    # The volumes and the inverse depth are affine along a line; only their start changes.
     slope0, slope1, slope2 = dot(sides.n0, r), dot(sides.n1, r), dot(sides.n2, r)
     slope = dot(sides.normal, r)
     for v in range(part[0], part[1]):
@@ -248,6 +252,7 @@ def draw_triangle(
             if min(min(e0, e1), e2) >= -sides.spare:
                 # Limits rounding for a triangle that is almost edge on.
                 s = min(max(sides.gain * (start + x * slope), least), most)
+                # `s` is in units of the mesh, the image in 1/m.
                 s32 = np.float32(per * s)
                 if s >= view.s_min and s32 > out[v, u]:
                     out[v, u] = s32

@@ -58,6 +58,7 @@ def draw_meshes(
     `bent` is `optics.bent`. `ids`, `faces` and `drawn_in` are all None or all given; `drawn_in` is
     written after the obstacles, in the first row of each mesh.
     """
+    # Each pending node has its index and a rectangle.
     waiting = np.empty((STACK, 5), np.int32)
     nearest = np.empty(STACK)
     for k in range(len(meshes.root)):
@@ -84,6 +85,7 @@ def _draw_mesh(
     lines, xs, view, bvh, root = optics.lines, optics.xs, optics.lens, meshes.bvh, meshes.root[k]
     number, scale = OBSTACLE + meshes.first[k], meshes.pose[k, 4]
     pose = seen_from(optics, meshes.pose, k)
+    # The range in units of the mesh.
     own = projection.ImageProjection(
         view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, view.cylindrical
     )
@@ -106,6 +108,7 @@ def _draw_mesh(
             int(waiting[tops, 3]),
             int(waiting[tops, 4]),
         )
+        # A single ray traverses the rest of the tree without projected boxes.
         if (part[1] - part[0]) * (part[3] - part[2]) == 1:
             v, u = part[0], part[2]
             f, d, ahead, y = pose.forward, pose.across, lines[v, 0], lines[v, 1]
@@ -115,6 +118,7 @@ def _draw_mesh(
                 tops,
             )  # fmt: skip
             continue
+        # `per / nearest` is the maximum inverse depth of the node [1/m].
         if _hidden(out, part, per / nearest[tops]):
             continue
         first, count = bvh.links[node, 0], bvh.links[node, 1]
@@ -238,6 +242,7 @@ def _cast(
     if not leave >= max(enter, 0.0):
         return
     while True:
+        # A hit since the push may be nearer than the node.
         if enter <= most:
             first, count = links[node, 0], links[node, 1]
             if count == 0:
@@ -247,6 +252,7 @@ def _cast(
                 hit = leave >= max(enter, 0.0) and enter <= most
                 hit_r = leave_r >= max(enter_r, 0.0) and enter_r <= most
                 if hit and hit_r:
+                    # Hits in the nearer child shorten `most` for the other one.
                     if enter_r < enter:
                         left, right, enter = right, left, enter_r
                     waiting[tops, 0] = right
@@ -268,6 +274,7 @@ def _cast(
                             ids[v, u] = number
                         if faces is not None:
                             faces[v, u] = i
+        # Nodes below `bottom` belong to the caller.
         if tops == bottom:
             return
         tops -= 1
@@ -335,12 +342,14 @@ def stopped_by(
     Arguments as in `distance_to`; `inverse` (3,) is the reciprocal of `sun`, and `last` the
     triangle that hid the previous point, tested first.
     """
+    # The triangle that hid the previous point often hides this one too.
     if last >= 0 and _stops(bvh.corners, last, at, sun, least):
         return last
     boxes, links = bvh.boxes, bvh.links
     tops, node = 0, root
     while True:
         enter, leave = _span_of(boxes, node, at, inverse)
+        # The first hit ends the search, so the order of the children is free.
         if leave >= max(enter, least):
             count = links[node, 1]
             if count == 0:
@@ -412,6 +421,7 @@ def _distance(corners: NDArray[np.float32], i: int, at: Vec, way: Vec) -> float:
     volume = a0 * h0 + a1 * h1 + a2 * h2
     if volume == 0.0:
         return -math.inf
+    # Barycentric coordinates u and v, then the distance.
     per = 1.0 / volume
     s0, s1, s2 = at[0] - p0, at[1] - p1, at[2] - p2
     u = per * (s0 * h0 + s1 * h1 + s2 * h2)

@@ -97,6 +97,7 @@ class PathTracer:
         if self._cube is None or self._cube[0] != k:
             self._cube = k, cube_of(k, side)
         cube = self._cube[1]
+        # The samples of a pixel share its paths.
         samples = math.ceil(self._samples / (side * side))
         images = []
         for number, face in enumerate(cube.faces):
@@ -150,6 +151,7 @@ def _sensor(mi: Any, axes: Floats, position: Floats, film: _Film, samples: int) 
 
 def _lights(mi: Any, light: Light) -> dict[str, Any]:
     """Return sun and sky. A white surface reflects 1 / pi of its irradiance in each direction."""
+    # Sine of each row's elevation; 0 below the horizon.
     sine = np.sin((0.5 - (np.arange(_SKY_ROWS) + 0.5) / _SKY_ROWS) * math.pi).clip(0.0)
     rows = light.horizon + sine[:, None] * (light.zenith - light.horizon)
     sky = np.repeat(rows[:, None], 2 * _SKY_ROWS, axis=1).astype(np.float32)
@@ -165,6 +167,7 @@ def _lights(mi: Any, light: Light) -> dict[str, Any]:
     if light.sun.any():
         lights["sun"] = {
             "type": "directional",
+            # Mitsuba expects the direction of the light's travel.
             "direction": (-light.to_sun).tolist(),
             "irradiance": {"type": "rgb", "value": (math.pi * light.sun).tolist()},
         }
@@ -247,6 +250,7 @@ def _ground(mi: Any, finish: Finish) -> dict[str, Any]:
     dark, bright = finish.albedo[FLOOR]
     mean = dark + mean_of(finish, FLOOR) * (bright - dark)
     pose = np.diag([RANGE_M, RANGE_M, 1.0, 1.0])
+    # Down is positive, so the floor covers it.
     pose[2, 3] = 0.01
     return {"type": "disk", "to_world": mi.ScalarTransform4f(pose), "bsdf": _diffuse(mean)}
 
@@ -327,6 +331,7 @@ def _triangles(mi: Any, finish: Finish, row: int, corners: Floats, placed: Float
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict(_material(mi, finish, row, (1.0, 1.0), (0.0, 0.0)))
     count = len(corners)
+    # Vertices are not shared, because each triangle has its own texture coordinates.
     mesh = mi.Mesh("mesh", 3 * count, count, has_vertex_texcoords=True, props=properties)
     data = mi.traverse(mesh)
     data["vertex_positions"] = placed.astype(np.float32).ravel()
@@ -393,6 +398,7 @@ def _material(
     texture = {
         "type": "bitmap",
         "bitmap": mi.Bitmap(mixed),
+        # Albedos are linear, so Mitsuba must not convert them from sRGB.
         "raw": True,
         "filter_type": "nearest",
         "to_uv": mi.ScalarTransform4f(place),

@@ -84,6 +84,7 @@ def _match(
             if depth_mm[row, column] == 0:
                 continue
             true_m = depth_mm[row, column] / MM_PER_M
+            # Column of the point in the right image.
             there = column - matching.shift_px_m / true_m
             if -0.5 <= there < covered:
                 disparity = matching.disparity_px_m / true_m
@@ -94,6 +95,7 @@ def _match(
                     measured_m = matching.disparity_px_m / disparity
                     if measured_m <= matching.range_m:
                         in_mm = np.rint(MM_PER_M * measured_m)
+                        # 0 means no return, so the minimum is 1 mm.
                         found[row, column] = min(max(in_mm, 1.0), MAX_MM)
             covered = min(covered, there)
 
@@ -157,6 +159,7 @@ def ranged_depth(
     measured = depth + sd * rng.standard_normal(depth.shape)
     kept = (depth_mm > 0) & (rng.random(depth.shape) >= ranging.lost_share)
     kept &= (measured >= ranging.least_m) & (measured <= range_m)
+    # 0 means no return, so the minimum is 1 mm.
     in_mm = np.clip(np.rint(MM_PER_M * measured), 1, MAX_MM)
     result: NDArray[np.uint16] = np.where(kept, in_mm, 0).astype(np.uint16)
     return result
@@ -167,6 +170,7 @@ def noisy_depth(
 ) -> NDArray[np.uint16]:
     """Return Z16 images (..., h, w) with a stereo camera's noise and missing pixels."""
     depth = depth_mm / MM_PER_M
+    # At NOISE_AT_M the standard deviation is `depth_noise` times the depth.
     sd = asked.depth_noise * depth * depth / NOISE_AT_M
     noisy = np.rint(MM_PER_M * (depth + sd * rng.standard_normal(depth.shape)))
     kept = (depth_mm > 0) & (rng.random(depth.shape) >= asked.depth_dropout)

@@ -52,6 +52,7 @@ class ColourArrays:
         floor = finish.albedo[FLOOR_ROW]
         share = mean_of(finish, FLOOR_ROW)
         sky = light.sky
+        # Down is positive, so -to_sun[2] is the cosine of sun and zenith.
         radiosity = (floor[0] + share * (floor[1] - floor[0])) * (sky - light.to_sun[2] * light.sun)
         if (inside := light.inside) is not None:
             # An upright surface then receives (sky + radiosity) / 2 = `inside.walls`.
@@ -127,6 +128,7 @@ def grey(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def write_grey(out: NDArray[np.uint8], rgb: NDArray[np.uint8]) -> None:
     """Write the luma (n,) of sRGB pixels (n, 3)."""
     red, green, blue = np.uint32(LUMA[0]), np.uint32(LUMA[1]), np.uint32(LUMA[2])
+    # Half of 2^16 rounds the shifted sum to the nearest integer.
     half, shift = np.uint32(1 << 15), np.uint32(16)
     for u in range(len(out)):
         luma = np.uint32(rgb[u, 0]) * red + np.uint32(rgb[u, 1]) * green
@@ -145,6 +147,7 @@ def antialiased(
     """Return an sRGB image with side x side rays per pixel, for display; sensors use one ray."""
     k, fine = intrinsics, finer(intrinsics, side)
     codes = render_picture(arena, centers, fine, position, quaternion).rgb
+    # The mean is taken of linear light, not of sRGB codes.
     light = linear_of(np.arange(256) / 255.0)[codes]
     mean = light.reshape(k.height, side, k.width, side, 3).mean(axis=(1, 3))
     rgb: NDArray[np.uint8] = np.rint(255.0 * srgb_of(mean)).astype(np.uint8)

@@ -53,6 +53,7 @@ def _slab(low: float, high: float) -> _Slab:
         return _Slab(1.0 / max(low, TINY), 0.0, 1.0 / max(high, TINY), 0.0)
     if high < 0.0:
         return _Slab(1.0 / min(high, -TINY), 0.0, 1.0 / min(low, -TINY), 0.0)
+    # Between the planes the entry is behind the camera; the exit is the plane ahead.
     return _Slab(0.0, _UNLIMITED, 1.0 / min(low, -TINY), 1.0 / max(high, TINY))
 
 
@@ -87,6 +88,7 @@ def draw_room(
     lid = 1.0 / (max(top, TINY) if above else min(top, -TINY))
     enter_gain, enter_base, exit_gain = (lid, 0.0, 0.0) if above else (0.0, _UNLIMITED, lid)
     covered, lid_seen = closed and above, 1.0 if closed else 0.0
+    # A camera in the room needs no entry test, so that loop is shorter.
     if north.enter_base > 0.0 and east.enter_base > 0.0 and not above:
         _draw_room_around(out, ids, optics, pose, north, east, floor, lid, lid_seen)
         return
@@ -97,6 +99,7 @@ def draw_room(
             marks = ids[v]
         for u in range(len(xs)):
             n, e, d = ray_of(pose, optics.bent, v, u, start, xs[u])
+            # Of several entries the last counts, which has the smallest inverse depth.
             by_side = min(
                 north.enter_gain * n + north.enter_base, east.enter_gain * e + east.enter_base
             )
@@ -108,12 +111,14 @@ def draw_room(
             leave_lid = exit_gain * d
             inner = leave if leave >= leave_lid else lid_seen * leave_lid
             inner = by_lid if covered else inner
+            # An entry through a wall shows its outer side, an entry through the lid the inside.
             s = by_side if by_side < by_lid else inner
             enters = min(by_side, by_lid) >= max(leave, leave_lid)
             s = s if enters else 0.0
             s = s if s >= optics.lens.s_min else 0.0
             row[u] = s
             if ids is not None:
+                # The surface's number follows from the same comparisons.
                 inwards = by_side < by_lid
                 norths = max(north.exit_a * n, north.exit_b * n)
                 easts = max(east.exit_a * e, east.exit_b * e)
@@ -187,6 +192,7 @@ def draw_box(
             marks = ids[v, left:end]
         for u in range(len(x_span)):
             a, b, d = ray_of(body.pose, optics.bent, v, left + u, start, x_span[u])
+            # A convex body is hit if its last entry is no farther than its first exit.
             enter = min(
                 i.enter_gain * a + i.enter_base,
                 min(j.enter_gain * b + j.enter_base, k.enter_gain * d + k.enter_base),
@@ -259,6 +265,7 @@ def draw_sphere(
             marks = ids[v, left:end]
         for u in range(len(x_span)):
             a, b, d = ray_of(body.pose, optics.bent, v, left + u, start, x_span[u])
+            # The larger root of (c.c - radius²) s² - 2 (d.c) s + d.d = 0 is the entry.
             toward = a * c[0] + b * c[1] + d * c[2]
             square = toward * toward - cc * (a * a + b * b + d * d)
             s = gain * (toward + math.sqrt(max(square, 0.0)))

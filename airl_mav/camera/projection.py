@@ -187,12 +187,15 @@ def pinhole_rectangle(
     z, x, y = dot(f, c), dot(r, c), dot(d, c)
     reach = _reach(f, half, sphere)
     radius = half[0] if sphere else math.sqrt(dot(half, half))
+    # Behind the camera, or beyond the range.
     if z + reach <= 0.0 or (z - reach) * view.s_min > 1.0:
         return 0, 0, 0, 0
+    # Corners at or behind the image plane have no projection: use the enclosing sphere.
     if sphere or z - reach < MIN_DEPTH_M:
         left, right = _span(z, x, radius)
         top, bottom = _span(z, y, radius)
     else:
+        # All corners are in front of the camera, so their projections bound the body.
         left, right, top, bottom = _WIDE, -_WIDE, _WIDE, -_WIDE
         for corner in range(8):
             i = half[0] if corner & 1 else -half[0]
@@ -229,9 +232,11 @@ def cylinder_span(out: Image, view: ImageProjection, pose: Pose, half: Vec, sphe
     if near < MIN_DEPTH_M:
         # The body may cross the cylinder's axis: above, below or around the camera.
         return 0.0, float(out.shape[0]), 0, out.shape[1]
+    # A box is bounded by its full width at its minimum distance.
     half_angle = math.asin(lateral / distance) if sphere else math.atan2(lateral, near)
     far = math.hypot(distance + reach, lateral)
     top, bottom = y - vertical, y + vertical
+    # An edge off the axis is steepest at the minimum distance, otherwise at the maximum.
     top = top / near if top < 0.0 else top / far
     bottom = bottom / near if bottom > 0.0 else bottom / far
     centre = view.line_centre + view.focal * bearing
@@ -263,10 +268,12 @@ def fisheye_rectangle(
     radius = half[0] if sphere else math.sqrt(dot(half, half))
     if (distance - radius) * view.s_min > 1.0:
         return 0, 0, 0, 0
+    # The camera is inside the enclosing sphere.
     if distance <= radius:
         return 0, out.shape[0], 0, out.shape[1]
     off, spread = math.atan2(aside, z), math.asin(radius / distance)
     inner, outer = _way_out(view, bent, off - spread), _way_out(view, bent, off + spread)
+    # A sphere across the optical axis covers a disk, any other one a ring sector.
     left, right, top, bottom = -outer, outer, -outer, outer
     if off > spread and off + spread < math.pi:
         # Half of the angle about the optical axis that the body covers.
@@ -292,6 +299,7 @@ def _way_out(view: ImageProjection, bent: Bent, angle: float) -> float:
 def _reached(first: float, last: float, inner: float, outer: float) -> tuple[float, float]:
     """Return the extent of a ring sector, between two angles, along the axis of angle 0."""
     turn = 2.0 * math.pi
+    # Extremes of the cosine: at the ends, or 1 and -1 inside the interval.
     high = max(math.cos(first), math.cos(last))
     low = min(math.cos(first), math.cos(last))
     if math.floor(last / turn) >= math.ceil(first / turn):

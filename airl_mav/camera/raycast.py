@@ -119,6 +119,7 @@ def _draw_obstacle(
 def invert(out: Image) -> None:
     """Convert inverse depth to depth [m], in place."""
     zero, one = np.float32(0.0), np.float32(1.0)
+    # The limits keep the quotient finite and raise near depths to MIN_DEPTH_M.
     least, most = np.float32(TINY), np.float32(1.0 / MIN_DEPTH_M)
     for v in range(out.shape[0]):
         row = out[v]
@@ -162,6 +163,7 @@ def aim(
     )
     s_min = max(1.0 / max_range, TINY)
     nowhere = (0.0, 0.0, 0.0)
+    # The lines of a cylinder are columns: across is right, along is down.
     if cylindrical:
         for u in range(len(lines)):
             angle = (u - cx) / focal
@@ -204,6 +206,7 @@ def draw_bodies(
     pose = Pose(axes.forward, axes.across, axes.along, room)
     draw_room(out, ids, optics, pose, half_room, bounds[5] > 0.0)
     for i in range(len(scene.shape)):
+        # A mesh is drawn in place of its obstacles.
         if is_owned(meshes, i):
             continue
         kept = None if drawn_in is None else drawn_in[i]

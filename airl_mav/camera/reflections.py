@@ -102,6 +102,7 @@ def draw_reflections(
     colour, bodies = np.empty(3), bodies_of(scene)
     for u in range(len(out)):
         seen = ids[u]
+        # Sky and ceiling have no material.
         if seen in (SKY, CEILING) or look.gloss.surface[row_of(seen)] == gloss.MATT:
             continue
         n, e, d = float(rays.north[u]), float(rays.east[u]), float(rays.down[u])
@@ -137,6 +138,7 @@ def _grown(
     tree: NDArray[np.float64], tops: int, seen: RayHit, ray: Vec, share: Vec, blur: float
 ) -> int:
     """Push a ray with a sufficient contribution; return the number of pending rays."""
+    # A full stack drops rays too.
     if max(max(share[0], share[1]), share[2]) < _COUNTS or tops == _WAITING:
         return tops
     _wait(tree, tops, seen.at, ray, share, seen.way, seen.depth + 1, max(seen.blur, blur))
@@ -173,6 +175,7 @@ def _follow(
     """Write the linear RGB (3,) of a tree's first ray; `nodes` (STACK,) is a buffer."""
     colour[:] = 0.0
     tops, followed, light = 1, 0, look.light
+    # The limit bounds the time for a pixel between mirrors.
     while tops > 0 and followed < MOST_RAYS:
         tops -= 1
         followed += 1
@@ -184,6 +187,7 @@ def _follow(
         if met.seen == SKY:
             _add(colour, share, sky_at(light, ray, origin[2]), 1.0)
             continue
+        # Beer's law: fog adds the horizon's light and attenuates the rest.
         if light.extinction > shading.ZERO:
             clear = math.exp(-float(light.extinction) * met.distance)
             _add(colour, share, light.horizon, 1.0 - clear)
@@ -205,6 +209,8 @@ def _follow(
             continue
         arrives = 0.0
         if _shines(light) and dot(seen.normal, _sun(light)) > 0.0:
+            # A mesh may shade itself, so its ray starts above the surface; `own` excludes convex
+            # bodies.
             begin = advanced(seen.at, seen.normal, ABOVE_M) if met.mesh >= 0 else seen.at
             arrives = sunlight(bodies, meshes, look.gloss.lets, met.seen, begin, _sun(light), nodes)
         if kind != gloss.METAL:
@@ -277,6 +283,7 @@ def _shine(
 @large_borrowing_kernel
 def _mirror(tree: NDArray[np.float64], tops: int, seen: RayHit, kind: int) -> int:
     """Push the mirrored rays of metal or varnish; return the number of pending rays."""
+    # Only the first hit is sampled, because the rays multiply at each further hit.
     many = 1 if seen.depth > 0 or gloss.is_smooth(seen.alpha) else gloss.SAMPLES
     for number in range(many):
         u, v = gloss.spread(number)
@@ -343,6 +350,7 @@ def albedo_at(
                 across, along = shading.on_sphere(a, b, c, per_turn)
     if not in_periods:
         across, along = across * per_m, along * per_m
+    # An oblique surface has more texels per pixel.
     steep = max(shading.F32(-dot(place.normal, ray)), shading.STEEP)
     texels = shading.texels2(surface, pixel2) * shading.F32(way) * shading.F32(way) / steep
     at = shading.texel_at(across + surface.offset[0], along + surface.offset[1], texels)
@@ -363,6 +371,7 @@ def albedo_at(
 def sky_at(light: shading.Lit, ray: Vec, down: float) -> Vec:
     """Return linear RGB of the sky, or of the ground below the horizon, as `draw_sky`."""
     rise, through = -ray[2], 1.0
+    # The path through fog ends at the top of the layer, or at the floor.
     if light.extinction > 0.0:
         thick = FOG_LAYER_M if rise > 0.0 else max(-down, 1e-3)
         through = math.exp(-float(light.extinction) * thick / max(abs(rise), 1e-6))

@@ -72,6 +72,7 @@ def camera_pose(
     # A positive rotation about the body's right axis raises the nose.
     half = 0.5 * mount.pitch_up
     tilt = (math.cos(half), 0.0, math.sin(half), 0.0)
+    # Intrinsic order: yaw about the body's down axis, then pitch.
     if mount.yaw != 0.0:
         turn = 0.5 * mount.yaw
         tilt = multiply((math.cos(turn), 0.0, 0.0, math.sin(turn)), tilt)

@@ -170,6 +170,7 @@ def meet(
         enter, leave = _span(bodies, i, origin, ray)
         if leave < enter:
             continue
+        # A ray that starts inside a body, as in glass, hits the far side.
         t = enter if enter > LEAST_M else leave
         if LEAST_M < t < best:
             best, seen = t, primitives.OBSTACLE + i
@@ -237,6 +238,7 @@ def _on_obstacle(bodies: Bodies, i: int, p: Vec, ray: Vec) -> SurfacePoint:
     a, b, c = primitives.turn_axes((p[0] - center[0], p[1] - center[1], p[2] - center[2]), cos, sin)
     side = 3
     if bodies.shape[i] == primitives.BOX:
+        # The face has the largest coordinate relative to the half size.
         qa, qb, qc = abs(a) / half[0], abs(b) / half[1], abs(c) / half[2]
         side = 2 if qc >= max(qa, qb) else (0 if qa >= qb else 1)
         outward = c if side == 2 else (a if side == 0 else b)
@@ -272,6 +274,7 @@ def sunlight(
     for side in range(4):
         axis = side // 2
         t = (bounds[side] - at[axis]) * inverse_of(to_sun[axis])
+        # Excludes the wall that holds the point; the same distance as `shadows._STEP_M`.
         if t <= 1e-3:
             continue
         p = advanced(at, to_sun, t)
@@ -279,6 +282,7 @@ def sunlight(
         if bounds[2 * other] <= p[other] <= bounds[2 * other + 1] and -bounds[4] <= p[2] <= 0.0:
             share *= lets[WALLS_ROW]
     for i in range(len(bodies.shape)):
+        # An opaque body ends the search.
         if share == 0.0:
             return 0.0
         if is_owned(meshes, i) or own == primitives.OBSTACLE + i:

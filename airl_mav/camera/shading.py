@@ -123,6 +123,7 @@ def surface_of(look: SceneLook, i: int) -> Surface:
         albedo[i, 1, 2] - dark[2],
     )
     base = np.int64(texture[i]) * STRIDE
+    # Procedural patterns are grey: one plane serves all channels.
     step = np.int64(STRIDE) if texture[i] >= _IMAGES else np.int64(0)
     return Surface(base, step, per_m[i], (offset[i, 0], offset[i, 1]), dark, more)
 
@@ -147,6 +148,7 @@ def texel_at(u: np.float32, v: np.float32, texels2: np.float32) -> np.int32:
     # A coordinate just below an integer may round up to it.
     column = min(F32(I32(_part(u) * side)), side - ONE)
     row = min(F32(I32(_part(v) * side)), side - ONE)
+    # A level of n x n texels begins at n², see `textures.STRIDE`.
     return I32(side * (side + row) + column)
 
 
@@ -202,6 +204,7 @@ def paint(
             horizon[1] + through * (green - horizon[1]),
             horizon[2] + through * (blue - horizon[2]),
         )
+        # Branch-free: pixels of other bodies keep their colour.
         row[u] = colour if (marks[u] >= first) & (marks[u] <= last) else row[u]
 
 
@@ -211,6 +214,7 @@ def encoded(x: np.float32) -> np.int32:
 
     The power is a minimax polynomial of the root, accurate to 0.09 of a code.
     """
+    # Light beyond white is clipped.
     x = min(x, ONE)
     s = np.sqrt(x)
     curve = F32(-413.73478559914724) + F32(131.81300432715605) * s
@@ -238,6 +242,7 @@ def turn_of(y: np.float32, x: np.float32) -> np.float32:
     angle = F32(0.14628965886563458) + F32(-0.03900338343142313) * z2
     angle = F32(-0.32118531071533873) + angle * z2
     angle = (F32(0.999214808018403) + angle * z2) * z * F32(0.5 / math.pi)
+    # Unfold the first octant: at the diagonal, then at both axes.
     angle = F32(0.25) - angle if ay > ax else angle
     angle = HALF - angle if x < ZERO else angle
     return -angle if y < ZERO else angle

@@ -96,6 +96,7 @@ def shade_by_walls(
     for u in range(len(far)):
         t = far[u]
         n, e, d = t * rays.north[u], t * rays.east[u], t * rays.down[u]
+        # Distance to the first wall towards the sun, and the height above the floor there.
         run = min((edge_n - n) * per_n, (edge_e - e) * per_e)
         over = above - d + run * up
         lit[u] = through if (run > _STEP_M and over < height) else ONE
@@ -154,6 +155,7 @@ def shade_by_obstacle(
     lines, xs, bent, view = optics.lines, optics.xs, optics.bent, optics.lens
     shape, half, world = body.shape, body.half, body.pose
     level = math.sqrt(to_sun[0] * to_sun[0] + to_sun[1] * to_sun[1])
+    # A box keeps its axes; a round body turns to the sun's azimuth.
     cos, sin = 1.0, 0.0
     if shape == BOX:
         cos, sin = math.cos(body.yaw), math.sin(body.yaw)
@@ -162,6 +164,7 @@ def shade_by_obstacle(
     pose = turned(world, cos, sin)
     sun = (cos * to_sun[0] + sin * to_sun[1], cos * to_sun[1] - sin * to_sun[0], to_sun[2])
     top, bottom, left, end = 0, len(lines), 0, len(xs)
+    # Only a pinhole bounds the shadow by a rectangle; other images test every pixel.
     if is_pinhole(bent, view):
         floor = -(world.center[2] + optics.camera[2])
         top, bottom, left, end = shadow_rectangle(
@@ -173,6 +176,7 @@ def shade_by_obstacle(
     f, c, along = pose, pose.center, along32(pose)
     c0, c1, c2 = F32(c[0]), F32(c[1]), F32(c[2])
     s0, s1, s2 = F32(sun[0]), F32(sun[1]), F32(sun[2])
+    # Slab test along the sun: inverse direction, and half thickness along it.
     i0, i1, i2 = F32(1.0 / sized(sun[0])), F32(1.0 / sized(sun[1])), F32(1.0 / sized(sun[2]))
     w0, w1, w2 = F32(half[0]) * abs(i0), F32(half[1]) * abs(i1), F32(half[2]) * abs(i2)
     square, per_level = F32(half[0] * half[0]), F32(1.0 / max(level, 1e-6))
@@ -215,6 +219,7 @@ def shade_by_obstacle(
                 a = c0 - t * n
                 b = c1 - t * e
                 d = c2 - t * s
+                # Distance of the line to the sun from the centre, which must lie towards the sun.
                 toward = a * s0 + b * s1 + d * s2
                 apart = a * a + b * b + d * d - toward * toward
                 hidden = (apart < square) & (toward > ZERO) & (ids_row[u] != own)
@@ -244,6 +249,7 @@ def shadow_rectangle(
         i = half[0] if k & 1 else -half[0]
         j = half[1] if k & 2 else -half[1]
         m = half[2] if k & 4 else -half[2]
+        # `sun` points up, so the factor is negative: away from the sun.
         fall = max(floor - m, 0.0) / sun[2]
         for down in range(2):
             if down:
@@ -377,6 +383,7 @@ def _shade_by_mesh(
             enter = max(max(a - w0, b - w1), e - w2)
             leave = min(min(a + w0, b + w1), e + w2)
             reached = (leave >= max(enter, ZERO)) & (ids_row[u] != SKY)
+            # Points in full shadow need no exact test.
             maybe[u] = reached & (lit_row[u] > ZERO)
         for u in range(end - left):
             if not maybe[u]:
@@ -388,6 +395,7 @@ def _shade_by_mesh(
             # Relative to the mesh's origin.
             at = (t * ray[0] - c[0], t * ray[1] - c[1], t * ray[2] - c[2])
             if ids_row[u] == own:
+                # Start above the visible side; a side away from the sun is dark without a test.
                 i = faces[v, left + u]
                 normal = (bvh.normals[i, 0], bvh.normals[i, 1], bvh.normals[i, 2])
                 side = -above if dot(normal, ray) > 0.0 else above

@@ -52,6 +52,7 @@ def span_of(
     """Return the part of left..end that sees surfaces first..last, in whole vectors."""
     seen, length = ids[left:end], I32(end - left)
     begin, stop = length, I32(0)
+    # A branch-free reduction, so that the loop vectorizes.
     for u in range(end - left):
         here = (seen[u] >= first) & (seen[u] <= last)
         at = I32(u)
@@ -85,6 +86,7 @@ def draw_sky(canvas: Canvas, camera: Vec, light: Lit) -> None:
     out, ids, rays, points = canvas.out, canvas.ids, canvas.rays, canvas.points
     above = F32(max(-camera[2], MIN_DEPTH_M))
     zenith, horizon, ground = light.zenith, light.horizon, light.ground
+    # Sky pixels have no surface, so the buffers of `Points` are free.
     rises, clear = points.up, points.pattern
     begin, stop = span_of(
         ids, 0, len(ids), 0, len(ids), I32(primitives.CEILING), I32(primitives.SKY)
@@ -111,6 +113,7 @@ def draw_sky(canvas: Canvas, camera: Vec, light: Lit) -> None:
             red = share * (zenith[0] - horizon[0])
             green = share * (zenith[1] - horizon[1])
             blue = share * (zenith[2] - horizon[2])
+            # Below the horizon the ground has one colour.
             red = red if rise >= ZERO else through * (ground[0] - horizon[0])
             green = green if rise >= ZERO else through * (ground[1] - horizon[1])
             blue = blue if rise >= ZERO else through * (ground[2] - horizon[2])
@@ -159,6 +162,7 @@ def shade_walls(canvas: Canvas, look: SceneLook, camera: Vec) -> None:
             t, n, e, d = depths[u], norths[u], easts[u], downs[u]
             north = seen[u] == first
             normal, to_sun = (n if north else e), (sun0 if north else sun1)
+            # Walls are thin: the side facing the camera decides the light.
             to_sun = -to_sun if normal > ZERO else to_sun
             across = (at1 + t * e if north else at0 + t * n) * walls.per_m + walls.offset[0]
             along = (at2 + t * d) * walls.per_m + walls.offset[1]
@@ -211,6 +215,7 @@ def shade_obstacle(
                 t = far_row[u]
                 n, e, d = ray32(pose, r, optics.bent, v, first + u, start, F32(x_row[u]))
                 a, b, c = t * n - c0, t * e - c1, t * d - c2
+                # The face has the largest coordinate relative to the half size.
                 qa, qb, qc = abs(a) * per0, abs(b) * per1, abs(c) * per2
                 on_c = qc >= max(qa, qb)
                 on_a = qa >= qb
@@ -220,6 +225,7 @@ def shade_obstacle(
                 to_sun = to_sun if outward > ZERO else -to_sun
                 up = ONE if c < ZERO else -ONE
                 across, along = shading.on_box(a, b, c, on_c, on_a)
+                # A pixel covers more texels with the square of the depth, and on oblique faces.
                 texels = texel * t * t / max(abs(normal), shading.STEEP)
                 place[u] = texel_at(across * per_m + begin_u, along * per_m + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
@@ -292,6 +298,7 @@ def _shade_mesh(
     pose = primitives.turned(Pose(axes.forward, axes.across, axes.along, offset), cos, sin)
     c0, c1, c2 = F32(pose.center[0]), F32(pose.center[1]), F32(pose.center[2])
     r = along32(pose)
+    # The sun in the mesh's axes.
     s0 = F32(cos * light.to_sun[0] + sin * light.to_sun[1])
     s1 = F32(cos * light.to_sun[1] - sin * light.to_sun[0])
     s2 = light.to_sun[2]

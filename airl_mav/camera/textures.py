@@ -45,12 +45,14 @@ def texels_of(file: ImageFile, side: int) -> Floats:
         words = " ".join(str(error).split()) or type(error).__name__
         raise UsageError(f"{file.file}: no PNG or JPEG that can be read: {words[:200]}") from None
     light = linear_of(np.arange(256) / 255.0).astype(np.float32)[pixels]
+    # Box filter to shrink a picture, bilinear to enlarge it.
     how = Image.Resampling.BOX if len(light) >= side else Image.Resampling.BILINEAR
     planes = [
         np.asarray(Image.fromarray(np.ascontiguousarray(plane)).resize((side, side), how))
         for plane in np.moveaxis(light, -1, 0)
     ]
     texels = np.clip(np.stack(planes, axis=-1).astype(np.float64), 0.0, 1.0)
+    # The cache shares the array between callers.
     texels.setflags(write=False)
     return texels
 
@@ -104,6 +106,7 @@ def atlas(images: tuple[ImageFile, ...] = ()) -> NDArray[np.float32]:
             if n == 1:
                 break
             n //= 2
+            # Each coarser level is the mean of 2 x 2 texels.
             level = level.reshape(n, 2, n, 2).mean(axis=(1, 3))
     made.setflags(write=False)
     return made
@@ -130,6 +133,7 @@ def _bricks(row: NDArray[np.intp], column: NDArray[np.intp]) -> Floats:
     height, length = SIDE // COURSES, SIDE // int(PERIOD["brick"])
     course = row // height
     along = column + (course % 2) * (length // 2)
+    # Fixed seeds: a pattern depends on its name only.
     rng = np.random.default_rng(3)
     tone = rng.uniform(0.75, 1.0, (COURSES, int(PERIOD["brick"])))
     brick = tone[course, (along % SIDE) // length]
@@ -146,7 +150,9 @@ def _value_noise(rng: np.random.Generator, cells: int, octaves: int) -> Floats:
         place = np.arange(SIDE) * n / SIDE
         low = place.astype(np.intp)
         part = place - low
+        # Smoothstep between the corners of a cell.
         blend = part * part * (3.0 - 2.0 * part)
+        # The last cell continues with the first, so the pattern repeats.
         high = (low + 1) % n
         rows = values[low] + (values[high] - values[low]) * blend[:, None]
         total += 0.5**octave * (rows[:, low] + (rows[:, high] - rows[:, low]) * blend)
@@ -164,6 +170,7 @@ def _leaves(rng: np.random.Generator) -> Floats:
     for k in range(count):
         middle = rng.random(2) * SIDE
         angle, size = rng.uniform(0.0, np.pi), length * rng.uniform(0.6, 1.1)
+        # Shortest offset in the repeating pattern.
         dr, dc = (
             (x - m + SIDE / 2) % SIDE - SIDE / 2 for x, m in zip((row, column), middle, strict=True)
         )

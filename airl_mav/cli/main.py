@@ -42,7 +42,7 @@ SUBCOMMANDS: dict[str, str] = {
 
 
 def subcommands() -> dict[str, tuple[str, str]]:
-    """Return all subcommands, those of add-ons last: purpose and module by name."""
+    """Return all subcommands, add-ons last: purpose and module by name."""
     core = {
         name: (purpose, f"airl_mav.cli.{name}_command") for name, purpose in SUBCOMMANDS.items()
     }

@@ -47,9 +47,11 @@ def attitude_setpoint(thrust: Vec, cy: float, sy: float) -> Quat:
     zx, zy, zz = -thrust[0] / norm, -thrust[1] / norm, -thrust[2] / norm
     # x = y_c x z with y_c = (-sin, cos, 0)
     xx, xy, xz = cy * zz, sy * zz, -sy * zy - cy * zx
+    # Thrust points down: the nose stays in front, as in bodyzToAttitude.
     if zz < 0.0:
         xx, xy, xz = -xx, -xy, -xz
     n = math.sqrt(xx * xx + xy * xy + xz * xz)
+    # Thrust is level: x points down, as in bodyzToAttitude.
     if n < 1e-6:
         xx, xy, xz, n = 0.0, 0.0, 1.0, 1.0
     xx, xy, xz = xx / n, xy / n, xz / n
@@ -102,6 +104,7 @@ def reduced_attitude(q: Quat, q_sp: Quat) -> tuple[Quat, float]:
         The attitude, body -> NED, and the sine of half the remaining turn about the thrust axis
         to q_sp, -1..1.
     """
+    # Roll and pitch come first: the reduced attitude ignores the heading (Brescianini et al.).
     down = (0.0, 0.0, 1.0)
     reduced = multiply(_shortest(rotate(q, down), rotate(q_sp, down)), q)
     mix = multiply(conjugate(reduced), q_sp)
@@ -124,8 +127,10 @@ def rates_towards(
     `reduced` is that attitude without a turn about its thrust axis, `half_turn` the sine of half
     that turn, `yaw_rate_ff` the heading rate about the world's down axis [rad/s].
     """
+    # Add the weighted turn about the thrust axis.
     wanted = multiply(reduced, (math.sqrt(1.0 - half_turn * half_turn), 0.0, 0.0, half_turn))
     error = multiply(conjugate(q), wanted)
+    # q and -q are the same attitude; the sign selects the shorter rotation.
     two = 2.0 if error[0] >= 0.0 else -2.0
     ff = rotate(conjugate(q), (0.0, 0.0, yaw_rate_ff))
     p = gains.att_p_roll * two * error[1] + ff[0]
@@ -165,11 +170,13 @@ def rate_control(
     axis that the mixer could not deliver in the last tick (its sign matters).
     """
     er, ep, ey = rates_sp[0] - rates[0], rates_sp[1] - rates[1], rates_sp[2] - rates[2]
+    # The derivative acts on the measurement, so steps of the setpoint do not kick.
     torque = (
         gains.rate_p_roll * er + integral[0] - gains.rate_d_roll * angular_acceleration[0],
         gains.rate_p_pitch * ep + integral[1] - gains.rate_d_pitch * angular_acceleration[1],
         gains.rate_p_yaw * ey + integral[2] - gains.rate_d_yaw * angular_acceleration[2],
     )
+    # Integration stops in the direction in which the mixer is saturated.
     er = 0.0 if er * saturation[0] > 0.0 else er
     ep = 0.0 if ep * saturation[1] > 0.0 else ep
     ey = 0.0 if ey * saturation[2] > 0.0 else ey

@@ -112,6 +112,7 @@ def cascade_tick(
     first = start(velocity, omega, memory, weights)
     # Setpoints of an outer loop take effect at the next tick, except at the first.
     published = attitude_sp(memory)
+    # The position loop runs at every second tick, see POSITION_TICKS.
     if memory[WAIT] == 0.0:
         position_loop(position, velocity, q, demand, memory, gains, weights, dt)
         memory[WAIT] = POSITION_TICKS
@@ -189,6 +190,7 @@ def rate_tick(
         memory[ATTITUDE_SP + i] = q[i]
     for i in range(3):
         memory[RATES_SP + i] = demand.rates[i]
+    # The rate demand bypasses the attitude loop: the present attitude is the setpoint.
     memory[YAW_RATE_SP], memory[THRUST_SP] = 0.0, demand.thrust
     memory[THRUST_ON] = demand.thrust
     motors = _rate_loop(omega, demand.rates, demand.thrust, memory, gains, weights, dt)
@@ -227,6 +229,7 @@ def _inner_loops(
 @kernel
 def hand_over(wanted: Vec, thrust_sp: float, first: bool, memory: Memory) -> tuple[Vec, float]:
     """Publish rates and collective; return the rates and collective to fly in this tick."""
+    # Except at the first tick, the rate loop uses the values published a tick ago.
     rates_sp, collective = wanted, thrust_sp
     if not first:
         rates_sp = three(memory, RATES_SP)
@@ -240,6 +243,7 @@ def hand_over(wanted: Vec, thrust_sp: float, first: bool, memory: Memory) -> tup
 @kernel
 def _skip_position_loop(velocity: Vec, memory: Memory, weights: Filters, dt: float) -> None:
     """Update the velocity's filter while no position is flown."""
+    # The derivative continues, so that the position loop can resume at any tick.
     if memory[WAIT] == 0.0:
         differentiate(velocity, memory, weights, POSITION_TICKS * dt)
         memory[WAIT] = POSITION_TICKS
@@ -308,6 +312,7 @@ def _trajectory_loop(
     period = POSITION_TICKS * dt
     differentiate(velocity, memory, weights, period)
     north, east, down = velocity_setpoint(position, demand.position, demand.velocity, gains)
+    # Without position and velocity the down axis is left to the acceleration.
     if math.isnan(demand.position[2]) and math.isnan(demand.velocity[2]):
         down = math.nan
     velocity_sp = (north, east, down)
@@ -345,6 +350,7 @@ def _publish(
 ) -> None:
     """Store the position loop's output: attitude, yaw rate and collective."""
     if math.isnan(yaw):
+        # An uncommanded heading keeps the present one.
         cos_yaw, sin_yaw = heading_of(q)
     else:
         cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
@@ -355,6 +361,7 @@ def _publish(
     for i in range(4):
         memory[ATTITUDE_SP + i] = q_sp[i]
     memory[YAW_RATE_SP] = 0.0 if math.isnan(yaw_rate) else yaw_rate
+    # The collective is the length of the thrust vector, which is already normalised.
     memory[THRUST_SP] = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
 
 
@@ -385,6 +392,7 @@ def torque_setpoint(
     Rates are FRD [rad/s]; the `SAT` of `memory` comes from the mixer's last tick.
     """
     rates_now = (omega[0], omega[1], omega[2])
+    # Gyro low-pass (IMU_GYRO_CUTOFF), then the filtered derivative (IMU_DGYRO_CUTOFF).
     for i in range(3):
         before, newer = memory[GYRO + i], memory[GYRO_NEWER + i]
         rate, held = filtered(weights.gyro, rates_now[i], newer, memory[GYRO_OLDER + i])
@@ -400,6 +408,7 @@ def torque_setpoint(
         gains,
         dt,
     )
+    # PX4 filters the yaw torque alone (MC_YAW_TQ_CUTOFF).
     memory[YAW_TORQUE] += weights.yaw_torque * (torque[2] - memory[YAW_TORQUE])
     for i in range(3):
         memory[RATE_INT + i] = integral[i]

@@ -62,6 +62,7 @@ class Gains(NamedTuple):
     @classmethod
     def from_parameters(cls, value: Callable[[str], float]) -> Gains:
         """Read all gains through a lookup of PX4 parameter names."""
+        # The arms come from PX4's control allocation geometry.
         shares = _allocation(
             sum(abs(value(f"CA_ROTOR{i}_PX")) for i in range(4)),
             sum(abs(value(f"CA_ROTOR{i}_PY")) for i in range(4)),
@@ -92,6 +93,7 @@ def _allocation(forward: float, right: float) -> tuple[float, float]:
     scale for both axes, so that the weaker one moves a motor by sin 45 deg.
     """
     weaker = min(forward, right)
+    # A vehicle without arms along an axis keeps both scales.
     if weaker <= LEAST_ARM * max(forward, right):
         return math.sqrt(0.5), math.sqrt(0.5)
     return math.sqrt(0.5) * weaker / right, math.sqrt(0.5) * weaker / forward

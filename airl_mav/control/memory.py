@@ -47,6 +47,7 @@ def butterworth(cutoff_hz: float, dt: float) -> Biquad:
     """Return a second-order Butterworth low-pass; a cut-off of 0 or above Nyquist's = no filter."""
     if cutoff_hz <= 0.0 or cutoff_hz >= 0.5 / dt:
         return Biquad(1.0, 0.0, 0.0, 0.0, 0.0)
+    # Bilinear transform with the cut-off prewarped.
     ohm = math.tan(math.pi * max(cutoff_hz, LEAST_CUTOFF / dt) * dt)
     damping = 2.0 * math.cos(math.pi / 4.0) * ohm
     c = 1.0 + damping + ohm * ohm
@@ -103,6 +104,7 @@ def trim_for_hover(
     # thrust_from_acceleration, solved for the acceleration that gives the command.
     upright = GRAVITY_M_S2 / math.hypot(GRAVITY_M_S2, north, east)
     memory[VEL_INT], memory[VEL_INT + 1] = north, east
+    # Down is positive, so a command above hover thrust needs a negative integral.
     memory[VEL_INT + 2] = (
         (gains.hover_thrust - upright * command) * GRAVITY_M_S2 / gains.hover_thrust
     )
@@ -115,6 +117,7 @@ def trim_against_torque(memory: Memory, motors: Motors, gains: Gains) -> None:
         (PITCH, gains.mix_pitch, gains.rate_int_max_pitch),
     )
     for i, (direction, mixed, most) in enumerate(axes):
+        # Torque of the commands, in the units of the rate loop.
         torque = math.fsum(d * m for d, m in zip(direction, motors, strict=True)) / (4.0 * mixed)
         memory[RATE_INT + i] = min(max(torque, -most), most)
 
@@ -126,6 +129,7 @@ def reset_integrals(memory: Memory) -> None:
         memory[VEL_INT + i] = 0.0
         memory[RATE_INT + i] = 0.0
         memory[SAT + i] = 0.0
+    # The next tick initialises the filters and runs all loops.
     memory[PRIMED] = 0.0
 
 

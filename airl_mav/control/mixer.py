@@ -37,6 +37,7 @@ def _excess(m: Motors, direction: Motors, high: float) -> float:
     """Return the multiple of `direction` that brings the worst motors back into [0, high]."""
     k_min = 0.0
     k_max = 0.0
+    # The multiple that returns each motor to its nearest limit.
     for i in range(4):
         k = 0.0
         if m[i] < 0.0:
@@ -51,6 +52,7 @@ def _excess(m: Motors, direction: Motors, high: float) -> float:
 @kernel
 def _desaturate(m: Motors, direction: Motors, high: float, lower_only: bool) -> Motors:
     gain = _excess(m, direction, high)
+    # Without airmode, thrust may be lowered but not raised.
     if lower_only and gain > 0.0:
         return m
     m = _add(m, direction, gain)
@@ -104,9 +106,11 @@ def desaturate(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, Vec]:
     r, p = gains.mix_roll, gains.mix_pitch
     rolling, pitching = _scaled(ROLL, r), _scaled(PITCH, p)
     m = _roll_and_pitch(thrust, torque, gains)
+    # Order of PX4: lower the thrust, then give up roll, then pitch.
     m = _desaturate(m, THRUST, 1.0, True)
     m = _desaturate(m, rolling, 1.0, False)
     m = _desaturate(m, pitching, 1.0, False)
+    # Yaw comes last; its margin lets it act at full thrust.
     m = _add(m, YAW, torque[2])
     m = _desaturate(m, YAW, 1.0 + YAW_MARGIN, False)
     m = _desaturate(m, THRUST, 1.0, True)
@@ -116,6 +120,7 @@ def desaturate(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, Vec]:
         clamp(m[2], 0.0, 1.0),
         clamp(m[3], 0.0, 1.0),
     )
+    # The torque that the clamped motors produce; the rest is missing.
     roll = (-out[0] + out[1] + out[2] - out[3]) / (4.0 * r)
     pitch = (out[0] - out[1] + out[2] - out[3]) / (4.0 * p)
     yaw = 0.25 * (out[0] + out[1] - out[2] - out[3])

@@ -34,6 +34,7 @@ def velocity_setpoint(position: Vec, position_sp: Vec, velocity_ff: Vec, gains: 
     fx = 0.0 if math.isnan(velocity_ff[0]) else velocity_ff[0]
     fy = 0.0 if math.isnan(velocity_ff[1]) else velocity_ff[1]
     fz = 0.0 if math.isnan(velocity_ff[2]) else velocity_ff[2]
+    # As PX4's ControlMath::constrainXY.
     limit = gains.vel_max_xy
     square_p = px * px + py * py
     vx, vy = px + fx, py + fy
@@ -46,6 +47,7 @@ def velocity_setpoint(position: Vec, position_sp: Vec, velocity_ff: Vec, gains: 
         b = px * fx + py * fy
         s = (-b + math.sqrt(b * b + a * (limit * limit - square_p))) / a if a > 0.0 else 0.0
         vx, vy = px + s * fx, py + s * fy
+    # Without any horizontal command the axes are not controlled.
     if (
         math.isnan(position_sp[0])
         and math.isnan(position_sp[1])
@@ -71,6 +73,7 @@ def thrust_from_acceleration(acc: Vec, gains: Gains) -> Vec:
     if square > (GRAVITY_M_S2 * gains.tilt_max) ** 2 and c < math.cos(gains.tilt_max):
         lean = math.sin(gains.tilt_max) / math.sqrt(square)
         c = math.cos(gains.tilt_max)
+    # NED: up is negative. Hover thrust balances gravity.
     vertical = acc[2] * gains.hover_thrust / GRAVITY_M_S2 - gains.hover_thrust
     collective = min(vertical / c, -gains.thrust_min)
     return -acc[0] * lean * collective, -acc[1] * lean * collective, c * collective
@@ -149,6 +152,7 @@ def _produced(
     ax, ay, _ = acceleration
     ex, ey, ez = error
     tx, ty, tz = thrust_from_acceleration(acceleration, gains)
+    # Vertical anti-windup: no integration further into saturation.
     if (tz >= -gains.thrust_min and ez >= 0.0) or (tz <= -gains.thrust_max and ez <= 0.0):
         ez = 0.0
     # Vertical thrust first, but a horizontal margin always stays.
@@ -159,7 +163,9 @@ def _produced(
     if norm > room:
         tx, ty = tx / norm * room, ty / norm * room
     per_thrust = GRAVITY_M_S2 / gains.hover_thrust
+    # The acceleration that the limited thrust produces.
     produced_x, produced_y = tx * per_thrust, ty * per_thrust
+    # Tracking anti-windup, as in PX4's PositionControl (Rundqwist, 1990).
     if ax * ax + ay * ay > produced_x * produced_x + produced_y * produced_y:
         arw = 2.0 / gains.vel_p_xy
         ex -= arw * (ax - produced_x)
@@ -168,6 +174,7 @@ def _produced(
     new_integral = (
         integral[0] + gains.vel_i_xy * ex * dt,
         integral[1] + gains.vel_i_xy * ey * dt,
+        # The vertical integral is limited to 1 g, as in PX4.
         clamp(integral[2] + gains.vel_i_z * ez * dt, -g, g),
     )
     return (tx, ty, tz), new_integral

@@ -50,6 +50,7 @@ def empty_batch(n: int, obstacles: int, movers: int, points: int, heights: int =
         tour_points=np.zeros((n, movers, points, 2)),
         tour_period_s=np.ones((n, movers)),
         tour_speed=np.zeros(n),
+        # NaN marks a goal without a height.
         goal=np.tile((0.0, 0.0, math.nan), (n, 1)),
         heights=np.zeros((n, heights)),
         grid=np.zeros((n, GRID_SIZE)),
@@ -116,11 +117,13 @@ def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
     batch.yaw[i, :count] = o.yaw
     height_m = arena.goal_height_m
     batch.goal[i, :2] = arena.goal
+    # NED: down is the negative height.
     batch.goal[i, 2] = math.nan if height_m is None else -height_m
     batch.grid[i] = 0.0
     if arena.ground is not None:
         relief = arena.ground.relief
         batch.heights[i, : len(relief.heights)], batch.grid[i] = relief
+    # Padding: a tour search never passes an infinite time.
     batch.tour_times_s[i] = np.inf
     batch.tour_speed[i] = 0.0
     for j, tour in enumerate(arena.tours):
@@ -128,6 +131,7 @@ def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
         batch.tour_times_s[i, j, :k] = tour.times_s
         batch.tour_points[i, j, :k] = tour.points
         batch.tour_period_s[i, j] = tour.times_s[-1]
+        # A mover starts at the first point of its tour.
         batch.center[i, arena.n_static + j, :2] = tour.points[0]
         batch.tour_speed[i] = max(batch.tour_speed[i], _fastest(tour.times_s, tour.points))
 
@@ -139,6 +143,7 @@ def _fastest(times_s: NDArray[np.float64], points: NDArray[np.float64]) -> float
     for k in range(len(times_s) - 1):
         north, east = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
         passed = times_s[k + 1] - times_s[k]
+        # Squares are compared, so one root at the end is enough.
         greatest = max(greatest, (north * north + east * east) / (passed * passed))
     return math.sqrt(greatest)
 
@@ -164,6 +169,7 @@ def move_obstacles(batch: ArenaBatch, i: int, time_us: int) -> None:
     The same interpolation as `Arena.centers_at`.
     """
     for j in range(batch.n_obstacles[i] - batch.n_static[i]):
+        # Tours are cyclic.
         t = (time_us / US_PER_S) % batch.tour_period_s[i, j]
         times = batch.tour_times_s[i, j]
         k = 0
@@ -177,6 +183,7 @@ def move_obstacles(batch: ArenaBatch, i: int, time_us: int) -> None:
             batch.center[i, obstacle, axis] = start + a * (end - start)
 
 
+# Contacts that are no obstacle; an obstacle's contact is its index.
 NOTHING = -1
 FLOOR = -2
 WALL = -3
@@ -204,8 +211,10 @@ def clearance(
     Arguments as in `touches`.
     """
     x, y, z = position
+    # Down is positive: `low` is the lowest point of the vehicle.
     low = z + half_height
     beside = min(min(x - bounds[0], bounds[1] - x), min(y - bounds[2], bounds[3] - y)) - radius
+    # Above the walls only the height counts, otherwise the distance to the nearest wall.
     room: float = min(-low, max(beside, -bounds[4] - low))
     if relief is not None and len(relief.heights) > 0:
         # Beyond a wall the nearest ground is at the wall's foot.
@@ -218,6 +227,7 @@ def clearance(
     for i in range(count):
         dx, dy, dz = x - center[i, 0], y - center[i, 1], z - center[i, 2]
         hx, hy, hz = half_size[i, 0], half_size[i, 1], half_size[i, 2]
+        # The bounding cylinder ignores yaw, so the distance is a lower bound.
         beside = math.sqrt(dx * dx + dy * dy) - math.sqrt(hx * hx + hy * hy) - radius
         room = min(room, max(beside, abs(dz) - half_height - hz))
     return room
@@ -251,6 +261,7 @@ def touches(
         relief: The ground; None = flat. Contacts with it count as FLOOR.
     """
     x, y, z = position
+    # The order of the tests decides what a simultaneous contact reports.
     if z + half_height > 0.0:
         return FLOOR
     # Beyond the walls and without hills the result is -infinity, so the ground is level.
@@ -279,6 +290,7 @@ def touches(
                 return i
         elif gap_z == 0.0:
             if shape[i] == _BOX:
+                # Offset from a box in its own axes; inside it is 0.
                 c, s = math.cos(yaw[i]), math.sin(yaw[i])
                 gx = max(0.0, abs(c * dx + s * dy) - hx)
                 gy = max(0.0, abs(c * dy - s * dx) - hy)

@@ -69,6 +69,7 @@ class Eyes:
         self._colour: ColourImages | None = None
         """Renderer of colour images; None for depth cameras."""
         if self.intrinsics.kind != "depth":
+            # Colour needs the appearance of an arena, which the depth kernels do not have.
             assert looks is not None  # noqa: S101 - colour cameras require arenas
             self._colour = ColourImages(self.intrinsics, self._mount, looks, self._meshes)
         self._formed: ImageFormation | None = None
@@ -81,6 +82,7 @@ class Eyes:
     @property
     def eye(self) -> Eye | None:
         """Camera for the depth kernels; None if images require more than depth rendering."""
+        # Only plain depth is rendered inside the flight kernels.
         if self._formed is not None or self._colour is not None or self._noise is not None:
             return None
         return self._eye(self.image)
@@ -160,6 +162,7 @@ class Cameras(Stateful):
         }
         """Additional cameras by name, triggered with the main camera."""
         failing = twin_faults(faults, "camera")
+        # Delays shift whole frames; the other faults change pixels.
         self._late = [each for each in failing if each.fault.kind == "delay"]
         self._first_us = np.zeros(n, np.int64)
         self.times = FrameTimes(
@@ -199,6 +202,7 @@ class Cameras(Stateful):
 
     def begin(self, i: int, seed: int) -> None:
         """Start the episode of slot i."""
+        # The first frame lies up to a period before the start, so every start has a frame.
         self._first_us[i] = -int(stream(seed, Stream.CAMERA).random() * self.times.period_us)
         for each in self._changed:
             if each.number in self._frozen:
@@ -220,6 +224,7 @@ class Cameras(Stateful):
         """Return the time (n,) of the next frozen image after these times; None = never."""
         if not self._freeze_us:
             return None
+        # A flight's time is at a whole tick, so a capture is due at the nearest tick.
         ticks = [(at - time_us + TICK_US // 2) // TICK_US for at in self._freeze_us.values()]
         due = [np.where(each > 0, time_us + each * TICK_US, NEVER_US) for each in ticks]
         soonest: NDArray[np.int64] = np.minimum.reduce(due)
@@ -260,7 +265,9 @@ class Cameras(Stateful):
                 taken = acts & (fleet.time_us + TICK_US // 2 >= self._freeze_us[each.number])
                 self.image[taken] = self._frozen[each.number][taken]
             elif acts.any():
+                # Requested noise only: the stages of the camera were applied above.
                 noise = DepthNoise(None, SensorNoise(depth_noise=each.fault.amount))
+                # Each fault has its own noise stream.
                 own = NOISE_SEED * (each.number + 1) + seeds
                 _make_noisy(self.image, noise, acts, own, frames)
 
@@ -310,6 +317,7 @@ def render_images(
     lens = eye.lens
     image = np.empty(eye.image.shape[1:], np.float32)
     for i in range(len(who)):
+        # `_to_z16` overwrites the same buffer for each vehicle.
         if not who[i]:
             continue
         move_obstacles(arenas, i, fleet.time_us[i])

@@ -80,6 +80,7 @@ class Looks:
         Raises UsageError if its images differ from the images of previous arenas.
         """
         if images := arena.look.finish.images:
+            # One atlas of textures serves all arenas in a call.
             if self.images not in ((), images):
                 raise UsageError(
                     f"arena {arena.name!r}, seed {arena.seed}: appearance.materials: accepted: the"
@@ -103,6 +104,7 @@ class Looks:
             getattr(batch, name)[i, :count] = getattr(look, name)
         if self.gloss is None and look.gloss is not None:
             self.gloss = _all_matt(*batch.texture.shape)
+        # Rows of an earlier arena in this slot must not remain.
         if self.gloss is not None:
             self.gloss.surface[i] = MATT
             self.gloss.lets[i] = 0.0
@@ -151,6 +153,7 @@ class ColourImages:
     ) -> None:
         """Store camera, mounting, arena appearance and meshes."""
         k, shape = intrinsics, (intrinsics.height, intrinsics.width)
+        # Colour has no maximum depth.
         self._lens = lens_of(k, math.inf)
         self._mount, self._looks, self._meshes = mount, looks, meshes
         rgb = np.zeros((*shape, 3), np.uint8)
@@ -207,6 +210,7 @@ def _render(
         surfaces = OBSTACLE + count
         position, quaternion = camera_pose(fleet.position[i], fleet.quaternion[i], mount)
         render_colour(
+            # Grey is computed from a buffer; RGB is rendered into the output.
             rgb if grey else out[i],
             canvas.depth,
             canvas.seen,

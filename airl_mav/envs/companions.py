@@ -96,12 +96,14 @@ class Companions:
             state: Telemetry.
             further: (n, ...) newest images of additional cameras, by name.
         """
+        # With compensation the policy has decided on predicted observations.
         if self._compensator is not None:
             image, state = self._image, self._state
         states = zip(self._states.known().values(), state.known().values(), strict=True)
         others = ((kept, further[name]) for name, kept in self._further.items())
         for kept, new in ((self._earlier, image), *states, *others):
             if len(kept):
+                # Newest first: shift by one decision.
                 kept[1:] = kept[:-1]
                 kept[0] = new
 
@@ -120,6 +122,7 @@ class Companions:
             sent_us: Times of sending.
             stop_us: Times at which a stop replaces each setpoint without a new one; None = never.
         """
+        # Ended flights are recorded too; `begin` clears them.
         everyone = np.arange(self._n)
         if self._compensator is not None:
             self._compensator.decided(everyone, setpoints, t2_us, sent_us, stop_us)
@@ -184,6 +187,7 @@ class Companions:
     def held(self) -> Mapping[str, Any]:
         """Return all variable arrays by name, for checkpoints."""
         held: dict[str, Any] = {}
+        # Unused parts are not saved.
         if self.remember:
             held["earlier"] = {"depth_mm": self._earlier, **self._states.known()}
             kept = {name: each for name, each in self._further.items() if len(each)}

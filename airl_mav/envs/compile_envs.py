@@ -13,6 +13,7 @@ def compile_vectorized(kind: CameraKind) -> None:
     """Compile all kernels by a flight of a few decisions."""
     flying = _navigation(kind)
     flying.begin([0], [1])
+    # A few decisions reach every kernel of a flight.
     for _ in range(3):
         flying.observe()
         flying.fly(np.zeros((1, 3)))

@@ -166,6 +166,7 @@ def plan(decision: DecisionBatch, fleet: Fleet) -> None:
 @borrowing_kernel
 def _add(decision: DecisionBatch, i: int, tick: int, kind: int) -> None:
     """Insert an event of vehicle i after all events at the same tick or earlier."""
+    # Insertion sort: a decision has few events.
     at = decision.events[i]
     ticks, kinds = decision.tick[i], decision.kind[i]
     while at > 0 and ticks[at - 1] > tick:
@@ -185,6 +186,7 @@ def _plan_sequential(decision: DecisionBatch, now_us: int, i: int, t2_us: int) -
         overdue = _overdue(decision, i, now_us)
         # A setpoint replaced in time never expires, even while the next one is in flight.
         if overdue < sent:
+            # The earlier of the two stops counts.
             stop_us = min(stop_us, overdue * TICK_US)
         decision.sent_us[i] = now_us + TICK_US * sent
     # A stop has the same link delay as a setpoint.
@@ -214,8 +216,10 @@ def _plan_pipelined(decision: DecisionBatch, now_us: int, i: int, t2_us: int) ->
     for k in range(decision.left.shape[1] - 1, -1, -1):
         if 0 < decision.left[i, k] <= ended:
             _add(decision, i, decision.left[i, k], _ARRIVE + k)
+    # The frame was captured `age` ticks before the next decision starts.
     _add(decision, i, ended - age, _CAPTURE)
     _add(decision, i, sent, _SEND)
+    # A later arrival is kept by `_keep_in_flight`.
     if accepted <= ended:
         _add(decision, i, accepted, _ACCEPT)
     if timing.timeout >= 0:
@@ -255,12 +259,14 @@ def next_stretch(decision: DecisionBatch, fleet: Fleet, i: int, state: State, j:
         event = decision.next[i]
         decision.next[i] += 1
         _carry_out(decision, fleet, i, state, j, event)
+    # At the end of a flight the remaining events have been executed above.
     if over or decision.next[i] == decision.events[i]:
         return 0
     until: int = min(
         decision.tick[i, decision.next[i]] - now,
         (decision.pause_us[i] - fleet.time_us[i]) // TICK_US,
     )
+    # The requested setpoint type differs from the followed one: wait for the next publication.
     if decision.timing.timeout >= 0 and decision.wanted[i] != fleet.by_rates[i] and until > 0:
         published = _until_published(fleet.time_us[i])
         if published == 0:
@@ -273,6 +279,7 @@ def next_stretch(decision: DecisionBatch, fleet: Fleet, i: int, state: State, j:
 
 
 @kernel
+# Publications start at RATES_FOLLOWED_US and repeat every KIND_US.
 def _until_published(time_us: int) -> int:
     """Return the ticks until the flight controller next publishes its control mode."""
     first, period = (RATES_FOLLOWED_US - time_us) // TICK_US, KIND_US // TICK_US
@@ -287,6 +294,7 @@ def _carry_out(
     timing = decision.timing
     kind = decision.kind[i, event]
     if kind == _SEND:
+        # NaN is altitude hold: a proportional vertical speed with a limit.
         if math.isnan(decision.setpoint[i, 2]):
             error_m = -timing.altitude_m - (state[POSITION + 2, j] + decision.errors[i, 2])
             down = min(max(ALTITUDE_P * error_m, -MAX_VERTICAL_M_S), MAX_VERTICAL_M_S)
@@ -319,6 +327,7 @@ def take(
     j: int,
 ) -> None:
     """Set the setpoint (4,) of vehicle i; arguments as in `next_stretch`."""
+    # With body rates the setpoint waits until the flight controller follows them.
     if decision.timing.timeout >= 0:
         for axis in range(4):
             decision.newest[i, axis] = setpoint[axis]
@@ -336,6 +345,7 @@ def take(
 def expire(decision: DecisionBatch, fleet: Fleet, i: int, state: State, j: int) -> None:
     """Stop vehicle i; with body rates, zero the rates first. Arguments as in `next_stretch`."""
     if decision.timing.timeout >= 0:
+        # The thrust remains; only the three rates become 0.
         for axis in range(3):
             decision.newest[i, axis] = 0.0
         decision.wanted[i] = False
@@ -370,6 +380,7 @@ def _look(seen: FramePoses, now_us: int, i: int, state: State, j: int) -> None:
 @borrowing_kernel
 def _keep_in_flight(decision: DecisionBatch, i: int, ended: int) -> None:
     """Keep the setpoints of vehicle i still in flight when its decision ends at a tick."""
+    # From the oldest on, so that no entry is overwritten before it is copied.
     left, in_flight = decision.left[i], decision.in_flight[i]
     for k in range(len(left) - 1, -1, -1):
         left[k] = max((left[k - 1] if k > 0 else decision.accepted[i]) - ended, 0)
@@ -386,6 +397,7 @@ def ticks_of(time_us: int) -> int:
 @kernel
 def frame_age_us(times: FrameTimes, i: int, time_us: int) -> int:
     """Return the age of vehicle i's newest decoded frame at a time [µs] of its episode."""
+    # Frames are decoded a transport time after their capture, one per period.
     since_us = time_us - times.transport_us - times.first_us[i]
     age: int = times.transport_us + since_us % times.period_us
     for k in range(len(times.late)):
@@ -402,7 +414,9 @@ def _delayed(times: FrameTimes, i: int, time_us: int, age_us: int, k: int) -> in
     last = _newest(times, i, to_us - 1)
     if healthy < from_us or time_us - times.transport_us >= last + delay_us:
         return age_us
+    # With a delay, the newest decoded frame is older by the delay.
     arrived = _newest(times, i, time_us - times.transport_us - delay_us)
+    # Frames from before the fault were not delayed and may be newer.
     if from_us != BEFORE_US:
         arrived = max(arrived, _newest(times, i, from_us - 1))
     return time_us - arrived

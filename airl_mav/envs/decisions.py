@@ -49,6 +49,7 @@ class FleetDecisions:
         """
         self.environment = bounded(gymnasium_spec(spec, knobs))
         self._reward = reward_of(self.environment.reward)
+        # Custom rewards run in Python, built-in ones in the kernels.
         self._own = self.environment.reward not in SHIPPED_REWARDS
         self._charged = self.environment.costs != _FREE
         self._action_spec = self.environment.action_spec
@@ -92,6 +93,7 @@ class FleetDecisions:
             raise gym.error.ResetNeeded("step() before reset()")
         asked = checked_actions(self._action_spec, actions, lead)
         chosen = commands(self._action_spec, asked if lead else asked[None])
+        # The fleet's setpoint is overwritten by the decision.
         last = None
         if self._charged:
             flown = navigation.fleet.setpoint
@@ -107,6 +109,7 @@ class FleetDecisions:
             if last is not None:
                 reward = reward - costs(costs_of, last, step)
         if self.curriculum is not None:
+            # An ended flight counts for the zone in which it began.
             for i in np.flatnonzero(ending):
                 success = bool(now.verdict[i] == FlightStatus.SUCCESS)
                 self.curriculum.record(int(navigation.zones[i]), success=success)

@@ -105,6 +105,7 @@ class DelayDraws(DrawnAhead):
 
     def draw(self, decision: NDArray[np.int64]) -> None:
         """Draw the next block of slots whose `decision` (n,), counted from 0, starts a block."""
+        # All draws of a block come from the episode's generator, in order.
         for i in np.flatnonzero(decision % BLOCK == 0):
             self._draw_block(int(i))
 
@@ -122,12 +123,14 @@ class Winds(DrawnAhead):
         """Prepare n slots; `faults` of the wind act in all of them."""
         super().__init__(n)
         self._faults = twin_faults(faults, "wind")
+        # Every field except the gust's time constant is 0.
         still = not (set(settings.model_dump(exclude={"gust_time_s"}).values()) - {0.0})
         self.calm = still and not self._faults
         """True if no wind blows in any episode."""
         self._settings = settings
         self.gusty = settings.gust_m_s > 0.0 or bool(self._faults)
         self._winds: list[Wind | None] = [None] * n
+        # No gusts: one row holds the steady wind for the whole flight.
         self.air = np.zeros((n, WIND_BLOCK if self.gusty else 0 if self.calm else 1, 3))
         """(n, k, 3) present blocks, as an argument of `fleet_step.advance`."""
 
@@ -139,6 +142,7 @@ class Winds(DrawnAhead):
         wind = Wind(wind_of_episode(self._settings, seed), rng)
         self._winds[i], self._seeds[i], self._blocks[i] = wind, seed, 0
         self._draw_block(i)
+        # Faults since before the flight have already tilted the vehicle at its start.
         return wind.steady + lasting(self._faults) if self._faults else wind.steady
 
     def ends_us(self) -> NDArray[np.int64] | None:
@@ -157,6 +161,7 @@ class Winds(DrawnAhead):
         wind = self._winds[i]
         if wind is not None:
             self.air[i] = wind.ahead()
+            # The block number counts from the start of the episode, as the faults' times do.
             if self._faults:
                 self.air[i] += gusts(self._faults, int(self._blocks[i]) * WIND_BLOCK, WIND_BLOCK)
             self._blocks[i] += 1

@@ -64,16 +64,20 @@ def _level_scan(
                 depth = depth_mm[i, v, u] / MM_PER_M
                 ahead, right = depth * rays.forward[u], depth * rays.right[u]
                 down = depth * rays.down[v]
+                # Rotate the point by roll, then by pitch; `BAND_M` selects points at the vehicle's
+                # height.
                 below = sr * right + cr * down
                 if abs(cp * below - sp * ahead) > BAND_M:
                     continue
                 level_right, level_ahead = cr * right - sr * down, cp * ahead + sp * below
                 angle = math.atan2(level_right, level_ahead) + 0.5 * rays.fov_rad
                 bearing = math.floor(angle * share)
+                # A scan all around wraps at its edge.
                 if whole:
                     bearing %= bearings
                 if 0 <= bearing < bearings:
                     distance = math.sqrt(level_ahead * level_ahead + level_right * level_right)
+                    # The nearest point of each bearing counts.
                     found[i, bearing] = min(found[i, bearing], distance)
 
 
@@ -86,13 +90,16 @@ def _carry(scans: Floats, moved: Moved, fov_rad: float, whole: bool, found: Floa
             distance = scans[i, bearing]
             if not math.isfinite(distance):
                 continue
+            # The middle of the bearing after the vehicle's turn; then the shift in the new axes.
             angle = (bearing + 0.5) * step - 0.5 * fov_rad - moved.turned_rad[i]
             ahead = distance * math.cos(angle) + moved.forward_m[i]
             right = distance * math.sin(angle) + moved.right_m[i]
             now = math.sqrt(ahead * ahead + right * right)
+            # A nearer obstacle covers more bearings than before.
             half = min(0.5 * step * distance / max(now, NEAREST_M), WIDEST_RAD)
             angle = math.atan2(right, ahead) + 0.5 * fov_rad
             middle = math.floor(angle / step)
+            # At least the bearing of the middle is covered.
             first = min(math.ceil((angle - half) / step - 0.5), middle)
             last = max(math.floor((angle + half) / step - 0.5), middle)
             for covered in range(first, last + 1):
@@ -125,6 +132,7 @@ COMPILED = Shrink(shrink_depth, shrink_colour, COMPILED_SCANNING)
 def _shrink_colour(image: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
     channels, rows, columns = out.shape[1], out.shape[2], out.shape[3]
     tall, wide = image.shape[1] // rows, image.shape[2] // columns
+    # The sizes are equal: transpose only.
     if tall == 1 and wide == 1:
         for i in range(len(out)):
             for row in range(rows):
@@ -137,6 +145,7 @@ def _shrink_colour(image: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
     sums = np.empty((channels, columns), np.uint32)
     for i in range(len(out)):
         for row in range(rows):
+            # Starting at half the count rounds the mean to the nearest.
             sums[:, :] = count // np.uint32(2)
             for k in range(tall):
                 for column in range(columns):
@@ -162,6 +171,8 @@ def _shrink(
     line, least = np.empty(depth_mm.shape[2], np.uint16), np.empty((rows, columns), np.uint16)
     for i in range(len(out)):
         for row in range(rows):
+            # Unsigned: 0 (no return) minus 1 wraps to 65,535, the farthest value, so min ignores
+            # it.
             for u in range(len(line)):
                 line[u] = depth_mm[i, row * tall, u] - np.uint16(1)
             for k in range(1, tall):
@@ -189,6 +200,7 @@ def _to_bytes(
     out: NDArray[np.uint8],
 ) -> None:
     """Write the bytes of depths (k,), which exceed the values in `Bytes` by `less`."""
+    # far_mm = 0: the bytes come from a table.
     if far_mm == 0.0:
         for u in range(len(depths)):
             out[u] = table[np.uint16(depths[u] - less)]
@@ -226,9 +238,11 @@ def encode_body(
         q, e = fleet.quaternion[i], errors[i]
         cos, sin = heading_told((q[0], q[1], q[2], q[3]), (e[6], e[7], e[8]))
         here = fleet.position[i]
+        # Policy inputs use telemetry: the true state plus the errors.
         north, east = goal[i, 0] - (here[0] + e[0]), goal[i, 1] - (here[1] + e[1])
         ahead, right = cos * north + sin * east, cos * east - sin * north
         distance = math.hypot(ahead, right)
+        # At the goal its direction is 0, not NaN.
         safe = max(distance, LEAST_DISTANCE_M)
         out.goal[i, 0], out.goal[i, 1] = ahead / safe, right / safe
         out.goal[i, 2] = distance / DISTANCE_SCALE_M
@@ -245,6 +259,7 @@ def heading_told(quaternion: Quat, turn: Vec) -> tuple[float, float]:
     `turn` is the attitude error [rad], as in `estimation.perturbed`.
     """
     angle = math.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
+    # The same operations as `np.sinc`, so that the result has the same bits.
     half = math.pi * (angle / (2.0 * math.pi))
     share = 0.5 if angle == 0.0 else 0.5 * (math.sin(half) / half)
     error = (math.cos(0.5 * angle), share * turn[0], share * turn[1], share * turn[2])

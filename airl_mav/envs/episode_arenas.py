@@ -40,6 +40,7 @@ def stages_of(settings: Curriculum | None, arena: ArenaSpec) -> list[CurriculumS
     zones = len(arena.zones_m)
     settings = settings or Curriculum()
     count = settings.stages or zones
+    # One stage, or the last one: everything as in the arena's profile.
     return [
         CurriculumStage(
             _eased(settings, arena, k / (count - 1) if count > 1 else 1.0),
@@ -64,6 +65,7 @@ def _eased(settings: Curriculum, arena: ArenaSpec, gone: float) -> ArenaSpec:
         return arena
     count = settings.count + (1.0 - settings.count) * gone
     speed = settings.speed + (1.0 - settings.speed) * gone
+    # The gap shrinks to the profile's value as the other quantities grow.
     gap_m = arena.min_clearance_m + (1.0 - gone) * settings.clearance_m
     static, moving = (
         kind.model_copy(update={"count": tuple(round(count * number) for number in kind.count)})
@@ -90,6 +92,7 @@ class CurriculumState:
 
     def record(self, zone: int, *, success: bool) -> None:
         """Record an episode's outcome; outcomes of earlier zones are ignored."""
+        # The zone may have opened while the episode flew.
         if zone != self.zone:
             return
         self._outcomes.append(success)
@@ -194,6 +197,7 @@ class EpisodeArenas:
         self.present[:] = [
             self._made(int(seed), None if zone < 0 else int(zone)) if begun else None
             for seed, zone, begun in zip(self.seeds, self.zones, self.begun, strict=True)
+            # Slots without an episode need a row too.
         ]
         spare = next((arena for arena in self.present if arena is not None), None)
         room = [spare if arena is None else arena for arena in self.present]

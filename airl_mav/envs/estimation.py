@@ -86,6 +86,7 @@ def perturbed(
     """
     turn = errors[..., ATTITUDE]
     angle = np.linalg.norm(turn, axis=-1)
+    # np.sinc(x) is sin(pi x) / (pi x), finite at angle 0.
     share = 0.5 * np.sinc(angle / (2.0 * np.pi))
     estimated = np.empty(quaternion.shape)
     _turn(
@@ -101,6 +102,7 @@ def perturbed(
 @kernel
 def _turn(cos: Array, share: Array, turn: Array, quaternion: Array, out: Array) -> None:
     """Write the products (n, 4) of rotations cos, share turn (n, 3) and quaternions (n, 4)."""
+    # Hamilton product of the error's rotation and the attitude.
     for i in range(len(out)):
         w = cos[i]
         x, y, z = share[i] * turn[i, 0], share[i] * turn[i, 1], share[i] * turn[i, 2]
@@ -134,6 +136,7 @@ def step_error(drift: Drift, errors: Array, i: int, decision: int, ticks: int) -
     """Step the errors (n, 9) of vehicle i after its n-th decision, which took `ticks`."""
     row = decision % BLOCK
     for k in range(N_ERRORS):
+        # Longer decisions have no row in the table.
         if ticks < len(drift.kept):
             kept, added = drift.kept[ticks, k], drift.added[ticks, k]
         else:
@@ -170,6 +173,7 @@ class TelemetryErrors(Stateful):
         if self._model is not None:
             rng = stream(seed, Stream.ESTIMATION)
             self._rngs[i], self._normals[i] = rng, rng.standard_normal((BLOCK, N_ERRORS))
+            # The first draw starts the process in its stationary distribution.
             self.errors[i] = self._model.sd * self._normals[i, 0]
 
     def draw(self, decisions: NDArray[np.int64]) -> None:

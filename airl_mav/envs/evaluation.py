@@ -95,6 +95,7 @@ class LearnedPilots:
                 return commands(card.actions, self._policy.act_batch(encoded))
             chosen = np.zeros((len(flying), command_numbers(card.actions)))
             for i in np.flatnonzero(flying):
+                # One row at a time, so that a row's result does not depend on the others.
                 row = {key: array[i : i + 1] for key, array in encoded.items()}
                 chosen[i] = commands(card.actions, self._own[int(i)].act_batch(row))[0]
         except ValueError as error:
@@ -123,6 +124,7 @@ class SinglePilots:
 
     def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Return the commands; see `Pilots`."""
+        # NaN in the last column is altitude hold.
         chosen = np.tile((0.0, 0.0, 0.0, math.nan), (len(flying), 1))
         for i in np.flatnonzero(flying):
             asked = self._policies[int(i)].act(seen.rows(int(i)))
@@ -133,6 +135,7 @@ class SinglePilots:
             chosen[i, :3] = action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s
             if action.down_m_s is not None:
                 chosen[i, 3] = action.down_m_s
+        # Without any vertical speed the commands have three columns.
         return chosen[:, :3] if np.isnan(chosen[:, 3]).all() else chosen
 
 
@@ -211,6 +214,7 @@ def fly_seeds(
     busy = np.zeros(n, np.bool_)
 
     def begin(slots: Sequence[int]) -> None:
+        # The list is reversed, so `pop` returns the seeds in order.
         taken = [waiting.pop() for _ in slots]
         navigation.begin(slots, taken, zone)
         for slot, seed in zip(slots, taken, strict=True):
@@ -237,6 +241,7 @@ def fly_seeds(
                     decisions=int(decisions[i]),
                 ),
             )
+        # Slots restart only after all results of this decision have been consumed.
         if ended and waiting:
             begin(ended[: len(waiting)])
 

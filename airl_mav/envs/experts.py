@@ -89,10 +89,12 @@ class GatePilot:
     def decide(self) -> NDArray[np.float32]:
         """Return the actions (n, 3) for the present states."""
         fleet, _, vehicle = self._navigation.whole_truth()
+        # Predicted position at which the new command acts.
         here = fleet.position + AHEAD_S * fleet.velocity
         _, _, yaw = quats_to_euler(fleet.quaternion)
         each = np.arange(len(here))
         reach = vehicle.radius + BEHIND_M
+        # A gate counts as passed once the whole vehicle is behind it; gates are sorted northwards.
         passed = self._middle[:, :, 0] + self._half[:, :, 0] + reach < fleet.position[:, 0, None]
         gate = passed.sum(axis=1)
         middle, half = self._middle[each, gate], self._half[each, gate]
@@ -100,6 +102,7 @@ class GatePilot:
         room = half[:, 1:] - np.array([vehicle.radius, vehicle.half_height]) - MARGIN_M
         # 1 = lined up, 0 = outside the opening.
         share = np.abs(off) / np.maximum(room, 0.1)
+        # Full speed while the offset uses up to two thirds of the room, none from four thirds on.
         lined_up = np.clip(2.0 - 1.5 * share.max(axis=1), 0.0, 1.0)
         before = middle[:, 0] - half[:, 0] - here[:, 0]
         waiting = np.clip(GAIN_1_S * (before - STANDOFF_M), -1.0, self._speed)
@@ -107,9 +110,11 @@ class GatePilot:
         wanted[:, 0] = lined_up * self._speed + (1.0 - lined_up) * waiting
         wanted[:, 1:] = GAIN_1_S * off
         to_goal = GAIN_1_S * (self._goal - here)
+        # Behind the last gate the goal is the target.
         wanted = np.where((middle[:, 0] >= NOWHERE)[:, None], to_goal, wanted)
         body = ned_to_heading(wanted, yaw)
         level = np.hypot(body[:, 0], body[:, 1])
+        # Limit the horizontal speed, keep its direction.
         body[:, :2] *= np.minimum(1.0, self._speed / np.maximum(level, 1e-9))[:, None]
         body[:, :2] /= self._speed
         body[:, 2] = np.clip(body[:, 2] / self._climb, -1.0, 1.0)
@@ -190,6 +195,7 @@ class GreedyPilots:
         seen = self._navigation.see()
         actions = [pilot.act(seen.rows(i)) for i, pilot in enumerate(self.pilots)]
         wanted = np.array([(a.forward_m_s, a.right_m_s, a.yaw_rate_rad_s) for a in actions])
+        # Compare all commands with the wish; a yaw rate counts as an equivalent speed.
         off = (wanted[:, None] - self._commands) * (1.0, 1.0, TURN_M)
         nearest: NDArray[np.int64] = (off**2).sum(axis=2).argmin(axis=1)
         return nearest
@@ -230,6 +236,7 @@ class Expert(Stateful):
     def set_state(self, state: State) -> None:
         """Restore a saved state; restore the flights first."""
         super().set_state(state)
+        # The planner's maps and the gates' openings follow from the arenas, so they are not saved.
         self._chooser.begin(np.flatnonzero(self._begun).tolist())
         if isinstance(self._chooser, GreedyPilots):
             for pilot, side in zip(self._chooser.pilots, self._sides.tolist(), strict=True):

@@ -59,6 +59,7 @@ def gusts(faults: Sequence[TwinFault], first_tick: int, ticks: int) -> Vector:
     for each in faults:
         share = each.at(time_us).astype(float)
         if each.fault.kind == "gust":
+            # Only gusts have a time profile.
             whole_s = (each.to_us - each.from_us) / US_PER_S
             elapsed_s = (time_us - each.from_us) / US_PER_S
             share *= [gust_share(elapsed, whole_s) for elapsed in elapsed_s.tolist()]

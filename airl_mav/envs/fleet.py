@@ -213,6 +213,7 @@ def hover(
         battery: State of charge at the start, 1 full to 0 empty.
         wind: Steady wind NED [m/s].
     """
+    # Clear every counter, then set the fields that are not 0.
     for array in fleet:
         array[i] = 0
     a = vehicle.airframe if airframe is None else airframe
@@ -220,17 +221,21 @@ def hover(
     fleet.position[i, 2] = -altitude_m
     fleet.quaternion[i, 0] = 1.0
     speeds, north, east = hover_speeds(a), 0.0, 0.0
+    # Thrust must balance weight and drag: tilt the vehicle into the wind.
     if wind != STILL:
         push, weight = drag_force(STILL, wind, a), a.mass * GRAVITY_M_S2
         thrust = (-push[0], -push[1], -push[2] - weight)
         fleet.quaternion[i] = attitude_setpoint(thrust, 1.0, 0.0)
         north, east = (GRAVITY_M_S2 * thrust[axis] / -thrust[2] for axis in (0, 1))
+        # Thrust grows with the square of the rotor speed.
         more = math.sqrt(math.hypot(*thrust) / weight)
         s0, s1, s2, s3 = (min(1.0, more * speed) for speed in speeds)
         speeds = s0, s1, s2, s3
     fleet.rotor[i] = speeds
+    # Invert the thrust curve: the commands that give these speeds.
     c0, c1, c2, c3 = (command_for(speed * speed, a.thrust_curve) for speed in speeds)
     collective = math.fsum((c0, c1, c2, c3)) / N_ROTORS
+    # The integrals start at their steady state of a hover.
     trim_for_hover(fleet.memory[i], collective, vehicle.gains, north, east)
     trim_against_torque(fleet.memory[i], (c0, c1, c2, c3), vehicle.gains)
     fleet.battery[i] = battery
@@ -284,6 +289,7 @@ def load(fleet: Fleet, i: int, state: State, j: int) -> None:
         state[VELOCITY + axis, j] = fleet.velocity[i, axis]
         state[RATES + axis, j] = fleet.omega[i, axis]
         state[FELT + axis, j] = fleet.felt[i, axis]
+        # Body rates need no conversion to NED.
         by_rates = fleet.by_rates[i]
         state[WANTED + axis, j] = (
             fleet.setpoint[i, axis] if by_rates else fleet.velocity_ned[i, axis]
@@ -295,6 +301,7 @@ def load(fleet: Fleet, i: int, state: State, j: int) -> None:
     state[ENERGY, j] = fleet.energy[i]
     state[BATTERY, j] = fleet.battery[i]
     state[DISTANCE, j] = fleet.distance[i]
+    # The time constant differs between randomized airframes.
     state[ROTOR_LEFT, j] = lag(airframe_of(fleet.airframe[i]), TICK_S)
     for k in range(AIRFRAME_SIZE):
         state[AIRFRAME + k, j] = fleet.airframe[i, k]

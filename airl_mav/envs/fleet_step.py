@@ -151,6 +151,7 @@ def advance(
             cyclically. None, or k = 0: calm.
     """
     n, never = len(ticks), np.zeros((0, 3), np.int64)
+    # A decision without events, so that `fly` only counts ticks.
     timing = Timing(False, 0, 0, -1, -1, 0.0, never, FrameTimes(np.zeros(n, np.int64), 1, 0, never))
     nothing = new_decision(timing, np.zeros((n, 9)))
     todo = np.where(fleet.verdict == _FLYING, ticks, 0)
@@ -190,6 +191,7 @@ def fly(
         for j in range(LANES):
             i = who[j]
             if i != _NOBODY:
+                # Repeats come before the loops, as a setpoint acts in the tick of its arrival.
                 if fleet.time_us[i] >= fleet.repeat_us[i]:
                     _repeat(fleet, i, state, j)
                 if air.shape[1] > 0:
@@ -200,12 +202,14 @@ def fly(
         _inner_loops(state, who, vehicle.gains, weights)
         if by_rates:
             _keep_rates(state, who)
+        # Position loops are due at every second tick, so the search alternates.
         odd ^= 1
         _move(state, vehicle, kept)
         for j in range(LANES):
             i = who[j]
             if i != _NOBODY:
                 here, hit = vec(state, POSITION, j), NOTHING
+                # Same order as `flight.judge`: move, contact, verdict.
                 fleet.time_us[i] += TICK_US
                 # Contact is impossible until the combined motion exceeds the clearance.
                 fleet.room[i] -= state[MOVED, j] + TICK_S * arenas.tour_speed[i]
@@ -216,6 +220,7 @@ def fly(
                 fleet.verdict[i] = _verdict(
                     here, goal, hit, state[BATTERY, j], fleet.time_us[i], rules
                 )
+                # An ended flight leaves its lane.
                 left[j] = left[j] - 1 if fleet.verdict[i] == _FLYING else 0
 
 
@@ -243,12 +248,14 @@ def _fill(
                     unload(fleet, who[j], state, j)
                     who[j] = _NOBODY
                 continue
+            # First a vehicle with the same parity, then any other.
             i = _next(todo, fleet.memory, odd, coming)
             if i == _NOBODY:
                 i = _next(todo, fleet.memory, odd ^ 1, coming)
             if i == _NOBODY:
                 break
             load(fleet, i, state, j)
+            # A vehicle with events gets its ticks from `next_stretch`.
             who[j], left[j], todo[i] = i, 0 if decision.events[i] > 0 else todo[i], 0
         aloft += who[j] != _NOBODY
     return aloft
@@ -342,11 +349,13 @@ def _outer_loops(
                     _restore(state, spare, j)
             elif state[BY_RATES, j] != 0.0:
                 _restore(state, spare, j)
+                # Body rates skip the position loop, but its velocity filter must not stop.
                 velocity, period = vec(state, VELOCITY, j), POSITION_TICKS * TICK_S
                 differentiate(velocity, state[MEMORY:ROWS, j], weights, period)
                 state[MEMORY + WAIT, j] = POSITION_TICKS
             else:
                 state[MEMORY + WAIT, j] = POSITION_TICKS
+                # In the first tick the inner loops use the setpoint of this tick.
                 if state[FIRST, j] != 0.0:
                     _publish(state, j)
     return by_rates > 0
@@ -372,6 +381,7 @@ def _inner_loops(state: State, who: NDArray[np.int64], gains: Gains, weights: Fi
             state[REDUCED + k, j] = reduced[k]
         state[MEMORY + WAIT, j] -= 1.0
     for j in range(state.shape[1]):
+        # A separate loop: `weighted_turn` calls functions without a vector form.
         state[HALF_TURN, j] = weighted_turn(state[HALF_TURN, j], gains)
     for j in range(state.shape[1]):
         memory, reduced = state[MEMORY:ROWS, j], quat(state, REDUCED, j)
@@ -390,6 +400,7 @@ def _inner_loops(state: State, who: NDArray[np.int64], gains: Gains, weights: Fi
             memory[SAT + axis] = 0.0
         for k in range(4):
             state[MOTORS + k, j] = motors[k]
+    # Desaturation is rare and not vectorized.
     for j in range(state.shape[1]):
         if state[FITS, j] == 0.0 and who[j] != _NOBODY:
             motors, missing = desaturate(state[COLLECTIVE, j], vec(state, TORQUE, j), gains)
@@ -445,15 +456,18 @@ def _move(state: State, vehicle: FleetConstants, kept: float) -> None:
         q, w = quat(state, ATTITUDE, j), vec(state, RATES, j)
         airframe = airframe_of(state[AIRFRAME : AIRFRAME + AIRFRAME_SIZE, j])
         motors, speeds = quat(state, MOTORS, j), quat(state, ROTOR, j)
+        # Rotor speeds follow the motor commands with a first-order lag.
         s0 = settle(speeds[0], motors[0], airframe, state[ROTOR_LEFT, j])
         s1 = settle(speeds[1], motors[1], airframe, state[ROTOR_LEFT, j])
         s2 = settle(speeds[2], motors[2], airframe, state[ROTOR_LEFT, j])
         s3 = settle(speeds[3], motors[3], airframe, state[ROTOR_LEFT, j])
         thrust, torque = wrench(s0, s1, s2, s3, airframe)
+        # Thrust acts along the body's z axis, upwards (FRD).
         lift = rotate(q, (0.0, 0.0, -thrust))
         wind = vec(state, WIND, j)
         drag = drag_force(v, wind, airframe)
         force = (lift[0] + drag[0], lift[1] + drag[1], lift[2] + drag[2])
+        # Rotational drag of the body.
         k = airframe.drag_angular
         damped = (torque[0] - k * w[0], torque[1] - k * w[1], torque[2] - k * w[2])
         # Power at the start of the tick, as for the drag.
@@ -463,6 +477,7 @@ def _move(state: State, vehicle: FleetConstants, kept: float) -> None:
         acceleration = felt(acceleration, v, v_new, kept, TICK_S, vehicle.power)
         x, y, z = p_new[0] - p[0], p_new[1] - p[1], p_new[2] - p[2]
         moved = math.sqrt(x**2 + y**2 + z**2)
+        # Battery: voltage under load, then the charge that the current drains.
         rest_v = open_circuit(state[BATTERY, j], pack.empty_v, pack.full_v)
         load_w = power + vehicle.computer_w
         current = load_w / terminal_voltage(rest_v, pack.resistance_ohm, load_w)
@@ -509,6 +524,7 @@ def _contact(
     radius, half_height = vehicle.radius, vehicle.half_height
     relief = relief_of(arenas, i)
     room = clearance(position, radius, half_height, bounds, count, center, half_size, relief)
+    # The exact test runs only where the lower bound permits a contact.
     if room > _ROUNDING_M:
         return room, NOTHING
     return room, touches(

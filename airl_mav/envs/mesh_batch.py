@@ -76,6 +76,7 @@ class MeshesSeen:
         forest = forest_of(tuple(self._files))
         if self._files or arena.ground is not None or self.batch is not None:
             batch = self.batch
+            # A new file, or an arena that is too large, rebuilds the trees.
             if batch is None or len(self._files) > before or not self._fits(batch, arena):
                 self.batch = batch = self._made(forest)
             self._put(batch, forest, i, arena)
@@ -83,6 +84,7 @@ class MeshesSeen:
 
     def _leave_glass_out(self, i: int, arena: Arena) -> None:
         """Update `by_depth` for slot i's arena, and for `batch`."""
+        # Without glass both batches are the same object.
         if not self._glass and arena.clear is None:
             self.by_depth = self.batch
             return
@@ -96,6 +98,7 @@ class MeshesSeen:
             or depth.bvh is not shown.bvh
             or depth.owner.shape[1] < len(arena.obstacles)
         ):
+            # New trees, or more obstacles, invalidate all rows.
             present = [k for k, each in enumerate(self._arenas) if each is not None]
             most = max(len(each.obstacles) for each in self._arenas if each is not None)
             room = len(self._arenas), max(most, shown.owner.shape[1])
@@ -106,6 +109,7 @@ class MeshesSeen:
             depth.owner[k, :width] = shown.owner[k]
             each = self._arenas[k]
             if each is not None and each.clear is not None:
+                # Depth rays pass through glass.
                 depth.owner[k, : len(each.obstacles)][each.clear] = UNSEEN
 
     def _fits(self, batch: MeshBatch, arena: Arena) -> bool:
@@ -120,6 +124,7 @@ class MeshesSeen:
         n = len(self._arenas)
         obstacles = max(len(arena.obstacles) for arena in present)
         meshes = max(_meshes_of(arena) for arena in present)
+        # Space only grows, so that a return to an earlier arena does not rebuild.
         rooms = [self._room, *map(_room_of, present)]
         self._room = max(nodes for nodes, _ in rooms), max(faces for _, faces in rooms)
         batch = MeshBatch(
@@ -141,6 +146,7 @@ class MeshesSeen:
         batch.present[i] = k
         roots = forest.roots
         if arena.ground is not None:
+            # Each slot has a fixed space behind the trees of the files.
             nodes, faces = self._room
             node, face = len(forest.bvh.boxes) + i * nodes, len(forest.bvh.corners) + i * faces
             _plant(batch.bvh, ground_tree(arena.ground), node, face)
@@ -188,6 +194,7 @@ def _plant(bvh: Bvh, tree: Bvh, node: int, face: int) -> None:
         tree.corners,
         tree.normals,
     )
+    # A leaf's link points to a triangle, an inner node's to a node.
     leaf = tree.links[:, 1] > 0
     bvh.links[nodes] = tree.links
     bvh.links[nodes, 0] += np.where(leaf, face, node).astype(np.int32)

@@ -150,6 +150,7 @@ class Navigation(Stateful):
         self.stages, self.arenas = self._places.stages, self._places.present
         self.seeds, self.zones = self._places.seeds, self._places.zones
         self.fleet, self._calm_start = new_fleet(n), new_fleet(1)
+        # The calm start is the same for all seeds, so it is computed once.
         hover(self._calm_start, 0, rules.altitude_m, self._vehicle, battery=battery_charge)
         self._number = np.zeros(n, np.int64)
         """(n,) number of the present decision in each episode, from 0."""
@@ -209,6 +210,7 @@ class Navigation(Stateful):
         rules, cameras = self.spec.episode, self.cameras
         hold_us = round(rules.hold_s * US_PER_S)
         late_us = round(sum(each.fault.amount for each in self._uplink) * US_PER_S)
+        # The newest frame at the next observation must be captured after the setpoint's arrival.
         least_us = self._link_us + late_us + cameras.latest_us + cameras.times.period_us
         if not pipelined and hold_us < least_us:
             raise UsageError(
@@ -216,6 +218,7 @@ class Navigation(Stateful):
                 f"(delay.link_ms, delay.transport_ms and {cameras.times.period_us / 1e3:g} ms"
                 " between two frames, and what faults delay)"
             )
+        # Negative: velocity setpoints do not time out.
         timeout_us = -TICK_US
         if self.by_rates:
             held_s = 0.0 if pipelined else rules.hold_s
@@ -233,6 +236,7 @@ class Navigation(Stateful):
 
     def _encoding_of(self, spec: EnvironmentSpec) -> Bytes | None:
         """Return the constants for encoding in kernels; None for encoding in Python."""
+        # The compiled encoding supports the plain layout only.
         if spec.layout != "body" or spec.frames > 1 or spec.in_flight or spec.goal_height:
             return None
         return None if self._companions.foresee else body_bytes(self.camera.range_m)
@@ -255,6 +259,7 @@ class Navigation(Stateful):
             who[i] = True
         self._before_draw, self._world, self._status = 0, None, None
         self._encoded = None
+        # The first frame shows the vehicle at its start.
         for array, theirs in zip(self._decision.seen, self._moving(), strict=True):
             array[who] = theirs[who]
         self._take_frames(who)
@@ -273,6 +278,7 @@ class Navigation(Stateful):
         randomisation = self.spec.randomisation
         airframe = None
         if spreads(randomisation):
+            # Every random part has its own stream, so one setting does not change other draws.
             rng = stream(seed, Stream.AIRFRAME)
             airframe = draw_airframe(self._vehicle.airframe, randomisation, rng)
         north, east, down = self._winds.begin(i, seed).tolist()
@@ -306,6 +312,7 @@ class Navigation(Stateful):
         else:
             image, state = self.cameras.image[rows], self.kinematics(rows)
         goal = self._places.batch.goal[rows]
+        # Goals without a height have two coordinates.
         if np.isnan(goal[:, 2]).all():
             goal = goal[:, :2]
         eyes = self.cameras.further
@@ -323,6 +330,7 @@ class Navigation(Stateful):
 
         For all vehicles, or for vehicles in `slots`.
         """
+        # The kernels have already encoded these observations; they are valid once.
         encoded, self._encoded = self._encoded, None
         if encoded is not None and slots is None:
             return encoded
@@ -368,6 +376,7 @@ class Navigation(Stateful):
         if commands.ndim != 2 or len(commands) != self.n or not least <= commands.shape[1] <= 4:
             accepted = " or ".join(f"({self.n}, {width})" for width in range(least, 5))
             raise ValueError(f"commands of shape {commands.shape}: accepted: {accepted}")
+        # Trace and companions need the state before the decision's flight.
         if self._trace is not None:
             self._trace.deciding(self.fleet, self._decision.seen.time_us)
         if self._companions.remember:
@@ -391,6 +400,7 @@ class Navigation(Stateful):
         """Fly a decision, with pauses for Python."""
         numbers, whole = self._room_for_status()
         waiting, resumed = self.n, False
+        # The kernels return early where Python must draw wind, freeze an image or record.
         while waiting > 0:
             if self._stops:
                 self._winds.blow(self.fleet)
@@ -430,6 +440,7 @@ class Navigation(Stateful):
             )
         if self._companions.account:
             self._companions.aged(TICK_US * decision.age)
+            # Sent at a whole tick, as in the kernels.
             sent_us = began_us + TICK_US * ((t2_us + TICK_US // 2) // TICK_US)
             stop_us = None
             if self._decision.timing.hover_us >= 0:
@@ -443,8 +454,10 @@ class Navigation(Stateful):
             self._before_draw -= 1
             return
         self._delays.draw(self._number)
+        # The errors of decision n + 1 are drawn ahead: `step_error` uses them at its end.
         self._telemetry.draw(self._number + 1)
         then = self._number + 1
+        # Decisions until the nearest end of any block; until then nothing is due.
         self._before_draw = int(np.minimum(-then % BLOCK, -(then + 1) % BLOCK).min())
 
     def _room_for_status(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -520,6 +533,7 @@ class Navigation(Stateful):
         """
         super().set_state(state)
         self._places.restore()
+        # 0 forces a contact check in the next tick.
         self.fleet.room[:] = 0.0
         self._before_draw, self._world, self._status = 0, None, None
         self._encoded = None

@@ -85,6 +85,7 @@ class PlannerBody(NamedTuple):
 
 def map_of(batch: ArenaBatch, i: int, body: PlannerBody) -> Map:
     """Return the map of arena i."""
+    # Rows run north and columns east, from the south-west corner.
     south, north, west, east = batch.bounds[i, :4]
     cell = max(FINEST_M, max(north - south, east - west) / CELLS)
     shape = math.ceil((north - south) / cell), math.ceil((east - west) / cell)
@@ -92,6 +93,7 @@ def map_of(batch: ArenaBatch, i: int, body: PlannerBody) -> Map:
     first = south + 0.5 * cell, west + 0.5 * cell
     _fill_gaps(batch, i, body, first, cell, gap)
     most_m = body.altitude - body.half_height - OVER_M
+    # Ground below the flight altitude needs no distance.
     if batch.grid[i, TOP] > most_m:
         gap = np.minimum(gap, _to_hills(batch, i, most_m, first, cell, gap.shape))
     _fill_times(gap, body.radius, first, cell, (batch.goal[i, 0], batch.goal[i, 1]), to_go)
@@ -113,6 +115,7 @@ def beside(
         return gap
     c, s = math.cos(batch.yaw[i, obstacle]), math.sin(batch.yaw[i, obstacle])
     gx, gy = abs(c * dx + s * dy) - half_size[0], abs(c * dy - s * dx) - half_size[1]
+    # Outside: distance to the box; inside: negative depth to the nearest side.
     beside: float = math.sqrt(max(gx, 0.0) ** 2 + max(gy, 0.0) ** 2) + min(0.0, max(gx, gy))
     return beside
 
@@ -136,6 +139,7 @@ def _to_hills(
         return np.full(shape, FAR)
     to_high = scipy.ndimage.distance_transform_edt(~high, sampling=cell)
     to_low = scipy.ndimage.distance_transform_edt(high, sampling=cell)
+    # Distances are between cell centres, so the border is half a cell nearer.
     distance: NDArray[np.float64] = to_high - to_low + np.where(high, 0.5, -0.5) * cell
     return distance
 
@@ -193,6 +197,7 @@ def _fill_times(
     slow = np.empty((rows, columns))
     for row in range(rows):
         for column in range(columns):
+            # Speed falls linearly with the gap, so that paths keep away from obstacles.
             room = gap[row, column] - radius
             share = SLOWEST + (1.0 - SLOWEST) * room / COMFORT_M
             slow[row, column] = 1.0 / (BLOCKED if room < 0.0 else min(1.0, share))
@@ -201,6 +206,7 @@ def _fill_times(
     to_go[goal_row, goal_column] = 0.0
     changed = 1.0
     sweep = 0
+    # Fast sweeping: four orders of rows and columns, until no cell changes by more than 10 ms.
     while changed > 1e-2 and sweep < 200:
         if sweep % 4 == 0:
             changed = 0.0
@@ -216,6 +222,8 @@ def _fill_times(
                     to_go[row, column - 1] if column > 0 else FAR,
                     to_go[row, column + 1] if column < columns - 1 else FAR,
                 )
+                # Godunov's upwind scheme: one neighbour, or both if their times differ by less than
+                # `f`.
                 least = min(a, b)
                 if least >= FAR:
                     continue
@@ -227,6 +235,7 @@ def _fill_times(
                     changed = max(changed, to_go[row, column] - found)
                     to_go[row, column] = found
         sweep += 1
+        # Convergence is tested after a full set of four sweeps.
         if sweep % 4 != 0:
             changed = 1.0
 
@@ -235,6 +244,7 @@ def _fill_times(
 def read_at(known: Map, field: NDArray[np.float64], north: float, east: float) -> float:
     """Return a field of the map at a position, by bilinear interpolation."""
     rows, columns = field.shape
+    # Just below the last index, so that row + 1 and column + 1 exist.
     x = min(max((north - known.north) / known.cell, 0.0), rows - 1.001)
     y = min(max((east - known.east) / known.cell, 0.0), columns - 1.001)
     row, column = int(x), int(y)
@@ -329,6 +339,7 @@ class Planner:
             rules.hold_s,
             response.velocity_time_s,
             response.yaw_rate_time_s,
+            # With a view all around, the heading has no cost.
             TURN_S * (spec.camera.of(navigation.vehicle.camera).horizontal_fov_deg < 360.0),
         )
         self._maps: dict[int, Map] = {}
@@ -364,6 +375,7 @@ class Planner:
 
 def _mean_t2_us(injection: Injection, delay: Delay) -> float:
     """Return the mean latency of a decision [µs], from a separate random generator."""
+    # A fixed seed: the mean must not depend on the episode.
     sampler = injection.sampler(np.random.default_rng(0))
     if sampler is None:
         return delay.native_ms * US_PER_MS
@@ -381,6 +393,7 @@ def _follow_movers(batch: ArenaBatch, i: int, time_s: float, places: NDArray[np.
         k = 0
         for step in range(places.shape[0]):
             t = (time_s + (step + 1) * STEP_S) % batch.tour_period_s[i, j]
+            # Tours are cyclic: after the end the search starts again.
             if times[k] > t:
                 k = 0
             while times[k + 1] <= t:
@@ -408,6 +421,7 @@ def _to_movers(
         obstacle = batch.n_static[i] + j
         dx, dy = north - places[j, 0], east - places[j, 1]
         half = batch.half_size[i, obstacle]
+        # An upper bound of the half diagonal: most movers are too far away to matter.
         reach = half[0] + half[1] + body.radius + WARY_GAP_M
         if dx * dx + dy * dy < reach * reach:
             # Shift the vehicle instead of the obstacle.
@@ -446,6 +460,7 @@ def best_command(
         time_s: Time since the start of the flight [s].
     """
     best, least = 0, math.inf
+    # Share of a first-order response in one step.
     share = 1.0 - math.exp(-STEP_S / timing.response)
     turned = timing.lead + timing.hold
     horizon = turned + AHEAD_S
@@ -462,14 +477,17 @@ def best_command(
             # Stop early once the cost exceeds the best.
             while t < horizon and cost + t < least and not there:
                 forward, right, rate = commands[c, 0], commands[c, 1], commands[c, 2]
+                # Until the new command acts, the vehicle follows the last one.
                 if t < timing.lead:
                     forward, right, _ = last
                 elif t >= turned + straight_on:
                     forward, right = 0.0, 0.0
+                # The yaw rate follows later than the velocity.
                 if t < timing.lead + timing.turn_response:
                     rate = last[2]
                 elif t >= turned + timing.turn_response:
                     rate = 0.0
+                # Once, when the turn has ended: the nose should point along the path.
                 if rate == 0.0 and t >= turned and not looked:
                     looked = True
                     cost += timing.turn * _off_the_way(known, x, y, nose)
@@ -477,6 +495,7 @@ def best_command(
                     cn, sn = math.cos(nose), math.sin(nose)
                 ax = (cn * forward - sn * right - vx) * share
                 ay = (sn * forward + cn * right - vy) * share
+                # Limit the acceleration, keep its direction.
                 most = MOST_M_S2 * STEP_S / max(math.sqrt(ax * ax + ay * ay), 1e-9)
                 vx, vy = vx + min(1.0, most) * ax, vy + min(1.0, most) * ay
                 x, y, nose, t = x + STEP_S * vx, y + STEP_S * vy, nose + STEP_S * rate, t + STEP_S
@@ -491,6 +510,7 @@ def best_command(
                     cost += WARY * (WARY_GAP_M - moving) * STEP_S
                 dx, dy = x - batch.goal[i, 0], y - batch.goal[i, 1]
                 there = dx * dx + dy * dy < body.arrived * body.arrived
+            # Time flown, plus the map's time from the end of the prediction.
             cost += t
             if not there:
                 cost += read_at(known, known.to_go, x, y) / body.top_speed
@@ -503,6 +523,7 @@ def best_command(
 def _off_the_way(known: Map, north: float, east: float, nose: float) -> float:
     """Return the angle between the nose and the path to the goal [rad], 0 to pi."""
     cell = known.cell
+    # Central differences of the time to go; the path runs downhill.
     down_x = read_at(known, known.to_go, north - cell, east)
     down_x -= read_at(known, known.to_go, north + cell, east)
     down_y = read_at(known, known.to_go, north, east - cell)

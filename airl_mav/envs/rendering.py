@@ -179,6 +179,7 @@ class EpisodeRenderer:
         arena = now.arena
         if arena is not self._arena:
             self._begin(arena)
+        # Static parts are drawn once and copied under every picture.
         if self._background is None:
             self._canvas.draw()
             self._background = self._canvas.copy_from_bbox(self._figure.bbox)
@@ -192,6 +193,7 @@ class EpisodeRenderer:
 
     def _update(self, moment: PictureContent, trail: NDArray[np.float64]) -> None:
         arena, now, position = moment.arena, moment.flights, moment.position
+        # Plots have east to the right: swap north and east.
         centers = arena.centers_at(moment.scene_us)[arena.n_static :, 1::-1]
         self._moving.set_verts(
             [outline + at for outline, at in zip(self._outlines, centers, strict=True)]
@@ -210,6 +212,7 @@ class EpisodeRenderer:
 
 def display_found() -> bool:
     """Return True if this machine has a display for windows."""
+    # Other systems have a display without these variables.
     if not sys.platform.startswith("linux"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -230,6 +233,7 @@ class Window:
             )
         except ImportError as error:  # the configured backend is unavailable
             raise _no_display(str(error)) from None
+        # A backend such as Agg creates figures without a window.
         if type(self._figure.canvas).required_interactive_framework is None:
             pyplot.close(self._figure)
             raise _no_display(f"matplotlib's backend is {pyplot.get_backend()}")

@@ -123,6 +123,7 @@ def pay(
         # A time cost makes the policy learn full thrust first: then the camera sees only the
         # ground, and the clipped actions have no gradient.
         worth = min(max(1.0 - (speed_m_s - PACE_M_S) / PACE_SPREAD_M_S, 0.0), 1.0)
+        # Progress beyond the pace earns nothing, and loses weight at higher speeds.
         nearer_m = min(nearer_m, PACE_M_S * passed_s) * worth
         return AGILE_BONUS * ended + AGILE_1_M * nearer_m - AGILE_TURN * turned
     # Krishnan et al. 2021, appendix B, eqs. 2 and 3: r = 1000 a - 1000 b - D_g + g D_c. As printed,
@@ -136,6 +137,7 @@ def pay(
 def _shipped(name: int, step: Step) -> NDArray[np.float64]:
     """Return `pay` of n vehicles."""
     before, now = step.before, step.now
+    # Four columns are body rates and thrust, three are velocities and a yaw rate.
     by_rates = step.commands.shape[1] == len(BodyRates._fields)
     turned = np.square(step.commands[:, :3] if by_rates else step.commands[:, 2:]).sum(axis=1)
     columns = (before.goal_distance_m, now.goal_distance_m, now.time_s - before.time_s)
@@ -153,6 +155,7 @@ def reward_of(name: str) -> Reward:
     if name in SHIPPED_REWARDS:
         return partial(_shipped, SHIPPED_REWARDS.index(name))
     found = plugins.load_part(plugins.REWARDS, name)
+    # A class is instantiated; its objects are the rewards.
     try:
         own = found() if isinstance(found, type) else found
     except Exception as error:

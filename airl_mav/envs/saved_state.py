@@ -54,6 +54,7 @@ def _put_back(held: Mapping[str, Any], state: State) -> None:
         if isinstance(part, np.ndarray):
             _restore_array(part, state, name)
         elif isinstance(part, list):
+            # In place, because the part owns the list.
             part[:] = unpack_generators(saved_array(state, name))
         elif isinstance(part, Stateful):
             part.set_state(state_of_part(state, name))
@@ -77,6 +78,7 @@ def _restore_array(target: NDArray[Any], state: State, key: str) -> None:
         raise UsageError(
             f"state: {key} is {value.dtype} {value.shape}; accepted: {target.dtype} {target.shape}"
         )
+    # In place: kernels and other parts share the array.
     target[...] = value
 
 

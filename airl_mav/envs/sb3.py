@@ -76,6 +76,7 @@ class NavigationVecEnv(Stateful, VecEnv):
 
     def reset(self) -> Encoded:
         """Start n episodes with the settings of `seed()` and `set_options()`."""
+        # SB3's `seed(n)` stores n, n + 1, ...; the first one seeds all episodes.
         seed = next((s for s in self._seeds if s is not None), None)
         observation, _ = self.env.reset(seed=seed, options=self._options[0])
         self._reset_seeds()
@@ -94,6 +95,7 @@ class NavigationVecEnv(Stateful, VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Fly one decision."""
+        # Seed and zone of the flown episode; a step may start the next one.
         flown = self.env.navigation
         seed, zone = int(flown.seeds[0]), int(flown.zones[0])
         seen, reward, terminated, truncated, info = self.env.step(self._actions)
@@ -107,6 +109,7 @@ class NavigationVecEnv(Stateful, VecEnv):
             episode |= {"r": float(self._return[i]), "l": int(self._length[i])}
             infos[i] = {
                 "terminal_observation": info["final_obs"][i],
+                # SB3 bootstraps the value of truncated episodes.
                 "TimeLimit.truncated": bool(truncated[i]),
                 "is_success": episode["success"],
                 "episode": episode | {"t": episode["flight_time_s"]},

@@ -71,6 +71,7 @@ def sight_of(spec: EnvironmentSpec, vehicle: VehicleProfile) -> Sight:
         raise UsageError(f"image_width_px, image_height_px: {problem}")
     if problem := further_mismatch(observation, sight.lenses):
         raise UsageError(f"cameras: {problem}")
+    # A level scan assumes that the middle of the image is ahead.
     if spec.layout == "scan" and camera.yaw_deg != 0.0:
         accepted = "another with a camera that does not look ahead (camera.yaw_deg)"
         raise FieldError("layout", spec.layout, accepted)

@@ -76,6 +76,7 @@ class NavigationEnv(FleetDecisions, gym.Env[Encoded, Any]):
             UsageError: Invalid option or seed, or arena generation failed for the seed.
             gymnasium.error.Error: The seed is negative, or not a Python int.
         """
+        # A reset without arguments continues with the present zone.
         if seed is not None or options:
             self._zone = zone_option(options)
         super().reset(seed=seed)
@@ -119,6 +120,7 @@ class NavigationEnv(FleetDecisions, gym.Env[Encoded, Any]):
         arena, flights, truth = navigation.arenas[0], navigation.flights(), navigation.truth()
         assert arena is not None  # noqa: S101 (an episode has begun)
         return PictureContent(
+            # One flight: row 0.
             arena,
             flights,
             truth.position[0],

@@ -372,6 +372,7 @@ class EnvironmentSpec(ProfileModel):
             ("costs.command_step", self.costs.command_step, 0.0),
             ("costs.turn_step", self.costs.turn_step, 0.0),
         ):
+            # These options act on velocities.
             if self.actions == BODY_RATES and value != usual:
                 raise ValueError(
                     f"{name} = {value!r}: accepted: {usual!r} with actions {BODY_RATES!r}, which"
@@ -416,6 +417,7 @@ def gymnasium_spec(spec: EnvironmentSpec | None, knobs: Mapping[str, Any]) -> En
     try:
         made = spec_of(spec, knobs)
     except FieldError as error:
+        # Only unknown keywords become an UnexpectedArgumentError.
         if error.field not in knobs.keys() - EnvironmentSpec.model_fields.keys():
             raise
         hint = error.problem.removeprefix("unknown field")
@@ -425,5 +427,6 @@ def gymnasium_spec(spec: EnvironmentSpec | None, knobs: Mapping[str, Any]) -> En
     if spec is not None or {"image_width_px", "image_height_px"} & knobs.keys():
         return made
     camera = made.camera.of(load_vehicle(made.vehicle).camera)
+    # Layout `paper` has additional rows.
     rows = camera.height_px + (STRIP_ROWS if made.layout == "paper" else 0)
     return spec_of(None, {**knobs, "image_width_px": camera.width_px, "image_height_px": rows})

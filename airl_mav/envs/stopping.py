@@ -122,6 +122,7 @@ class Braking(ProfileModel):
     def distance_from_m(self, speed_m_s: float) -> float:
         """Return the stopping distance from a true speed [m]; as v² beyond the measurement."""
         flown, distance = np.array([0.0, *self.flown_m_s]), np.array([0.0, *self.distance_m])
+        # The kinetic energy grows with v².
         beyond = max(1.0, speed_m_s / float(flown[-1])) ** 2
         return float(np.interp(speed_m_s, flown, distance)) * beyond
 
@@ -129,6 +130,7 @@ class Braking(ProfileModel):
     def _curves(
         self,
     ) -> tuple[scipy.interpolate.PchipInterpolator, scipy.interpolate.PchipInterpolator]:
+        # 0 m/s belongs to the curve; PCHIP keeps it monotonic.
         at = np.array([0.0, *self.commanded_m_s])
         return (
             scipy.interpolate.PchipInterpolator(at, [0.0, *self.flown_m_s]),
@@ -152,11 +154,13 @@ def _braking(vehicle_json: str) -> Braking:
     if folder is None:
         return measure_braking(vehicle)
     path = folder / f"braking-{profile_digest(vehicle)[:16]}.json"
+    # A missing or damaged file is measured again.
     with suppress(UsageError):
         stored = read_json(path, SCHEMA, "braking")
         del stored["schema"]
         return validated(Braking, stored, path)
     measured = measure_braking(vehicle)
+    # The cache is optional: a read-only folder must not fail.
     with suppress(OSError):
         write_json(path, {"schema": SCHEMA, **measured.model_dump()})
     return measured
@@ -190,6 +194,7 @@ def twin_of(vehicle: VehicleProfile) -> FleetConstants:
 def open_space(n: int, obstacles: int = 0) -> ArenaBatch:
     """Return n arenas without walls in reach, with capacity for obstacles."""
     batch = empty_batch(n, obstacles, 0, 0)
+    # Walls 1 mm high, far away; the goal is behind the vehicle.
     batch.bounds[:] = [-FAR_M, FAR_M, -FAR_M, FAR_M, 1e-3, 0.0]
     batch.goal[:, :2] = [-FAR_M, 0.0]
     batch.n_static[:] = obstacles
@@ -212,12 +217,14 @@ def run_ups(vehicle: FleetConstants, speeds: ArrayLike, moments_s: Sequence[floa
     fleet, arenas = new_fleet(n), open_space(n)
     for i in range(n):
         hover(fleet, i, ALTITUDE_M, vehicle)
+    # Forward is north, because the vehicle hovers with heading north.
     fleet.setpoint[:, 0] = wanted
     taken, flown = [], 0
     for moment in moments_s:
         ticks = round(moment / TICK_S)
         advance(fleet, arenas, np.full(n, ticks - flown, np.int64), vehicle, RULES, None)
         flown = ticks
+        # A copy: the fleet keeps flying.
         taken.append(Fleet._make(array.copy() for array in fleet))
     return Fleet._make(np.concatenate(arrays) for arrays in zip(*taken, strict=True))
 
@@ -228,11 +235,13 @@ def stop(fleet: Fleet, arenas: ArenaBatch, vehicle: FleetConstants) -> None:
     A vehicle remains at its turning point, or at its point of contact.
     """
     fleet.setpoint[:] = 0.0
+    # The new setpoint acts at once.
     fleet.repeat_us[:] = fleet.time_us
     moving = np.ones(len(fleet.time_us), np.bool_)
     for _ in range(round(_LONGEST_STOP_S / (_STEP_TICKS * TICK_S))):
         before: NDArray[np.float64] = fleet.position[:, 0].copy()
         advance(fleet, arenas, np.where(moving, _STEP_TICKS, 0), vehicle, RULES, None)
+        # The turning point: the vehicle no longer moves north.
         moving &= fleet.position[:, 0] > before
         if not moving.any():
             return
@@ -336,6 +345,7 @@ class StoppingTask:
         """
         braking = braking_of(self.vehicle)
         braked_m = braking.stopping_m(speed_m_s, 0.0)
+        # stopping_m(v, 1) - stopping_m(v, 0) is the speed flown at this setpoint.
         flown_m_s = braking.stopping_m(speed_m_s, 1.0) - braked_m
         return self.loop.inference_s((self.room_m - braked_m) / flown_m_s)
 
@@ -361,6 +371,7 @@ def fly_into(
     """
     rngs = [latency_generator(seed + i) for i in range(draws)]
     samplers = [latency.sampler(rng) or FixedSampler(_us(native_s)) for rng in rngs]
+    # Separate generators, so that the latencies depend on the seed alone.
     others = [np.random.default_rng((seed + i, draws)) for i in range(draws)]
     phases = np.array([rng.random(2) for rng in others])
     reaction_us = _reactions_us(task.loop, samplers, phases[:, 0])
@@ -389,6 +400,7 @@ def greatest_speed(
         return not fly_into(task, speed_m_s, latency, native_s, draws, seed).any()
 
     low, high = _LEAST_SPEED_M_S, braking_of(task.vehicle).fastest_m_s
+    # The usual results first: no limit, or no speed at all.
     if stands(high):
         return high
     if not stands(low):
@@ -416,6 +428,7 @@ def _reactions_us(
     for i, sampler in enumerate(samplers):
         observed_us = transport_us + int(phases[i] * period_us)
         sent_us = observed_us + sampler.sample_us()
+        # Until the first frame after time 0 has been decoded.
         while observed_us < transport_us + period_us:
             observed_us = sent_us + _us(loop.hold_s)
             sent_us = observed_us + sampler.sample_us()
@@ -488,6 +501,7 @@ def speed_bound(spec: EnvironmentSpec) -> SpeedBound | None:
         for source in injections_of(delay)
     )
     low_high = spec.randomisation.extra_delay_ms
+    # The worst case: the maximum of the random extra delay.
     t2_s = (t2_ms + low_high[1]) / MS_PER_S
     vehicle, _ = equipped(spec.vehicle, delay.computer, Payload())
     loop = DecisionLoop.of(vehicle, spec.episode.hold_s, delay)

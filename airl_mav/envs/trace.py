@@ -47,6 +47,7 @@ class _Tables:
         """Add one row to each slot of `who` (k,); values (k, width)."""
         at = self._count[who]
         if at.size and at.max() == self._rows.shape[1]:
+            # Doubling keeps the cost of growth constant per row.
             self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)], axis=1)
         self._rows[who, at] = values
         self._count[who] += 1
@@ -92,6 +93,7 @@ class Trace:
         """Sample the vehicles of `who` (k,)."""
         now = fleet.time_us[who]
         first = now == 0
+        # The first sample has no interval; 1 s avoids a division by zero.
         passed_s = np.where(first, 1.0, (now - self._sampled_us[who]) / US_PER_S)
         mean_w = np.where(first, 0.0, (fleet.energy[who] - self._sampled_j[who]) / passed_s)
         state = [fleet.position[who], fleet.velocity[who], fleet.quaternion[who]]

@@ -132,6 +132,7 @@ class NavigationVectorEnv(FleetDecisions, Stateful, VectorEnv[Encoded, NDArray[A
             own = [None if each is None else episode_seed(each) for each in seed]
             if len(own) != self.num_envs:
                 raise UsageError(f"seed: {len(own)} numbers; accepted: {self.num_envs}")
+            # Given seeds also seed the generator, so that later episodes are reproducible.
             if given := [each for each in own if each is not None]:
                 self.np_random = np.random.default_rng(np.random.SeedSequence(given))
         slots = np.flatnonzero(chosen).tolist()
@@ -165,6 +166,7 @@ class NavigationVectorEnv(FleetDecisions, Stateful, VectorEnv[Encoded, NDArray[A
             InvalidAction: Wrong number of actions, or outside the set; values beyond -1..1 are
                 clipped.
         """
+        # Flights that ended in an earlier step: NEXT_STEP restarts them, DISABLED rejects them.
         over = self._over()
         if over.any() and self.autoreset_mode == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded("step() after the end of an episode")
@@ -180,6 +182,7 @@ class NavigationVectorEnv(FleetDecisions, Stateful, VectorEnv[Encoded, NDArray[A
         elif ended.any():
             final = _masked(_outcomes(now, ended), ended)
         if begun.any():
+            # A step that only restarts a flight has no reward.
             reward = np.where(over, 0.0, reward)
             slots = np.flatnonzero(begun).tolist()
             now = self._begin(slots, self._next_seeds(len(slots)))
@@ -241,6 +244,7 @@ class NavigationVectorEnv(FleetDecisions, Stateful, VectorEnv[Encoded, NDArray[A
             UsageError: The state is from another environment.
         """
         own = state_of_part(state, "env")
+        # The state contains its environment, so that another one can reject it.
         self._check_same(unpack(saved_array(own, "spec")))
         super().set_state(state)
         self._zone = unpack(saved_array(own, "zone"))

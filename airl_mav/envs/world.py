@@ -103,12 +103,14 @@ def decide(
     if not resumed:
         _begin(decision, fleet, goal, commands, w.t2_us, w.number, w.extra_us)
         plan(decision, fleet)
+    # After a pause only unfinished decisions continue.
     todo = (decision.next < decision.events).astype(np.int64)
     going = todo.copy()
     fly(fleet, w.arenas, todo, w.vehicle, w.rules, w.air, decision)
     waiting = _end(decision, fleet, w.drift, w.number, going)
     if waiting == 0:
         render_images(decision.seen, w.arenas, np.ones(len(todo), np.bool_), w.eye)
+        # Status and rewards follow the last event of all vehicles.
         status(fleet, goal, numbers, whole)
         _judge(decision, commands, numbers, whole, w.reward, w.hold_s)
         if len(seen.depth) > 0:
@@ -130,6 +132,7 @@ def _begin(
     for i in range(len(commands)):
         decision.t2_us[i] = t2_us[i, number[i] % BLOCK] + extra_us[i]
         decision.before_m[i] = goal_distance(fleet, goal, i)
+        # Body rates and thrust pass unchanged.
         setpoint, command = decision.setpoint[i], commands[i]
         if decision.timing.timeout >= 0:
             for axis in range(4):
@@ -180,8 +183,10 @@ def _judge(
     """Write rewards and ends of flights; arguments as in `World` and `decide`."""
     for i in range(len(commands)):
         verdict, command = whole[0, i], commands[i]
+        # Only the decision in which a flight ends counts.
         ended = decision.flying[i] and verdict != _FLYING
         whole[2, i] = (TRUNCATED if verdict == _TIMEOUT else TERMINATED) if ended else GOES_ON
+        # The yaw rate is the third command, of velocities and of body rates.
         turned = command[2] * command[2]
         if decision.timing.timeout >= 0:
             turned = command[0] * command[0] + command[1] * command[1] + turned

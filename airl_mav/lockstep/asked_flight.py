@@ -53,6 +53,7 @@ class AskedFlight:
 
     def __init__(self, resolved: ResolvedScenario, seed: int) -> None:
         """Start a flight: take off and request the first action."""
+        # The flight's thread puts events; the caller of `step` puts answers.
         self._events: SimpleQueue[Observation | FlownEpisode | BaseException] = SimpleQueue()
         self._answers: SimpleQueue[AnyAction] = SimpleQueue()
         self._idle = IDLE[resolved.pilot.commands]
@@ -151,15 +152,19 @@ class _Account:
         """Process the true states of the newest ticks."""
         truths, verdict = simulation.truths, referee.verdict
         self._simulation, self._referee, self._hit = simulation, referee, hit
+        # Distance and energy count from the start of navigation to the verdict.
         if referee.navigation_us is None or self._at_verdict is not None:
             self._newest = truths[-1].copy()
             return
+        # The last call may contain ticks after the verdict.
         if verdict is not None:
             truths = truths[truths["time_us"] <= verdict.time_us]
+        # The newest position of the last call joins the polyline.
         places = np.vstack([self._newest["motion"][None, :3], truths["motion"][:, :3]])
         self._distance_m += float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
         self._energy_j += float(truths["power_w"].sum()) * TICK_S
         self._newest = truths[-1].copy()
+        # The state at the verdict is kept: later ticks do not change it.
         if verdict is not None:
             self._at_verdict = self._now()
 
@@ -190,6 +195,7 @@ class _Account:
         _, referee = self._flown()
         tick, outcome = self._newest, self.outcome()
         time_us, motion = int(tick["time_us"]), tick["motion"]
+        # Before navigation, times count from now and are zero.
         began_us = time_us if referee.navigation_us is None else referee.navigation_us
         return FlightArrays(
             verdict=np.array(

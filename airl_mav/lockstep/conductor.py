@@ -118,6 +118,7 @@ class Inbound:
             frame: A MAVLink frame of the companion.
             now_us: Simulated time [µs].
         """
+        # Filtered by the header alone, before decoding: these messages are frequent.
         if frame[:1] == _MAVLINK_2 and frame[_MESSAGE] in _IGNORED:
             return NOTHING
         messages = self._decoder.feed(frame)
@@ -125,12 +126,14 @@ class Inbound:
             return NOTHING
         message = messages[0]
         number = message.get_msgId()
+        # Messages that MAVSDK sends at wall times would make the flight irreproducible.
         if number in _BY_THE_WALL_CLOCK or number == dialect.MAVLINK_MSG_ID_SETUP_SIGNING:
             return NOTHING
         if number in _SETPOINTS:
             return self._take_setpoint(message, now_us)
         if number == dialect.MAVLINK_MSG_ID_COMMAND_LONG:
             return self._take_command(message, now_us)
+        # Repacked with a new sequence number: dropped frames must leave no gap.
         return Passed((self._pack(message),))
 
     def renewed(self, setpoints_sent: int, now_us: int) -> bytes | None:
@@ -166,6 +169,7 @@ class Inbound:
         return Passed((self.repeat(now_us),))
 
     def _take_command(self, message: WireMessage, now_us: int) -> Passed:
+        # Commands that MAVSDK sends at wall times are answered here, not by the vehicle.
         result = _ASKED_BY_THE_WALL_CLOCK.get((message.command, message.param1))
         if result is not None:
             return Passed(answer=self._answer(message, result))
@@ -175,8 +179,10 @@ class Inbound:
                 # Offboard mode needs a fresh setpoint. MAVSDK has just sent one. If it equals the
                 # last setpoint of the previous offboard flight, it was dropped as a repetition.
                 before = (self.repeat(now_us),)
+        # Leaving offboard ends the repetition of setpoints.
         elif message.command in _ENDS_OFFBOARD:
             self.next_repeat_us = None
+        # Requests of rates use separate sequence numbers, because their order may vary.
         if message.command in _RATES_AND_REQUESTS:
             return Passed((self._pack(message, self._aside),), of_the_flight=False)
         return Passed((*before, self._pack(message)))
@@ -300,17 +306,21 @@ class Conductor:
     def quiet_until_us(self) -> float:
         """Time of the companion's next turn [µs]; `arrivals` handles MAVSDK's repetitions."""
         turn = self._turn
+        # 0: the conductor must check each tick.
         if self._suspended or self._asked is not None or turn.wake_us is None:
             return 0.0
         if turn.interrupt is not None and turn.interrupt.is_set():
             return 0.0
+        # Between checks of a condition the vehicle may run uninterrupted.
         wake_us, poll = float(turn.wake_us), turn.poll
         if poll is not None and poll.quiet_us is not None and not poll.due(self._waiting):
             # At most to the tick of the next heartbeat: the vehicle's uninterrupted run ends there.
             checks = poll.quiet_us(self._waiting) / poll.every_us
             wake_us += poll.every_us * (checks if math.isinf(checks) else max(0, int(checks) - 1))
+        # A viewer needs frames at a minimum rate.
         if self.is_shown:
             wake_us = min(wake_us, self.clock.time_us() + SHOWN_US)
+        # A time-based order may come first.
         return min(wake_us, self.orders_us())
 
     @property
@@ -348,17 +358,22 @@ class Conductor:
         del sockets
         self._readable = readable
         if self._wall is not None:
+            # With pacing, the tick waits for the wall clock here.
             self._wall.sleep_until(tick_us)
         self._pass_over_polls(tick_us)
         self.clock.sleep_until(tick_us - TICK_US)  # start of the newest tick
+        # All telemetry of the tick is kept, and forwarded with the next turn.
         self._keep(self._vehicle.after_tick(expected=self._asked is not None))
+        # A suspended companion gets no turn, only time.
         if self._suspended:
             self.clock.sleep_until(tick_us)
             return tick_us
+        # An interrupt ends the companion's sleep at the start of this tick.
         interrupt = self._turn.interrupt
         if interrupt is not None and interrupt.is_set():
             self._turn = Turn(self.clock.time_us())
         while True:
+            # Events of the tick in order: turns and setpoint repetitions, whichever comes first.
             wake_us, repeat_us = self._turn.wake_us, self._inbound.next_repeat_us
             first_us = wake_us if repeat_us is None else repeat_us
             if wake_us is not None and repeat_us is not None:
@@ -366,10 +381,12 @@ class Conductor:
             if first_us is None or first_us > tick_us:
                 break
             self.clock.sleep_until(first_us)
+            # At equal times the turn has precedence.
             if first_us == wake_us:
                 self._vehicle.settle()
                 self._keep(self._vehicle.take())
                 poll = self._turn.poll
+                # A condition that still fails costs the companion no turn.
                 if poll is None or poll.due(self._waiting):
                     self._give_turn(readable)
                 else:
@@ -399,6 +416,7 @@ class Conductor:
         now_us = self.clock.time_us()
 
         def handle(frame: bytes) -> threading.Event | None:
+            # Frames that MAVSDK sends during the turn pass the filter one by one.
             passed = self._inbound.take(frame, now_us)
             if passed.answer is not None:
                 self._partner.send([passed.answer])
@@ -407,16 +425,20 @@ class Conductor:
                 waits = self._deliver(wanted, readable, of_the_flight=passed.of_the_flight) or waits
             return self._answered if waits else None
 
+        # The turn has reached its time limit while the companion still waits for an answer.
         if self._asked is not None and self._turn.interrupt is self._answered:
             raise FirmwareLostError(
                 f"the flight controller did not answer command {self._asked} of the companion"
             )
+        # Telemetry reaches the companion before its turn starts.
         self._pass_telemetry()
         self._turn = self._partner.turn(now_us, handle)
+        # No wake time: the companion has ended.
         if self._turn.wake_us is None:
             self.ended = True
             self._inbound.end()
             return
+        # A setpoint equal to the last one was dropped as a repetition and must count.
         again = self._inbound.renewed(self._turn.setpoints_sent, now_us)
         if again is not None:
             self._deliver(again, readable)
@@ -430,14 +452,17 @@ class Conductor:
             True if the frame is a command without an acknowledgement yet.
         """
         now_us, vehicle = self.clock.time_us(), self._vehicle
+        # The digest contains frames of the flight, not requests that depend on the wall clock.
         if of_the_flight:
             self._digest.add("commands", now_us, frame)
+        # Real firmware answers later: the companion waits for the acknowledgement.
         if vehicle.answers_later and (command := command_of(frame)) is not None:
             self._asked = command
             self._answered.clear()
         # A command may block the vehicle's input for some simulated time: request no echo then.
         vehicle.deliver(frame, lambda: readable(now_us), echo=self._asked is None)
         answers = vehicle.take()
+        # Older telemetry first, then the answers, in the order of sending.
         if answers:
             self._pass_telemetry()
             self._pass(answers)

@@ -82,6 +82,7 @@ def scenario_of(spec: EnvironmentSpec, beside: Mapping[str, Any]) -> Scenario:
     Raises:
         FieldError: A field has a wrong type, is out of range, or needs the vectorized simulator.
     """
+    # Settings that only the vectorized simulator supports must have their default.
     usual = EnvironmentSpec()
     for name in TWIN_ALONE:
         value, accepted = (reduce(getattr, name.split("."), each) for each in (spec, usual))
@@ -143,6 +144,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
             UsageError: An option or a profile cannot be used, an option is supported only by the
                 vectorized simulator, or there is no display.
         """
+        # Settings of the flight beside those of the environment.
         beside = {name: knobs.pop(name) for name in BESIDE if name in knobs}
         self.environment = bounded(gymnasium_spec(spec, knobs))
         self._reward = reward_of(self.environment.reward)
@@ -150,6 +152,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         asked = PolicyInfo("asked", "decides by Gymnasium's API", asked=actions.commands)
         self._resolved: ResolvedScenario = resolve(scenario_of(self.environment, beside), asked)
         self._sees = sight_of(self.environment, self._resolved.vehicle).observation
+        # The goal's dimension comes from the arena of the first seed.
         flat = len(self._resolved.arena_of(self._resolved.scenario.seed).goal_point) == 2
         if self._sees.goal_height and flat:
             accepted = f"false in arena {self.environment.arena!r}, whose goals have none"
@@ -157,7 +160,9 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         self.render_mode = render_mode
         self._pictures = Pictures(self.environment, self._sees.kind, render_mode)
         self.metadata = self.metadata | self._pictures.metadata
+        # Several sources of t2 are drawn per episode, see `reset`.
         self._sources = injections_of(self.environment.delay)
+        # Kernels compile here instead of in the first episode.
         warm_up(self._resolved.vehicle, self._resolved.scenario.plant)
         self.observation_space: gym.Space[Any] = observation_space(self._sees)
         self.action_space = action_space(actions)
@@ -182,19 +187,24 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
             LockstepError: The companion hangs or raised an error.
             gymnasium.error.Error: The seed is negative, or the vehicle has not taken off.
         """
+        # A running flight ends before the next one starts.
         self._end()
         if seed is not None or options:
             zone = zone_option(options)
             scenario = self._resolved.scenario.model_copy(update={"zone": zone})
             self._resolved = replace(self._resolved, scenario=scenario)
         super().reset(seed=seed)
+        # Without a seed, the episode's seed comes from the environment's generator.
         self._seed = draw_seeds(self.np_random, 1)[0] if seed is None else episode_seed(seed)
         resolved = self._resolved
         if len(self._sources) > 1:
             resolved = replace(resolved, injection=source_of(self._sources, self._seed))
         flight = AskedFlight(resolved, self._seed)
+        # The finalizer ends the thread of a flight that is never closed.
         self._flight, self._ending = flight, weakref.finalize(self, flight.end)
         self._ending.atexit = False  # The flight handles program exit.
+        # The first event is the observation of the first decision, or the end of a failed
+        # take-off.
         asked = self._heard(flight.asked)
         if isinstance(asked, FlownEpisode):
             raise gym.error.Error(f"seed {self._seed}: it has not taken off: {asked.record.reason}")
@@ -202,6 +212,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         self._newest = self._encode(asked)
         self._look(flight)
         self._before = flight.flights()
+        # Body rates have four numbers; velocities at a held altitude have three.
         by_rates = self.environment.action_spec.commands == "body_rates"
         self._last = np.zeros((1, 4 if by_rates else 3))
         return self._seen(), self._info(self._before)
@@ -220,13 +231,16 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
             raise gym.error.ResetNeeded(
                 "step() without an episode that goes on: reset() begins one"
             )
+        # Checked before the flight continues: an invalid action changes nothing.
         number = checked_actions(spec, action, ())
         asked = self._heard(lambda: flight.answer(command(spec, number)))
+        # Reward terms compare the state before and after the decision.
         before, now, outcome = self._before, flight.flights(), flight.outcome()
         level = commands(spec, number[None])[:, : self._last.shape[1]]
         step = Step(before, now, level, self.environment.episode.hold_s)
         reward = self._reward(step) - costs(self.environment.costs, self._last, step)
         self._before, self._last = now, level
+        # After the last decision the newest observation is returned again.
         if isinstance(asked, Observation):
             self._newest = self._encode(asked)
         self._look(flight)
@@ -235,6 +249,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
             info |= {"success": outcome is Outcome.SUCCESS, "outcome": outcome.value}
             self.flown = flight.end()
             self._end()
+        # Gymnasium: a timeout is a truncation, an end by the flight itself a termination.
         truncated = outcome in (Outcome.TIMEOUT, Outcome.ABORTED)
         terminated = outcome is not None and not truncated
         return self._seen(), float(reward[0]), terminated, truncated, info

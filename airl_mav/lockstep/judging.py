@@ -83,9 +83,11 @@ class Judge:
 
     def _may_decide(self, referee: Referee, truths: Record) -> bool:
         """Return True if the flight may end before the last of some ticks (n,)."""
+        # A single tick is always judged on its own.
         if referee.verdict is not None or len(truths) < 2:
             return False
         last, task, began_us = truths[-1], referee.task, referee.navigation_us
+        # Cheap necessary conditions; the referee decides tick by tick if one holds.
         if self._crash.hit is not None or last["charge"] <= 0.0:
             return True
         if began_us is None:

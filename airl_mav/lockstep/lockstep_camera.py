@@ -55,7 +55,7 @@ class UnderWay:
 
 
 class MemoryCamera:
-    """In-process camera: `firmware.FrameServer` and, with `latest`, `companion.frame_source.FrameSource`."""
+    """In-process camera: `firmware.FrameServer` and, with `latest`, `frame_source.FrameSource`."""
 
     endpoint = "memory"
 
@@ -93,6 +93,7 @@ class MemoryCamera:
         clock, under_way = self.clock, self._under_way
         if clock is None:
             raise RuntimeError("nobody looks: the camera has no companion's clock")
+        # The timeout counts in simulated time: wall time must not affect the flight.
         deadline_us = clock.time_us() + int(timeout_s * US_PER_S)
         while True:
             newest = self.latest()
@@ -100,6 +101,7 @@ class MemoryCamera:
                 return newest
             if clock.time_us() >= deadline_us:
                 return None
+            # A frame in transit has a known arrival; otherwise its publication ends the sleep.
             if under_way.next_us is not None:
                 clock.sleep_until(min(deadline_us, under_way.next_us))
             else:

@@ -80,11 +80,14 @@ def rehearse(
     with heard_compiling(lambda begins: observer.waiting(COMPILING if begins else LOADING)):
         warm_up(scenario.vehicle, scenario.scenario.plant)
     for index, seed in enumerate(scenario.seeds):
+        # Completed episodes of an earlier run are skipped.
         if index in done:
             continue
+        # A fresh policy per seed: its memory must not carry over.
         policy, tlog = scenario.fresh_policy(seed), folder.tlog_path(index)
         log = folder.path / FIRMWARE_PRINTS
         flown = fly(scenario, policy, index, seed, tlog=tlog, log=log, observer=observer, view=view)
+        # Saved before it is reported, so that a reported flight is never lost.
         folder.save_episodes([flown])
         observer.finished(flown.record)
 
@@ -130,9 +133,11 @@ def fly(
         try:
             return flight.fly(tlog, log)
         except FirmwareLostError as error:
+            # The first line of the error is the note; the rest is its output.
             what, *_ = str(error).splitlines()
             notes.append(f"flown again: {what}")
             title = f"flight {index:03d}, seed {seed}"
+            # A flight that is lost repeatedly has a cause that a retry does not remove.
             if len(notes) == MAX_ATTEMPTS:
                 raise LockstepError(
                     f"{title}: lost {MAX_ATTEMPTS} times; at last {error}"
@@ -188,6 +193,7 @@ class LockstepFlight:
         """Arena of the flight."""
         self._goal = self.arena.goal_point
         self._start: Start = "hover" if resolved.scenario.start == "hover" else "arm"
+        # Only the built-in firmware is bit-identical, so only its flights get digests.
         self._witnessed = resolved.scenario.firmware == "builtin"
         self._digest = FlightDigest() if self._witnessed else Unwitnessed()
         self._stop = threading.Event()
@@ -215,6 +221,7 @@ class LockstepFlight:
         asked = resolved.scenario
         vehicle = real_vehicle(asked, resolved.vehicle, log)
         with ExitStack() as held:
+            # Imported on demand: a flight without viewer needs no web server.
             if self._view is not None:
                 from airl_mav.lockstep.watched_flight import Watched
 
@@ -231,8 +238,10 @@ class LockstepFlight:
                 )
             )
             self._abandon = self._stage.abandon
+            # `abandon` may be requested before the stage exists.
             if self._called_off:
                 self._abandon.set()
+            # Callbacks after each call of the simulator, on its thread.
             self._stage.firmware.on_ticks = self._look
             self._stage.conductor.orders_us = lambda: self._judge.due_us
             self._stage.firmware.on_message = self._hear
@@ -259,8 +268,10 @@ class LockstepFlight:
 
     def _program(self) -> None:
         resolved, stage, watched = self._resolved, self._stage, self._watched
+        # Compensation and latency come from the scenario unless a viewer changes them.
         compensator, decided = resolved.compensator(), None
         latency = resolved.latency_sampler(self._seed, native=False)
+        # Checked inside the flight: the first frame is needed.
         check_camera(self._policy, stage.camera, self._stop, compensator)
         if watched is not None:
             latency = watched.companion.latency(latency)
@@ -322,19 +333,23 @@ class LockstepFlight:
         self._observer.text(Text(time_us=now_us, severity=severity, text=message.text))
 
     def _flown(self, simulation: Simulation) -> FlownEpisode:
+        # Logs close before the arrays are read.
         self._stage.firmware.close_logs()
         # No mission result and no error: a fault kept the companion from starting.
         result = self._result or MissionResult(self._stage.unheard, (), DecisionLog())
         referee = self._supervisor.referee
         battery = self._judge.battery
+        # A flight without a verdict ends with the companion's reason.
         if referee.verdict is None:
             battery = simulation.plant.battery_remaining
             referee.abort(simulation.time_us, self._stage.out or result.reason)
         arrays = simulation.arrays()
         trajectory = Trajectory.from_arrays(part_of(arrays, "trajectory"))
         setpoints = part_of(arrays, "setpoints")
+        # The digest covers the setpoints that the vehicle has accepted.
         self._digest.add_setpoints(setpoints)
         latency = part_of(arrays, "estimate", keep_prefix=True)
+        # No slips in lockstep, hence the empty array.
         latency |= join_stamps(result.log.columns(), setpoints, np.zeros((0, 2), np.int64))
         record = judged_record(
             self._resolved,
@@ -353,6 +368,7 @@ class LockstepFlight:
             faults=faults_of(arrays),
             sha256=self._fingerprint(),
         )
+        # A flight that a viewer changed is not reproducible: its digest is removed.
         if self._watched is not None and self._watched.companion.touched:
             notes = (*record.notes, BY_HAND)
             record = replace(record, notes=notes, invalid=(*record.invalid, BY_HAND), sha256=None)

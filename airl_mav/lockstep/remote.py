@@ -70,12 +70,14 @@ class RemoteStage:
             phase=self._enter,
         )
         clock = SimClock()
+        # The conductor drives the vehicle; the partner is the link to the companion.
         vehicle = builtin_vehicle(clock, asked.faults)
         self._conductor = Conductor(vehicle.end, self._partner, self._digest, asked.pace, clock)
         self.firmware = Firmware(vehicle.stack, camera, self._conductor, failing=vehicle.failing)
         self._judge = Judge(None, self._digest, order=self._partner.order)
         self.end_us = math.inf
         """Maximum simulated time of the flight [µs]."""
+        # Orders by time: the end of the flight, and the judge's deadlines.
         self._conductor.orders_us = lambda: min(self.end_us, self._judge.due_us)
 
     @property
@@ -102,6 +104,7 @@ class RemoteStage:
         """
         asked = self._asked
         loaded = self.firmware.load(setup, tlog, BOOT_UNIX_US)
+        # Without a goal radius the flight has no verdict.
         if asked.goal_radius_m is not None and setup.arena is not None:
             task = Task(setup.arena.goal_point, asked.goal_radius_m, asked.time_limit_s)
             supervisor = EpisodeSupervisor(Referee(task), loaded.time_us)
@@ -109,6 +112,7 @@ class RemoteStage:
                 supervisor, self._digest, order=self._partner.order, judged=self._decide
             )
         self.firmware.on_ticks = self._judge.look
+        # The companion starts a fixed time after the vehicle.
         self._conductor.begin(loaded.time_us + COMPANION_STARTS_US)
         return loaded
 
@@ -162,6 +166,7 @@ def fly_vehicle_in_lockstep(
     check_vehicle(asked)
     vehicle, computer_w = aircraft_of(asked)
     ports = asked.open_ports
+    # A stored key makes other machines acceptable.
     stored = None if asked.signing_key is None else StoredSigning(asked.signing_key)
     with (
         closing(
@@ -185,6 +190,7 @@ def fly_vehicle_in_lockstep(
             stage.firmware.on_log_lost = listener.say
             start_us = stage.load(episode, asked.tlog).time_us
             listener.ready(camera.endpoint, goal)
+            # The duration counts in simulated time from the start of the flight.
             end_us = None
             if asked.duration is not None:
                 end_us = start_us + int(asked.duration * US_PER_S)
@@ -201,6 +207,7 @@ def _fly(
     start_us, stopwatch = stage.time_us, WallClock()
     stage.end_us = math.inf if end_us is None else end_us
     while not stage.ended and not stop.is_set() and stage.time_us < stage.end_us:
+        # Before the first turn the companion is not connected.
         alone = stage.turns == 0
         stage.step()
         if alone:
@@ -211,5 +218,6 @@ def _fly(
         f"{flown_s:.1f} s simulated in {wall_s:.1f} s: {flown_s / wall_s:.2f} x real time; "
         f"{stage.turns} turns"
     )
+    # Digests let two flights be compared without their logs.
     for name, sha256 in stage.lanes().items():
         say(f"{name:<13} {sha256}")

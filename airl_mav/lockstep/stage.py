@@ -59,6 +59,7 @@ class LockstepStage:
             vehicle: Vehicle, closed with the stage; None = the built-in autopilot.
             patience_s: Maximum duration of the companion's turn [s of wall time].
         """
+        # The order of creation follows the dependencies: clock, vehicle, partner, conductor.
         clock = SimClock()
         self._vehicle = vehicle = vehicle or builtin_vehicle(clock, faults)
         self._partner = ThreadPartner(patience_s)
@@ -85,6 +86,7 @@ class LockstepStage:
         self._open.enter_context(closing(self.firmware))
         self.link = MavsdkLink(
             *(RAW_URL, self.clock, self.abandon),
+            # Silence in wall time means nothing in lockstep.
             heard=lambda: self.conductor.heard,
             poll=self.clock.poll,
         )
@@ -139,12 +141,14 @@ class LockstepStage:
         begun(started_us)
         simulation = firmware.simulation
         if simulation is not None and simulation.faults is not None:
+            # Registered before the first tick, so that a fault at time 0 acts.
             self._give_up_when_cut(simulation.faults)
             self._let_companion_fail(simulation.faults)
 
         def connected() -> None:
             try:
                 self.link.connect(HEARD_TIMEOUT_S)
+            # Without faults, a vehicle that cannot be heard is an error of the setup.
             except LinkError as error:
                 if not setup.aircraft.faults:
                     raise
@@ -154,6 +158,7 @@ class LockstepStage:
 
         self._partner.start(connected)
         conductor.begin(started_us + self._vehicle.heard_after_us + COMPANION_STARTS_US)
+        # A companion that is out for good ends the flight at the verdict or when disarmed.
         while not conductor.ended and not (self.out and (judged() or self._down())):
             firmware.step()
         if self.out.endswith(STOPPED):
@@ -164,6 +169,7 @@ class LockstepStage:
             conductor.resume()
             while not conductor.ended:
                 firmware.step()
+        # Errors of the companion's thread are raised here, on the caller's thread.
         self._raise_what_broke()
         assert firmware.simulation is not None  # noqa: S101 (loaded above)
         return firmware.simulation
@@ -184,6 +190,7 @@ class LockstepStage:
         """Suspend the companion's turns during its faults, and for good after it is killed."""
 
         def changed() -> None:
+            # Several faults may overlap; a permanent fault wins.
             acting = [each.fault for each in faults.acting("companion")]
             for_good = next((fault for fault in acting if fault.for_good), None)
             if for_good is not None:
@@ -193,6 +200,7 @@ class LockstepStage:
             elif not self.out:
                 self.conductor.resume()
 
+        # Called once for faults that act from the start.
         changed()
         faults.on_change(changed)
 

@@ -98,14 +98,18 @@ class ThreadPartner:
 
     def turn(self, now_us: int, handle: Handle) -> Turn:
         """Let the companion run until it sleeps; see `turns.Partner`."""
+        # The companion waits in the middle of its turn for an answer.
         if self._interrupted:
             self._interrupted = False  # The turn continues, and its answer has arrived.
         else:
+            # Input since the last barrier must be processed before the companion runs.
             if self._fed:
                 self._settle(handle)
+            # The released lock wakes the companion's thread.
             self._sent_before = self._setpoints_sent
             self._go.release()
         turn = self._work(handle)
+        # A pending answer gives control back; the turn continues when the answer arrives.
         if isinstance(turn, threading.Event):
             self._interrupted = True
             return Turn(now_us + LONGEST_ANSWER_US, turn, self._sent_before)
@@ -116,6 +120,7 @@ class ThreadPartner:
 
     def _settle(self, handle: Handle) -> None:
         """Wait until MAVSDK has processed all input and sent all output."""
+        # A PING is the barrier: MAVSDK processes its input in order and answers it last.
         number, self._fed = self._barriers, False
         self._barriers += 1
         ping = self._encoder.frame(_PING_LAYOUT, _PING_LAYOUT.payload((0, number, 0, 0)))
@@ -134,8 +139,10 @@ class ThreadPartner:
                 continue
             if not isinstance(item, bytes):
                 raise LockstepError("the companion gave back a turn that it did not have")
+            # Bytes 18 to 21 hold the PING's sequence number.
             if _is_ping(item) and item[18:22] == wanted:
                 return
+            # Frames before the answer belong to the turn.
             handle(item)
         raise LockstepError(f"MAVSDK hangs: no answer to a PING in {PATIENCE_S} s")
 
@@ -144,8 +151,10 @@ class ThreadPartner:
         waited = Patience()
         heartbeat_s = HEARTBEAT_S
         while waited.so_far_s() < self._patience_s:
+            # The timeout bounds the wait for the next heartbeat.
             with suppress(Empty):
                 item = self._inbox.get(timeout=HEARTBEAT_S)
+                # Anything but bytes is the end of the turn.
                 if not isinstance(item, bytes):
                     return item
                 if (answered := handle(item)) is not None:

@@ -51,6 +51,7 @@ def fly_in_lockstep(
         Abandoned: The simulator does not give turns any longer.
     """
     digest = FlightDigest()
+    # The connection timeout also bounds each turn.
     turns = TokenTurns(stop, abandon, asked.connect_timeout)
     clock = ConductedClock(turns.clock, turns.sleep)
 
@@ -70,6 +71,7 @@ def fly_in_lockstep(
         link.connect(asked.connect_timeout, stop)
         link.set_timeout(ANSWER_TIMEOUT_S)
         camera = TokenFrameSource(frames, turns, clock)
+        # Turns start before the camera check, which needs frames.
         with turns.taken(link):
             check_camera(mission.policy, camera, stop, mission.compensator)
             result = fly_mission(
@@ -85,6 +87,8 @@ def fly_in_lockstep(
                 watchdog_settings=mission.watchdog,
                 limit_settings=mission.limits,
                 guard=clock,
+                # Without injection a fixed t2 is used: the measured one would differ in each
+                # flight.
                 latency=mission.latency or FixedSampler(NATIVE_T2_US),
                 compensator=mission.compensator,
                 mount_pitch_up_rad=mission.mount_pitch_up_rad,

@@ -119,12 +119,15 @@ class TokenPartner:
 
     def turn(self, now_us: int, handle: Handle) -> Turn:
         """Let the companion run until it sleeps; see `turns.Partner`."""
+        # Frames arrive by simulated time, whether the companion sleeps or not.
         arrived = self._camera.arrive(now_us)
         self._unseen = self._unseen or arrived
+        # The companion need not be woken: the conductor continues.
         if self._rest is not None and not self._wakes(self._rest, now_us, arrived):
             return self._asleep(self._rest)
         if not self._heard and not self._knock():
             return Turn(None)
+        # Texts with the number of the previous turn are late repetitions.
         over = TurnGiven(self._number, now_us)
         self._number += 1
         # Drain the socket: earlier messages must not fill its buffer.
@@ -134,6 +137,7 @@ class TokenPartner:
         given = TurnGiven(self._number, now_us, self._camera.sequence, self._order)
         back = self._exchange(given, handle)
         if back is None:
+            # None: the flight was aborted while waiting.
             return Turn(None)
         if back.ended:
             self.close()
@@ -145,6 +149,7 @@ class TokenPartner:
 
     def _understood(self, back: TurnBack, now_us: int) -> _Rest:
         wake_us = back.wake_us
+        # A companion without a wish for its next turn gets one after a fixed interval.
         if wake_us is None:
             wake_us = now_us + self._turn_us
         elif wake_us <= now_us:
@@ -166,6 +171,8 @@ class TokenPartner:
     def _asleep(self, rest: _Rest) -> Turn:
         """Return the time or event until which the conductor can continue alone."""
         wake_us, interrupt = rest.wake_us, None
+        # A sleep until the next frame ends at its arrival, which is known once the frame is in
+        # transit.
         if rest.event == "frame":
             under_way = self._camera.under_way
             if under_way.next_us is not None:
@@ -197,16 +204,19 @@ class TokenPartner:
         for again_s in _repeats(self._patience_s):
             if again:
                 self._repeat()
+            # A lost frame is repeated together with the turn.
             if again or self._unseen:
                 self._camera.send()
             again, self._unseen = True, False
             self._say(given)
+            # Wall time: the companion is another process.
             stopwatch = WallClock()
             while (left_s := again_s - stopwatch.time_us() / US_PER_S) > 0.0:
                 if self._wait(left_s):
                     back = self._hear(self._wire.receive(), given, handle)
                     if back is not None:
                         return back
+                # Checked after each wait, so that Ctrl-C takes effect.
                 if self._broken_off():
                     return None
         raise LockstepError(
@@ -233,13 +243,16 @@ class TokenPartner:
         found = None
         for peer, message in ((each.peer, each.message) for each in heard):
             text = message.text if message.get_type() == "STATUSTEXT" else ""
+            # The number proves which turn is returned; texts may be duplicated.
             if (back := TurnBack.parse(text)) is not None:
+                # A turn that was never given is a protocol error.
                 if back.number > given.number:
                     raise LockstepError(f"the companion's {text!r}: accepted: D{given.number}")
                 if back.number == given.number:
                     found = back
                     if given.number > 0:  # turn 0: before the first turn
                         self._wire.keep_to(peer)
+            # A malformed text with the token's letter is reported, not ignored.
             elif _TURN_BACK.match(text):
                 raise LockstepError(
                     f"the companion's {text!r}; accepted: D<turn> [<wake_us> [<setpoints> "

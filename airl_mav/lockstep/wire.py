@@ -50,10 +50,12 @@ def newest(frames: Sequence[bytes]) -> list[bytes]:
     """Return frames without `UNREAD` messages, and only the newest of each of the `STATES`."""
     kept: list[bytes] = []
     replaced: set[bytes] = set()
+    # From the newest to the oldest: the first frame of each state is the one to keep.
     for frame in reversed(frames):
         if frame[_MESSAGE] in UNREAD:
             continue
         if frame[_MESSAGE] in STATES:
+            # States of several systems are kept separately.
             sent_by = frame[_SENT_BY]
             if sent_by in replaced:
                 continue
@@ -86,6 +88,7 @@ def datagrams(frames: Iterable[bytes], longest: int) -> Iterator[bytes]:
     waiting: list[bytes] = []
     length = 0
     for frame in frames:
+        # A frame is never split between datagrams.
         if waiting and length + len(frame) > longest:
             yield b"".join(waiting)
             waiting, length = [], 0
@@ -152,6 +155,7 @@ class Wire:
         self._known = stored is None
         """True after a message that only a companion can have sent."""
         self._kept: tuple[Peer] | None = None
+        # Discards what an earlier companion has left in the socket.
         endpoint.receive()
 
     def send(self, frames: bytes) -> None:
@@ -166,6 +170,7 @@ class Wire:
         """Return all accepted messages, oldest first."""
         heard: list[Heard] = []
         for peer, data in self._endpoint.arrivals():
+            # Once the companion is known, other senders are foreign.
             if self._kept is not None and peer != self._kept[0]:
                 self.foreign += 1
                 continue
@@ -176,6 +181,7 @@ class Wire:
             self._known = self._known or any(map(is_signed, accepted))
             if not accepted or not self._known:
                 continue
+            # Answers go to the newest accepted sender.
             if peer is not None and (self._learned is None or peer != self._learned[0]):
                 end = self._endpoint.towards(peer)
                 self._learned = None if end is None else (peer, end)
@@ -219,6 +225,7 @@ class Wire:
         if count == self._told:
             return
         now_us = self._clock.time_us()
+        # The first report is immediate, further ones at intervals.
         if self._tell_us is not None and now_us < self._tell_us:
             return
         self._told, self._tell_us = count, now_us + TELL_EVERY_US

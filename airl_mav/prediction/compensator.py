@@ -87,6 +87,7 @@ class Reprojector:
         nearest = np.full(size, _UNSEEN, np.uint32)
         for rank, sight in enumerate(sights):
             pixels, depth_mm = self._carried(sight, pose)
+            # A single minimum selects the newest image first, then the nearest depth.
             np.minimum.at(nearest, pixels, depth_mm + np.uint32(rank * _RANK))
         out = (nearest & np.uint32(MAX_MM)).astype(np.uint16)
         # Points beyond the range were observed as empty.
@@ -105,6 +106,7 @@ class Reprojector:
         mm = sight.depth_mm.reshape(-1)
         empty = mm == 0
         depth = mm * np.float32(1.0 / MM_PER_M)
+        # Empty pixels are carried at the range, so that free directions stay known.
         depth[empty] = self._range_m
         points = (turn @ self._rays) * depth
         forward, right = points[0] + shift[0], points[1] + shift[1]
@@ -143,6 +145,7 @@ class Reprojector:
         column, row, there, empty = column[kept], row[kept], there[kept], empty[kept]
         pixels = (row * np.float32(k.width) + column).astype(np.intp)
         carried_mm = np.rint(there * np.float32(MM_PER_M)).astype(np.uint32)
+        # Empty and out-of-range points carry the mark MAX_MM until the minimum is known.
         carried_mm[empty | (there > self._range_m)] = MAX_MM
         return pixels, carried_mm
 
@@ -158,6 +161,7 @@ class Reprojector:
 
     def _ground_mm(self, pose: CameraPose) -> Image:
         """Return the depth (h w) [mm] of level ground at the height of the take-off."""
+        # Down component of each ray.
         sinking = pose.axes[2].astype(np.float32) @ self._rays
         height = np.float32(-pose.position[2])
         with np.errstate(divide="ignore"):
@@ -192,6 +196,7 @@ def flown_on(
     """
     turn, lag, turn_lag = command[:, 3], response.velocity_time_s, response.yaw_rate_time_s
     fading, turn_fading = np.exp(-seconds / lag), np.exp(-seconds / turn_lag)
+    # Extrapolate the heading of the final turn back to now.
     lead = (motion.heading_rate - turn) * turn_lag
     turned = turn * seconds
     wanted = (command[:, 0] + 1j * command[:, 1]) * np.exp(1j * (motion.heading + lead))
@@ -201,6 +206,7 @@ def flown_on(
     arc = seconds * np.sinc(turned / (2.0 * math.pi)) * np.exp(0.5j * turned)
     moved = follows * arc + velocity * (lag * (1.0 - fading))
     velocity = follows * np.exp(1j * turned) + velocity * fading
+    # The vertical velocity has the same time constant, but no turn.
     sinking = motion.velocity[:, 2] - command[:, 2]
     sunk = command[:, 2] * seconds + sinking * (lag * (1.0 - fading))
     return MotionBatch(
@@ -220,6 +226,7 @@ def leaning(motion: MotionBatch, command: Array, response: Response) -> tuple[Ar
     course = np.exp(-1j * motion.heading)
     velocity = (motion.velocity[:, 0] + 1j * motion.velocity[:, 1]) * course
     wanted = command[:, 0] + 1j * command[:, 1]
+    # Acceleration of the first-order response, plus the drag that it must overcome.
     push = (wanted - velocity) / response.velocity_time_s + response.drag_1_s * velocity
     pitch = -np.arctan2(push.real, GRAVITY_M_S2)
     return np.arctan2(push.imag * np.cos(pitch), GRAVITY_M_S2), pitch
@@ -326,6 +333,7 @@ class Compensator:
         """
         roll, pitch, heading = quats_to_euler(state.quaternion)
         now = MotionBatch(state.position, state.velocity, heading, self._heading_rate(now_us))
+        # The state now, flown on to the time of effect.
         then, command = self._carried(now, now_us)
         quaternion = state.quaternion.copy()
         tilted = leaning(then, command, self._response)
@@ -373,6 +381,7 @@ class Compensator:
     def _heading_rate(self, now_us: NDArray[np.int64]) -> Vector:
         """Return the turn rates (n,) [rad/s] of the vehicles, by their setpoints alone."""
         turns, begins_us = self._setpoint[:, ::-1, 3].T, self._answered_us.T[::-1]
+        # Each turn lasts until the response to the next setpoint begins.
         ends_us = np.minimum(np.vstack([begins_us[1:], now_us]), now_us)
         answered_s = np.maximum(ends_us - begins_us, 0) / US_PER_S
         fading = np.exp(-answered_s / self._response.yaw_rate_time_s)
@@ -386,12 +395,14 @@ class Compensator:
     ) -> tuple[MotionBatch, Vector]:
         """Return the predicted motion, and the setpoints (n, 4) that will be in effect."""
         acts_us = now_us + self.memory.latency.expected_us() + LINK_US
+        # A stop follows the newest setpoint: zero velocity.
         flown = [*self._setpoint.swapaxes(0, 1)[::-1], np.zeros_like(self._setpoint[:, 0])]
         # Each lasts until the next takes effect, limited to the time from now to the effect.
         marks_us = np.vstack([now_us, self._answered_us.T[-2::-1], self._stopped_us, acts_us])
         marks_us = np.minimum(np.maximum.accumulate(marks_us), acts_us)
         seconds = np.diff(marks_us, axis=0) / US_PER_S
         command = flown[0]
+        # Skip setpoints that no vehicle flies in this time.
         for k in np.flatnonzero(seconds.any(axis=1)).tolist():
             motion = flown_on(motion, flown[k], self._response, seconds[k])
             command = np.where(seconds[k, :, None] > 0.0, flown[k], command)
@@ -401,6 +412,7 @@ class Compensator:
         self, i: int, depth_mm: NDArray[np.uint16], position: Vector, quaternion: Vector
     ) -> None:
         """Store an image of companion i, and its pose."""
+        # Newest first; the oldest image is dropped.
         for array in (self._depth_mm, self._position, self._axes):
             array[i, 1:] = array[i, :-1]
         pose = self._mount.pose(position, quaternion)

@@ -82,6 +82,7 @@ class ExpectedLatency:
     def expected_us(self) -> NDArray[np.int64]:
         """Return the expected t2 (n,) [µs] of each next decision."""
         known = np.minimum(self.count, REMEMBERED)
+        # Before the ring is full, only measured entries count.
         counted = np.arange(REMEMBERED) < known[:, None]
         total = np.where(counted, self.measured_us, 0).sum(axis=1)
         mean: NDArray[np.int64] = total // np.maximum(known, 1)

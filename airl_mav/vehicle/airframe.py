@@ -80,6 +80,7 @@ def draw_airframe(nominal: Airframe, shares: Spread, rng: np.random.Generator) -
     )
     return nominal._replace(
         mass=nominal.mass * mass,
+        # The shape is unchanged, so the inertia scales with the mass.
         inertia_xx=nominal.inertia_xx * mass,
         inertia_yy=nominal.inertia_yy * mass,
         inertia_zz=nominal.inertia_zz * mass,
@@ -127,6 +128,7 @@ def command_for(thrust: float, thrust_curve: float) -> float:
     if c == 0.0:
         return thrust
     b = 1.0 - c
+    # Positive root of c u² + (1 - c) u = thrust.
     return (math.sqrt(b * b + 4.0 * c * thrust) - b) / (2.0 * c)
 
 
@@ -159,6 +161,7 @@ def hover_speeds(airframe: Airframe) -> tuple[float, float, float, float]:
         airframe.com_forward / airframe.arm_forward,
     )
     s0, s1, s2, s3 = (
+        # A centre of mass outside the rotors would need negative thrust.
         math.sqrt(max(0.0, share * (1.0 + RIGHT_SIGN[i] * right + FORWARD_SIGN[i] * forward)))
         for i in range(N_ROTORS)
     )

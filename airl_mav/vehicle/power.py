@@ -76,6 +76,7 @@ class PowerModel(NamedTuple):
                 len(CORNERS) / tip_m_s**2,
                 1.0 / power.drive_efficiency,
             )
+            # The fields of the regression are unused.
             return cls(*rotors, *(0.0,) * (len(cls._fields) - len(rotors)))
         return cls(
             *(0.0,) * 6,
@@ -141,9 +142,11 @@ def momentum_power_w(
     `thrust` is T, of all rotors [N]. The speed of a rotor follows from its `thrust_max`.
     `in_plane2` and `climb`, V_c, are as in `induced_velocity`.
     """
+    # Without thrust the discs have no induced velocity.
     if thrust < LEAST_THRUST_N:
         return m.avionics_w
     ideal2 = m.ideal2_per_thrust * thrust
+    # The induced factor covers the losses of a real disc; the climb has none.
     up = max(0.0, climb)
     inflow = INDUCED_FACTOR * induced_velocity(ideal2, in_plane2, up) + up
     # T mu² by the rotors' mean square speed: thrust is proportional to the squared speed.
@@ -164,6 +167,7 @@ def regression_power_w(velocity: Vec, acceleration: Vec, wind: Vec, m: PowerMode
     axy = math.sqrt(acceleration[0] * acceleration[0] + acceleration[1] * acceleration[1])
     vz = abs(velocity[2])
     az = abs(acceleration[2])
+    # Positive with a tail wind.
     tail = velocity[0] * wind[0] + velocity[1] * wind[1]
     p = m.b1 * vxy + m.b2 * axy + m.b3 * vxy * axy + m.b4 * vz + m.b5 * az + m.b6 * vz * az
     return max(0.0, p + m.b7 * m.payload_g + m.b8 * tail + m.b9)
@@ -219,6 +223,7 @@ def flight_power_w(
         + 2.0 * (q[2] * q[3] - q[0] * q[1]) * y
         + (1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2])) * z
     )
+    # Rounding may make the difference negative.
     in_plane2 = max(0.0, x * x + y * y + z * z - climb * climb)
     return momentum_power_w(thrust, airframe.thrust_max, in_plane2, climb, m)
 
@@ -243,8 +248,10 @@ def level_power_w(speed: float, airframe: Airframe, m: PowerModel) -> float:
         still = (0.0, 0.0, 0.0)
         return regression_power_w((speed, 0.0, 0.0), still, still, m)
     weight = airframe.mass * GRAVITY_M_S2
+    # Equilibrium: the thrust carries the weight and balances the drag.
     drag = (airframe.drag_linear + airframe.drag_quadratic * speed) * speed
     thrust = math.sqrt(weight * weight + drag * drag)
+    # Components of the speed along and across the thrust.
     climb = speed * drag / thrust
     in_plane = speed * weight / thrust
     return momentum_power_w(thrust, airframe.thrust_max, in_plane * in_plane, climb, m)

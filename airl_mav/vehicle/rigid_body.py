@@ -34,6 +34,7 @@ def accelerate(
     m = airframe.mass
     vx = velocity[0] + force[0] / m * dt
     vy = velocity[1] + force[1] / m * dt
+    # NED: gravity acts along +z.
     vz = velocity[2] + (force[2] / m + GRAVITY_M_S2) * dt
     ix, iy, iz = airframe.inertia_xx, airframe.inertia_yy, airframe.inertia_zz
     p, r_, s = omega
@@ -51,6 +52,7 @@ def drift(position: Vec, velocity: Vec, q: Quat, spin: Vec, dt: float) -> tuple[
 
     Returns position, attitude and angular velocity FRD [rad/s].
     """
+    # `spin` is in world axes, so its rotation multiplies from the left.
     dq = exponential((spin[0] * dt, spin[1] * dt, spin[2] * dt))
     q_new = normalize(multiply(dq, q))
     body = rotate((q_new[0], -q_new[1], -q_new[2], -q_new[3]), spin)

@@ -13,6 +13,7 @@ Vec = tuple[float, float, float]
 @kernel
 def rotate(q: Quat, v: Vec) -> Vec:
     """Rotate v by q: body to world."""
+    # v + w t + u x t with t = 2 u x v and u the vector part.
     w, x, y, z = q
     tx = 2.0 * (y * v[2] - z * v[1])
     ty = 2.0 * (z * v[0] - x * v[2])
@@ -52,6 +53,7 @@ def normalize(q: Quat) -> Quat:
 def exponential(r: Vec) -> Quat:
     """Return the quaternion of a rotation vector [rad]."""
     angle = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+    # The limit of sin(angle / 2) / angle at 0.
     s = 0.5 if angle < 1e-8 else math.sin(0.5 * angle) / angle
     return (math.cos(0.5 * angle), s * r[0], s * r[1], s * r[2])
 

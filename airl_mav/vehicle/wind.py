@@ -20,6 +20,7 @@ def wind_of_episode(settings: WindSettings, seed: int) -> WindSettings:
     """Return the wind of a seed's episode: the random part becomes steady."""
     if settings.random_m_s == 0.0:
         return settings
+    # Uniform direction and speed become part of the steady wind.
     rng = stream(seed, Stream.WIND)
     towards, speed = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, settings.random_m_s)
     drawn = {
@@ -48,11 +49,14 @@ class Wind:
         """Begin an episode with settings from `wind_of_episode`; `rng` draws the gusts."""
         self.steady = np.array([settings.north_m_s, settings.east_m_s, 0.0])
         """(3,) NED [m/s]."""
+        # Vertical gusts are half as strong.
         sigma = settings.gust_m_s * np.array([1.0, 1.0, 0.5])
         self._keep = math.exp(-tick_s / settings.gust_time_s)
+        # The drive keeps the variance of the gusts constant.
         self._drive = math.sqrt(1.0 - self._keep**2) * sigma
         self._calm = settings.gust_m_s == 0.0
         self._rng = rng
+        # The gusts start in their stationary distribution.
         self._gust = np.zeros(3) if self._calm else sigma * rng.standard_normal(3)
         self._ahead = np.zeros((0, 3))
         self._next = 0

@@ -54,13 +54,16 @@ def open_named_camera(
     converted to the `wanted` camera of `whose`, such as "vehicle quad"; a driver's additional
     images to the cameras in `further`, by name.
     """
+    # An address has a scheme; the publisher defines its own camera, so nothing is converted.
     if "://" in name:
         return open_camera(name, clock)
     _check_fits(name, wanted, whose)
     camera = _driver(name, clock)
     lenses: Mapping[str, Lens] = getattr(camera, "lenses", {})
+    # Only images that both policy and driver have are converted.
     given = {each: lens for each, lens in (further or {}).items() if each in lenses}
     fitting = Fitting(camera.lens, wanted)
+    # A check that fails must release the camera.
     try:
         check_coverage(name, camera.lens, fitting, whose)
         others = {}
@@ -87,11 +90,13 @@ def _check_fits(name: str, wanted: Intrinsics, whose: str) -> None:
 
 def _driver(name: str, clock: Clock) -> DepthCamera:
     brand, _, which = name.partition(":")
+    # Missing optional packages become one line that names the extra to install.
     if brand in EXTRAS:
         try:
             return _shipped(brand, which, clock)
         except ImportError as error:
             raise FieldError("camera", name, problem=f"needs {EXTRAS[brand]}: {error}") from None
+    # Custom drivers resolve last: they cannot replace the built-in names.
     if reference(CAMERAS, name) is None:
         accepted = (
             "tcp://HOST:PORT, ipc://PATH, realsense, oak-d, ros2:/TOPIC, rosbag:PATH,"
@@ -118,6 +123,7 @@ def _shipped(brand: str, which: str, clock: Clock) -> DepthCamera:
         from companion.cameras.oak_d import open_oak_d
 
         return open_oak_d(which)
+    # A ROS 2 topic is absolute; a recording needs a path.
     if not which.startswith("/") if brand == ROS2 else not which:
         raise FieldError("camera", f"{brand}:{which}", "ros2:/TOPIC or rosbag:PATH")
     if brand == ROS2:

@@ -110,6 +110,7 @@ class CameraThread:
         self._changed = threading.Condition()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._read_on, name="camera", daemon=True)
+        # The thread starts last: it uses all attributes above.
         self._thread.start()
 
     def latest(self) -> ReceivedFrame | None:
@@ -120,6 +121,7 @@ class CameraThread:
         """Wait for a frame with another sequence; see `FrameSource`."""
         with self._changed:
             arrived = self._changed.wait_for(
+                # Inequality, not order: the sequence restarts with the driver.
                 lambda: (
                     self._newest is not None and self._newest.frame.sequence != newer_than_sequence
                 ),
@@ -138,8 +140,10 @@ class CameraThread:
         try:
             while not self._ended.is_set():
                 image = self._camera.read(READ_S)
+                # A timeout of `read` gives the loop a chance to end.
                 if image is None:
                     continue
+                # The capture time is on the companion's clock, for every clock that a driver uses.
                 taken_us = self._clock.time_us() - image.age_us
                 self.dropped += missing_between(last_number, image.number)
                 last_number = image.number
@@ -153,6 +157,7 @@ class CameraThread:
                 }
                 frame = Frame(sequence, taken_us, depth_mm, self._fitting.wanted, further=further)
                 received = ReceivedFrame(frame, self._clock.time_us())
+                # Only the newest frame is kept; waiting threads wake together.
                 with self._changed:
                     self._newest = received
                     self._changed.notify_all()

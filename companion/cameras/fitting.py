@@ -72,11 +72,13 @@ class Fitting:
         """Look up each pixel of the target camera in the images of the lens."""
         self.wanted = wanted
         """Target camera of the images returned by `fit`."""
+        # Enough points that no pixel of the lens falls between two of them, up to a limit.
         points = math.ceil(max(lens.fx, lens.fy) / wanted.focal)
         points = min(max(points, 1), MOST_POINTS)
         self._shape = lens.height, lens.width
         self._deeper: NDArray[np.float32] | None = None
         """Factors from depth along the axis to the target's depth; None = factor 1."""
+        # Pinhole to pinhole is separable: one lookup per row and one per column.
         if lens.distortion is None and wanted.projection == "pinhole":
             columns, off_side = _places(
                 *(wanted.width, wanted.focal, wanted.cx), *(lens.width, lens.fx, lens.cx), points
@@ -85,17 +87,22 @@ class Fitting:
                 *(wanted.height, wanted.focal, wanted.cy), *(lens.height, lens.fy, lens.cy), points
             )
             self._rows, self._columns = rows[:, None], columns[None, :]
+            # A target pixel without a counterpart reads as "no return".
             self._unseen = off_end[:, None] | off_side[None, :]
             self.coverage = 1.0 - float(self._unseen.mean())
             """Share of the target image seen by the lens, 0 to 1."""
             return
+        # Otherwise every sample ray is looked up in both dimensions.
         rays = rays_of(finer(wanted, points))
         row, column = _looked_up(lens, rays)
         inside = (row >= 0) & (row < lens.height) & (column >= 0) & (column < lens.width)
+        # Indices outside are replaced by 0 and masked by `_unseen`.
         self._rows = np.where(inside, row, 0).astype(np.intp)
         self._columns = np.where(inside, column, 0).astype(np.intp)
         self._unseen = ~inside
+        # Rays of a fisheye target outside its image circle are zero and do not count.
         self.coverage = float(inside[rays.any(axis=0)].mean())
+        # Targets other than pinholes measure along the ray, the lens along its axis.
         if wanted.projection != "pinhole":
             deeper = np.divide(1.0, rays[0], out=np.ones_like(rays[0]), where=inside)
             self._deeper = deeper.astype(np.float32)
@@ -120,6 +127,7 @@ def _looked_up(
     lens: Lens, rays: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rounded rows and columns (h, w) of a lens for rays (3, h, w); -1 outside."""
+    # A pinhole sees only ahead of the lens; a fisheye up to the end of its polynomial.
     forward, right, down = rays
     ahead = forward > LEAST_FORWARD
     if lens.distortion is None:
@@ -130,6 +138,7 @@ def _looked_up(
         ahead &= off <= sees_to(lens.distortion)
         scale = distorted(off, lens.distortion) / np.maximum(aside, 1e-9)
     row, column = (
+        # `scale` turns the sideways part of a ray into focal lengths.
         np.rint(lens.cy + lens.fy * down * scale),
         np.rint(lens.cx + lens.fx * right * scale),
     )

@@ -53,8 +53,10 @@ class OakD:
         """
         self._pipeline, self._silence = pipeline, Silence()
         self._now: Callable[..., timedelta] = dai.Clock.now if now is None else now
+        # A queue of one frame without blocking: only the newest image counts.
         self._queue = depth.createOutputQueue(maxSize=1, blocking=False)
         self._pipeline.start()
+        # The first image reports the rectified lens; it is also the first result of `read`.
         try:
             first = self._taken(FAILED_S)
             if first is None:
@@ -81,6 +83,7 @@ class OakD:
         return DepthImage(
             _checked(frame),
             plausible_age_us((self._now() - taken) // _US),
+            # Sequence numbers count captured images, so gaps show drops.
             frame.getSequenceNum(),
         )
 
@@ -101,6 +104,7 @@ class OakD:
 def _lens_of(frame: Any) -> Lens:
     """Return the lens of an image, as used by depthai's point-cloud nodes, or raise ValueError."""
     about = frame.getTransformation()
+    # Without a factory calibration the intrinsics are invalid, and so are distances.
     if not about.isValid():
         raise ValueError("its images come without intrinsics: the device is not calibrated")
     (fx, _, cx), (_, fy, cy), _ = about.getIntrinsicMatrix()
@@ -126,6 +130,7 @@ def open_oak_d(which: str) -> OakD:
     """
     name = f"oak-d:{which}" if which else "oak-d"
     found = [each.getDeviceId() for each in dai.Device.getAllAvailableDevices()]
+    # A network camera (PoE) need not answer the discovery.
     if not _is_address(which):
         if not found:
             raise FieldError("camera", name, problem="depthai finds no camera")

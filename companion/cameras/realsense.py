@@ -35,6 +35,7 @@ class RealSense:
         k = profile.as_video_stream_profile().intrinsics
         self.lens = Lens(k.width, k.height, k.fx, k.fy, k.ppx, k.ppy)
         """Lens of the depth stream, which librealsense delivers rectified."""
+        # A queue of one keeps the newest frame.
         self._queue = rs.frame_queue(1)
         self._silence = Silence()
         self._sensor.open(profile)
@@ -51,6 +52,7 @@ class RealSense:
         # Copied, as librealsense reuses the memory after the frame is released.
         image = np.array(depth.get_data(), np.uint16)
         unit_mm = depth.get_units() * MM_PER_M
+        # Depth units differ between models; 1 mm is the common case and needs no scaling.
         if abs(unit_mm - 1.0) > 1e-6:
             image = np.clip(np.rint(image * unit_mm), 0, MAX_MM).astype(np.uint16)
         return DepthImage(image, self._age_us(depth), depth.get_frame_number())
@@ -77,6 +79,7 @@ def open_realsense(which: str) -> RealSense:
             return RealSense(context.load_device(which))
         except RuntimeError as error:
             raise FieldError("camera", f"realsense:{which}", problem=str(error)) from None
+    # Cameras by serial number, in the order of enumeration.
     found = {each.get_info(rs.camera_info.serial_number): each for each in context.query_devices()}
     if not found:
         raise FieldError("camera", _name(which), problem="librealsense finds no camera")
@@ -95,6 +98,7 @@ def _name(which: str) -> str:
 
 def _depth_stream(device: Any) -> tuple[Any, Any]:
     """Return the sensor and the profile closest to 848 pixels width and 30 images/s."""
+    # Z16 depth profiles of all sensors of the device.
     offered = [
         (sensor, profile)
         for sensor in device.query_sensors()

@@ -130,6 +130,7 @@ class Ros2Camera:
         """Subscribe to depth images, and wait for the camera's description, or raise FieldError."""
         self._utc_now_us, self._silence = utc_now_us, Silence()
         self._participant = _participant()
+        # The camera_info topic stands beside the image topic (ROS convention).
         described = info_topic(topic)
         about = self._reader(described, CameraInfo)
         info = _next(about, DESCRIBED_S)
@@ -146,6 +147,7 @@ class Ros2Camera:
             """Lens described by the first camera_info."""
         except ValueError as error:
             raise FieldError("camera", name, problem=f"{described}: {error}") from None
+        # Subscribed last: no image arrives before the lens is known.
         self._images = self._reader(topic, Image)
 
     def _reader(self, topic: str, kind: type[Any]) -> DataReader[Any]:
@@ -170,6 +172,7 @@ class Ros2Camera:
 def _next(reader: DataReader[Any], timeout_s: float) -> Any | None:
     try:
         return reader.take_one(timeout=duration(microseconds=round(timeout_s * 1e6)))
+    # An exhausted reader and a timeout both mean no sample yet.
     except StopIteration:
         return None
     except DDSException as error:
@@ -192,6 +195,7 @@ _restricted: dict[int, Domain] = {}
 
 def _participant() -> DomainParticipant:
     number = _domain()
+    # An explicit CYCLONEDDS_URI takes precedence over ROS_LOCALHOST_ONLY.
     alone = os.environ.get("ROS_LOCALHOST_ONLY") == "1"
     if alone and "CYCLONEDDS_URI" not in os.environ and number not in _restricted:
         _restricted[number] = Domain(number, HERE_ALONE)

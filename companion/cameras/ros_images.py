@@ -35,16 +35,19 @@ def depth_mm(message: Any) -> NDArray[np.uint16]:
     kind = np.dtype(f"{order}u2" if message.encoding in MILLIMETRES else f"{order}f4")
     height, width, step = message.height, message.width, message.step
     data = np.frombuffer(memoryview(message.data), np.uint8)
+    # Rows may be padded, so `step` can exceed the width.
     least = width * kind.itemsize
     if not height or not width or step < least or len(data) != height * step:
         raise ValueError(
             f"{width} x {height} pixels of {kind.itemsize} bytes in rows of {step} bytes are not"
             f" {len(data)} bytes"
         )
+    # Padding is cut before the bytes are viewed as pixels.
     rows = np.ascontiguousarray(data.reshape(height, step)[:, :least])
     image = rows.view(kind)
     if message.encoding in MILLIMETRES:
         return image.astype(np.uint16)
+    # Conversion of NaN and infinity raises warnings in NumPy; both become 0 below.
     with np.errstate(invalid="ignore", over="ignore"):
         mm = np.rint(image * np.float32(MM_PER_M))
         known = np.isfinite(image) & (mm > 0)
@@ -78,14 +81,17 @@ def lens_of(message: Any, image_topic: str = "") -> Lens:
     are unsupported.
     """
     roi = message.roi
+    # An ROI of zeros means the whole image (CameraInfo.msg).
     cropped = (roi.width, roi.height) not in ((0, 0), (message.width, message.height))
     if max(message.binning_x, message.binning_y) > 1 or cropped:
         raise ValueError("binned or cropped images; accepted: whole ones")
     distorts = any(abs(each) > 0.0 for each in message.d)
+    # image_proc publishes rectified images under names such as image_rect.
     rectified = RECTIFIED in image_topic.rpartition("/")[2]
     fisheye = message.distortion_model == EQUIDISTANT and not rectified
     coefficients = _coefficients(message) if fisheye else None
     distorts &= not fisheye
+    # K describes raw images, P rectified ones.
     fx, cx, fy, cy = (
         (message.p[0], message.p[2], message.p[5], message.p[6])
         if distorts

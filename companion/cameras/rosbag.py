@@ -22,6 +22,7 @@ class RosBag:
 
     def __init__(self, which: str, clock: Clock) -> None:
         """Open a recording by PATH of its folder or file, or PATH:TOPIC; else FieldError."""
+        # The separator is ":/", since a topic starts with a slash and a path may contain colons.
         path, separator, topic = which.rpartition(":/")
         if not separator:
             path, topic = which, ""
@@ -47,6 +48,7 @@ class RosBag:
 
     def _chosen(self, name: str, path: str, topic: str | None) -> str:
         """Return the requested topic, or the only topic with depth images."""
+        # Without a topic, exactly one topic with depth images must exist.
         images = sorted(each.topic for each in self._bag.connections if each.msgtype == IMAGE)
         if topic is None:
             images = [each for each in images if self._is_depth(each)]
@@ -64,6 +66,7 @@ class RosBag:
         try:
             return first is not None and depth_mm(first[1]).size > 0
         except ValueError:
+            # Colour images use the same message type; the encoding distinguishes them.
             return False
 
     def _described(self, name: str) -> Lens:
@@ -91,10 +94,12 @@ class RosBag:
         if self._next is None:
             raise RuntimeError("the recording is over")
         arrived_us, message = self._next
+        # Replay time starts with the first request.
         if self._first_us is None:
             self._first_us, self._began_us = arrived_us, self._clock.time_us()
         due_us = self._began_us + arrived_us - self._first_us
         until_us = self._clock.time_us() + round(timeout_s * US_PER_S)
+        # The wait ends at the timeout, and the image stays pending.
         self._clock.sleep_until(min(due_us, until_us))
         if due_us > until_us:
             return None

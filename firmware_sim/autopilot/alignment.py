@@ -66,12 +66,14 @@ class FieldCheck(NamedTuple):
             attitude: Rotation from body to world; its heading has no effect.
         """
         strength = float(np.linalg.norm(field))
+        # Written with "not <=" so that a NaN counts as disturbed.
         if self.checked & Checked.STRENGTH and not (
             abs(strength - STRENGTH_GAUSS) <= self.strength_gauss
         ):
             return True
         if not self.checked & Checked.INCLINATION:
             return False
+        # Only the down component is needed: it does not depend on the heading.
         _, _, down = rotate(attitude, (field.item(0), field.item(1), field.item(2)))
         inclination = math.asin(max(-1.0, min(1.0, down / max(strength, _LEAST_GAUSS))))
         return not abs(inclination - INCLINATION_RAD) <= self.inclination_rad
@@ -130,15 +132,18 @@ class Alignment:
         record, needed = self._record, self._needed()
         elapsed_us = record["time_us"].item(0) - record["rest_since_us"].item(0)
         counts = record["rest_count"][0].tolist()
+        # Every required sensor must have at least one sample.
         if elapsed_us < ALIGN_US or not all(counts[kind] for kind in needed):
             if elapsed_us > LONGEST_ALIGN_US:
                 self._restart()
             return None
         sums = record["rest_sum"][0]
         ax, ay, az = (sums[_ACCEL] / counts[IMU]).tolist()
+        # At rest the accelerometer measures -g: roll and pitch level this vector.
         roll, pitch = math.atan2(-ay, -az), math.atan2(ax, math.hypot(ay, az))
         by_compass, heading = COMPASS in needed, 0.0
         if by_compass:
+            # The field in a frame with heading 0 gives the heading directly.
             level = tuple(quat_from_euler(roll, pitch, 0.0).tolist())
             self.field = field = sums[_FIELD] / counts[COMPASS]
             if FieldCheck.read(self._value).disturbed(field, level):
@@ -146,6 +151,7 @@ class Alignment:
                 self._restart()
                 return None
             heading = es.true_heading(field, level, MAGNETIC_DECLINATION)
+        # Mean of altitudes, not of pressures: altitude is not linear in pressure.
         altitude_m = sums.item(_ALTITUDE) / counts[BAROMETER]
         fix = local_to_geodetic(sums[_PLACE] / counts[FIXES], HOME) if FIXES in needed else None
         return Aligned(quat_from_euler(roll, pitch, heading), altitude_m, fix, by_compass)
@@ -155,8 +161,10 @@ class Alignment:
 
         GPS is not required if external vision may replace it.
         """
+        # With external vision enabled, indoor flights without GPS must align too.
         gps = self._value("EKF2_GPS_CTRL") != 0 and not self._value("EKF2_EV_CTRL")
         mag = self._value("EKF2_MAG_TYPE") != _NO_COMPASS
+        # A bool as a factor keeps or drops the sensor.
         return (*(FIXES,) * gps, *(COMPASS,) * mag, BAROMETER)
 
     def _restart(self) -> None:
@@ -171,6 +179,7 @@ def add(c: Any, measured: int) -> None:
 
     `measured` has the bits of the slow sensors with new data in this tick (`engine.record`).
     """
+    # A negative time marks the first sample.
     if c.rest_since_us < 0:
         c.rest_since_us = c.time_us
     c.rest_count[IMU] += 1

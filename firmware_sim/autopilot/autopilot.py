@@ -166,6 +166,7 @@ class BuiltinAutopilot:
         """Process one tick's sensors; return the motor commands until the next tick."""
         self.take(sample)
         self.decide_if_due()
+        # A climb that ends changes the demand within this tick.
         if climb_record(self.record):
             self._due_us = 0
             self.decide_if_due()
@@ -179,10 +180,12 @@ class BuiltinAutopilot:
 
     def take(self, sample: SensorSample) -> None:
         """Update the estimate with one tick's sensors. Repeated calls have no effect."""
+        # The tick may already be in the estimate from compiled ticks.
         if sample.time_us == self._taken_us:
             return
         sensors = self.supervisor.sensors
         sensors.take(sample)
+        # Samples of failed sensors must not reach the estimator.
         self.estimator.step(sensors.trusted(sample) if sensors.distrusted else sample)
         self._taken_us, self._snapshot = sample.time_us, None
         self._newest.take(sample)
@@ -198,11 +201,14 @@ class BuiltinAutopilot:
         time_us, supervisor = self._taken_us, self.supervisor
         if time_us < 0:
             return
+        # Python aligns when a compiled tick only collects the sums.
         if not self.record["aligned"].item(0) and self.estimator.align():
             self._navigator.due_us = 0
+        # Order: mode end, home, readiness, failsafes, navigation, then the demand.
         if self._commander.flight.phase is _AIR and self._guidance.is_done(self._state):
             self._commander.handle(CommanderEvent.MODE_DONE)
         if self._home.place is None and self.estimator.origin is not None:
+            # While armed, home stays at the place of arming.
             if self._commander.flight.phase < _GROUND:
                 self._home.set_here()
             else:
@@ -232,6 +238,7 @@ class BuiltinAutopilot:
         changed = flight is not self._commander.flight or healthy != self._decided_healthy
         due_us = min(self._due_us, self.supervisor.next_us, self._navigator.due_us)
         due, follows = self._taken_us >= due_us, setpoint is self._guidance.context.setpoint
+        # A new setpoint alone does not need the whole decision.
         if not (changed or due or follows):
             follows = self._follow()
         if changed or not follows or (due and not self._finds_nothing_new()):
@@ -242,6 +249,7 @@ class BuiltinAutopilot:
 
     def _is_undisturbed(self) -> bool:
         """Return whether the newest decision holds apart from setpoints and failsafe checks."""
+        # Any new text or event needs a full decision, so that clients see it at once.
         said = len(self._messages) + len(self._events) > self._unsaid
         if said or not self._is_steady or self._manual_control.was_heard:
             return False
@@ -250,6 +258,7 @@ class BuiltinAutopilot:
     def _follow(self) -> bool:
         """Apply the newest setpoint if nothing else has changed; return True if applied."""
         guidance = self._guidance
+        # Changed inputs of the estimator need `_prepare`.
         if self.estimator.is_changed or not (guidance.is_steady(_AIR) and self._is_undisturbed()):
             return False
         self._demand = guidance.demand(self._state, _AIR, self._taken_us)
@@ -263,16 +272,19 @@ class BuiltinAutopilot:
         if not (self._is_undisturbed() and self._is_idle()):
             return False
         climb = self._guidance.context.climb
+        # The mode must process the end of a climb.
         if climb.has_ended or self._due_us == 0:
             return False
         if not supervisor.is_unchanged(self._taken_us, flight):
             return False
+        # Conditions are unchanged, but delays of failsafes run on.
         self._commander.obey(NO_INTERVENTION)
         if self._commander.flight is not flight:
             self._navigator.due_us = 0
             return False
         self._navigator.due_us = self._taken_us + IDLE_US
         self._due_us = min(supervisor.next_us, self._navigator.due_us)
+        # Compiled code updates the demand of a climb.
         if climb.flies:
             self.record["climb_due_us"] = self._taken_us
         else:  # A mode may rely on the call: offboard detects a new setpoint type there.
@@ -303,6 +315,7 @@ class BuiltinAutopilot:
         self._decided_on = flight, _ = self._commander.flight, self._guidance.context.setpoint
         self._decided_healthy = self.record["healthy"].item(0)
         phase = flight.phase
+        # The land detector looks for one transition at a time.
         self.record["detecting"] = (
             LANDING if phase is _AIR else LIFT_OFF if phase is _GROUND else NOTHING
         )
@@ -311,6 +324,7 @@ class BuiltinAutopilot:
         )
         steady = self._guidance.is_steady(phase) and not self._manual_control.was_heard
         self._is_steady = steady and phase is _AIR
+        # A mode with a varying demand decides at its own rate.
         if not steady:
             self._due_us = min(self._due_us, self._taken_us + DECIDE_US)
 
@@ -335,6 +349,7 @@ class BuiltinAutopilot:
         before, self._snapshot = self._commander.flight, None
         self._taken_us = self.estimator.flown()
         self._newest.follow(read)
+        # Alignment and the end of a climb need a decision at once.
         if event in (ALIGN, CLIMBED):
             self._due_us = 0
         if self.record["detected"].item(0):
@@ -351,6 +366,7 @@ class BuiltinAutopilot:
         armed = flight.phase >= _GROUND
         if not armed:
             self._home.stands()
+        # Nothing to navigate: look again after IDLE_US.
         if self._is_idle():
             navigator.due_us = self._taken_us + IDLE_US
             return
@@ -435,6 +451,7 @@ class BuiltinAutopilot:
     @property
     def ticks_to_motors(self) -> int:
         """Number of ticks after the next until the motors reflect its demand."""
+        # Attitude and rate setpoints skip the outer loops, which add ticks.
         ticks, wanted = ticks_to_motors(self._memory), self._guidance.context.setpoint
         if isinstance(wanted, RateDemand):
             return 0
@@ -474,8 +491,10 @@ class BuiltinAutopilot:
     def arm(self, *, force: bool) -> Result:
         """Request arming. The pre-arm checks also run for a forced request, as in PX4."""
         del force
+        # Without samples or when armed already, no check applies: the commander answers.
         if self.sample is None or self.flight.phase >= _GROUND:
             return self._commander.handle(CommanderEvent.ARM)
+        # Check now: the newest result may be up to a period old.
         self._look_anew(self.flight.mode)
         refusals = self.supervisor.refusals(self.sample, self.flight)
         self._say_all(refusals)
@@ -509,6 +528,7 @@ class BuiltinAutopilot:
         self, mode: Mode, request: ModeRequest | None = None, granted: OperatorText | None = None
     ) -> Result:
         self._look_anew(mode)
+        # The geofence may forbid the place of the request.
         if self.flight.phase >= _GROUND:
             request = self._navigator.permitted(request, self._situation())
         available = self.supervisor.available(mode)
@@ -525,6 +545,7 @@ class BuiltinAutopilot:
         if not self._navigator.mission_is_valid(self._situation()):
             self.say(OperatorText.of(Severity.CRITICAL, events.MISSION_DENIED))
             return Result.DENIED
+        # -1 means the current item.
         if not -1 <= index < len(self.plans.mission):
             return Result.DENIED
         self._commander.handle(Ask(Mode.MISSION))
@@ -543,6 +564,7 @@ class BuiltinAutopilot:
     def set_home(self, place: Geodetic | None) -> Result:
         """Move home; None = the current position."""
         done = self._home.set_here() if place is None else self._home.set_to(place)
+        # Home is part of the snapshot, and modes may fly to it.
         self._snapshot, self._due_us = None, 0
         return Result.ACCEPTED if done else Result.TEMPORARILY_REJECTED
 
@@ -596,9 +618,11 @@ class BuiltinAutopilot:
         moved = self._manual_control.offer(sticks, source, time_us)
         self.supervisor.watch.hear_pilot(time_us)
         flown, override = self.flight.mode, int(self.parameters["COM_RC_OVERRIDE"])
+        # COM_RC_OVERRIDE: bit 0 for automatic modes, bit 1 for offboard.
         bit = 2 if flown is Mode.OFFBOARD else 1
         takes_over = moved and override & bit and flown not in WITH_STICKS
         if takes_over and self.flight.failsafe:
+            # In a failsafe, the framework decides whether the sticks take over.
             self._commander.obey(Intervention(sticks_moved=True))
             return
         if takes_over and self.flight.phase is _AIR and flown is not Mode.ORBIT:
@@ -642,6 +666,7 @@ class BuiltinAutopilot:
             return self._snapshot
         if self._taken_us < 0:
             raise RuntimeError("no tick yet: the autopilot has no state")
+        # Without findings and ESC reports, only `_told` can change logged data.
         calm = self.supervisor.is_calm and self._newest.esc_outputs is None
         revision = self._told if calm else None
         self._snapshot = Snapshot(self._parts, self._taken_us, self._demand, revision)

@@ -59,6 +59,7 @@ class ClimbLimits(NamedTuple):
 def move_on(c: Fields, now_us: int) -> None:
     """Advance the climb of a flight controller to a time [µs], which must not decrease."""
     own, row = c.climb, _DOWN
+    # Near the ground a take-off climbs gently; settling always uses the full limits.
     if own[TARGET] > own[HEIGHT]:
         row = _GENTLY if c.climbs == RISING and own[HEIGHT] < own[NEAR_GROUND] else _UP
     speed, acceleration, jerk = (
@@ -66,12 +67,14 @@ def move_on(c: Fields, now_us: int) -> None:
         c.climb_limits[row, 1],
         c.climb_limits[row, 2],
     )
+    # The first step has no time before it and changes nothing.
     elapsed_s = 0.0 if c.climb_us < 0 else (now_us - c.climb_us) / US_PER_S
     c.climb_us = now_us
     own[HEIGHT] += own[SPEED] * elapsed_s
     left_m = own[TARGET] - own[HEIGHT]
     # Maximum speed from which braking is still possible.
     wanted = math.copysign(min(speed, _braking_speed(abs(left_m), acceleration, jerk)), left_m)
+    # Acceleration limit: bounds the change of speed in this step.
     most = acceleration * elapsed_s
     own[SPEED] += min(most, max(-most, wanted - own[SPEED]))
 
@@ -98,10 +101,12 @@ def climb_if_due(c: Fields) -> bool:
         return False
     if c.climbs == RAMPING:
         limit_m_s = ramp_m_s(c.ramp, c.time_us)
+        # Down is positive in the demand, so the larger value is the slower climb.
         c.climb_due_us, c.demand[5] = c.time_us + DECIDE_US, max(-own[SPEED], -limit_m_s)
         own[SPEED] = max(0.0, limit_m_s)
         return False
     if c.climbs == RISING:
+        # Height of the vehicle, not of the trajectory, ends the take-off.
         height_m = own[HOME_DOWN] - c.state[P + 2]
         if height_m > own[END]:
             c.climbs = CLIMB_ENDED
@@ -109,6 +114,7 @@ def climb_if_due(c: Fields) -> bool:
         own[HEIGHT] = height_m
     move_on(c, c.time_us)
     c.climb_due_us, c.demand[5] = c.time_us + DECIDE_US, -own[SPEED]
+    # Settling holds a height; rising commands only a speed.
     if c.climbs == SETTLING:
         c.demand[2] = own[HOME_DOWN] - own[HEIGHT]
         if abs(own[TARGET] - own[HEIGHT]) <= SETTLED_M:
@@ -174,7 +180,9 @@ class Climb:
         """
         ramp, record = self._record["ramp"][0], self._record
         ramp[_BEGAN:_TAKES] = began_us, value("COM_SPOOLUP_TIME")
+        # A ramp of 0 s would divide by zero.
         ramp[_TAKES] = max(value("MPC_TKO_RAMP_T"), 1e-3)
+        # PX4's Takeoff: the ramp starts where the velocity controller commands zero thrust.
         ramp[_FROM:] = -GRAVITY_M_S2 / value("MPC_Z_VEL_P_ACC"), value("MPC_TKO_SPEED")
         record["climbs"] = RAMPING if flies else NO_CLIMB
         record["climb_due_us"] = time_us + DECIDE_US

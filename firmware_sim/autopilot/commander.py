@@ -256,6 +256,7 @@ TABLE: dict[
 
 
 def _unless_ignored(event: CommanderEvent, phase: FlightPhase) -> CommanderEvent | None:
+    # `is`: only the shared cell of an event without effect counts.
     return None if TABLE[event][phase] is _IGNORE else event
 
 
@@ -266,6 +267,7 @@ READINESS = tuple(
 """[phase][estimator healthy]: event to handle, None if the table ignores it. Looked up in every
 tick."""
 
+# Modes that are not restored after disarming, see `after_disarm`.
 _PASSING = {
     *(Mode.TAKEOFF, Mode.LAND, Mode.PRECISION_LAND, Mode.RETURN),
     *(Mode.ORBIT, Mode.FOLLOW, Mode.DESCEND),
@@ -283,6 +285,7 @@ class EventOutcome:
 
 def transition(flight: CommanderState, event: Ask | CommanderEvent) -> EventOutcome:
     """Return the outcome of an event for a flight. Termination has no exit."""
+    # Terminated vehicles accept no mode, and their mode does not end.
     if flight.mode is Mode.TERMINATION:
         if isinstance(event, Ask):
             refused = _unavailable(event.mode)
@@ -308,6 +311,7 @@ def status_of(flight: CommanderState) -> CommanderStatus:
     arming = (Arming.BOOT, Arming.STANDBY, Arming.ARMED, Arming.ARMED)[flight.phase]
     if flight.phase is not FlightPhase.AIR:
         landed = Landed.ON_GROUND
+    # Take-off is a separate landed state in MAVLink's extended state.
     elif flight.mode is Mode.TAKEOFF:
         landed = Landed.TAKEOFF
     elif flight.mode is Mode.LAND:

@@ -116,6 +116,7 @@ class InnovationCounter:
             Duration of the run [s] if it is too long to be noise, else 0.
         """
         side = (deviations > FAR) - (deviations < -FAR)
+        # A change of side ends a run: noise changes its sign.
         if side == 0 or side != self._side:
             self._side, self.length, self._since_us = side, 0, time_us
         if side == 0:
@@ -160,6 +161,7 @@ class Compass:
         if ratio <= 1.0:
             self.given_up, self._refused_us = False, None
         elif self._refused_us is None:
+            # The gate's width follows from the innovation and its ratio.
             self._refused_us, self._gate_rad = time_us, abs(innovation_rad) / ratio
         elif time_us - self._refused_us >= REFUSED_US:
             self.given_up = True
@@ -241,9 +243,11 @@ class Consistency:
         deviations = innovation / sigma
         if not np.isfinite(deviations).all():
             return None
+        # Read the excess before this sample changes it.
         excess, record = self.velocity_excess, self._record
         _note_velocity(record, deviations, acceleration)
         seen = min(record["fixes"].item(0), LOOK_BACK)
+        # A receiver that is later than stated is off by the speed change in that time.
         late = LATE_S * np.max(record["accelerations"][0, :seen], axis=0)
         unexplained = np.sign(innovation) * np.maximum(np.abs(innovation) - late, 0.0)
         deviations = unexplained / (sigma * math.sqrt(excess))
@@ -252,6 +256,7 @@ class Consistency:
         ]
         if not any(lasted):
             return None
+        # The longest run gives the smallest error that explains the deviation.
         return self._anew(restart_for(float(np.abs(innovation).max()), max(lasted)))
 
     def heading(self, deviations: float, time_us: int, *, within: bool) -> Restart | None:
@@ -272,5 +277,6 @@ class Consistency:
     def _anew(self, restart: Restart) -> Restart:
         for run in (*self._runs, self._heading):
             run.restart()
+        # NaN skips the next difference: the restart moves the innovations.
         self._record["velocity_before"] = np.nan
         return restart

@@ -68,6 +68,7 @@ def propagate(row: Vector, gyro: Vector, accel: Vector, transition: Vector, dt: 
         transition: (16, 16), updated where it differs from the identity.
         dt: Time step [s].
     """
+    # Subtract the estimated biases: rates and specific force in body axes.
     wx = gyro[0] - row[GYRO_BIAS]
     wy = gyro[1] - row[GYRO_BIAS + 1]
     wz = gyro[2] - row[GYRO_BIAS + 2]
@@ -76,14 +77,17 @@ def propagate(row: Vector, gyro: Vector, accel: Vector, transition: Vector, dt: 
     fz = accel[2] - row[ACCEL_BIAS + 2]
     q = attitude(row)
     r = _matrix(q)
+    # Attitude: exact for a constant rate over the tick.
     turned = multiply(q, exponential((wx * dt, wy * dt, wz * dt)))
     row[Q], row[Q + 1], row[Q + 2], row[Q + 3] = normalize(turned)
     row[RATES], row[RATES + 1], row[RATES + 2] = wx, wy, wz
     # dv/dtheta = -R [f]x, dv/dba = -R, dtheta/dtheta = I - [w]x, dtheta/dbg = -I
+    # Row i of R maps the specific force to the world axis i.
     for i in range(3):
         rx, ry, rz = r[i]
         a = rx * fx + ry * fy + rz * fz
         if i == 2:
+            # At rest the accelerometer measures -g; adding g gives zero acceleration.
             a += GRAVITY_M_S2
         row[P + i] += row[V + i] * dt + 0.5 * a * dt * dt
         row[V + i] += a * dt
@@ -96,6 +100,7 @@ def propagate(row: Vector, gyro: Vector, accel: Vector, transition: Vector, dt: 
         transition[VEL + i, ACC + 1] = -ry * dt
         transition[VEL + i, ACC + 2] = -rz * dt
         transition[ATT + i, GYRO + i] = -dt
+    # Attitude block: I - [w dt]x, first order in dt.
     transition[ATT, ATT + 1], transition[ATT, ATT + 2] = wz * dt, -wy * dt
     transition[ATT + 1, ATT], transition[ATT + 1, ATT + 2] = -wz * dt, wx * dt
     transition[ATT + 2, ATT], transition[ATT + 2, ATT + 1] = wy * dt, -wx * dt
@@ -106,6 +111,7 @@ def inject(row: Vector, error: Vector) -> None:
     """Inject an error (16,) into the nominal state (ROW_SIZE,)."""
     turn = exponential((error[ATT], error[ATT + 1], error[ATT + 2]))
     q = normalize(multiply(attitude(row), turn))
+    # q and -q are the same attitude: keep w >= 0.
     sign = 1.0 if q[0] >= 0.0 else -1.0
     for i in range(4):
         row[Q + i] = sign * q[i]
@@ -129,6 +135,7 @@ def true_heading(field: Vector, q: Quat, declination: float) -> float:
     """
     north, east, _ = rotate(q, (field[0], field[1], field[2]))
     angle = declination - math.atan2(east, north)
+    # Wrap to -pi..pi.
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
@@ -147,9 +154,11 @@ def observe_heading(
         h: Written.
     """
     w, x, y, z = q = attitude(row)
+    # 2 (w y - z x) is the sine of the pitch.
     if abs(2.0 * (w * y - z * x)) > _STEEPEST:
         return False
     innovation[0] = true_heading(field, q, declination)
+    # The Jacobian in world axes, rotated into body axes, where the attitude error is defined.
     turn = rotate(conjugate(q), (by_turn[0], by_turn[1], by_turn[2]))
     h[0, ATT], h[0, ATT + 1], h[0, ATT + 2] = turn
     return True
@@ -164,6 +173,7 @@ def gate_ratio(innovation: Vector, variance: Vector) -> float:
     worst = 0.0
     for i in range(len(innovation)):
         ratio = abs(innovation[i]) / math.sqrt(variance[i])
+        # A NaN is kept, so that the gate rejects the measurement.
         if ratio > worst or math.isnan(ratio):
             worst = ratio
     return worst / GATE
@@ -179,6 +189,7 @@ def converged(row: Vector, covariance: Vector) -> bool:
     for i in range(N_STATES):
         sigma = math.sqrt(covariance[i, i])
         row[SIGMA + i] = sigma
+        # States without a threshold must be finite too.
         good = good and math.isfinite(sigma)
     for i in range(len(_READY_SIGMA)):
         good = good and row[SIGMA + i] < _READY_SIGMA[i]

@@ -101,6 +101,7 @@ class Estimator:
         self.filter = new_filter(np.diag(es.INITIAL_SIGMA**2), self._process_noise())
         """Filter for the error's covariance."""
         if isinstance(self.filter, KernelFilter):
+            # Compiled ticks read the arrays of the record, so the filter works in place there.
             self.filter.keep_in(
                 record["covariance"][0], record["transition"][0], record["process_noise"][0]
             )
@@ -115,6 +116,7 @@ class Estimator:
         self._fixed_us: int | None = None
         """Time of alignment with a GPS position; None: not aligned, or aligned without GPS."""
         self._estimate: StateEstimate | None = None
+        # GPS is fused in two parts, so a bad height does not reject a good horizontal fix.
         horizontal = selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
         record["gps_horizontal_h"] = horizontal
         record["gps_vertical_h"] = selecting(es.POS + 2, es.VEL + 2)
@@ -125,8 +127,10 @@ class Estimator:
             "gps_vertical", 3, record["gps_vertical_h"][0], record["gps_vertical_us"]
         )
         self._gps_sinking = Measurement("gps_down_velocity", 3, selecting(es.VEL + 2))
+        # A barometer measures -z plus its own offset.
         record["baro_h"] = selecting(es.BARO) - selecting(es.POS + 2)
         self._baro = Measurement("baro", 1, record["baro_h"][0], record["baro_fused_us"])
+        # `observe_heading` writes this Jacobian for every sample: it depends on the attitude.
         heading_h, heading_us = record["heading_h"][0], record["heading_fused_us"]
         self._heading = Measurement("heading", 2, heading_h, heading_us)
         self._horizon = FusionHorizon()
@@ -178,20 +182,24 @@ class Estimator:
     def step(self, sample: SensorSample) -> None:
         """Process one tick's sensors."""
         self._time_us, self._estimate, self.is_changed = sample.time_us, None, True
+        # Alignment and logs read the newest samples from the record.
         self._note(sample)
         if not self.aligned:
             self._alignment.take(sample)
             self.align()
         else:
             self._predict(sample)
+            # The yaw estimator runs beside the filter and needs every IMU sample.
             self.yaw.feel(sample.gyro, sample.accel)
             self._fuse_slower(sample)
             if sample.odometry is not None:
                 self.see(sample.odometry)
             elif self.vision.fused:
+                # Without a new pose only the timeout of vision is checked.
                 self.vision.look(sample.time_us)
             if sample.distance is not None:
                 self.measure(sample.distance)
+            # Ranges are fused before flow, which needs the height above ground.
             if self.range is not None:
                 self.range.step(sample.time_us, self._aids, flying=self.flying)
             if self.flow is not None:
@@ -237,6 +245,7 @@ class Estimator:
     @property
     def compiled(self) -> bool:
         """True if compiled ticks are equivalent to `step`: GPS is the only aid in use."""
+        # These conditions need code that exists only in Python.
         return (
             self.range is None
             and self.flow is None
@@ -258,7 +267,9 @@ class Estimator:
         record["baro_variance"] = value("EKF2_BARO_NOISE") ** 2
         record["heading_variance"] = value("EKF2_HEAD_NOISE") ** 2
         record["gps_variance"] = value("EKF2_GPS_P_NOISE") ** 2, value("EKF2_GPS_V_NOISE") ** 2
+        # NaN marks an unknown origin; the compiled tick then leaves fixes to Python.
         record["origin"] = self.origin or (math.nan,) * 3
+        # A delayed horizon excludes compiled ticks, see `compiled`.
         self._horizon.assume(value("EKF2_GPS_DELAY"))
         self._suspect()
 
@@ -277,6 +288,7 @@ class Estimator:
         self._time_us, self._estimate = sample.time_us, None
         self._fuse_slower(sample)
         self._suspect()
+        # The same test of convergence as in compiled ticks.
         settle_record(self.record)
 
     def flown(self) -> int:
@@ -288,6 +300,7 @@ class Estimator:
         """Process a pose from an external estimator, received now."""
         self.odometry, self.odometry_us = odometry, self._time_us
         if self.aligned:
+            # Vision position is not used while GPS is fused, see `external_vision`.
             gps = self._uses_gps and self.fuses_gps(self._time_us)
             self.vision.take(odometry, self._time_us, gps=gps, flying=self.flying)
             self._estimate = None
@@ -308,9 +321,11 @@ class Estimator:
 
     def _know_ground(self) -> RangeFinder:
         """Return the range finder; the first call adds the terrain state to the filter."""
+        # Flights without ranges and flow keep the cheaper filter of 16 states.
         if self.range is None:
             terrain = TerrainFilter(self.filter)
             self.filter = terrain
+            # All users of the filter must see the wrapped one.
             self.recovery.use(terrain)
             self.vision.use(terrain)
             self.range = RangeFinder(self._value, self.state, terrain, self._time_us)
@@ -348,8 +363,10 @@ class Estimator:
                 # Local NED continues; its geodetic origin is now known.
                 self.origin, self._estimate = origin, None
             return
+        # The vehicle stays at its geodetic position, so its local position changes.
         here = local_to_geodetic(self.state[es.P : es.V], before)
         self.state[es.P : es.V] = geodetic_to_local(here, origin)
+        # Terrain and barometer refer to the origin's altitude and shift with it.
         if self.range is not None:
             self.range.moved(origin.altitude_m - before.altitude_m)
         self._origin_altitude_baro += origin.altitude_m - before.altitude_m
@@ -372,8 +389,10 @@ class Estimator:
             or any(
                 m.fused_us is not None and now_us - m.fused_us <= longest_us
                 for m in (vision.position, vision.velocity)
+                # Position or velocity: either limits the drift of dead reckoning.
             )
             or (flow is not None and flow.told_motion_since(now_us - longest_us))
+            # On the ground, flow that arrives proves a source of position before take-off.
             or (flow is not None and not flying and flow.is_coming(now_us))
         )
 
@@ -425,6 +444,7 @@ class Estimator:
     @property
     def field_disturbed(self) -> bool:
         """True if the compass measures a field other than the earth's, by EKF2_MAG_CHECK."""
+        # Before alignment, use the mean field at rest.
         field = self.record["mag"][0] if self.aligned else self._alignment.field
         if field is None:
             return False
@@ -451,10 +471,12 @@ class Estimator:
             return False
         self.aligned = self.is_changed = True
         self.state[es.Q : es.RATES] = aligned.quaternion
+        # Without a compass the heading is arbitrary: local NED is not yet geographic.
         self.vision.is_north_known = aligned.by_compass
         self._origin_altitude_baro = aligned.altitude_baro_m
         if aligned.fix is not None:
             self.origin, self._fixed_us = aligned.fix, self._time_us
+        # The origin is at the vehicle here: move it to the chosen place.
         if self._chosen_origin is not None:
             self.move_origin(self._chosen_origin)
         return True
@@ -467,8 +489,10 @@ class Estimator:
     def _process_noise(self) -> Vector:
         value = self._value
         q = np.zeros(es.N_STATES)
+        # As in PX4, the variance grows by (noise dt)² per step.
         q[es.VEL : es.ATT] = (value("EKF2_ACC_NOISE") * TICK_S) ** 2
         q[es.ATT : es.GYRO] = (value("EKF2_GYR_NOISE") * TICK_S) ** 2
+        # Bias noises are per PX4 step: scale the variance from 100 Hz to this tick rate.
         q[es.GYRO : es.ACC] = value("EKF2_GYR_B_NOISE") ** 2 * BIAS_STEP_S * TICK_S
         q[es.ACC : es.BARO] = value("EKF2_ACC_B_NOISE") ** 2 * BIAS_STEP_S * TICK_S
         q[es.BARO] = BARO_WALK_M_SQRT_S**2 * TICK_S
@@ -476,6 +500,7 @@ class Estimator:
 
     def _predict(self, sample: SensorSample) -> None:
         state = self.state
+        # Only delayed horizons need the motion of every tick.
         past = [each for each in self._horizons if each.is_past]
         before = state[es.P : es.Q].copy() if past else None
         self.filter.predict(state, sample.gyro, sample.accel)
@@ -488,10 +513,12 @@ class Estimator:
     def _fuse(self, m: Measurement) -> bool:
         """Fuse a measurement if it is within the gate; return whether it was."""
         if self.innovations is not None:
+            # Consistency tests need the innovation before the fusion changes the state.
             s = m.h @ self.filter.covariance @ m.h.T + np.diag(m.variance)
             self.innovations(m.name, m.innovation.copy(), s)
         ratio = self.filter.fuse(self.state, m.innovation, m.h, m.variance)
         self.state[m.slot] = ratio
+        # False for NaN, too: a NaN never counts as fused.
         within = ratio <= 1.0
         if within:
             m.fused_us = self._time_us
@@ -506,9 +533,11 @@ class Estimator:
         self._horizon.assume(value("EKF2_GPS_DELAY"))
         self._observe_yaw(fix.velocity_ned, math.sqrt(r_v))
         recovery, now = self.recovery, self._now
+        # The excess of earlier fixes: a fix must not change its own weight.
         excess = recovery.consistency.velocity_excess
         recovery.take_velocity(fix.velocity_ned - self._then()[3:], r_v, now)
         r_v *= excess
+        # A heading reset moves the state, so it comes before the innovations.
         if recovery.heading_is_wrong(now):
             recovery.turn(measured, fix.velocity_ned, self._then().copy(), r_p, r_v, now)
         m, then = self._gps_horizontal, self._then()
@@ -516,6 +545,7 @@ class Estimator:
         m.innovation[2:] = fix.velocity_ned[:2] - then[3:5]
         m.variance[:2], m.variance[2:] = r_p, r_v
         self._fuse(m)
+        # The horizontal fusion has changed the state: read the reference again.
         m, then = self._gps_vertical, self._then()
         m.innovation[0] = measured[2] - then[2]
         m.innovation[1] = fix.velocity_ned[2] - then[5]
@@ -526,12 +556,14 @@ class Estimator:
             sinking = self._gps_sinking
             sinking.innovation[0], sinking.variance[0] = m.innovation[1], r_v
             self._fuse(sinking)
+        # The bias between two height sources is not estimated: fuse only one of them.
         elif not self.vision.fused & Control.VERTICAL:
             self._fuse(m)
 
     def _observe_yaw(self, velocity: Vector, accuracy: float) -> None:
         state = self.state
         if self._horizon.is_past:
+            # The yaw estimator runs in the present: shift a delayed velocity to now.
             velocity = velocity + state[es.V : es.Q] - self._then()[3:]
         bias = state[es.GYRO_BIAS : es.ACCEL_BIAS]
         self.yaw.observe(velocity, accuracy, bias, flying=self.flying)
@@ -543,9 +575,11 @@ class Estimator:
 
     def _fuse_baro(self, pressure: float) -> None:
         height = altitude_m(pressure) - self._origin_altitude_baro
+        # The filter's height is -z; the barometer reads it with its offset.
         expected = -self.state.item(es.P + 2) + self.state.item(es.BARO_OFFSET)
         self._baro.innovation[0] = height - expected
         self._baro.variance[0] = self._value("EKF2_BARO_NOISE") ** 2
+        # A barometer that is rejected for long is corrected if the ground is the height reference.
         if not self._fuse(self._baro) and self.range is not None:
             self.range.correct(self._baro, self._time_us)
 
@@ -571,6 +605,7 @@ class Estimator:
 
     def _judge(self, innovation: Vector, variance: Vector) -> float:
         """Check a velocity of external vision against the inertial sensors, at GPS's rate."""
+        # GPS velocities are checked in `_fuse_gps`; vision replaces them only without GPS.
         by_gps = self._uses_gps and self.fuses_gps(self._time_us)
         if not by_gps and self._time_us - self._judged_us >= _JUDGED_EVERY_US:
             self._judged_us = self._time_us

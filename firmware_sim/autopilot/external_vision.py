@@ -125,23 +125,29 @@ class ExternalVision:
             gps: True if GPS is being fused.
             flying: True if the vehicle is in the air.
         """
+        # Bits above 15 have no meaning here.
         asked = Control(int(self._value("EKF2_EV_CTRL")) & 15)
         if self._is_stuck(odometry, now_us, flying=flying):
             return
         self.horizon.assume(self._value("EKF2_EV_DELAY"))
+        # Data that the parameter no longer selects stop at once.
         self.fused &= asked
         previous, wanted = self._previous, self._value("EKF2_EV_QMIN")
         good = wanted <= 0 or odometry.quality >= wanted
+        # Fusion starts only with a sufficient rate: two good poses close together.
         begins = good and previous is not None and now_us - self._previous_us < LONGEST_INTERVAL_US
         jumped = previous is not None and odometry.reset_counter != previous.reset_counter
+        # The rotation between the frames is needed before position and velocity.
         self._learn_frame(odometry, anew=jumped)
         sample = _Sample(odometry, now_us, good, begins, jumped)
+        # Heading first: it decides in which frame position and velocity are fused.
         if asked & Control.YAW:
             self._take_yaw(sample, gps=gps)
         if asked & Control.VELOCITY:
             self._take_velocity(sample)
         if asked & Control.HORIZONTAL and not gps:
             self._take_position(sample, flying=flying)
+        # GPS and vision position would differ by a bias that is not estimated.
         elif gps:
             self.fused &= ~Control.HORIZONTAL
         if asked & Control.VERTICAL and self._value("EKF2_HGT_REF") == HEIGHT_BY_VISION:
@@ -157,6 +163,7 @@ class ExternalVision:
         In the air any repetition is a fault. At rest it is one if the first second showed noise.
         """
         before = self._newest
+        # Compare position, velocity and quaternion; missing values count as equal.
         repeats = before is not None and all(
             (a is None and b is None) or (a is not None and b is not None and np.array_equal(a, b))
             for a, b in zip(odometry[:3], before[:3], strict=True)
@@ -164,6 +171,7 @@ class ExternalVision:
         self._newest = odometry
         if before is None:
             self._first_us = now_us
+        # A repetition, or a second without one, decides whether the source has noise.
         elif self._has_noise is None and (repeats or now_us - self._first_us >= LEARN_US):
             self._has_noise = not repeats
         return repeats and (flying or bool(self._has_noise))
@@ -189,6 +197,7 @@ class ExternalVision:
         told = self._variance(odometry.orientation_variance, noise).item(2)
         variance = max(told, noise, LEAST_VARIANCE)
         m = self.yaw
+        # A jump of the source, or long rejection, needs a reset; else fuse with a gate.
         if active:
             anew = jumped or self._is_overdue(m, now_us)
         else:
@@ -196,6 +205,7 @@ class ExternalVision:
             anew = not (in_ned and self.is_north_known)
         if anew and good:
             self._filter.restart(turn_to(self._state, self._filter.covariance, yaw, variance))
+            # From now on the heading belongs to the vision frame, unless the pose is in NED.
             self.fused |= Control.YAW
             self.is_north_known, m.fused_us = in_ned, now_us
         elif good:
@@ -223,12 +233,14 @@ class ExternalVision:
         if not good:
             return
         m, frame = self.velocity, odometry.velocity_frame
+        # NED does not depend on the attitude: clear the entries of an earlier body velocity.
         m.h[:, es.ATT : es.GYRO] = 0.0
         if frame == "body":
             body = quat_to_matrix(self._state[es.Q : es.RATES])
             # An attitude error rotates a velocity measured in body axes.
             m.h[:, es.ATT : es.GYRO] = body @ _cross(measured)
             measured = body @ measured
+        # FRD without vision heading: rotate from the vision frame into the filter's.
         elif frame == "frd" and not self.fused & Control.YAW:
             measured = self._into_own_frame(measured)
         noise = self._value("EKF2_EVV_NOISE")
@@ -246,17 +258,20 @@ class ExternalVision:
         odometry, now_us, good, begins, jumped = sample
         active = bool(self.fused & Control.HORIZONTAL)
         needs_north = odometry.pose_frame == "ned" and not self.is_north_known
+        # A NED position is useless while local NED has no north.
         if odometry.position is None or needs_north or not (active or begins):
             self.fused &= ~Control.HORIZONTAL
             return
         measured, variance = self._place(odometry.position, odometry)
         m = self.position
         overdue = self._is_overdue(m, now_us)
+        # Reset at the start, after a jump of the source, or after long rejection.
         if not active or (jumped and good) or (overdue and good and self._resets_left > 0):
             self._put(measured, variance)
             m.fused_us = now_us
             if not active:
                 self._resets_left = RESETS
+            # A limited number in flight: a source that disagrees again and again is wrong.
             elif overdue and flying:
                 self._resets_left -= 1
             self.fused |= Control.HORIZONTAL
@@ -289,12 +304,14 @@ class ExternalVision:
         noise = self._value("EKF2_EVP_NOISE")
         variance = np.maximum(self._variance(odometry.position_variance, noise), LEAST_VARIANCE)
         if odometry.pose_frame == "frd" and not self.fused & Control.YAW:
+            # A rotated position is also uncertain by the rotation.
             turned = self._variance(odometry.orientation_variance, self._value("EKF2_EVA_NOISE"))
             position, variance = self._into_own_frame(position), np.maximum(variance, turned.max())
         return position, variance
 
     def _variance(self, told: Vector, noise: float) -> Vector:
         """Return the variance (3,): as reported, at least the parameter's (EKF2_EV_NOISE_MD)."""
+        # A client may report a variance; the parameter is its minimum.
         if self._value("EKF2_EV_NOISE_MD") == 0 and np.isfinite(told).all():
             return np.maximum(told, noise**2)
         return np.full(3, noise**2)
@@ -308,6 +325,7 @@ class ExternalVision:
 
     def _put(self, place: Vector, variance: Vector) -> None:
         """Reset the horizontal position and its covariance."""
+        # Shift by the difference at the measurement time, so that motion since then stays.
         moved = place[:2] - self._then()[:2]
         self._state[es.P : es.P + 2] += moved
         covariance = self._filter.covariance.copy()
@@ -319,6 +337,7 @@ class ExternalVision:
         """Reset the height; the barometer offset shifts with it."""
         moved = down - self._then().item(2)
         self._state[es.P + 2] += moved
+        # The barometer must agree with the new height.
         self._state[es.BARO_OFFSET] += moved
         if self.on_height_moved is not None:
             self.on_height_moved(moved)
@@ -336,10 +355,12 @@ class ExternalVision:
         if anew or not self._is_frame_known:
             self._frame, self._is_frame_known = normalize(turn), True
             return
+        # q and -q are the same rotation: average the nearer of both.
         sign = 1.0 if sum(a * b for a, b in zip(turn, self._frame, strict=True)) >= 0.0 else -1.0
         w, x, y, z = (
             a + FRAME_SHARE * (sign * b - a) for a, b in zip(self._frame, turn, strict=True)
         )
+        # A mean of quaternions does not have unit length.
         self._frame = normalize((w, x, y, z))
 
     def _into_own_frame(self, vector: Vector) -> Vector:

@@ -30,6 +30,7 @@ class FilterpyFilter:
 
     def predict(self, state: Vector, gyro: Vector, accel: Vector) -> None:
         """Advance the nominal state, updated in place, and the covariance by one tick."""
+        # filterpy holds F as an attribute: `propagate` writes into it.
         propagate(state, gyro, accel, self._ekf.F, TICK_S)
         self._ekf.predict()
 
@@ -40,11 +41,13 @@ class FilterpyFilter:
     def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
         """Correct the nominal state by one measurement, unless it fails the gate."""
         ekf = self._ekf
+        # The gate is tested before `update`, which would change the covariance.
         s = h @ ekf.P @ h.T + np.diag(variance)
         ratio: float = gate_ratio(innovation, np.diag(s).copy())
         if ratio <= 1.0:
             ekf.dim_z = len(innovation)
             ekf.update(innovation, lambda _x: h, lambda x: h @ x, R=np.diag(variance))
             inject(state, ekf.x)
+            # The correction is in the nominal state now: the error is zero again.
             ekf.x = np.zeros(N_STATES)
         return ratio

@@ -32,6 +32,7 @@ _MOVING = 9
 @kernel
 def _times_transposed(f: Vector, p: Vector, columns: int, out: Vector) -> None:
     """Write (f p)' (columns, 9) for the moving rows of f (16, 16) and the first columns of p."""
+    # Position, velocity and attitude rows in turn; only entries that differ from I are used.
     for j in range(columns):
         ax, ay, az = p[ATT, j], p[ATT + 1, j], p[ATT + 2, j]
         bx, by, bz = p[ACC, j], p[ACC + 1, j], p[ACC + 2, j]
@@ -42,6 +43,7 @@ def _times_transposed(f: Vector, p: Vector, columns: int, out: Vector) -> None:
             by_attitude = f[i, ATT] * ax + f[i, ATT + 1] * ay + f[i, ATT + 2] * az
             by_bias = f[i, ACC] * bx + f[i, ACC + 1] * by + f[i, ACC + 2] * bz
             out[j, i] = p[i, j] + by_attitude + by_bias
+            # f holds the unit diagonal of the attitude block.
             i = ATT + k
             turned = f[i, ATT] * ax + f[i, ATT + 1] * ay + f[i, ATT + 2] * az
             out[j, i] = turned + f[i, GYRO + k] * p[GYRO + k, j]
@@ -55,11 +57,14 @@ def predict(
     propagate(state, gyro, accel, f, dt)
     half = np.empty((N_STATES, _MOVING))
     whole = np.empty((_MOVING, _MOVING))
+    # First f p, then (f p) f', each transposed, so that one function does both.
     _times_transposed(f, p, N_STATES, half)
     _times_transposed(f, half, _MOVING, whole)
+    # Compute the upper triangle and mirror it: the covariance stays exactly symmetric.
     for i in range(_MOVING):
         for j in range(i, _MOVING):
             p[i, j] = p[j, i] = whole[i, j]
+        # Biases and offset do not move: only their covariance with moving states changes.
         for j in range(_MOVING, N_STATES):
             p[i, j] = p[j, i] = half[j, i]
     for i in range(N_STATES):
@@ -72,18 +77,23 @@ def fuse(state: Vector, p: Vector, innovation: Vector, h: Vector, variance: Vect
     m = len(innovation)
     column = np.empty(N_STATES)
     total = np.empty(m)
+    # The gate tests all components against the covariance before the fusion.
     for k in range(m):
         total[k] = spread(p, h[k], column) + variance[k]
     ratio = gate_ratio(innovation, total)
+    # False for NaN, too.
     if not ratio <= 1.0:
         return ratio
     error = np.zeros(N_STATES)
+    # Sequential scalar fusion: no matrix inverse.
     for k in range(m):
         weight = 1.0 / (spread(p, h[k], column) + variance[k])
+        # The error so far already explains a part of this component.
         rest = innovation[k]
         for i in range(N_STATES):
             rest -= h[k, i] * error[i]
         for i in range(N_STATES):
+            # p is symmetric: p h' is both the column and, transposed, the row.
             error[i] += column[i] * rest * weight
             for j in range(N_STATES):
                 p[i, j] -= column[i] * column[j] * weight
@@ -116,6 +126,7 @@ class KernelFilter:
 
     def keep_in(self, covariance: Vector, transition: Vector, noise: Vector) -> None:
         """Use these arrays for covariance and transition (16, 16) and noise (16,) from now on."""
+        # Copy the values first: the arrays of the record replace the own ones.
         covariance[:], transition[:], noise[:] = self.covariance, self._transition, self._noise
         self.covariance, self._transition, self._noise = covariance, transition, noise
 

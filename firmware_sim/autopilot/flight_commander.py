@@ -52,6 +52,7 @@ class AutoDisarm:
         """
         self.due_us = math.inf
         if flight.mode is _TERMINATION and flight.phase >= _GROUND:
+            # Termination has its own timeout, on the ground and in the air.
             if self._stopped_since_us is None:
                 self._stopped_since_us = time_us
             due_us = self._stopped_since_us + self._value("COM_KILL_DISARM") * US_PER_S
@@ -64,8 +65,10 @@ class AutoDisarm:
             self._standing_since_us = None
             self._flown = flight.phase is _AIR
             return None
+        # Motors that run on the ground restart the time.
         if self._standing_since_us is None or not idle:
             self._standing_since_us = time_us
+        # A landing and an unused arming have separate timeouts.
         limit_s = self._value("COM_DISARM_LAND" if self._flown else "COM_DISARM_PRFLT")
         due_us = self._standing_since_us + limit_s * US_PER_S
         self.due_us = due_us if limit_s > 0.0 and time_us < due_us else math.inf
@@ -140,6 +143,7 @@ class FlightCommander:
             granted: Text to send upon acceptance.
         """
         step = transition(self.flight, event)
+        # A text of the table takes precedence over the command's.
         text = granted if step.text is None and step.result is Result.ACCEPTED else step.text
         if text is not None:
             self._say(text)
@@ -164,12 +168,15 @@ class FlightCommander:
         if self._newest.sample is None:
             return
         self._commanded.guidance.context.armed = flight.phase >= _GROUND
+        # A request may repeat the mode with another target.
         if flight.mode is not flown or request is not None:
             self._commanded.navigator.due_us = 0
             self._commanded.guidance.enter(flight.mode, self._state, request)
+        # Phase changes need a check at once.
         if flight.phase is not before.phase:
             self._note_times(flight.phase)
             self._commanded.supervisor.next_us = 0
+        # Arming: home and timers start here, and the mode starts again at this place.
         if before.phase < _GROUND <= flight.phase:
             self._commanded.auto_disarm.armed()
             self._commanded.home.armed()
@@ -189,6 +196,7 @@ class FlightCommander:
         if decision.text is not None:
             self._say(decision.text)
         flight = decision.flight
+        # A request belongs to its mode: another mode must not receive it.
         request = request if flight.mode is asked else None
         if flight != self.flight or flight.mode is not flown or request is not None:
             self._become(flight, flown, request)

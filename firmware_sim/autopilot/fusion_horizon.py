@@ -115,17 +115,21 @@ class FusionHorizon:
 
     def assume(self, delay_ms: float) -> None:
         """Set the horizon back by the assumed delay of fixes [ms]."""
+        # A delay shorter than the simulated latency counts as none.
         late_us = (delay_ms - self._simulated_ms) * US_PER_MS
         length = 1 + max(0, round(late_us / TICK_US))
         if length != self._log.maxlen:
+            # A new length discards the log: the horizon starts at the present.
             self._log = deque([self._travelled], maxlen=length)
             self.is_past = length > 1
 
     def moved(self, before: Vector, after: Vector) -> None:
         """Record a tick's prediction: position and velocity (6,) NED before and after it."""
+        # A new array each time: the log keeps the old ones.
         self._travelled = self._travelled + (after - before)
         self._log.append(self._travelled)
 
     def seen_from(self, state: Vector) -> Vector:
         """Return position and velocity (6,) NED at the horizon, based on the current state."""
+        # The log's first entry is the motion up to the horizon.
         return state[P:Q] - (self._travelled - self._log[0])

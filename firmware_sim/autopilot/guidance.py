@@ -51,9 +51,11 @@ class Guidance:
         self._stopped = mode is Mode.TERMINATION
         if self._stopped:
             return
+        # Without a request, the next mode may continue the motion of the last one.
         if request is None:
             request = self._flown.remainder(state)
         new = self._modes[mode]
+        # Settings of a mode do not survive a change of mode.
         if new is not self._flown:
             self.context.travel.speed_m_s, self.context.orbit = NAN, None
         self._flown = new
@@ -85,6 +87,7 @@ class Guidance:
             text = f"Using default takeoff altitude: {default:.1f} m"
             context.say(OperatorText(Severity.INFO, text, events.TAKEOFF_DEFAULT.event(default)))
             altitude_m = default + height
+        # As in PX4: a take-off does not descend.
         if altitude_m < height:
             higher = events.TAKEOFF_ALREADY_HIGHER.event()
             context.say(
@@ -110,6 +113,7 @@ class Guidance:
         if phase is _AIR:
             self._spool_since_us = None
             return self._flown.demand(state, time_us)
+        # On the ground, only a mode that lifts off starts the motors.
         if phase is _GROUND and self._flown.lifts:
             return self._ramped(self._flown.demand(state, time_us), time_us)
         self._spool_since_us = None
@@ -121,6 +125,7 @@ class Guidance:
             return True
         if phase is _AIR or not self._flown.lifts:
             return self._flown.is_steady
+        # In the ramp, compiled ticks update the demand.
         return self.context.climb.flies
 
     def _ramped(self, demand: AnyDemand, time_us: int) -> AnyDemand:
@@ -137,5 +142,6 @@ class Guidance:
         # After lift-off, the climb continues from the ramp.
         limit = context.climb.ramp(self._spool_since_us, context.value, time_us, flies=straight)
         (north, east, _), (vn, ve, vd) = demand.position, demand.velocity
+        # Limit only the climb; NaN means no vertical velocity is commanded.
         down = -limit if math.isnan(vd) else max(vd, -limit)
         return Demand((north, east, NAN), (vn, ve, down), demand.yaw, demand.yaw_rate)

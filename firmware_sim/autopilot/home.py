@@ -44,12 +44,14 @@ class Home:
         north, east, down = state[P:V].tolist()
         sigma_north, sigma_east, sigma_down = state[SIGMA : SIGMA + 3].tolist()
         away = math.hypot(north - home[0], east - home[1])
+        # Both limits: an inaccurate estimate alone does not move home.
         moved = away > max(2.0 * math.hypot(sigma_north, sigma_east), LEAST_MOVE_M)
         if moved or abs(down - home[2]) > max(2.0 * sigma_down, LEAST_CLIMB_M):
             self.set_here()
 
     def armed(self) -> bool:
         """Set home to the arming position unless chosen; return whether home is new."""
+        # Without a fix, only local home is known.
         if self._estimator.origin is None:
             self._guidance.at_home(self._estimator.state)
             return False

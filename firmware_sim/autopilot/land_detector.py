@@ -73,6 +73,7 @@ def lifts_off(state: Vector, thrust: float, land: Vector) -> bool:
 
     MPC_THR_HOVER may be wrong: a lighter vehicle climbs at less thrust.
     """
+    # Lift-off needs both climb and thrust near hover, or a fast climb.
     climb_m_s = -state[V + 2]
     hovers = climb_m_s > LIFT_SPEED_M_S and thrust > land[_LIFT_THRUST]
     return bool(climb_m_s > land[_LIFTED_M_S] or hovers)
@@ -102,6 +103,7 @@ class LandDetector:
         land, self._ground = self._record["land"][0], ground
         if ground is None:
             return
+        # A terrain estimate without ranges must not prevent a landing.
         self._ground_seen = self._ground_seen or ground.by_range
         far = ground.valid and ground.dist_bottom_m >= NEAR_GROUND_M
         unsure = UNSURE if self._ground_seen and not ground.valid else 1.0

@@ -66,12 +66,15 @@ class ManualControl:
         if source not in _ALLOWED.get(mode, ()):
             return False
         fresh = self.sticks(time_us) is not None
+        # COM_RC_IN_MODE 3 keeps its first source; others switch after a loss.
         held = fresh or mode == 3
         if held and self._source is not None and source is not self._source:
             return False
+        # After a loss, the first sticks are the rest position.
         if not fresh:
             self._rest = sticks
         elapsed_s = (time_us - self._time_us) / US_PER_S
+        # Low-pass with the real time between messages.
         weight = min(1.0, elapsed_s / (elapsed_s + FOLLOWED_S)) if elapsed_s > 0.0 else 0.0
         self._rest = Sticks(
             *(r + weight * (s - r) for r, s in zip(self._rest, sticks, strict=True))

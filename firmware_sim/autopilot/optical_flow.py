@@ -113,13 +113,16 @@ class OpticalFlowFusion:
         """Store a measurement for this tick; missing rotation comes from the vehicle's gyro."""
         interval_s = reading.interval_s
         told = np.isfinite(reading.flow).all() and 0.0 <= interval_s < LONGEST_S
+        # A zero interval is accepted only with quality 0, as a report of no flow.
         if not told or (interval_s == 0.0 and reading.quality > 0):
             return
         before = self.reading
         repeats = before is not None and np.array_equal(reading.flow, before.flow)
+        # A coarse sensor may repeat zeros at rest: only non-zero repetitions count.
         self._repeated = self._repeated + 1 if repeats and reading.flow.any() else 0
         self._rate = self._turned / self._turned_s if self._turned_s > 0.0 else np.zeros(3)
         self._turned, self._turned_s = np.zeros(3), 0.0
+        # Rotation of the vehicle's gyro over the same interval replaces missing axes.
         turned, own = reading.turned, self._rate * interval_s
         if not np.isfinite(turned[:2]).all():
             turned = own
@@ -165,10 +168,14 @@ class OpticalFlowFusion:
     def _control(self, reading: FlowReading, now_us: int, *, aided: bool, flying: bool) -> None:
         value, ground = self._value, self._ground
         rate, gyro = self._rates(reading)
+        # The measurement belongs to the middle of its integration time.
         self.horizon.assume(value("EKF2_OF_DELAY") + 0.5 * MS_PER_S * reading.interval_s)
+        # Remove the rotation: the rest is translation over the ground.
         compensated = rate - gyro[:2]
         variance = self._variance(reading.quality)
+        # Test every measurement; `_fuse` reads the ratios.
         self._test(compensated, gyro, variance)
+        # On the ground PX4 accepts another minimum quality.
         least_quality = value("EKF2_OF_QMIN" if flying else "EKF2_OF_QMIN_GND")
         fast = max(math.hypot(*rate.tolist()), math.hypot(*compensated.tolist()))
         good = (
@@ -179,6 +186,7 @@ class OpticalFlowFusion:
         if good:
             # As in PX4, invalid flow is also smoothed: the velocity may be reset to it.
             self._smooth(compensated)
+        # Height by terrain and estimate, not by the newest range.
         height = self._terrain.down - self._state.item(es.P + 2)
         possible = LEAST_HEIGHT_M <= height <= GREATEST_HEIGHT_M
         tells_ground = not ground.is_reference
@@ -187,6 +195,7 @@ class OpticalFlowFusion:
         elif self.fused:
             if good:
                 self._fuse(compensated, gyro, variance, now_us, ground=tells_ground)
+            # Rejected for too long: reset to flow if nothing else measures motion.
             if self.fused_us is not None and now_us - self.fused_us > _UNUSED_US:
                 if good and flying and not aided:
                     self._put_velocity(variance, now_us)
@@ -198,6 +207,7 @@ class OpticalFlowFusion:
     def _may_begin(self, now_us: int, *, aided: bool) -> bool:
         """Return whether the conditions for fusion besides a good measurement are met."""
         lately = self.fused_us is not None and now_us - self.fused_us <= _BEGIN_AGAIN_US
+        # Flow needs a known scale: a height above ground, or another aid.
         known = aided or self._ground.is_reference or self._ground.clearance().valid
         return self._count > _TO_BEGIN and known and not lately
 
@@ -206,9 +216,11 @@ class OpticalFlowFusion:
     ) -> None:
         ground = self._ground
         tells_ground = not ground.is_reference
+        # Without another aid, velocity drifts freely: start from the flow velocity.
         if not aided:
             self._put_velocity(variance, now_us)
         elif not self._fuse(compensated, gyro, variance, now_us, ground=tells_ground):
+            # The terrain is reset by flow only if no range measures it.
             if ground.tells_ground or not tells_ground:
                 return
             self._put_ground(now_us)
@@ -216,6 +228,7 @@ class OpticalFlowFusion:
 
     def _stop(self) -> None:
         if self.fused:
+            # A restart needs a new series of measurements.
             self.fused, self._count = False, 0
 
     def _fuse(
@@ -228,10 +241,12 @@ class OpticalFlowFusion:
         jacobian = self._jacobian()
         for axis in range(2):
             row = jacobian[axis]
+            # The first axis has changed the state: compute the second innovation again.
             if axis == 1:
                 self.innovation[1] = compensated[1] - self._predicted(gyro)[1]
                 self.ratio[1] = self._ratio(self.innovation.item(1), row, variance)
                 if self.ratio[1] > 1.0:
+                    # Skip only this axis: the first is fused already.
                     continue
             self._terrain.fuse_with_ground(
                 self._state, self.innovation.item(axis), row, variance, vehicle=True, ground=ground
@@ -249,6 +264,7 @@ class OpticalFlowFusion:
         if reading.interval_s == 0.0:
             return np.zeros(2), np.zeros(3)
         gyro = -reading.turned / reading.interval_s
+        # The vehicle's gyro with opposite sign, minus the estimated bias.
         reference = self._state[es.GYRO_BIAS : es.ACCEL_BIAS] - self._rate
         off = np.clip(gyro - reference, -_GREATEST_BIAS_RAD_S, _GREATEST_BIAS_RAD_S)
         self._gyro_bias += _BIAS_SHARE * (off - self._gyro_bias)
@@ -257,6 +273,7 @@ class OpticalFlowFusion:
     def _variance(self, quality: int) -> float:
         """Return the variance of the flow [rad²/s²] for a quality."""
         value, least = self._value, self._value("EKF2_OF_QMIN")
+        # Interpolate the standard deviation between best and worst quality.
         best = max(value("EKF2_OF_N_MIN"), _LEAST_NOISE_RAD_S)
         worst = max(value("EKF2_OF_N_MAX"), _LEAST_NOISE_RAD_S)
         span = _BEST_QUALITY - least
@@ -271,11 +288,13 @@ class OpticalFlowFusion:
             self.ratio[axis] = self._ratio(self.innovation.item(axis), jacobian[axis], variance)
 
     def _ratio(self, innovation: float, row: Vector, variance: float) -> float:
+        # PX4 limits the gate to at least one standard deviation.
         gate = max(self._value("EKF2_OF_GATE"), 1.0)
         return innovation**2 / (gate**2 * (self._terrain.spread(row) + variance))
 
     def _smooth(self, compensated: Vector) -> None:
         scale = self._range_m
+        # Flow about x shows motion to the right, flow about y motion backward.
         velocity = np.array([-compensated[1] * scale, compensated[0] * scale])
         if self._count == 0:
             self._smoothed_velocity, self._smoothed_rate = velocity, compensated
@@ -303,6 +322,7 @@ class OpticalFlowFusion:
     @property
     def _height_m(self) -> float:
         """Height of the sensor above ground, at least `_LEAST_CLEARANCE_M` [m]."""
+        # The sensor's mounting position rotates with the vehicle.
         offset = (self._rotation @ self._place).item(2)
         return max(abs(self._terrain.down - self._then.item(2) - offset), _LEAST_CLEARANCE_M)
 
@@ -314,7 +334,9 @@ class OpticalFlowFusion:
     def _predicted(self, gyro: Vector) -> Vector:
         """Return the expected flow (2,) without rotation [rad/s]."""
         rotation = self._rotation
+        # A sensor away from the centre also moves by the rotation (w x r).
         body = rotation.T @ self._then[3:] + np.cross(-gyro, self._place)
+        # 1 / range: height divided by the cosine of the tilt.
         scale = rotation.item(2, 2) / self._height_m
         return np.array([body[1] * scale, -body[0] * scale])
 
@@ -327,10 +349,13 @@ class OpticalFlowFusion:
     def _put_velocity(self, variance: float, now_us: int) -> None:
         """Reset the horizontal velocity to the flow velocity."""
         state, p = self._state, self._terrain.covariance.copy()
+        # Rotate the smoothed body velocity to NED, without its vertical component.
         level = self._rotation[:2, :2] @ self._smoothed_velocity
         state[es.V : es.V + 2] = level
         for i in (es.VEL, es.VEL + 1):
+            # Correlations of the old velocity do not hold for the new one.
             p[i, :] = p[:, i] = 0.0
+            # A flow error of s [rad/s] is a velocity error of s times range.
             p[i, i] = self._range_m**2 * variance
         self._terrain.restart(p)
         self._agree(now_us)
@@ -339,8 +364,10 @@ class OpticalFlowFusion:
         """Reset the terrain height from flow at the known velocity."""
         state = self._state
         forward, right = -self._smoothed_rate.item(1), self._smoothed_rate.item(0)
+        # Speed over flow gives the distance to the ground.
         seen = math.hypot(*(self._rotation[:2, :2] @ np.array([forward, right])).tolist())
         least = self._value("EKF2_MIN_RNG")
+        # Too little flow to divide by: assume the minimum range.
         away = math.hypot(*state[es.V : es.V + 2].tolist()) / seen if seen > 1e-6 else least
         self._terrain.put(state.item(es.P + 2) + max(away, least), _UNKNOWN_GROUND_M2)
         self._ground.ground_seen(now_us)
@@ -355,11 +382,14 @@ class OpticalFlowFusion:
 
     def _stand(self, now_us: int, *, free: bool) -> None:
         """Hold position on the ground while flow arrives without other aids."""
+        # In the air, or with another aid, a fixed position would be wrong.
         if free or not self.is_coming(now_us):
             self._stands_at = None
             return
+        # The first call records the position; later calls hold it.
         if self._stands_at is None:
             self._stands_at = self._state[es.P : es.P + 2].copy()
+        # PX4's ZeroVelocityUpdate and FakePosFusion run at 5 Hz.
         elif now_us - self._stood_us >= _STAND_EVERY_US:
             self._stood_us = now_us
             m = self.standing
@@ -387,10 +417,13 @@ def flow_by_errors(rotation: Vector, velocity: Vector, height_m: float) -> Vecto
     # A body rotation t changes v_body by v_body x t, and R22 by R20 t_y - R21 t_x.
     by_turn = np.array([[0.0, -z, y], [z, 0.0, -x]])
     tilt = np.array([-rotation.item(2, 1), rotation.item(2, 0), 0.0]) / height_m
+    # Flow about x depends on v_y, flow about y on -v_x.
     for axis, (seen, sign) in enumerate(((1, 1.0), (0, -1.0))):
         row = jacobian[axis]
         row[es.VEL : es.ATT] = sign * scale * rotation[:, seen]
         row[es.ATT : es.GYRO] = sign * (scale * by_turn[seen] + body[seen] * tilt)
+        # Flow falls with height: d(v / h) / dh = -v / h².
         by_height = -sign * scale * body[seen] / height_m
+        # The height above ground is terrain z minus vehicle z.
         row[es.POS + 2], row[GROUND] = -by_height, by_height
     return jacobian

@@ -66,6 +66,7 @@ class Parameters:
             self._bounded_text(name) for name in sorted(self._bounded)
         ]
         self._keeper = keeper
+        # Stored values come after the overrides: the user's choice wins.
         if keeper is not None:
             for name, value in keeper.read().items():
                 self._store(name, value)
@@ -127,6 +128,7 @@ class Parameters:
                 kept = self._keeper.read()
             except UsageError:
                 return False
+            # Names that are no longer stored return to their defaults.
             for name, value in {**self._defaults, **kept}.items():
                 self._store(name, value)
             self._changed()
@@ -158,11 +160,13 @@ class Parameters:
         if index is None or not math.isfinite(value):
             return False
         spec = SPECS[index]
+        # The default's type decides: INT32 values are truncated.
         stored = type(spec.default)(value)
         if isinstance(stored, int) and not _INT32_LOW <= stored <= _INT32_HIGH:
             return False
         self._values[index] = stored
         self.revision += 1
+        # Flight code reads the clipped value, clients the stored one.
         self._flown[name] = spec.flown(stored)
         if not self._is_bounded(name):
             self._bounded.discard(name)

@@ -137,7 +137,9 @@ def _needs(r: Readiness, need: Need) -> bool:
     return bool(NEEDS[r.mode] & need)
 
 
+# Before convergence, another check explains the missing position.
 def _global_required(r: Readiness) -> bool:
+    # Before convergence, another check explains the missing position.
     return r.settings.com_arm_wo_gps == _GLOBAL_REQUIRED and not r.armed and r.converged
 
 
@@ -201,6 +203,7 @@ def _battery_level(r: Readiness) -> BatteryWarning:
 
 def _battery_blocks(r: Readiness) -> bool:
     """Return whether the charge prevents arming: below COM_ARM_BAT_MIN, else critical."""
+    # COM_ARM_BAT_MIN replaces PX4's fixed limit.
     if _charge_required(r):
         return r.charge_short
     return r.conditions.battery_warning >= BatteryWarning.CRITICAL

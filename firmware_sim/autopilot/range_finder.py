@@ -110,6 +110,7 @@ class RangeFinder:
         """Newest reading of any distance sensor, in any direction."""
         self.reading_us = 0
         """Time of arrival of the reading [µs]."""
+        # -1 runs the first step in any case.
         self._step = -1
         self._begin_ground()
 
@@ -120,8 +121,10 @@ class RangeFinder:
         EKF2::UpdateRangeSample).
         """
         self.reading, self.reading_us = reading, now_us
+        # Upward and sideways sensors say nothing about the ground.
         if reading.orientation != DOWNWARD or not math.isfinite(reading.distance_m):
             return
+        # Another sensor takes over only after a timeout, so that two sensors do not alternate.
         if source != self._source:
             if self._source is not None and now_us - self._last_us <= US_PER_S:
                 return
@@ -137,23 +140,27 @@ class RangeFinder:
             flying: True if the vehicle is in the air.
         """
         step = now_us // STEP_US
+        # Timeouts need at most PX4's 100 Hz.
         if self._waiting is None and step == self._step:
             return
         self._step = step
         self._check(now_us, flying=flying)
         if self.sensor.is_new:
             self._control(now_us, aids())
+        # No range for two intervals: stop, before the estimate relies on old ones.
         elif self._fuses and now_us - self._last_us > 2 * LONGEST_INTERVAL_US:
             self._stop()
         self._follow_ground(now_us, flying=flying)
         self.sensor.is_new = False
         value, terrain = self._value, self.terrain
         free = not self.is_reference
+        # While the ground is the height reference it is fixed by definition.
         terrain.walk_m_s = value("EKF2_TERR_NOISE") if free else 0.0
         terrain.slope = value("EKF2_TERR_GRAD")
 
     def clearance(self) -> Clearance:
         """Return the height above ground."""
+        # The filtered ratio is a square with a sign.
         ratio = math.sqrt(abs(self._filtered_ratio)) if self.tells_ground else math.nan
         return Clearance(
             max(self._clearance_m, 0.0),
@@ -182,10 +189,12 @@ class RangeFinder:
 
         Source: PX4 1.16, EKF/aid_sources/barometer, which stops it and restarts with a new bias.
         """
+        # A barometer that was never fused has been rejected since the start.
         refused_us = now_us - (baro.fused_us or 0)
         if not (self.is_reference and refused_us > TIMEOUT_US):
             return
         self._state[es.BARO_OFFSET] += baro.innovation.item(0)
+        # Restart the offset, with its initial uncertainty and no correlations.
         covariance = self.terrain.covariance.copy()
         covariance[es.BARO, :] = covariance[:, es.BARO] = 0.0
         covariance[es.BARO, es.BARO] = es.INITIAL_SIGMA.item(es.BARO) ** 2
@@ -209,11 +218,14 @@ class RangeFinder:
             self._waiting = None
         sensor.quality_s, sensor.fog_m = value("EKF2_RNG_QLTY_T"), value("EKF2_RNG_FOG")
         q, pitch = es.attitude(self._state), value("EKF2_RNG_PITCH")
+        # The ray in world axes: its down component is the cosine of the tilt.
         ray = rotate(q, (math.sin(pitch), 0.0, math.cos(pitch)))
         sensor.check(now_us, ray[2])
         if sensor.is_healthy:
             x, y, z = (value(f"EKF2_RNG_POS_{axis}") for axis in "XYZ")
+            # Add the sensor's depth below the reference point, along the ray.
             sensor.range_m += rotate(q, (x, y, z))[2] / sensor.cos_tilt
+            # On the ground the vertical speed is zero, so the check shows nothing.
             if flying:
                 self._compare(now_us)
         elif not flying and sensor.is_regular and sensor.is_new:
@@ -224,7 +236,9 @@ class RangeFinder:
         """Check a range against the vertical speed."""
         value, sensor, p = self._value, self.sensor, self.terrain.covariance
         north, east, down = self._state[es.V : es.Q].tolist()
+        # Horizontal speed counts as motion only beyond its own uncertainty.
         spread = float(p[es.VEL, es.VEL] + p[es.VEL + 1, es.VEL + 1])
+        # EKF2_RNG_SFE: noise that grows with the range.
         scaled = value("EKF2_RNG_SFE") * sensor.dist_bottom_m
         self.consistency.update(
             sensor.dist_bottom_m,
@@ -241,6 +255,7 @@ class RangeFinder:
     def _control(self, now_us: int, aids: Aids) -> None:
         value, sensor = self._value, self.sensor
         control = int(value("EKF2_RNG_CTRL"))
+        # The assumed delay may change in flight.
         self.terrain.horizon.assume(value("EKF2_RNG_DELAY"))
         measured, variance = self._measure(now_us)
         goes_on = (
@@ -252,6 +267,7 @@ class RangeFinder:
             self._fuses and control == RangeControl.CONDITIONAL and self._is_suitable(aids)
         )
         always = self._fuses and control == RangeControl.ON
+        # First the use of ranges for height, then for terrain, then the fusion.
         if self.tells_height:
             if not (conditional or always):
                 self._stop_height()
@@ -259,6 +275,7 @@ class RangeFinder:
             self._begin_height(measured, variance, now_us, always=always)
         if not self._fuses:
             if goes_on and sensor.is_regular:
+                # A large difference at the start: reset the terrain instead of a slow fusion.
                 if self.ratio > 1.0:
                     self._put_ground(variance, now_us)
                 self.tells_ground = True
@@ -270,6 +287,7 @@ class RangeFinder:
     def _measure(self, now_us: int) -> tuple[float, float]:
         """Return the newest height above ground [m] and its variance; update the test ratio."""
         value, sensor, p = self._value, self.sensor, self.terrain.covariance
+        # EKF2_MIN_RNG: range of a vehicle that stands on the ground.
         measured = max(sensor.dist_bottom_m, value("EKF2_MIN_RNG"))
         scaled = value("EKF2_RNG_SFE") * sensor.range_m
         # PX4 adds the variance of the vehicle's height to the sensor's.
@@ -285,6 +303,7 @@ class RangeFinder:
 
     def _filter_ratio(self, now_us: int) -> None:
         """Add the newest test ratio to the mean (updateAidSourceStatus)."""
+        # PX4 bounds the time step of this filter.
         dt = min(1.0, max(0.001, (now_us - self._tested_us) / US_PER_S))
         signed = math.copysign(self.ratio, -self.innovation)
         if self._tested_us == 0:
@@ -298,13 +317,16 @@ class RangeFinder:
     def _is_suitable(self, aids: Aids) -> bool:
         """Return whether height and speed are low enough for conditional range height."""
         value, (north, east) = self._value, self._state[es.V : es.V + 2].tolist()
+        # Hysteresis: starting needs tighter limits than continuing.
         share, steady = (1.0, 1.0) if self.tells_height else (_TO_BEGIN, _STEADY)
         slow = math.hypot(north, east) <= share * value("EKF2_RNG_A_VMAX")
         low = self._clearance_m < share * value("EKF2_RNG_A_HMAX")
+        # Without horizontal aiding the speed estimate has no meaning.
         return low and self.ratio < steady and (slow or not aids.horizontal)
 
     def _begin_height(self, measured: float, variance: float, now_us: int, *, always: bool) -> None:
         self.tells_height = True
+        # Range height beside another reference: it corrects, but the reference stays.
         if int(self._value("EKF2_HGT_REF")) != HEIGHT_BY_RANGE:
             if self.ratio > 1.0:
                 self._put_ground(variance, now_us)
@@ -317,6 +339,7 @@ class RangeFinder:
             self._agree(now_us)
         elif self.ratio > 1.0:
             self._put_ground(variance, now_us)
+        # While the ground is the reference, ranges do not correct it.
         self.tells_ground = False
 
     def _fuse(self, measured: float, variance: float, now_us: int, aids: Aids) -> None:
@@ -331,12 +354,14 @@ class RangeFinder:
             self.fused_us = now_us
             if self.tells_ground:
                 self._ground_us = now_us
+        # No other height source: height follows the range after the timeout.
         alone = now_us - aids.height_us > TIMEOUT_US
         if alone and self.tells_height and self.is_reference:
             # PX4 moves the ground with the vehicle here, so that it drifts with every range.
             ground = self.terrain.down
             self._put_height(measured - ground, None)
             self.terrain.down = ground
+            # Without a source of vertical speed, its drift would move the height away again.
             if not aids.vertical_speed:
                 self._state[es.V + 2] = 0.0
             self._agree(now_us)
@@ -350,6 +375,7 @@ class RangeFinder:
 
     def _put_ground(self, variance: float, now_us: int) -> None:
         """Reset the terrain height to the newest range."""
+        # Resets count so that users of the terrain can detect jumps.
         self.terrain.put_by_range(self.innovation, variance)
         self._resets += 1
         self._agree(now_us)
@@ -363,9 +389,11 @@ class RangeFinder:
         """
         state, p = self._state, self.terrain.covariance
         moved = -height_m - state.item(es.P + 2)
+        # The barometer offset shifts by the same amount: the innovation of the barometer stays.
         state[es.P + 2] += moved
         state[es.BARO_OFFSET] += moved
         if variance is not None:
+            # The new height does not depend on the old one.
             covariance, z = p.copy(), es.POS + 2
             covariance[z, :] = covariance[:, z] = 0.0
             covariance[z, z] = variance
@@ -390,6 +418,7 @@ class RangeFinder:
         """Maintain the terrain without measurements, and update its validity."""
         unused = self._ground_us is None or now_us - self._ground_us > _UNUSED_US
         if flying:
+            # Lift-off: the height above ground is known one last time.
             if not self._flying:
                 self._begin_ground()
         elif not self.tells_ground and unused and not self.is_reference:
@@ -398,8 +427,11 @@ class RangeFinder:
         clearance, spread = self._clearance_m, self.terrain.clearance_variance()
         possible = clearance >= 0.0 and self._ground_us is not None and spread > 0.0
         if self._valid:
+            # Hysteresis: once valid, an uncertainty of 10 % of the height (at least 0.5 m) is
+            # enough.
             self._valid = possible and spread < max(0.1 * clearance, 0.5) ** 2
         else:
+            # Validity starts with a recent measurement by ranges or another source.
             times = (self.fused_us if self.tells_ground else None, self._seen_us)
             recent = any(time is not None and now_us - time <= TIMEOUT_US for time in times)
             self._valid = possible and recent

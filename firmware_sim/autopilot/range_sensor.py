@@ -83,6 +83,7 @@ class RangeSensor:
         """
         self.cos_tilt = cos_tilt
         age_us = now_us - self.range_us
+        # Low-pass of the age: a sensor with many gaps is rejected even after a good sample.
         self._age_us += _AGE_SHARE * (age_us - self._age_us)
         self._age_us = min(self._age_us, _GREATEST_AGE_US)
         if age_us > 2 * LONGEST_INTERVAL_US or self._age_us >= _DISCONTINUOUS_US:
@@ -91,7 +92,9 @@ class RangeSensor:
         self.is_regular = True
         if not self.is_new:
             return
+        # Invalid until all checks pass.
         self.is_valid = False
+        # -1 = unknown quality counts as good.
         if self._quality == 0:
             self._bad_us = now_us
         if not (
@@ -108,10 +111,12 @@ class RangeSensor:
     def _look_whether_stuck(self) -> None:
         if self.range_us - self._valid_us <= _STUCK_AFTER_US:
             return
+        # Ranges move again.
         if self._stuck_high - self._stuck_low > _MOVES_M:
             self._stuck, self._stuck_low, self._stuck_high = False, 0.0, 0.0
             return
         self._stuck_high = max(self._stuck_high, self.range_m)
+        # Below `_MOVES_M` the minimum is not set yet.
         if self._stuck_low < _MOVES_M or self.range_m < self._stuck_low:
             self._stuck_low = self.range_m
         self._stuck = True
@@ -123,8 +128,10 @@ class RangeSensor:
             return
         self._recent.append(self.dist_bottom_m)
         median = sorted(self._recent)[_MEDIAN // 2]
+        # A sudden jump from far to near: fog, not ground.
         if not self._blocked and median < fog and self._median - median > _FOG_FACTOR * fog:
             self._blocked = True
+        # Twice the limit to leave: hysteresis.
         elif self._blocked and median > _FOG_FACTOR * fog:
             self._blocked = False
         self._median = median
@@ -177,18 +184,22 @@ class RangeConsistency:
         dt = (now_us - self._before_us) / US_PER_S
         known, before = self._before_us != 0, self._before_m
         self._before_us, self._before_m = now_us, dist_bottom_m
+        # The first sample, and large gaps, give no rate.
         if not (known and 0.001 <= dt <= 0.5):
             return
+        # A shrinking range must match the downward speed.
         innovation = -(dist_bottom_m - before) / dt - down_m_s
         # Variance of the difference of two ranges, divided by the time between them.
         spread = 2.0 * variance / dt**2 + down_variance
         self.ratio = innovation**2 / spread / gate**2
         share = dt / (dt + self._TAU_S)
+        # The sign shows a steady difference; noise cancels in the mean.
         self.mean_ratio += share * (math.copysign(self.ratio, innovation) - self.mean_ratio)
         if abs(self.mean_ratio) >= 1.0:
             # PX4 compares microseconds with 2 here: only current motion counts.
             if now_us - self._moved_us > self._TAU_S:
                 self.is_consistent, self._inconsistent_us = False, now_us
+        # Consistency returns only with proof: fast motion that agrees after the probation.
         elif (
             abs(down_m_s) > self._FAST_M_S
             and self.ratio < 1.0

@@ -53,8 +53,10 @@ class EmergencyYaw:
 
     def is_suspected(self, state: Vector, yaw: YawEstimator) -> bool:
         """Return whether the nominal state's heading is likely wrong."""
+        # Difference on the circle.
         heading = yaw_of(es.attitude(state))
         off = abs(math.remainder(yaw.yaw - heading, 2.0 * math.pi))
+        # Far beyond both a fixed limit and the yaw estimator's own uncertainty.
         apart = off > max(FAILED_RAD, SUSPECTED_SIGMA * math.sqrt(yaw.variance))
         return apart and yaw.explained(heading) > EXPLAINED
 
@@ -77,6 +79,7 @@ class EmergencyYaw:
         refused = fused_us is not None and time_us - fused_us >= REFUSED_US
         doubted = self.is_doubted(time_us)
         sigma = math.sqrt(yaw.variance)
+        # A doubt may come from biases, so it needs a surer yaw than a rejection.
         return (refused and sigma < CONVERGED_RAD) or (doubted and sigma < SURE_RAD)
 
 
@@ -92,9 +95,11 @@ def turn_to(state: Vector, covariance: Vector, yaw: float, variance: float) -> V
         yaw: Heading [rad].
         variance: Variance of the heading [rad²].
     """
+    # Half angles make the quaternion.
     half = 0.5 * (yaw - yaw_of(es.attitude(state)))
     turn = (math.cos(half), 0.0, 0.0, math.sin(half))
     state[es.Q : es.RATES] = multiply(turn, es.attitude(state))
+    # Rounding can leave tiny negative variances.
     known = np.maximum(covariance.diagonal(), 0.0).copy()
     known[es.VEL :] = np.maximum(known[es.VEL :], es.INITIAL_SIGMA[es.VEL :] ** 2)
     after = np.diag(known)
@@ -102,6 +107,7 @@ def turn_to(state: Vector, covariance: Vector, yaw: float, variance: float) -> V
     tilt = covariance.diagonal()[es.ATT : es.ATT + 2].max()
     world = quat_to_matrix(state[es.Q : es.RATES])
     here = slice(es.ATT, es.GYRO)
+    # Variances per world axis, rotated into body axes.
     after[here, here] = world.T @ np.diag([tilt, tilt, variance]) @ world
     return after
 
@@ -160,6 +166,7 @@ class Recovery:
     def take_heading(self, innovation: float, ratio: float, now: RecoveryState) -> None:
         """Check the innovation of a heading and its test ratio: above 1 it was rejected."""
         self.compass.tested(innovation, ratio, now.time_us)
+        # GATE times the ratio gives standard deviations; the sign equals the innovation's sign.
         deviations = math.copysign(es.GATE * ratio, innovation)
         self._answer(self.consistency.heading(deviations, now.time_us, within=ratio <= 1.0), now)
 
@@ -191,9 +198,11 @@ class Recovery:
         state = self._state
         if self.doubts_inertial(now.time_us):
             # The heading error had been attributed to the inertial sensors.
+            # Discard the biases that the heading error caused; the yaw estimator has its own tilt.
             state[es.GYRO_BIAS : es.BARO_OFFSET] = self._biases_before
             state[es.Q : es.RATES] = self._yaw.attitude
         covariance = turn_to(state, self._filter.covariance, self._yaw.yaw, self._yaw.variance)
+        # Shift by the difference at the fix: a delayed fix moves the present state equally.
         state[es.P : es.P + 2] += place[:2] - then[:2]
         state[es.V : es.Q] += velocity - then[3:]
         for i in range(2):
@@ -201,6 +210,7 @@ class Recovery:
         for i in range(3):
             covariance[es.VEL + i, es.VEL + i] = r_v
         self._filter.restart(covariance)
+        # The wrong heading came from the compass, so the compass stays off.
         self.compass.fail()
         self.emergency.resets += 1
 
@@ -216,12 +226,14 @@ class Recovery:
             return
         if self._is_suspected(now):
             self.emergency.doubt(now.time_us)
+            # The heading reset removes the cause, so no restart is needed.
             if self._is_due(now):
                 return
         self._restart(restart, now.time_us)
 
     def _restart(self, restart: Restart, time_us: int) -> None:
         """Increase the filter's variances for the effects of faulty inertial sensors."""
+        # Keep the first biases of a series: later ones already contain the fault.
         if not self.doubts_inertial(time_us):
             self._biases_before = self._state[es.GYRO_BIAS : es.BARO_OFFSET].copy()
         self.consistency.restarted(time_us)
@@ -233,5 +245,6 @@ class Recovery:
             (es.ACC, restart.accel_bias_m_s2),
         ):
             block = variances[first : first + 3]
+            # Only increase: a restart must not claim more certainty.
             np.maximum(block, sigma**2, out=block)
         self._filter.restart(np.diag(variances))

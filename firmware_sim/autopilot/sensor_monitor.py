@@ -118,6 +118,7 @@ class SensorWatch:
         self.repeats = value == self.value
         times = self._times
         times[SEEN] = now_us
+        # A repetition at any time proves that the source may repeat.
         if self.repeats:
             self.noisy = self.noisy or False
             return
@@ -138,8 +139,10 @@ class SensorWatch:
         seen_us, changed_us, first_us = times_us
         if seen_us < 0:
             return None
+        # A second without a repetition: the sensor has noise.
         if self.noisy is None and first_us >= 0 and seen_us - first_us >= LEARN_US:
             self.noisy = True
+        # At rest without noise, repeated values count as new.
         if not (flying or self.noisy):
             self._times[CHANGED] = changed_us = seen_us
         before, self.failed = self.failed, ""
@@ -147,6 +150,7 @@ class SensorWatch:
             self.failed = "TIMEOUT"
         elif now_us - changed_us > self.kind.stale_us:
             self.failed = "STALE"
+        # Report only the start of a failure.
         if not self.failed or before:
             return None
         text, event = f"{self.kind.name} #0 failed: {self.failed}!", self.kind.event
@@ -216,6 +220,7 @@ class SensorMonitor:
 
     def _doubtful(self, watch: SensorWatch) -> bool:
         """Return whether the newest sample must not be fused, from the first repetition."""
+        # In flight even the first repetition is not fused.
         return watch.failed == "STALE" or (watch.repeats and self._flying)
 
     def judge(self, sample: SensorSample, *, flying: bool) -> list[OperatorText]:
@@ -241,6 +246,7 @@ class SensorMonitor:
         """Return the sensors with recent data; frozen sensors do not count."""
         data = []
         for watch, (seen_us, changed_us, _) in zip(self.all, self._times.tolist(), strict=True):
+            # A frozen sensor still sends: its last change counts.
             newest_us = changed_us if watch.failed == "STALE" else seen_us
             data.append(seen_us >= 0 and now_us - newest_us < NO_DATA_US)
         return Valid._make(data)
@@ -317,5 +323,6 @@ class NewestSensors:
     def follow(self, read: Callable[[], SensorSample]) -> None:
         """Record that compiled ticks ran; `read` returns the newest sample on demand."""
         self._read = read
+        # The first fix carries accuracy and satellites, which the record does not hold.
         if self._fix is None:
             self.take(read())

@@ -59,12 +59,14 @@ class Axis:
     def plan(self, velocity: float, limit: float, jerk: float) -> None:
         """Plan the fastest change to a velocity [m/s] within an acceleration and a jerk > 0."""
         a0 = self.acceleration
+        # Velocity after the present acceleration has ended at the maximum jerk.
         coasting = self.velocity + 0.5 * a0 * abs(a0) / jerk
         sign = _sign(velocity - coasting) or _sign(a0)
         self._wanted, self._jerk, self._limit = velocity, sign * jerk, limit
         if sign == 0.0:
             self._phases = (0.0, 0.0, 0.0)
             return
+        # Peak acceleration of a plan without a constant phase.
         square = 0.5 * a0 * a0 + self._jerk * (velocity - self.velocity)
         self._ramp_to(sign * math.sqrt(max(0.0, square)), None)
 
@@ -82,6 +84,7 @@ class Axis:
     def _ramp_to(self, peak: float, duration_s: float | None) -> None:
         """Compute the phases from the acceleration of the second phase."""
         a0, jerk = self.acceleration, self._jerk
+        # The limit cuts the peak; a constant phase makes up for it.
         peak = min(self._limit, max(-self._limit, peak))
         up = max(0.0, (peak - a0) / jerk)
         peak = a0 + jerk * up
@@ -89,6 +92,7 @@ class Axis:
         if duration_s is not None:
             flat = max(0.0, duration_s - up - down)
         elif abs(peak) > _TINY:
+            # Speed gained by both ramps; the rest comes from the constant phase.
             gained = 0.5 * (a0 + peak) * up + 0.5 * peak * down
             flat = max(0.0, (self._wanted - self.velocity - gained) / peak)
         else:
@@ -105,12 +109,14 @@ class Axis:
             left -= step
         up, flat, down = rests
         self._phases = (up, flat, down)
+        # Beyond the plan the acceleration is exactly zero, without rounding errors.
         if left > 0.0:
             self.acceleration = 0.0
             self._move(left, 0.0)
 
     def _move(self, t: float, jerk: float) -> None:
         a, v = self.acceleration, self.velocity
+        # Exact integration: the jerk is constant within a phase.
         self.position += v * t + a * t * t / 2.0 + jerk * t**3 / 6.0
         self.velocity += a * t + jerk * t * t / 2.0
         self.acceleration += jerk * t
@@ -196,6 +202,7 @@ class SmoothTrajectory:
     def advance(self, vehicle: Vec, leg: PathSegment, limits: PathLimits, seconds: float) -> None:
         """Advance by a time [s] with the vehicle at a position NED [m]."""
         wanted = self._wanted(leg, limits)
+        # The trajectory slows down in time, so its shape stays.
         share = self._waiting(vehicle, limits.error_m)
         for axis in self.axes:
             axis.advance(seconds * share)
@@ -219,10 +226,12 @@ class SmoothTrajectory:
         if turning and leg.previous is not None:
             aim = _aim_ahead(here, leg.previous, target, limits.acceptance_m)
         speed = _horizontal_speed(here, leg, limits)
+        # In a turn the speed may not rise.
         if turning:
             speed = min(self._turn_speed, speed)
         else:
             self._turn_speed = speed
+        # Free height: the vertical speed is given, as in a landing.
         if not math.isnan(leg.vertical_m_s):
             return (*_scaled(aim[0] - here[0], aim[1] - here[1], speed), leg.vertical_m_s)
         vertical = self._vertical_speed(leg, limits)
@@ -230,6 +239,7 @@ class SmoothTrajectory:
         length = math.sqrt(sum(w * w for w in way))
         if length < _TINY:
             return leg.velocity
+        # Scale the direction to the combined speed; `_clamped` then applies both limits.
         total = math.hypot(speed, vertical) / length
         velocity = (way[0] * total, way[1] * total, way[2] * total)
         (vx, vy, vz), (mx, my, mz) = _clamped(velocity, speed, vertical), leg.velocity
@@ -239,6 +249,7 @@ class SmoothTrajectory:
         (x, y, _), (vx, vy, _) = self.position, self.velocity
         north, east = target[0] - x, target[1] - y
         speed, distance = math.hypot(vx, vy), math.hypot(north, east)
+        # Slow or close: the direction of motion says nothing about a turn.
         if speed <= TURNING_M_S or distance <= acceptance_m:
             return False
         return (vx * north + vy * east) / (speed * distance) < TURNING_COSINE
@@ -249,10 +260,12 @@ class SmoothTrajectory:
         climbing = target[2] < here[2]
         most = limits.up_m_s if climbing else limits.down_m_s
         acceleration = limits.up_m_s2 if climbing else limits.down_m_s2
+        # Arrival speed at a waypoint with a change of height: limited by the turn.
         arrival = 0.0
         if after is not None and abs(target[2] - after[2]) > 1e-3:
             back = math.hypot(target[0] - here[0], target[1] - here[1])
             on = math.hypot(target[0] - after[0], target[1] - after[1])
+            # The turn in the vertical plane, with horizontal distance as the first axis.
             angle = _angle((-back, here[2]), (0.0, target[2]), (on, after[2]))
             arrival = min(most, _turn_speed(angle, acceleration, limits.vertical_acceptance_m))
         distance = abs(target[2] - here[2])
@@ -262,6 +275,7 @@ class SmoothTrajectory:
         """Return the time scale of the trajectory, reduced while the vehicle lags behind."""
         (x, y, _), (vx, vy, _) = self.position, self.velocity
         north, east = x - vehicle[0], y - vehicle[1]
+        # A vehicle ahead of the trajectory does not slow it down.
         if error_m <= 0.0 or north * vx + east * vy < 0.0:
             return 1.0
         return 1.0 - min(1.0, math.hypot(north, east) / error_m)
@@ -285,6 +299,7 @@ def _horizontal_speed(here: Vec, leg: PathSegment, limits: PathLimits) -> float:
     target, after = leg.target, leg.following
     acceleration, jerk = limits.acceleration_m_s2, limits.jerk_m_s3
     arrival = 0.0
+    # Speed at the waypoint: limited by the turn and by the next leg.
     if after is not None:
         beyond = math.hypot(target[0] - after[0], target[1] - after[1])
         if beyond >= max(limits.acceptance_m, 1e-3):
@@ -301,6 +316,7 @@ def _turn_speed(angle: float, acceleration: float, radius_m: float) -> float:
 
     Source: PX4 1.16, computeMaxSpeedInWaypoint.
     """
+    # The circle touches both legs at the acceptance radius.
     return math.sqrt(acceleration * radius_m * math.tan(min(angle, math.pi - 1e-6) / 2.0))
 
 
@@ -323,6 +339,7 @@ def _aim_ahead(here: Vec, start: Vec, target: Vec, acceptance_m: float) -> Vec:
     if length < _TINY:
         return target
     x, y, z = (a / length for a in along)
+    # Nearest point of the leg, then on along the leg by the look-ahead.
     done = (here[0] - start[0]) * x + (here[1] - start[1]) * y + (here[2] - start[2]) * z
     closest = (start[0] + done * x, start[1] + done * y, start[2] + done * z)
     l1, aside = max(acceptance_m, LEAST_L1_M), math.dist(closest, here)
@@ -343,6 +360,7 @@ def _clamped(velocity: Vec, horizontal: float, vertical: float) -> Vec:
     if norm > horizontal:
         share = horizontal / norm
         vx, vy = vx * share, vy * share
+        # Below 0.5 m/s each axis is clipped separately.
         vz = vz if max(horizontal, norm) < 0.5 else vz * share
     if abs(vz) > vertical:
         share = vertical / abs(vz)
@@ -405,6 +423,7 @@ class Travel:
         """
         position, velocity = _three(state, P), _three(state, V)
         now = quat_yaw(state[Q:RATES])
+        # After a pause the old trajectory is elsewhere.
         if self._time_us is None or time_us - self._time_us > PAUSE_US:
             self._trajectory.restart(position, velocity)
             self._yaw, self._yaw_rate, self._wanted_yaw = now, 0.0, None
@@ -451,9 +470,11 @@ class Travel:
         """Turn the heading setpoint, limited to MPC_YAWRAUTO_MAX."""
         limit = self._value("MPC_YAWRAUTO_MAX") * DEG
         most = limit * elapsed_s
+        # Turn on the shorter way.
         step = min(most, max(-most, wrap_pi(yaw - self._yaw)))
         self._yaw = wrap_pi(self._yaw + step)
         if elapsed_s > 0.0:
+            # Low-pass: a step of the heading gives no jump of the rate.
             weight = elapsed_s / (elapsed_s + YAW_RATE_TAU_S)
             self._yaw_rate += weight * (step / elapsed_s - self._yaw_rate)
             self._yaw_rate = min(limit, max(-limit, self._yaw_rate))

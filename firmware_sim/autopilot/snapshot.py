@@ -51,8 +51,10 @@ def setpoint_of(tick: Any, velocity: Vector) -> Setpoint:
         velocity: Setpoint of the velocity loop (3,) NED [m/s].
     """
     kind, demand = tick["demand_kind"], tick["demand"].copy()
+    # Other kinds have no position setpoint: log the present position instead.
     if kind not in (POSITION, TRAJECTORY):
         return Setpoint(tick["state"][:3].copy(), velocity, math.nan, 0.0)
+    # The two layouts of `demand` hold yaw and yaw rate at different places.
     yaw = 6 if kind == POSITION else 9
     return Setpoint(demand[:3], velocity, float(demand[yaw]), float(demand[yaw + 1]))
 
@@ -91,6 +93,7 @@ class Snapshot:
             demand: Active demand; None = the motors are stopped.
             revision: See `AutopilotState`.
         """
+        # No copies: most snapshots are read only in part.
         self._parts, self.time_us, self._demand = parts, time_us, demand
         self.revision = revision
         self.status: CommanderStatus = parts.commander.status

@@ -4,8 +4,8 @@ PX4's EKF always has a terrain state. Here it is added with the first range, at 
 inner filter (`ErrorFilter`) carries the 16 errors; this class carries the terrain height, its
 variance and its covariance with the 16 errors. Only ranges and optical flow measure the ground. All
 other measurements correct the 16 errors as without it. The result equals one filter of 17 states
-(Simon, Optimal State Estimation, ch. 5 and 7). Source of the process noise and of the range fusion: PX4
-1.16, EKF/covariance.cpp, terrain_control.cpp and range_height_fusion.cpp.
+(Simon, Optimal State Estimation, ch. 5 and 7). Source of the process noise and of the range fusion:
+PX4 1.16, EKF/covariance.cpp, terrain_control.cpp and range_height_fusion.cpp.
 """
 
 from __future__ import annotations
@@ -66,15 +66,19 @@ class TerrainFilter:
         self.cross = self._transition @ self.cross
         if self.walk_m_s > 0.0:
             north, east = state[es.V : es.V + 2].tolist()
+            # Terrain noise: a constant part, and slope times horizontal speed.
             rate = self.walk_m_s**2 + self.slope**2 * (north * north + east * east)
             self.variance += rate * STEP_S * TICK_S
 
     def restart(self, covariance: Vector) -> None:
         """Continue with another covariance; uncorrelated states lose the terrain correlation."""
         self._inner.restart(covariance)
+        # A row with only its diagonal is a state that has been reset.
         alone = np.count_nonzero(covariance, axis=1) <= 1
         self.cross[alone] = 0.0
+        # A tiny diagonal keeps the solve regular for states of zero variance.
         known = _solved(covariance + 1e-12 * np.eye(es.N_STATES), self.cross)
+        # Otherwise the joint covariance is not positive semidefinite: drop the correlation.
         if known is None or not float(self.cross @ known) <= self.variance:
             self.cross[:] = 0.0
 
@@ -84,10 +88,12 @@ class TerrainFilter:
         if len(h) == 1:
             # Most measurements are scalar: the same without array overhead.
             row = h[0]
+            # Read the covariance before the inner filter changes it.
             before = p @ row
             total = float(row @ before) + variance.item(0)
             ratio = self._inner.fuse(state, innovation, h, variance)
             if ratio <= 1.0:
+                # The terrain gains from the correlation only: gain = cross h' / s.
                 by_one = float(row @ self.cross)
                 weight = by_one / total
                 self.down += weight * innovation.item(0)
@@ -100,6 +106,7 @@ class TerrainFilter:
         if ratio <= 1.0:
             by_ground = h @ self.cross
             weights = _solved(totals, by_ground)
+            # Singular: the correlation cannot be trusted.
             if weights is None:
                 self.cross[:] = 0.0
                 return ratio
@@ -158,6 +165,7 @@ class TerrainFilter:
         p = self._joint()
         spread = p @ row
         gain = spread / (float(row @ spread) + variance)
+        # A zero gain leaves a state as it is, while its covariance stays consistent.
         if not ground:
             gain[GROUND] = 0.0
         if not vehicle:
@@ -165,6 +173,7 @@ class TerrainFilter:
         # Joseph form: valid for any gain.
         p -= np.outer(gain, spread)
         p += np.outer(gain * variance - p @ row, gain)
+        # Remove the asymmetry of rounding.
         p = 0.5 * (p + p.T)
         self.down += gain.item(GROUND) * innovation
         self.variance, self.cross = float(p[GROUND, GROUND]), p[:GROUND, GROUND].copy()
@@ -188,6 +197,7 @@ class TerrainFilter:
         """Reset the terrain to a height above ground, as uncertain as the vehicle's height."""
         p, z = self._inner.covariance, es.POS + 2
         self.down += innovation
+        # The terrain error is the vehicle's height error plus the range error: fully correlated.
         self.variance, self.cross = float(p[z, z]) + variance, p[:, z].copy()
 
 

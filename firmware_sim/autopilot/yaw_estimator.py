@@ -98,11 +98,15 @@ class TurnedMotion:
         w = self._seen
         if not len(w):
             return 0.0
+        # Complex numbers: a turn is a factor, and the best turn has the phase of the product.
         u = self._complex("felt_motion") * cmath.exp(1j * turn)
+        # Without the means the unknown constant velocity cancels.
         u, w = u - u.mean(), w - w.mean()
         common = complex(np.vdot(u, w))
         power = float(np.vdot(u, u).real + np.vdot(w, w).real)
+        # GPS noise explains a part of the power: 2 components per fix.
         rest = power - 2.0 * EXCUSED * self._record["motion_variance"].item(0) * len(w)
+        # Rest at the best angle, and rest at the tested angle.
         turned = max(rest - 2.0 * abs(common), 0.0)
         as_they_are = rest - 2.0 * common.real
         return 1.0 - turned / as_they_are if as_they_are > turned else 0.0
@@ -161,7 +165,9 @@ LONGEST = 64
 @kernel
 def _accel_gain(force_norm: float) -> float:
     """Return the gain of the tilt correction [1/s], zero while the vehicle accelerates."""
+    # Specific force far from g shows acceleration, not tilt.
     off = abs(force_norm - GRAVITY_M_S2) / GRAVITY_M_S2
+    # Zero at half g of difference, squared as in PX4.
     rest = 1.0 - min(2.0 * off, 1.0)
     return TILT_GAIN * rest * rest
 
@@ -187,6 +193,7 @@ def _level(m: Vector, gyro: Vec, force: Vec, dt: float) -> None:
     """Advance a model's attitude by the gyro; correct its tilt to the smoothed specific force."""
     norm = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
     gain = _accel_gain(norm)
+    # Cross product of the expected down axis and the measured force: it levels the model.
     down = rotate(conjugate(_quat(m)), (0.0, 0.0, 1.0))
     share = gain / norm if gain > 0.0 else 0.0
     tilt = (
@@ -194,6 +201,7 @@ def _level(m: Vector, gyro: Vec, force: Vec, dt: float) -> None:
         share * (down[2] * force[0] - down[0] * force[2]),
         share * (down[0] * force[1] - down[1] * force[0]),
     )
+    # As in PX4, only slow turns correct the gyro bias.
     spin2 = 0.0
     for i in range(3):
         spin2 += (gyro[i] - m[BIAS + i]) ** 2
@@ -219,7 +227,9 @@ def _predict(m: Vector, accel: Vec, dt: float) -> tuple[float, float]:
     change, which is returned (north, east).
     """
     north, east, _ = rotate(_quat(m), (accel[0] * dt, accel[1] * dt, accel[2] * dt))
+    # A heading error of 1 rad turns the change (n, e) to (-e, n).
     by_n, by_e = -east, north
+    # First covariance with the heading, since the velocity block uses old and new values.
     ny = m[P_NY] + by_n * m[P_YY]
     ey = m[P_EY] + by_e * m[P_YY]
     moved = (ACCEL_NOISE * dt) ** 2
@@ -236,6 +246,7 @@ def _predict(m: Vector, accel: Vec, dt: float) -> tuple[float, float]:
 @kernel
 def _add_change(shared: Vector, north: float, east: float) -> None:
     """Add a velocity change of the first model, without the rotation from GPS corrections."""
+    # Undo the turns by GPS: the IMU-only velocity stays independent of GPS.
     c, s = math.cos(shared[TURNED]), math.sin(shared[TURNED])
     shared[FELT] += c * north + s * east
     shared[FELT + 1] += c * east - s * north
@@ -252,6 +263,7 @@ def advance(models: Vector, shared: Vector, gyro: Vector, accel: Vector, dt: flo
         accel: Samples (3 n,), specific force FRD [m/s²].
         dt: Time step [s].
     """
+    # Low-pass for the specific force, ten times faster than the tilt correction.
     share = min(ACCEL_FILTER * dt * TILT_GAIN, 1.0)
     low, high = (1.0 - ALIGN_SHARE) * GRAVITY_M_S2, (1.0 + ALIGN_SHARE) * GRAVITY_M_S2
     for k in range(0, len(gyro), 3):
@@ -260,6 +272,7 @@ def advance(models: Vector, shared: Vector, gyro: Vector, accel: Vector, dt: flo
             shared[FORCE + i] += share * (a[i] - shared[FORCE + i])
         force = (shared[FORCE], shared[FORCE + 1], shared[FORCE + 2])
         if shared[ALIGNED] == 0.0:
+            # Tilt is aligned once, when both the sample and its mean are near 1 g.
             now2 = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
             mean2 = force[0] * force[0] + force[1] * force[1] + force[2] * force[2]
             if not (low * low < now2 < high * high and low * low < mean2 < high * high):
@@ -273,10 +286,12 @@ def advance(models: Vector, shared: Vector, gyro: Vector, accel: Vector, dt: flo
         w = (gyro[k], gyro[k + 1], gyro[k + 2])
         for j in range(N_MODELS):
             _level(models[j], w, force, dt)
+            # Velocity is unknown until the first fix; until then only attitude is predicted.
             if shared[STARTED] != 0.0:
                 north, east = _predict(models[j], a, dt)
                 if j == 0:
                     _add_change(shared, north, east)
+    # YAW follows the attitude, once per block: no sample in between reads it.
     if len(gyro) > 0 and shared[STARTED] != 0.0:
         for j in range(N_MODELS):
             models[j, YAW] = yaw_of(_quat(models[j]))
@@ -288,13 +303,16 @@ def _start(models: Vector, shared: Vector, north: float, east: float, variance: 
     step = 2.0 * math.pi / N_MODELS
     for j in range(N_MODELS):
         m = models[j]
+        # The middle of each of the equal sectors.
         yaw = -math.pi + (j + 0.5) * step
         _turn(m, yaw - yaw_of(_quat(m)))
         m[:ATTITUDE] = 0.0
         m[X], m[X + 1], m[YAW] = north, east, yaw
         m[P_NN] = m[P_EE] = variance
+        # Half a sector is the standard deviation of a hypothesis.
         m[P_YY] = (0.5 * step) ** 2
         m[WEIGHT] = 1.0 / N_MODELS
+    # No heading is preferred yet: 90° of standard deviation.
     shared[STARTED], shared[RESULT], shared[VARIANCE] = 1.0, 0.0, (0.5 * math.pi) ** 2
     shared[FELT:] = 0.0
 
@@ -302,18 +320,22 @@ def _start(models: Vector, shared: Vector, north: float, east: float, variance: 
 @kernel
 def _correct(m: Vector, north: float, east: float, variance: float) -> float:
     """Fuse a velocity into a model; return the density of its innovation."""
+    # Inverse of the 2x2 innovation covariance.
     s_nn, s_ne, s_ee = m[P_NN] + variance, m[P_NE], m[P_EE] + variance
     determinant = s_nn * s_ee - s_ne * s_ne
     i_nn, i_ne, i_ee = s_ee / determinant, -s_ne / determinant, s_nn / determinant
     d_n, d_e = north - m[X], east - m[X + 1]
     nis = d_n * d_n * i_nn + 2.0 * d_n * d_e * i_ne + d_e * d_e * i_ee
+    # As in PX4, outliers are shortened to five standard deviations instead of rejected.
     if nis > NIS_LIMIT:
         shorter = math.sqrt(NIS_LIMIT / nis)
         d_n, d_e, nis = d_n * shorter, d_e * shorter, NIS_LIMIT
     p_nn, p_ne, p_ny, p_ee, p_ey = m[P_NN], m[P_NE], m[P_NY], m[P_EE], m[P_EY]
+    # Kalman gains of velocity (n, e) and heading (y) by each velocity component.
     k_nn, k_ne = p_nn * i_nn + p_ne * i_ne, p_nn * i_ne + p_ne * i_ee
     k_en, k_ee = p_ne * i_nn + p_ee * i_ne, p_ne * i_ne + p_ee * i_ee
     k_yn, k_ye = p_ny * i_nn + p_ey * i_ne, p_ny * i_ne + p_ey * i_ee
+    # P = (I - K H) P for the upper triangle; the diagonal stays positive.
     m[P_NN] = max(p_nn - k_nn * p_nn - k_ne * p_ne, LEAST_VARIANCE)
     m[P_NE] = p_ne - k_nn * p_ne - k_ne * p_ee
     m[P_NY] = p_ny - k_nn * p_ny - k_ne * p_ey
@@ -324,7 +346,9 @@ def _correct(m: Vector, north: float, east: float, variance: float) -> float:
     m[X + 1] += k_en * d_n + k_ee * d_e
     turned = k_yn * d_n + k_ye * d_e
     m[YAW] = (m[YAW] + turned + math.pi) % (2.0 * math.pi) - math.pi
+    # Attitude and YAW turn together.
     _turn(m, turned)
+    # Density of a normal distribution in two dimensions: the model's likelihood.
     return math.exp(-0.5 * nis) / (2.0 * math.pi * math.sqrt(determinant))
 
 
@@ -345,24 +369,29 @@ def fuse(models: Vector, shared: Vector, north: float, east: float, accuracy: fl
     if shared[STARTED] == 0.0:
         _start(models, shared, north, east, variance)
         return
+    # The first turn of model 0 is its correction, recorded in TURNED.
     total, before = 0.0, models[0, YAW]
     for j in range(N_MODELS):
         density = _correct(models[j], north, east, variance)
+        # A minimum weight lets every model recover later.
         models[j, WEIGHT] = max(models[j, WEIGHT] * density, LEAST_WEIGHT)
         total += models[j, WEIGHT]
     shared[TURNED] += models[0, YAW] - before
+    # Weighted mean on the circle: angles cannot be averaged directly.
     ahead = aside = 0.0
     for j in range(N_MODELS):
         m = models[j]
         m[WEIGHT] /= total
         ahead += m[WEIGHT] * math.cos(m[YAW])
         aside += m[WEIGHT] * math.sin(m[YAW])
+    # Variance of the mixture: variance of each model plus its distance from the mean.
     yaw, spread = math.atan2(aside, ahead), 0.0
     for j in range(N_MODELS):
         m = models[j]
         off = (m[YAW] - yaw + math.pi) % (2.0 * math.pi) - math.pi
         spread += m[WEIGHT] * (m[P_YY] + off * off)
     shared[RESULT], shared[VARIANCE] = yaw, spread
+    # Numerical failure: start over with the next fix.
     if not (math.isfinite(spread) and spread > 0.0):
         shared[STARTED], shared[VARIANCE] = 0.0, math.inf
 
@@ -394,6 +423,7 @@ def observe(record: Any, north: float, east: float, accuracy: float) -> None:
         fuse(record.yaw_models, record.yaw_shared, north, east, accuracy)
         note_motion(record, north, east, accuracy)
         return
+    # On the ground there is no acceleration to learn from: restart, and keep the filter's bias.
     record.motions = 0
     record.yaw_shared[STARTED], record.yaw_shared[VARIANCE] = 0.0, math.inf
     for j in range(N_MODELS):
@@ -429,6 +459,7 @@ class YawEstimator:
         self._motion = TurnedMotion(record)
         self.models = record["yaw_models"][0]
         """Models (N_MODELS, MODEL_SIZE)."""
+        # Identity attitude until `advance` aligns the tilt.
         self.models[:, ATTITUDE] = 1.0
         self._shared = record["yaw_shared"][0]
         self._shared[VARIANCE] = math.inf
@@ -473,5 +504,6 @@ class YawEstimator:
 
         The range is 0 to 1; see `TurnedMotion`.
         """
+        # The axes of the IMU-only velocity: model 0 without the turns by GPS.
         along = self.models.item(0, YAW) - self._shared.item(TURNED)
         return self._motion.explained(yaw - along)

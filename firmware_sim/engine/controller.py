@@ -68,12 +68,14 @@ class Controller:
 
     def command(self, demand: AnyDemand | None) -> None:
         """Set the demand of the coming ticks; None = stop the motors."""
+        # The same object means the same demand: nothing to write.
         if demand is self._demand:
             return
         self._demand, record, wanted = demand, self._record, self._wanted
         if demand is None:
             record["demand_kind"] = IDLE
             self._motors[:] = 0.0
+            # Integrators must not wind up while the motors are stopped.
             self.rest()
         elif isinstance(demand, Demand):
             record["demand_kind"] = POSITION

@@ -87,11 +87,13 @@ def write(p: Vec, v: Vec, q: Quat, omega: Vec, before: Vector, tick_s: float, ro
         tick_s: Length of the tick [s].
         row: (16,) output.
     """
+    # Acceleration is differenced, so that it includes contacts.
     accel = (
         (v[0] - before[3]) / tick_s,
         (v[1] - before[4]) / tick_s,
         (v[2] - before[5]) / tick_s,
     )
+    # An accelerometer measures acceleration minus gravity, in body axes.
     felt = rotate(conjugate(q), (accel[0], accel[1], accel[2] - GRAVITY_M_S2))
     row[0], row[1], row[2] = p
     row[3], row[4], row[5] = v
@@ -130,6 +132,7 @@ def from_bullet(
     if q[0] < 0.0:
         q = (-q[0], -q[1], -q[2], -q[3])
     body = conjugate(q)
+    # ENU to NED: swap the first two axes, negate the third.
     omega = rotate(body, (angular[1], angular[0], -angular[2]))
     p, v = (at[1], at[0], -at[2]), (linear[1], linear[0], -linear[2])
     write(p, v, q, omega, before, tick_s, row)
@@ -179,9 +182,11 @@ def actuate(
         settle(speeds[3], motors[3], a, left),
     )
     thrust, torque = wrench(s[0], s[1], s[2], s[3], a)
+    # Forces act at the attitude before the tick.
     q, w, k = quaternion(row), rates(row), a.drag_angular
     lift = rotate(q, (0.0, 0.0, -thrust))
     drag = drag_force(velocity(row), (wind[0], wind[1], wind[2]), a)
+    # Angular drag opposes the rates in body axes.
     turn = rotate(q, (torque[0] - k * w[0], torque[1] - k * w[1], torque[2] - k * w[2]))
     here = (row[0], row[1], row[2])
     force = (lift[0] + drag[0], lift[1] + drag[1], lift[2] + drag[2])
@@ -233,6 +238,7 @@ def absorb(
     m, a = power_model_of(power), airframe_of(airframe)
     thrust, _ = wrench(speeds[0], speeds[1], speeds[2], speeds[3], a)
     if standing:
+        # In contact the power model assumes no acceleration.
         acceleration = (0.0, 0.0, 0.0)
         used = standing_power_w(thrust, a, m)
     else:
@@ -241,5 +247,6 @@ def absorb(
         used = flight_power_w(thrust, older, quaternion(before), air, acceleration, a, m)
         kept = felt_share(m, tick_s)
         acceleration = felt(acceleration, older, velocity(row), kept, tick_s, m)
+    # The battery also feeds the computer; the returned power is the vehicle's alone.
     reading = supply(used + computer_w, charge, pack)
     return used, acceleration, reading, drain(charge, reading[1], pack[3], tick_s)

@@ -246,6 +246,7 @@ FLOWN_TICK = np.dtype(
 def new_aircraft() -> Record:
     """Return an aircraft record without constants, all zero."""
     record = np.zeros(1, AIRCRAFT)
+    # Identity attitude: a zero quaternion is no rotation.
     record["motion"][0, 6] = 1.0
     return record
 
@@ -258,11 +259,13 @@ def new_sample() -> Record:
 def new_controller() -> Record:
     """Return a record of a flight controller after boot."""
     record = np.zeros(1, CONTROLLER)
+    # -1 marks times that have not happened.
     never = ("baro_fused_us", "heading_fused_us", "gps_horizontal_us", "gps_vertical_us")
     for name in (*never, "watch", "still_since_us", "rest_since_us", "climb_us"):
         record[name] = -1
     record["origin"] = record["velocity_before"] = np.nan
     record["velocity_noise"] = 1.0
+    # NaN: the first pressure never counts as a repetition.
     record["pressure_hpa"] = np.nan
     record["transition"] = np.eye(N_STATES)
     record["demand_kind"] = IDLE

@@ -148,11 +148,13 @@ def control(c: Fields) -> None:
         c: Fields of a flight controller; `output`, `motors` and `memory` are updated.
     """
     kind, s, d = c.demand_kind, c.state, c.demand
+    # Stopped motors: the loops do not run, and integrators stay at rest.
     if kind == IDLE:
         for i in range(4):
             c.motors[i] = 0.0
         return
     gains, f = c.gains, c.filters
+    # Unpack the record once: the control loops take tuples.
     weights = Filters(f[0], Biquad(f[1], f[2], f[3], f[4], f[5]), f[6], f[7])
     p, v = (s[0], s[1], s[2]), (s[3], s[4], s[5])
     q, w = (s[6], s[7], s[8], s[9]), (s[10], s[11], s[12])
@@ -183,10 +185,12 @@ def _detect(c: Fields) -> bool:
     """Return True if the vehicle has just lifted off, or has come to rest on the ground."""
     thrust, down_m_s = c.output[_THRUST], c.output[_VELOCITY + 2]
     if c.detecting == LIFT_OFF:
+        # A new flight starts without time at rest.
         c.still_since_us = -1
         return lifts_off(c.state, thrust, c.land)
     if c.detecting != LANDING:
         return False
+    # Time at rest counts only while the setpoint descends.
     if down_m_s <= 0.0 or not rests(c.state, thrust, c.land):
         c.still_since_us = -1
         return False
@@ -211,6 +215,7 @@ def command(c: Fields, flown: Fields) -> None:
     """
     control(c)
     log_flown(c, flown)
+    # Detection uses the output of this tick.
     c.detected = 1 if _detect(c) else 0
 
 
@@ -243,9 +248,11 @@ def push(a: Fields, motors: Speeds, wind: Vector) -> tuple[Vec, Vec, Vec]:
     )
     for i in range(4):
         a.speeds[i] = speeds[i]
+    # The thrust carries a part of the weight; the floor bears the rest.
     weight_n = airframe_of(a.airframe).mass * GRAVITY_M_S2
     pressing_n = weight_n + pushed[2]
     bears_n = HOLD_SHARE * FRICTION * pressing_n
+    # The floor holds against lift-off, sliding, tipping and turning about the vertical axis.
     a.held = (
         pressing_n > LIGHT_SHARE * weight_n
         and math.hypot(pushed[0], pushed[1]) <= bears_n
@@ -278,6 +285,7 @@ def finish(a: Fields, after: Vector, wind: Vector, standing: bool) -> None:
     for i in range(4):
         a.battery[i] = reading[i]
     for i in range(WIDTH):
+        # Copy last: `absorb` compares the motion before and after.
         a.motion[i] = after[i]
     a.ticks += 1
     # From the tick count: periods of some rates are not whole microseconds.
@@ -298,6 +306,7 @@ def _nearing_m(a: Fields) -> float:
     v, w = velocity(a.motion), rates(a.motion)
     speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     spin = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    # Speed of the vehicle, of moving objects, and of its outermost part by rotation.
     nearing: float = a.tick_s * (a.closing_m_s + speed + a.reach_m * spin)
     return nearing
 
@@ -320,13 +329,16 @@ def _glide(a: Fields, c: Fields, wind: Vector, after: Vector) -> None:
     before, dt = a.motion, a.tick_s
     here, thrust, torque = push(a, _turning(a, c), wind)
     q, airframe = quaternion(before), airframe_of(a.airframe)
+    # Torque in body axes, where the inertia is constant.
     turn = rotate(conjugate(q), torque)
     v, spin = accelerate(velocity(before), q, rates(before), thrust, turn, airframe, dt)
     p, q_new, omega = drift(here, v, q, spin, dt)
+    # Keep w >= 0, as the estimate does.
     if q_new[0] < 0.0:
         q_new = (-q_new[0], -q_new[1], -q_new[2], -q_new[3])
     write(p, v, q_new, omega, before, dt, after)
     finish(a, after, wind, False)
+    # Contact room shrinks by the largest possible approach; Python measures it again at zero.
     a.room_m -= _nearing_m(a)
 
 
@@ -345,6 +357,7 @@ def _rest(a: Fields, motors: Speeds, wind: Vector, after: Vector) -> None:
     row = a.motion
     for i in range(WIDTH):
         after[i] = row[i]
+    # At rest the accelerometer measures the floor's push: -g in body axes.
     after[13], after[14], after[15] = rotate(conjugate(quaternion(row)), (0.0, 0.0, -GRAVITY_M_S2))
     finish(a, after, wind, True)
     a.room_m -= _nearing_m(a)
@@ -381,6 +394,7 @@ def is_due(schedule: Vector, time_us: int) -> bool:
     # Rounding may assign a time on a boundary to the period before.
     if (period + 1) * US_PER_S / rate <= time_us:
         period += 1
+    # Periods are counted from zero, so that rounding does not add up.
     schedule[2], schedule[1] = period, (period + 1) * US_PER_S / rate
     return True
 
@@ -400,9 +414,11 @@ def sense(
         gps: (n, 9) white noise: correlated error, position, velocity.
     """
     row, sigma, now_us = a.motion, a.imu_sigma, a.time_us
+    # One row of white noise per sample, drawn in blocks by Python.
     white = inertial[a.noise_at[_INERTIAL]]
     a.noise_at[_INERTIAL] += 1
     felt, turning = force(row), rates(row)
+    # Biases are random walks; each sample adds its own white noise.
     for i in range(3):
         a.accel_bias[i] += sigma[6 + i] * white[6 + i]
         a.gyro_bias[i] += sigma[9 + i] * white[9 + i]
@@ -413,6 +429,7 @@ def sense(
     if is_due(a.mag_rate, now_us):
         white = compass[a.noise_at[_COMPASS]]
         a.noise_at[_COMPASS] += 1
+        # The compass measures the earth's field in body axes.
         field = MAGNETIC_FIELD_NED
         seen = rotate(conjugate(quaternion(row)), (field[0], field[1], field[2]))
         for i in range(3):
@@ -421,6 +438,7 @@ def sense(
     if is_due(a.baro_rate, now_us):
         white = barometer[a.noise_at[_BAROMETER]]
         a.noise_at[_BAROMETER] += 1
+        # Drift is a random walk, noise is white; both in pascal.
         a.baro_drift_pa += a.baro_step_pa * white[0]
         off_pa = a.baro_drift_pa + a.baro_noise_pa * white[1]
         sample.pressure_hpa = atmosphere.pressure_hpa(_HOME_M - row[2]) + off_pa / PA_PER_HPA
@@ -429,6 +447,7 @@ def sense(
         white = gps[a.noise_at[_GPS]]
         a.noise_at[_GPS] += 1
         for i in range(3):
+            # Correlated error: a first-order Gauss-Markov process.
             a.gps_error[i] = a.gps_keep * a.gps_error[i] + a.gps_drive * white[i]
             sample.gps_position[i] = row[i] + a.gps_error[i] + a.gps_noise_m[i] * white[3 + i]
             sample.gps_velocity[i] = row[3 + i] + a.gps_noise_m_s * white[6 + i]
@@ -464,6 +483,7 @@ def _copied(new: Vector, old: Vector) -> bool:
     """Copy a sample (3,); return True if it differs from the previous sample."""
     changed = False
     for i in range(3):
+        # No early exit: all three values must be copied.
         changed = changed or new[i] != old[i]
         old[i] = new[i]
     return changed
@@ -488,6 +508,7 @@ def _take(c: Fields, sample: Fields) -> int:
         else:
             repeated |= MAG
     if sample.measured & PRESSURE:
+        # Equality of floats is meant: a frozen sensor repeats its value exactly.
         if sample.pressure_hpa != c.pressure_hpa:
             _watch(c, BARO_ROW)
         else:
@@ -495,6 +516,7 @@ def _take(c: Fields, sample: Fields) -> int:
         c.pressure_hpa = sample.pressure_hpa
     if sample.measured & GPS:
         moved = _copied(sample.gps_position, c.gps_position)
+        # `_copied` first: `or` must not skip the copy.
         if _copied(sample.gps_velocity, c.gps_velocity) or moved:
             _watch(c, GPS_ROW)
         else:
@@ -508,20 +530,24 @@ def fuse_gps(c: Fields, sample: Fields) -> bool:
     if c.gps == OFF:
         return True
     known = not math.isnan(c.origin[0])
+    # A receiver that has been rejected for long may need a heading reset.
     recent = c.gps_horizontal_us >= 0 and c.time_us - c.gps_horizontal_us < REFUSED_US
     if c.gps != TRUSTED or not (known and recent):
         return False
     s, p, r_p, r_v = c.state, c.covariance, c.gps_variance[0], c.gps_variance[1]
     deviations = np.empty(3)
+    # Test all axes before any change: Python repeats the whole fix.
     for i in range(3):
         off = sample.gps_velocity[i] - s[es.V + i]
         deviations[i] = off / math.sqrt(p[es.VEL + i, es.VEL + i] + r_v)
         # False for NaN, too.
         if not abs(deviations[i]) <= FAR:
             return False
+    # The sample is relative to HOME; the filter's origin may differ.
     here = local_to_geodetic(sample.gps_position, HOME)
     place = geodetic_to_local(here, Geodetic(c.origin[0], c.origin[1], c.origin[2]))
     north, east, down = sample.gps_velocity[0], sample.gps_velocity[1], sample.gps_velocity[2]
+    # Same order as `Estimator._fuse_gps`, so both give identical results.
     observe(c, north, east, math.sqrt(r_v))
     note_velocity(c, deviations, s[es.ACCELERATION : es.SIGMA])
     z, r = c.innovation4, c.variance4
@@ -532,6 +558,7 @@ def fuse_gps(c: Fields, sample: Fields) -> bool:
     s[es.RATIO] = ratio
     if ratio <= 1.0:
         c.gps_horizontal_us = c.time_us
+    # The horizontal fusion has changed s: the vertical innovation uses the new state.
     z, r = c.innovation2, c.variance2
     z[0], z[1] = place[2] - s[2], down - s[es.V + 2]
     # A receiver's vertical accuracy is about half its horizontal accuracy.
@@ -562,10 +589,12 @@ def fuse_heading(c: Fields) -> bool:
         return True
     if c.compass == SUSPECT:
         return False
+    # At steep pitch the heading is not observable: nothing to fuse, nothing to check.
     if not es.observe_heading(
         c.state, c.mag, MAGNETIC_DECLINATION, HEADING_BY_TURN_NED, c.innovation, c.heading_h
     ):
         return True
+    # The variance of the innovation decides whether it is calm.
     total = spread(c.covariance, c.heading_h[0], np.empty(es.N_STATES)) + c.heading_variance
     # False for NaN, too.
     if not abs(c.innovation[0]) <= CALM_RATIO * es.GATE * math.sqrt(total):
@@ -582,6 +611,7 @@ def _await_alignment(c: Fields, sample: Fields) -> bool:
     _take_inertial(c, sample)
     _take(c, sample)
     add(c, sample.measured)
+    # The first fix is a separate event, see `ALIGN`.
     first_fix = sample.measured & GPS != 0 and c.rest_count[FIXES] == 1
     return first_fix or c.time_us - c.rest_since_us >= ALIGN_US
 
@@ -597,15 +627,18 @@ def estimate(c: Fields, sample: Fields) -> int:
     Returns:
         Bits of the measurements that Python must fuse, as in `measured`, and of repeated samples.
     """
+    # The IMU runs every tick, so most ticks end after the prediction.
     _take_inertial(c, sample)
     predict(c.state, c.covariance, c.process_noise, c.transition, c.gyro, c.accel, TICK_S)
     feel(c)
     if sample.measured == 0:
         return 0
     repeated = _take(c, sample)
+    # Python decides whether a repeated sample is a fault or normal for this sensor.
     if repeated != 0:
         return sample.measured | repeated << REPEATED_BITS
     if sample.measured & GPS and not fuse_gps(c, sample):
+        # Nothing is fused yet: Python fuses all of the tick in the usual order.
         return int(sample.measured)
     if sample.measured & PRESSURE:
         fuse_pressure(c)
@@ -633,6 +666,7 @@ def begin_touch(
     """
     a, c = aircraft[0], controller[0]
     command(c, flown[0])
+    # The battery belongs to the aircraft, so `command` does not log it.
     for i in range(4):
         flown[0].battery[i] = a.battery[i]
     return push(a, _turning(a, c), wind)
@@ -662,6 +696,7 @@ def end_touch(
     sense(a, sample[0], inertial, compass, barometer, gps)
     if c.aligned == 0:
         return ALIGN if _await_alignment(c, sample[0]) else NONE
+    # Python finishes the fusion, then settles the health itself.
     c.left = estimate(c, sample[0])
     if c.left != 0:
         return FUSE
@@ -725,6 +760,7 @@ def stretch(
     a, seen, c = aircraft[0], sample[0], controller[0]
     after, at, steady = np.empty(WIDTH), a.noise_at, len(wind) == 1
     for k in range(ticks):
+        # One tick needs at most one row of each block: check all before anything moves.
         if (
             at[_INERTIAL] >= len(inertial)
             or at[_COMPASS] >= len(compass)
@@ -733,8 +769,10 @@ def stretch(
             or (not steady and at[_WIND] >= len(wind))
         ):
             return k << EVENT_BITS | NOISE
+        # The take-off has ended: Python decides before this tick.
         if climb_if_due(c):
             return k << EVENT_BITS | CLIMBED
+        # A resting vehicle that the floor no longer holds needs the contact physics.
         if not _is_clear(a) or (a.resting != 0 and a.held == 0):
             return k << EVENT_BITS | ROOM
         row, charged = flown[k], a.charge > 0.0
@@ -751,16 +789,19 @@ def stretch(
         log(a, truths[k])
         sense(a, seen, inertial, compass, barometer, gps)
         if c.aligned == 0:
+            # Before alignment nothing can be fused.
             if _await_alignment(c, seen):
                 return (k + 1) << EVENT_BITS | ALIGN
             continue
         c.left = estimate(c, seen)
         if c.left != 0:
+            # Tick k is logged but not complete: `k`, not `k + 1`.
             return k << EVENT_BITS | FUSE
         if settle(c):
             return (k + 1) << EVENT_BITS | HEALTH
         if c.detected != 0:
             return (k + 1) << EVENT_BITS | DETECTED
+        # Only the tick that empties the battery ends the stretch.
         if charged and a.charge <= 0.0:
             return (k + 1) << EVENT_BITS | EMPTY
     return ticks << EVENT_BITS | NONE

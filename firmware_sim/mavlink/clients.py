@@ -72,6 +72,7 @@ class Client:
 
     def wakes(self, now_us: int, texts: Sequence[OperatorText]) -> bool:
         """Return True if anything may be due for this client at simulated time [µs]."""
+        # Ordered by cost and likelihood: the due time alone decides in most ticks.
         events = self.events
         return bool(
             self.link.scheduler.wake_us <= now_us
@@ -85,10 +86,12 @@ class Client:
     def next_us(self, now_us: int) -> float:
         """Return the next due time of all but the fast streams [µs]; `now_us` = immediately."""
         events, context, plan = self.events, self.context, self.link.scheduler
+        # Pending frames and running transfers need the very next tick.
         if self.late or self.link.pending or (context is not None and context.is_busy):
             return now_us
         slow_us = plan.next_slow_us(now_us)
         if self.announced_origin is None:
+            # The origin is announced only on the time grid of the slow streams.
             slow_us = min(slow_us, plan.grid_us(now_us))
         return slow_us if events is None else min(slow_us, events.next_us)
 
@@ -97,6 +100,7 @@ class Client:
         due = self.link.scheduler.due(now_us)
         if self.late:
             late, self.late = self.late, []
+            # A deferred stream that is due again is sent once.
             due = [*late, *(name for name in due if name not in late)]
         return due
 
@@ -140,11 +144,13 @@ class Clients:
         self._backlog: deque[tuple[Client, WireMessage]] = deque()
         """Decoded messages deferred to the next tick."""
         self._clients: dict[Peer, Client] = {}
+        # One decoder for all unknown peers bounds the memory that spoofed addresses can use.
         self._doorkeeper = Decoder(datagrams=endpoint.datagrams)
         """Decoder for data from unknown peers."""
         self._strangers = Allowance()
         self._dropped = 0
         self._gone = LinkCounters(0, 0, 0, 0, 0)
+        # PX4 SITL sends to the preset remote before that remote sends any data.
         preset = endpoint.towards(None)
         if preset is not None:
             self._clients[None] = welcome(None, preset)
@@ -181,6 +187,7 @@ class Clients:
         self._strangers.renew()
         for client in self._clients.values():
             client.allowance.renew()
+            # A restart can set the time back, which would leave the rate limits exhausted.
             client.forwards.renew()
             client.heard_us = now_us
 
@@ -192,6 +199,7 @@ class Clients:
         """
         backlog, listening = self._backlog, self._listening
         arrivals = self.endpoint.arrivals()
+        # Decoded messages come first, which keeps the order of arrival.
         bounded = listening.begin()
         while not bounded or listening.left():
             if backlog:
@@ -207,6 +215,7 @@ class Clients:
         client = self._clients.get(peer)
         if client is None:
             client, messages = self._meet(peer, chunk, now_us)
+        # An empty or damaged chunk also costs one frame of the allowance.
         elif client.allowance.left(now_us):
             messages = client.link.decode(chunk)
             client.allowance.take(max(1, len(messages)), now_us)
@@ -221,6 +230,7 @@ class Clients:
     def forget_silent(self, now_us: int, silent_us: int = SILENT_US) -> None:
         """Remove clients without a message for `silent_us` before simulated `now_us` [µs]."""
         for peer, client in tuple(self._clients.items()):
+            # The preset remote (peer None) stays, as in PX4 SITL.
             if peer is not None and now_us - client.heard_us >= silent_us:
                 self._gone += client.link.counters
                 client.close()
@@ -236,6 +246,7 @@ class Clients:
         self, peer: Peer, chunk: bytes, now_us: int
     ) -> tuple[Client | None, list[WireMessage]]:
         """Return the client created by a valid frame from a new peer, and its messages."""
+        # All unknown peers share one rate limit, so changing the source address does not evade it.
         if not self._strangers.left(now_us):
             self._dropped += 1
             return None, []
@@ -252,10 +263,12 @@ class Clients:
         if not messages:
             return None, []
         end = self.endpoint.towards(peer)
+        # The room check comes last, because it can remove a silent client.
         if end is None or not self._room(now_us):
             self._dropped += 1
             return None, []
         client = self._welcome(peer, end)
+        # The shared decoder has counted these messages; the client's link must count them too.
         client.link.note(messages)
         client.allowance.take(len(messages), now_us)
         self._clients[peer] = client
@@ -266,6 +279,7 @@ class Clients:
         learned = [client for peer, client in self._clients.items() if peer is not None]
         if len(learned) < MAX_CLIENTS:
             return True
+        # A full link gives the place of its most silent client to the new client.
         silent_us = now_us - min(client.heard_us for client in learned)
         if silent_us < GONE_US:
             return False
@@ -354,11 +368,13 @@ class Forwarder:
             system_id: System id of this vehicle.
             now_us: Simulated time [µs].
         """
+        # Messages without target fields are broadcasts.
         target = getattr(message, "target_system", ANY), getattr(message, "target_component", ANY)
         if target == (system_id, COMPONENT_ID) or message.get_msgId() in NEVER:
             return False
         if not origin.forwards.left(now_us):
             return False
+        # A frame never returns to the client that sent it.
         receivers = [
             client
             for client in self._everybody()
@@ -366,6 +382,7 @@ class Forwarder:
         ]
         if not receivers:
             return False
+        # Only frames with a receiver enter the memory of recent frames.
         frame = bytes(message.get_msgbuf())
         if not self._is_new(sender(message), frame):
             return False
@@ -377,6 +394,7 @@ class Forwarder:
     def _is_new(self, source: tuple[int, int], frame: bytes) -> bool:
         frames = self._seen.get(source)
         if frames is None:
+            # The sender that was silent longest is removed (`move_to_end` below keeps this order).
             if len(self._seen) >= REMEMBERED_SENDERS:
                 self._seen.popitem(last=False)
             frames = self._seen[source] = deque(maxlen=REMEMBERED_FRAMES)
@@ -389,6 +407,8 @@ class Forwarder:
 
 def _concerns(target: tuple[int, int], client: Client) -> bool:
     system, component = target
+    # A target that no client has announced is unknown: the frame is dropped, as in MAVLink
+    # routing.
     if system == ANY:
         return bool(client.components)
     if component == ANY:

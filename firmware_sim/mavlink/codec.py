@@ -124,12 +124,14 @@ class WireLayout:
     def __init__(self, kind: type[WireMessage]) -> None:
         self.id_bytes: bytes = kind.id.to_bytes(3, "little")
         self.crc_extra = bytes([kind.crc_extra])
+        # Wire order sorts fields by size; `Values` follows the order of definition in the XML.
         names = kind.ordered_fieldnames
         formats = dict(zip(names, _FIELD_FORMAT.findall(kind.unpacker.format), strict=True))
         sizes = dict(zip(names, kind.lengths, strict=True))
         starts = accumulate((sizes[n] for n in kind.fieldnames), initial=0)
         firsts = dict(zip(kind.fieldnames, starts, strict=False))  # the last one is the end
         self._packers: dict[int, _Packer] = {}
+        # One packer per number of extension fields that a caller may omit.
         # Extension fields are last on the wire too: omitting them shortens the payload.
         for end in range(len(names) - len(_extension_fields(kind)), len(names) + 1):
             slots = [firsts[n] + i for n in names[:end] for i in range(sizes[n])]
@@ -235,14 +237,17 @@ class Reader:
 
         None unless the chunk is exactly one valid, unsigned MAVLink 2 frame of this message.
         """
+        # Byte 2 holds the incompatibility flags: a signed frame needs `Decoder`.
         if len(chunk) < _HEADER_V2 + _CHECKSUM or chunk[0] != _MARKER_V2 or chunk[2] != 0:
             return None
         end = _HEADER_V2 + chunk[1]
         if len(chunk) != end + _CHECKSUM or chunk[7:10] != self._id:
             return None
+        # CRC_EXTRA covers the message definition, so a different field layout fails here.
         if _checksum(chunk[1:end] + self._crc_extra) != int.from_bytes(chunk[end:], "little"):
             return None
         # MAVLink 2 omits trailing zeros.
+        # The slice also drops extension fields that are newer than this dialect.
         size = self._wire.size
         return self._wire.unpack(chunk[_HEADER_V2:end][:size].ljust(size, b"\0"))
 
@@ -280,8 +285,10 @@ class Decoder:
         self._rest = b""
         found: list[WireMessage] = []
         start = damaged = 0
+        # Each pass consumes one frame, or one byte that starts no valid frame.
         while start < len(buffer):
             end = _frame_end(buffer, start)
+            # In a datagram a frame cannot continue: the header is false or truncated.
             if end is not None and end > len(buffer):
                 if not self._datagrams:
                     # Bounded: a frame claims at most 280 bytes.
@@ -290,11 +297,13 @@ class Decoder:
                 end = None
             message = None if end is None else self._decode(buffer, start, end)
             damaged += end is not None and message is None
+            # Only frames with a plausible header count: other bytes are cheap to skip.
             if damaged > MOST_DAMAGED:
                 self.malformed += not self._in_garbage
                 self._in_garbage = not self._datagrams
                 return found
             if end is None or message is None:
+                # A run of garbage counts once, however many bytes it has.
                 self.malformed += not self._in_garbage
                 self._in_garbage = True
                 start += 1
@@ -305,6 +314,7 @@ class Decoder:
                 self.unknown += 1
             else:
                 found.append(message)
+        # The next datagram starts a new run.
         if self._datagrams:
             self._in_garbage = False
         return found
@@ -323,6 +333,7 @@ class Decoder:
 
 def _frame_end(buffer: bytes, start: int) -> int | None:
     """Return the end of the frame at `start` (possibly past the buffer), None if not a frame."""
+    # A header that is cut off after the marker claims the shortest frame.
     marker, left = buffer[start], len(buffer) - start
     if marker == _MARKER_V1:
         length = buffer[start + 1] if left > 1 else 0
@@ -365,11 +376,13 @@ class TextEncoder:
         with a common id. A chunk with a NUL is the last, so an empty chunk follows a full last
         chunk.
         """
+        # STATUSTEXT is ASCII in PX4; other characters become question marks.
         text = message.text.encode("ascii", errors="replace")
         if message.event is not None:
             text += SAID_BY_EVENT
         if len(text) <= CHUNK_BYTES:
             return [dialect.MAVLink_statustext_message(message.severity, text)]
+        # Id 0 means a single chunk, so ids run from 1 to 65535.
         self._id = self._id % _LAST_ID + 1
         starts = range(0, len(text) + 1, CHUNK_BYTES)
         return [

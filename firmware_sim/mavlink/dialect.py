@@ -41,6 +41,7 @@ def load() -> ModuleType:
     present = sys.modules.get(_NAME)
     if present is not None:
         return present
+    # Without a writable folder, each process generates its own module.
     folder = writable_folder(f"mavlink-{_digest()}")
     if folder is not None:
         return _imported(generated(folder))
@@ -64,6 +65,7 @@ def _digest() -> str:
 def generated(folder: Path) -> Path:
     """Return the path of the module in a folder. Generates a missing module."""
     path = folder / f"{_NAME}.py"
+    # A temporary folder hides the half-written module from other processes.
     if not path.is_file():
         with tempfile.TemporaryDirectory(dir=folder) as temporary:
             made = Path(temporary) / path.name
@@ -77,6 +79,7 @@ def _imported(path: Path) -> ModuleType:
     if spec is None or spec.loader is None:
         raise ImportError(f"{path}: cannot be imported")
     module = importlib.util.module_from_spec(spec)
+    # Registered before execution, as in importlib's documentation.
     sys.modules[_NAME] = module
     try:
         spec.loader.exec_module(module)
@@ -103,6 +106,7 @@ def generate(newer: Path, definitions: Path, included: tuple[str, ...], module: 
 
     folder = module.parent
     root = Xml.parse(newer).getroot()  # noqa: S314 (our own file)
+    # A newer definition replaces pymavlink's message with the same number.
     numbers = {message.get("id") for message in root.iter("message")}
     for name in included:
         tree = Xml.parse(definitions / f"{name}.xml")  # noqa: S314 (pymavlink's own file)
@@ -110,6 +114,7 @@ def generate(newer: Path, definitions: Path, included: tuple[str, ...], module: 
             for message in [m for m in messages if m.get("id") in numbers]:
                 messages.remove(message)
         tree.write(folder / f"{name}.xml")
+    # Include and version come first, as in pymavlink's own files.
     include, version = Xml.Element("include"), Xml.Element("version")
     include.text = f"{included[-1]}.xml"
     version.text = "3"  # HEARTBEAT's mavlink_version, as in minimal.xml

@@ -158,10 +158,12 @@ class UdpPeer:
 
     def send_streams(self, frames: Sequence[bytes]) -> None:
         """Send each frame as a separate datagram, as PX4 does: some clients require it."""
+        # Local names avoid attribute lookups in the loop over all frames.
         send, address = self._socket.sendto, self._address
         for frame in frames:
             try:
                 send(frame, address)
+            # A full socket buffer or an ICMP error loses the frame, as UDP does.
             except OSError:
                 self.send_errors += 1
 
@@ -206,6 +208,7 @@ class UdpEndpoint:
         self.peer: Address | None = None
         """Most recent sender other than the preset remote; None until the first."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        # Non-blocking: reading runs in the tick and must return at once.
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         try:
@@ -213,6 +216,7 @@ class UdpEndpoint:
         except OSError as error:
             self._socket.close()
             problem = f"cannot be used ({error.strerror})"
+            # EADDRINUSE gets its own class, because callers can choose another port.
             if error.errno == errno.EADDRINUSE:
                 problem = "is taken (another simulator?)"
             where = f"UDP port {local[1]} on {local[0]}"
@@ -233,6 +237,7 @@ class UdpEndpoint:
         """Return the datagrams received, oldest first, and store their sender."""
         chunks: list[bytes] = []
         for peer, data in self.arrivals():
+            # Only a chunk with a MAVLink marker changes the peer: a port scan must not.
             if peer is not None and peer != self.peer and data and data[0] in _MARKERS:
                 self._lost += 0 if self._learned is None else self._learned.send_errors
                 self.peer, self._learned = peer, UdpPeer(self._socket, peer)
@@ -241,6 +246,7 @@ class UdpEndpoint:
 
     def arrivals(self) -> Iterator[tuple[Peer, bytes]]:
         """Yield received datagrams with their senders, oldest first."""
+        # The limit keeps a flood from extending this call.
         for _ in range(MAX_DATAGRAMS_PER_CALL):
             try:
                 data, address = self._socket.recvfrom(MAX_DATAGRAM)
@@ -248,6 +254,7 @@ class UdpEndpoint:
                 return
             except OSError:
                 continue  # ICMP error from an earlier send; nothing arrived
+            # The preset remote is peer None, so that its client exists from the start.
             yield (None if address == self._remote else address), data
 
     def towards(self, peer: Peer) -> Sender | None:
@@ -287,6 +294,7 @@ def _usable(address: Address, option: str, *, lowest_port: int, insecure: bool) 
         number = socket.gethostbyname(host)
     except (OSError, UnicodeError) as error:
         raise UsageError(f"{option}: host {host!r}: no such IPv4 host") from error
+    # Without authentication, only this machine may reach the port by default.
     if not ipaddress.IPv4Address(number).is_loopback and not insecure:
         raise UsageError(
             f"{option}: {host}:{port} can be reached from other machines and MAVLink is "

@@ -93,8 +93,10 @@ class EventSender:
             # Numbering restarts with this boot: clients must drop the numbers of earlier boots.
             self._first = False
             yield self._current(now_us, reset=True)
+        # Each client catches up from its own number.
         while self._sent != latest:
             self._sent = (self._sent + 1) % NUMBERS
+            # None: the buffer has dropped this event already.
             sent = self._buffer.get(self._sent)
             if sent is not None:
                 yield message(sent)
@@ -112,6 +114,7 @@ def message(sent: SentEvent) -> WireMessage:
     """Return EVENT, addressed to all systems."""
     event = sent.event
     arguments = event.arguments.ljust(_ARGUMENT_BYTES, b"\0")
+    # Destination 0/0 is MAVLink's broadcast.
     everybody = 0
     return dialect.MAVLink_event_message(
         *(everybody, everybody, event.number, boot_ms(sent.time_us), sent.sequence),

@@ -133,6 +133,7 @@ class Link:
         """
         self.name = config.name
         self.builders = builders
+        # Configured streams come first: their order is the order within a tick.
         names = [*config.rates_hz, *(name for name in builders if name not in config.rates_hz)]
         self.scheduler = StreamScheduler(
             names,
@@ -153,6 +154,7 @@ class Link:
         self._replies = builders if replies is None else replies
         self._stream_encoder = Encoder(system_id)
         self._reply_encoder = (
+            # Separate encoders keep the telemetry's sequence numbers independent of requests.
             Encoder(system_id) if config.separate_replies else self._stream_encoder
         )
         self._decoder = Decoder(datagrams=config.endpoint.datagrams)
@@ -186,6 +188,7 @@ class Link:
     def decode(self, chunk: bytes) -> list[WireMessage]:
         """Return the messages in a chunk of bytes from this client."""
         messages = self._decoder.feed(chunk)
+        # Frames are checked after decoding: signatures do not change the payload.
         if self._signing is not None and self._signing.key is not None:
             heard = len(messages)
             messages = [m for m in messages if self._signing.accepts(bytes(m.get_msgbuf()))]
@@ -214,12 +217,14 @@ class Link:
     def send_stream(self, name: str, state: AutopilotState) -> bool:
         """Send a streamed message now; return True if it had content."""
         builder = self._replies[name]
+        # None marks a stream of the compiled packer.
         if builder is None:
             payload = fast_payload(name, state)
         else:
             payload = _payload(layout(name), builder(state))
         if payload is None:
             return False
+        # Empty bytes mean that a value does not fit its field.
         if payload:
             self._reply(self._reply_encoder.frame(layout(name), payload))
         else:
@@ -258,6 +263,7 @@ class Link:
         frames, encoder, quiet = self.pending, self._stream_encoder, self.scheduler.quiet
         for name in names:
             shape, builder = self._streams[name]
+            # Another link may have built the same message in this tick.
             if builder in payloads:
                 payload = payloads[builder]
             else:
@@ -265,6 +271,7 @@ class Link:
                 payload = None if values is None else _payload(shape, values)
                 payloads[builder] = payload
             if payload is None:
+                # A stream without content does not wake the link.
                 quiet.add(name)
                 continue
             quiet.discard(name)
@@ -282,6 +289,7 @@ class Link:
             context: Values of `telemetry.TickContext.of`.
             most: Maximum number of frames per tick.
         """
+        # One call packs the frames of all n ticks in compiled code.
         plan, encoder = self.scheduler, self._stream_encoder
         frames, next_us = self._packer.pack(
             *(flown, after_us, context, plan.numbers, plan.due_us, plan.intervals_us),
@@ -289,6 +297,7 @@ class Link:
         )
         plan.packed(next_us)
         if frames:
+            # The compiled packer has used these sequence numbers.
             encoder.skip(len(frames))
             self.pending += frames
 
@@ -298,6 +307,7 @@ class Link:
         if not frames:
             return
         self.pending = []
+        # Signed at the end of the tick, because the time stamp must rise in order of sending.
         if self._signing is not None and self._signing.key is not None:
             frames = [self._signed(frame) for frame in frames]
         self.endpoint.send_streams(frames)

@@ -32,6 +32,7 @@ class OwnStreams:
         self._truth: Callable[[], TrueState] | None = None
         self._system_id = SYSTEM_ID
         self.builders: Mapping[str, Builder] = {
+            # The lambda resolves the meter at call time.
             "VIBRATION": lambda state: self.vibration.message(state),
             "BATTERY_STATUS": self._battery_status,
             "TIME_ESTIMATE_TO_TARGET": self._time_estimate,
@@ -89,6 +90,8 @@ class Radio:
     def hear(self, message: WireMessage, now_us: int) -> None:
         """Store an RC_CHANNELS_OVERRIDE received at simulated `now_us` [µs]."""
         said = [getattr(message, f"chan{number}_raw") for number in range(1, CHANNELS + 1)]
+        # Trailing unused channels do not count: PX4 reports the number of channels up to the last
+        # used one.
         while said and _says_nothing(said[-1], len(said) - 1):
             said.pop()
         self._said, self._time_us = tuple(said), now_us
@@ -96,6 +99,7 @@ class Radio:
 
     def updates(self) -> Builder:
         """Return a builder of RC_CHANNELS for one link. Sends each update once."""
+        # Updates before the link opened are not sent.
         sent = self._count
 
         def build(_state: AutopilotState) -> Values | None:
@@ -104,6 +108,7 @@ class Radio:
                 return None
             sent = self._count
             said = self._said
+            # RC_CHANNELS always has 18 values; UINT16_MAX marks the missing ones.
             unused = (UINT16_MAX,) * (CHANNELS - len(said))
             signal = _FULL_SIGNAL if said else 0
             return boot_ms(self._time_us), len(said), *said, *unused, signal

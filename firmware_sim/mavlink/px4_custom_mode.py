@@ -52,7 +52,9 @@ _AUTO_MODES: dict[int, Mode | OperatorText] = {
         for mode, (main, sub) in MAIN_SUB.items()
         if main == MAIN_AUTO and mode is not Mode.DESCEND
     },
+    # Sub mode 0 of AUTO means Mission.
     0: Mode.MISSION,
+    # External modes exist in PX4 only after a ROS 2 node registers them.
     **{
         10 + n: _unavailable(f"External {n}", NavigationMode(15 + n), MAIN_AUTO, 10 + n)
         for n in range(1, 9)
@@ -63,6 +65,7 @@ _AUTO_MODES: dict[int, Mode | OperatorText] = {
 def base_mode(status: CommanderStatus) -> int:
     """Return the MAV_MODE_FLAG bits of HEARTBEAT."""
     bits: int = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+    # Acro alone does not stabilize the attitude.
     if status.mode is not Mode.ACRO:
         bits |= dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
     if MAIN_SUB[status.mode][0] == MAIN_AUTO:
@@ -83,6 +86,7 @@ def system_status(status: CommanderStatus, *, can_arm: bool) -> int:
     if status.mode is Mode.TERMINATION:
         return int(dialect.MAV_STATE_FLIGHT_TERMINATION)
     if status.arming is Arming.ARMED:
+        # ACTIVE or CRITICAL applies only to an armed vehicle.
         return int(dialect.MAV_STATE_CRITICAL if status.failsafe else dialect.MAV_STATE_ACTIVE)
     standby = status.arming is Arming.STANDBY and can_arm
     return int(dialect.MAV_STATE_STANDBY if standby else dialect.MAV_STATE_UNINIT)
@@ -95,10 +99,12 @@ def requested_mode(base: int, main: int, sub: int) -> Mode | OperatorText | None
     an unavailable mode. None: PX4 accepts the request without effect (unknown main mode).
     """
     if not base & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+        # Clients without custom modes describe the mode by bits.
         return _from_base_mode(base)
     if main == MAIN_AUTO:
         return _AUTO_MODES.get(sub, _UNSUPPORTED)
     if main == MAIN_POSCTL:
+        # PX4 treats an unknown sub mode of POSCTL as Position.
         return _POSITION_MODES.get(sub, Mode.POSITION)
     return _MAIN_MODES.get(main)
 
@@ -106,9 +112,11 @@ def requested_mode(base: int, main: int, sub: int) -> Mode | OperatorText | None
 def _from_base_mode(base: int) -> Mode | OperatorText | None:
     """Return the mode that PX4 derives from the bits of clients without custom modes."""
     if base & dialect.MAV_MODE_FLAG_AUTO_ENABLED:
+        # Sub mode 4 is AUTO_MISSION in px4_custom_mode.h.
         return _AUTO_MODES[4]
     if not base & dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED:
         return None
     if base & dialect.MAV_MODE_FLAG_GUIDED_ENABLED:
         return Mode.POSITION
+    # Main mode 7 is STABILIZED, 1 is MANUAL.
     return _MAIN_MODES[7 if base & dialect.MAV_MODE_FLAG_STABILIZE_ENABLED else 1]

@@ -94,8 +94,10 @@ class ListeningTime:
     def begin(self) -> bool:
         """Start reading, with a new budget in a new tick; return True if time is limited."""
         tick = self._tick
+        # Without a clock only the number of messages is limited.
         if tick.clock is None:
             return False
+        # `begin` runs several times per tick; the budget renews once per tick.
         if self._tick_us != tick.next_us:
             self._tick_us, self._left_us = tick.next_us, LISTEN_US
         self._looked_us = tick.clock.time_us()
@@ -108,6 +110,7 @@ class ListeningTime:
             return True
         now_us = tick.clock.time_us()
         spent_us, self._looked_us = now_us - self._looked_us, now_us
+        # Idle time is charged first: it delays no tick.
         idle = now_us < tick.next_us
         if idle and tick.idle_us > 0:
             tick.idle_us -= spent_us
@@ -138,6 +141,7 @@ class Complaints:
             ("refused", refused, "frames refused: bad signature"),
             ("dropped", dropped, "datagrams dropped: flood or full"),
         ):
+            # The first warning is due at once.
             told_us, told = self._told.get((name, kind), (-EVERY_US, 0))
             if count > told and now_us - told_us >= EVERY_US:
                 self._told[name, kind] = now_us, count

@@ -181,9 +181,11 @@ class StreamScheduler:
             raise ValueError(f"interval_us={interval_us}: must be >= 0")
         index = self._index[name]
         if interval_us == self.intervals_us[index]:
+            # An unchanged interval keeps its phase.
             return
         self.intervals_us[index] = interval_us
         self._plan(index, now_us)
+        # The next call recomputes the due times from here.
         self.wake_us = self._next_us = self.fast_us = min(self.wake_us, now_us)
 
     def restart(self) -> None:
@@ -201,6 +203,7 @@ class StreamScheduler:
         if self._rebase_pending:
             return now_us
         names, quiet = self._names, self.quiet
+        # A stream without content must not wake the server on its account.
         due = [due_us for i, due_us in self._slow_due_us.items() if names[i] not in quiet]
         return self.grid_us(max(now_us, min(due, default=_NEVER)))
 
@@ -220,8 +223,10 @@ class StreamScheduler:
         if now_us < self._next_us or not (begins or self.is_time(now_us)):
             return []
         plan, names = self._slow_due_us, []
+        # In order of the due times; equal times keep the order of the table.
         for due_us, i in sorted([(due_us, i) for i, due_us in plan.items() if due_us <= now_us]):
             interval_us = self.intervals_us.item(i)
+            # Advance by whole intervals beyond now: missed times are skipped, the phase stays.
             plan[i] = due_us + interval_us * (1 + (now_us - due_us) // interval_us)
             names.append(self._names[i])
         self._next_us = min(plan.values(), default=_NEVER)
@@ -232,6 +237,7 @@ class StreamScheduler:
         """Schedule the next time of an enabled stream, or remove a disabled stream."""
         sent = self.intervals_us.item(index) != OFF
         if self.numbers.item(index) >= 0:
+            # Compiled code reads `due_us`; the dictionary holds only slow streams.
             self.due_us[index] = due_us if sent else _NEVER
         elif sent:
             self._slow_due_us[index] = due_us
@@ -240,8 +246,10 @@ class StreamScheduler:
 
     def _rebase(self, now_us: int) -> None:
         self._rebase_pending = False
+        # Align to the grid that starts at the first tick.
         if self._every_us > 1:
             now_us = TICK_US + (now_us - TICK_US - 1) // self._every_us * self._every_us
         for i, interval_us in enumerate(self.intervals_us.tolist()):
+            # The stagger of one tick per stream spreads the first messages.
             self._plan(i, now_us if interval_us == OFF else now_us + i * TICK_US % interval_us)
         self.wake_us = self._next_us = self.fast_us = now_us

@@ -105,6 +105,7 @@ class MavlinkServer:
         self._announced = Allowance(TEXTS_PER_S, TEXTS_BURST)
         self._answers_apart = any(config.separate_replies for config in links)
         """True if replies must not change the telemetry, which includes events."""
+        # The buffer is common to all clients; each client has its own position in it.
         self._events = EventBuffer()
         self._complaints = Complaints()
         self._first_in_turn = 0
@@ -121,6 +122,7 @@ class MavlinkServer:
         self._forwarder = Forwarder(self._all)
         self._traffic = TrafficLog(lambda: self._now_us)
         self._links = [self._open(config, link_id) for link_id, config in enumerate(links)]
+        # One poll for all sockets: most ticks receive nothing.
         self._arrivals = select.poll()
         for number in self.filenos():
             self._arrivals.register(number, select.POLLIN)
@@ -135,6 +137,7 @@ class MavlinkServer:
         Keeps clients and the rates they have set. Drops running parameter lists and messages for
         the old autopilot (stale setpoints). Simulated time may restart.
         """
+        # Data received for the old autopilot is dropped before the new one is attached.
         if self._port is not None:
             self._discard()
         self._port, self._has_sample = port, False
@@ -145,6 +148,7 @@ class MavlinkServer:
         self._complaints.restart()
         self._announced.renew()
         self._calibration = RunningCalibration()
+        # A new boot restarts the event numbers.
         self._events = EventBuffer()
         for clients in self._links:
             clients.restart(self._now_us)
@@ -159,6 +163,7 @@ class MavlinkServer:
         """
         self._now_us = now_us
         effective = 0
+        # Timeout 0: the tick never waits for data.
         readable = [number for number, _ in self._arrivals.poll(0)]
         for clients in self._links:
             if not clients.may_receive(readable):
@@ -190,11 +195,13 @@ class MavlinkServer:
         port = self._port
         if port is None:
             return
+        # Without a sensor sample the state is undefined, so nothing is sent.
         if not self._has_sample:
             if port.sample is None:
                 return
             self._has_sample = True
         after_us = TICK_US
+        # Without a log, the current state is the row of the only tick.
         if flown is None:
             flown = flown_of(port.state())
             after_us = now_us - flown["time_us"].item(0)
@@ -205,6 +212,7 @@ class MavlinkServer:
         for event in port.take_events():
             self._events.add(event, now_us)
         everyone = list(self._all())
+        # Mission progress (reached, jumped) is sent even without a transfer.
         progress = port.plans.progress
         if self._is_transferring or progress != self._mission_progress:
             self._mission_progress = progress
@@ -212,6 +220,7 @@ class MavlinkServer:
             self._is_transferring = any(
                 c.context is not None and c.context.is_busy for c in everyone
             )
+        # Skipping idle clients keeps most ticks free of Python work.
         due = [(client, client.due(now_us)) for client in everyone if client.wakes(now_us, texts)]
         if due:
             self._stream(due, flown, after_us, texts)
@@ -241,7 +250,9 @@ class MavlinkServer:
             for client in self._all():
                 client.link.scheduler.quiet.clear()  # home or pilot input may be available
         payloads: Payloads = {}
+        # Half of the budget goes to fast streams, divided among the clients with due streams.
         most = max(1, STREAMS_PER_TICK // (2 * len(due)))
+        # The other half goes to slow streams.
         share = _share([len(names) for _, names in due])
         for client, names in due:
             link = client.link
@@ -254,8 +265,10 @@ class MavlinkServer:
                     link.stream_fast(flown, after_us, context, most)
             if texts or (client.events is not None and client.events.has_news(now_us)):
                 _stream_news(client, texts, now_us)
+            # Streams beyond the share wait for the next tick, where they come first.
             if len(names) > share:
                 names, client.late = names[:share], names[share:]
+            # The origin is sent when it changes, not at a rate.
             moved = origin is not None and origin != client.announced_origin
             if moved and link.scheduler.is_time(now_us):
                 client.announced_origin = origin
@@ -269,6 +282,7 @@ class MavlinkServer:
         self._forget_us = now_us + FORGET_EVERY_US
         for clients in self._links:
             clients.forget_silent(now_us)
+            # The counters include removed clients, so a flood from many addresses is reported.
             count = clients.counters
             for text in self._complaints.due(clients.name, count.refused, count.dropped, now_us):
                 _tell(clients, text)
@@ -282,8 +296,10 @@ class MavlinkServer:
         """
         first = self._first_in_turn
         sent = 0
+        # Round robin, so that one client's long transfer does not starve the others.
         for turn in range(len(clients)):
             place = (first + turn) % len(clients)
+            # The minimum lets transfers progress even when every tick is late.
             if sent >= PIECES_PER_TICK or (
                 sent >= LEAST_PIECES_PER_TICK and self._tick_time.is_short()
             ):
@@ -345,6 +361,7 @@ class MavlinkServer:
             client = Client(peer, link, texts, reply_texts, heard_us=self._now_us)
             if self._port is not None:
                 self._connect(client, self._port)
+                # A client that connects in flight starts its streams now.
                 link.scheduler.restart()
             return client
 
@@ -352,6 +369,7 @@ class MavlinkServer:
 
     def _connect(self, client: Client, port: AutopilotPort) -> None:
         client.link.identify(self._system_id)
+        # Ends transfers that refer to the old autopilot.
         client.close()
         client.context = Context(
             client.link,
@@ -374,6 +392,7 @@ class MavlinkServer:
         """Drop data received for the previous autopilot."""
         for clients in self._links:
             for _ in range(_DISCARD_CALLS):
+                # A new budget per read: the loop must empty the socket in one tick.
                 clients.renew()
                 for client, _message in clients.receive(self._now_us):
                     client.link.ignored += 1
@@ -398,6 +417,7 @@ class MavlinkServer:
         effective = handle(message, kind, context)
         if effective:
             self._senders.note(message, kind, source)
+        # Frames without effect here may still concern another client.
         forwarded = self._forwarder.forward(message, client, self._system_id, self._now_us)
         return effective or forwarded
 
@@ -409,11 +429,13 @@ class MavlinkServer:
 
     def _announce(self, text: OperatorText) -> None:
         """Queue a text once per tick, so that a repeating client cannot flood the others."""
+        # The limit bounds the texts that all clients can trigger in a tick.
         if text in self._texts or len(self._texts) >= TEXTS_PER_TICK:
             return
         if not self._announced.left(self._now_us):
             return
         self._announced.take(1, self._now_us)
+        # Events are telemetry: in lockstep a request must not add one.
         if text.event is not None and self._answers_apart:
             text = replace(text, event=None)
         elif text.event is not None:

@@ -65,6 +65,7 @@ _SOURCES: Final = (
 )
 _AT: Final = {name: place for place, name in enumerate(_SOURCES)}
 
+# One bit per group of sources, see `_PART_OF`.
 _PLACED, _WANTED, _GOAL_PART, _FIX_PART, _ESC_PART, _HEALTH = (1 << bit for bit in range(6))
 _PART_OF: Final = {
     _PLACED: ("located", "lat_e7", "lon_e7", "alt_mm", "above_home_mm", "hud_alt", "amsl", "up"),
@@ -194,16 +195,19 @@ class _Table(NamedTuple):
 
 
 def _table() -> _Table:
+    # `heads` has a row per message, `fields` a row per field; `first` delimits the rows.
     heads, fields, first = [], [], [0]
     for name, sources in FIELDS.items():
         kind = dialect.mavlink_map[message_id(name)]
         need = NEEDS.get(name, "one")
         parts = 0
+        # The message needs each group with at least one of its sources.
         for part, marks in _PART_OF.items():
             parts |= part if {need, *sources} & {*marks} else 0
         heads.append((kind.id, kind.crc_extra, kind.unpacker.size, _AT[need], parts))
         formats = _FIELD_FORMAT.findall(kind.unpacker.format)
         counts = [int(count or 1) for count, _ in formats]
+        # Wire layout: position of each field in the packed struct, arrays with their count.
         sizes = [count * _SIZES[code] for count, (_, code) in zip(counts, formats, strict=True)]
         starts = accumulate(sizes, initial=0)
         wire = {
@@ -212,6 +216,7 @@ def _table() -> _Table:
                 kind.ordered_fieldnames, starts, counts, formats, strict=False
             )
         }
+        # From wire order back to the order of definition, in which `FIELDS` lists the sources.
         places = [
             (start + i * _SIZES[code], _FLOAT if code == "f" else _SIZES[code])
             for start, code, count in (wire[field] for field in kind.fieldnames)
@@ -236,6 +241,7 @@ def _crc_table() -> Ints:
     table = np.zeros(256, np.int64)
     for byte in range(256):
         crc = byte
+        # Reflected polynomial 0x1021, least significant bit first.
         for _ in range(8):
             crc = (crc >> 1) ^ 0x8408 if crc & 1 else crc >> 1
         table[byte] = crc
@@ -269,6 +275,7 @@ class TickContext:
         controllers, bits of SYS_STATUS, load.
         """
         revision, self._revision = self._revision, state.revision
+        # The autopilot changes the revision object whenever a value below may have changed.
         if revision is not None and revision is self._revision:
             return self.row
         origin, home, goal, fix = state.origin, state.home, state.destination, state.gps
@@ -285,6 +292,7 @@ class TickContext:
             *sensor_bits(state),
             units.uint16(state.load * 1e3),
         )
+        # An equal tuple keeps the row: its identity shows the server that nothing changed.
         if values != self._values:
             self._values, self.row = values, np.array(values, np.float64)
         return self.row
@@ -293,6 +301,7 @@ class TickContext:
 def flown_of(state: AutopilotState) -> Record:
     """Return a snapshot as the log of a tick (1,)."""
     flown, estimate, wanted = np.zeros(1, FLOWN_TICK), state.estimate, state.setpoint
+    # The row has the layout of the estimator's state (`es`), as in compiled logs.
     row = flown["state"][0]
     row[es.P : es.V], row[es.V : es.Q] = estimate.position, estimate.velocity
     row[es.Q : es.RATES], row[es.RATES : es.GYRO_BIAS] = (
@@ -315,9 +324,11 @@ def flown_of(state: AutopilotState) -> Record:
         ("battery", state.battery),
     ):
         flown[name] = value
+    # Fixes are logged in metres from HOME, not in degrees.
     if (fix := state.gps) is not None:
         flown["gps_position"] = geodetic_to_local(fix.position, HOME)
         flown["gps_velocity"] = fix.velocity_ned
+    # A snapshot always has a position setpoint; the last columns stay zero.
     flown["demand"][0, :8] = (*wanted.position, *wanted.velocity, wanted.yaw, wanted.yaw_rate)
     flown["output"] = (
         *state.attitude_setpoint,
@@ -340,11 +351,13 @@ def _put3(v: Vector, at: int, a: float, b: float, c: float) -> None:
 def _estimated(v: Vector, row: Vector) -> None:
     """Write attitude, rates, position, velocity and their variances."""
     w, x, y, z = row[es.Q], row[es.Q + 1], row[es.Q + 2], row[es.Q + 3]
+    # ZYX Euler angles; the clamp keeps asin in its domain despite rounding.
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
     _put3(v, _ROLL, roll, pitch, yaw_of((w, x, y, z)))
     for i in range(4):
         v[_QW + i] = row[es.Q + i]
+    # Variances are the squares of the estimator's standard deviations.
     for i in range(3):
         v[_P + i] = row[es.RATES + i]
         v[_X + i], v[_VX + i] = row[es.P + i], row[es.V + i]
@@ -352,6 +365,7 @@ def _estimated(v: Vector, row: Vector) -> None:
         v[_VAR_ROLL + i] = row[es.SIGMA + 6 + i] ** 2
         v[_VAR_VX + i] = row[es.SIGMA + 3 + i] ** 2
         v[_VX_CM + i] = units.cm_s(row[es.V + i])
+    # Centidegrees and whole degrees wrap at 360; rounding can reach 360, hence the second modulo.
     v[_YAW_CDEG] = units.centidegrees(v[_ROLL + 2])
     north, east = row[es.V], row[es.V + 1]
     v[_GROUND_SPEED], v[_CLIMB] = math.hypot(north, east), -row[es.V + 2]
@@ -364,6 +378,7 @@ def _placed(v: Vector, row: Vector, context: Vector) -> None:
     down, origin_m, home_m = row[es.P + 2], context[_ORIGIN_M], context[_HOME_M]
     known = not math.isnan(origin_m)
     v[_LOCATED] = 0.0
+    # NaN positions stay unlocated: GLOBAL_POSITION_INT is not sent then.
     if known and math.isfinite(row[es.P]) and math.isfinite(row[es.P + 1]) and math.isfinite(down):
         origin = Geodetic(context[_LATITUDE], context[_LONGITUDE], origin_m)
         here = local_to_geodetic(row[es.P : es.V], origin)
@@ -371,9 +386,11 @@ def _placed(v: Vector, row: Vector, context: Vector) -> None:
         v[_LAT_E7] = units.deg_e7(here.latitude_deg)
         v[_LAT_E7 + 1] = units.deg_e7(here.longitude_deg)
         v[_LAT_E7 + 2] = units.mm(here.altitude_m)
+        # Before home is set, the height counts from the origin.
         v[_LAT_E7 + 3] = units.mm(here.altitude_m - (origin_m if math.isnan(home_m) else home_m))
     v[_UP] = v[_ABOVE_HOME] = -down
     v[_AMSL] = origin_m - down
+    # VFR_HUD falls back to the pressure altitude, as in PX4.
     v[_HUD_ALT] = origin_m - down if known else v[_PRESSURE + 1]
     if known and not math.isnan(home_m):
         v[_ABOVE_HOME] = origin_m - down - home_m
@@ -388,6 +405,7 @@ def _wanted(v: Vector, row: Fields, context: Vector) -> None:
     acceleration are always set. Disarmed, position and velocity are NaN.
     """
     out, d, kind, armed = row.output, row.demand, row.demand_kind, context[_ARMED] != 0.0
+    # The attitude and rate setpoints are the first seven outputs of the control loops.
     for i in range(7):
         v[_SP_QW + i] = out[i]
     thrust = out[10]
@@ -395,6 +413,7 @@ def _wanted(v: Vector, row: Fields, context: Vector) -> None:
     v[_THROTTLE] = units.saturate(100.0 * thrust if armed else 0.0, 0, units.UINT16_MAX - 1, 0)
     q_sp = (out[0], out[1], out[2], out[3])
     yaw, yaw_rate = math.nan, 0.0
+    # The yaw setpoint's index depends on the kind of demand; other kinds have none.
     if kind == POSITION:
         yaw, yaw_rate = d[6], d[7]
     elif kind == TRAJECTORY:
@@ -407,13 +426,16 @@ def _wanted(v: Vector, row: Fields, context: Vector) -> None:
         if not armed:
             place = speed = math.nan
         v[_SP_X + i], v[_SP_VX + i] = place, speed
+        # A NaN component sets its ignore bit in the type mask.
         mask |= 0 if math.isfinite(place) else _X_IGNORE << i
         mask |= 0 if math.isfinite(speed) else _VX_IGNORE << i
     v[_SP_MASK] = mask
     if armed:
+        # The acceleration setpoint follows from thrust and attitude: hover thrust means 1 g.
         north, east, down = rotate(q_sp, (0.0, 0.0, thrust / context[_HOVER]))
         g = GRAVITY_M_S2
         _put3(v, _SP_AX, -g * north, -g * east, g * (1.0 - down))
+        # Without a yaw setpoint PX4 reports the heading of its attitude setpoint.
         v[_SP_YAW] = yaw if math.isfinite(yaw) else yaw_of(q_sp)
         v[_SP_YAW + 1] = yaw_rate if math.isfinite(yaw_rate) else 0.0
     else:
@@ -421,6 +443,7 @@ def _wanted(v: Vector, row: Fields, context: Vector) -> None:
         _put3(v, _SP_AX, 0.0, 0.0, 100.0)
         v[_SP_YAW], v[_SP_YAW + 1] = v[_ROLL + 2], 0.0
     for i in range(4):
+        # Outputs 0..1 map to 1000..2000 µs.
         pulse = _PWM_MIN + units.saturate(_PWM_SPAN * row.motors[i], 0, _PWM_SPAN, 0)
         v[_PWM_1 + i] = pulse if armed else _PWM_DISARMED
 
@@ -432,6 +455,7 @@ def _speed_controllers(v: Vector, row: Fields, context: Vector) -> None:
     for i in range(4):
         output = context[_ESCS + i]
         if told:
+            # Without feedback the output follows the command; a disarmed motor is off.
             output = row.motors[i] if armed else 0.0
         v[_ESC_CDEG_1 + i] = units.int16((esc.IDLE_C + esc.SPAN_C * output) * 100.0)
         v[_RPM_1 + i] = round(esc.RPM * output)
@@ -446,6 +470,7 @@ def _goal(v: Vector, context: Vector) -> None:
     """Write the target of an automatic mode."""
     north, east, down = context[_GOAL], context[_GOAL + 1], context[_GOAL + 2]
     v[_GOAL_KNOWN] = 0.0
+    # Only automatic modes have a target; it is NaN otherwise.
     if math.isfinite(north) and math.isfinite(east) and math.isfinite(down):
         origin = Geodetic(context[_LATITUDE], context[_LONGITUDE], context[_ORIGIN_M])
         place = local_to_geodetic(context[_GOAL:_FIX], origin)
@@ -462,6 +487,7 @@ def _fix(v: Vector, row: Fields, context: Vector) -> None:
     if math.isnan(context[_FIX]):
         return
     north, east = row.gps_velocity[0], row.gps_velocity[1]
+    # Back from metres around HOME to degrees.
     place = local_to_geodetic(row.gps_position, HOME)
     v[_FIX_KNOWN], v[_FIX_KNOWN + 1] = 1.0, context[_FIX]
     v[_FIX_KNOWN + 2] = units.deg_e7(place.latitude_deg)
@@ -469,6 +495,7 @@ def _fix(v: Vector, row: Fields, context: Vector) -> None:
     v[_FIX_KNOWN + 4] = units.mm(place.altitude_m)
     v[_FIX_KNOWN + 5] = units.uint16(math.hypot(north, east) * 100.0)
     v[_FIX_KNOWN + 6] = units.centidegrees(math.atan2(east, north))
+    # GPS_RAW_INT: 255 satellites mean unknown.
     v[_FIX_KNOWN + 7] = units.saturate(context[_FIX + 1], 0, 254, 255)
     v[_FIX_KNOWN + 8] = units.uint32(context[_FIX + 2] * 1e3)
     v[_FIX_KNOWN + 9] = units.uint32(context[_FIX + 3] * 1e3)
@@ -478,6 +505,7 @@ def _fix(v: Vector, row: Fields, context: Vector) -> None:
 def _health(v: Vector, row: Fields, context: Vector) -> None:
     """Write the health of the parts, and the battery."""
     for i in range(4):
+        # The context row ends with the three bit fields and the load.
         v[_PARTS_PRESENT + i] = context[PARTS + i]
     v[_PARTS_PRESENT + 4] = _PARACHUTE
     v[_BATTERY_MV] = units.uint16(row.battery[0] * 1e3)
@@ -488,6 +516,7 @@ def _health(v: Vector, row: Fields, context: Vector) -> None:
 @large_kernel
 def _sources(v: Vector, row: Fields) -> None:
     """Write the sources (len(_SOURCES),) of a tick's log that belong to no part."""
+    # Constants come first: several messages share them.
     s = row.state
     v[_ZERO], v[_NAN], v[_ONE], v[_HEALTHY] = 0.0, math.nan, 1.0, row.healthy
     v[_TIME_US], v[_TIME_US + 1] = row.time_us, units.boot_ms(row.time_us)
@@ -496,10 +525,12 @@ def _sources(v: Vector, row: Fields) -> None:
     v[_LOCAL_NED + 2], v[_LOCAL_NED + 3], v[_LOCAL_NED + 4] = _GLOBAL_INT, 4.0, _PPM
     v[_LOCAL_NED + 5], v[_LOCAL_NED + 6] = 0b1111, units.UINT16_MAX
     _estimated(v, s)
+    # HIGHRES_IMU has bias-corrected values, as in PX4.
     for i in range(3):
         v[_AX + i] = row.accel[i] - s[es.ACCEL_BIAS + i]
         v[_AX + 3 + i] = row.gyro[i] - s[es.GYRO_BIAS + i]
         v[_AX + 6 + i] = row.mag[i]
+    # The pressure altitude follows from the standard atmosphere.
     v[_PRESSURE], v[_PRESSURE + 1] = row.pressure_hpa, atmosphere.altitude_m(row.pressure_hpa)
     v[_PRESSURE + 2], v[_PRESSURE + 3] = row.temperature_c, _IMU_FIELDS
 
@@ -507,6 +538,7 @@ def _sources(v: Vector, row: Fields) -> None:
 @large_kernel
 def _parts(v: Vector, row: Fields, context: Vector, parts: int) -> None:
     """Write the sources of some parts, after `_sources`."""
+    # Order matters: the target reuses the yaw setpoint written by `_wanted`.
     if parts & _PLACED:
         _placed(v, row.state, context)
     if parts & _WANTED:
@@ -568,10 +600,12 @@ _PPM: int = dialect.ESC_CONNECTION_TYPE_PPM
 def _write(out: Bytes, at: int, kind: int, value: float, word: Vector, bits: Bytes) -> None:
     """Write a value at an offset: kind 0 = float32, else bytes of a little-endian integer."""
     if kind == 0:
+        # `bits` is a byte view of `word`, so writing the float fills the bytes.
         word[0] = value
         for i in range(4):
             out[at + i] = bits[i]
     else:
+        # Negative integers wrap to two's complement in the shifted bytes.
         whole = np.int64(value)
         for i in range(kind):
             out[at + i] = (whole >> (8 * i)) & 0xFF
@@ -584,6 +618,7 @@ def _frame(
     """Write the MAVLink 2 frame of message `number` at `at`; return its end."""
     table = _TABLE
     size, start = table.sizes[number], at + 10
+    # Omitted extension fields must be zero.
     for i in range(size):
         out[start + i] = 0
     for f in range(table.first[number], table.first[number + 1]):
@@ -592,9 +627,11 @@ def _frame(
     while size > 1 and out[start + size - 1] == 0:
         size -= 1
     identity = table.ids[number]
+    # Header: marker, length, two flag bytes, sequence, sender, 24-bit message id.
     out[at], out[at + 1], out[at + 2], out[at + 3] = 0xFD, size, 0, 0
     out[at + 4], out[at + 5], out[at + 6] = seq, system, COMPONENT_ID
     out[at + 7], out[at + 8], out[at + 9] = identity & 0xFF, identity >> 8 & 0xFF, identity >> 16
+    # X.25 over everything after the marker, then CRC_EXTRA.
     crc = 0xFFFF
     for i in range(at + 1, start + size):
         crc = crc >> 8 ^ _CRC[(crc ^ out[i]) & 0xFF]
@@ -635,14 +672,18 @@ def _pack(
     v, word = np.empty(len(_SOURCES)), np.empty(1, np.float32)
     bits = word.view(np.uint8)
     at, n, next_us = 0, 0, _NEVER
+    # Ticks in order, and streams in table order within a tick.
     for k in range(len(flown)):
         row, made, parts = flown[k], False, 0
         now_us = row.time_us + after_us
         for s in range(len(numbers)):
+            # A full output leaves the due time as it is: the stream comes in the next call.
             if numbers[s] < 0 or interval_us[s] == 0 or due_us[s] > now_us or n == most:
                 continue
             late_us = now_us - due_us[s]
+            # Missed times are skipped; the phase stays.
             due_us[s] += interval_us[s] * (1 + late_us // interval_us[s])
+            # Sources and parts are computed once per tick, and only for ticks with a due message.
             if not made:
                 _sources(v, row)
                 made = True
@@ -650,10 +691,12 @@ def _pack(
             if missing != 0:
                 _parts(v, row, context, missing)
                 parts |= missing
+            # A message without content uses no sequence number.
             if v[_TABLE.needs[numbers[s]]] != 0.0:
                 at = _frame(numbers[s], v, system, seq + n & 0xFF, out, at, word, bits)
                 ends[n] = at
                 n += 1
+    # Earliest due time of all enabled fast streams.
     for s in range(len(numbers)):
         if numbers[s] >= 0 and interval_us[s] != 0:
             next_us = min(next_us, due_us[s])
@@ -683,6 +726,7 @@ class Packer:
 
         See `_pack`; `most` is the maximum number of frames per tick.
         """
+        # The limit is per tick; the buffers hold all ticks of a call and are reused.
         most *= len(flown)
         if len(self._ends) < most:
             self._ends = np.empty(most, np.int64)
@@ -695,14 +739,17 @@ class Packer:
             return [], next_us
         ends = self._ends[:n].tolist()
         data = self._out[: ends[-1]].tobytes()
+        # Split the consecutive frames at their ends.
         frames = [data[start:end] for start, end in zip([0, *ends], ends, strict=False)]
         return frames, next_us
 
 
 def payload(name: str, state: AutopilotState) -> bytes | None:
     """Return the payload of a message, without trailing zeros; None = no content."""
+    # Due time 0 and interval 1 make exactly this message due.
     number, once = np.array([NUMBERS[name]]), np.ones(1, np.int64)
     frames, _ = Packer().pack(
         flown_of(state), 0, TickContext().of(state), number, np.zeros(1, np.int64), once, 1, 0, 1
     )
+    # Strip header and checksum.
     return frames[0][10:-2] if frames else None

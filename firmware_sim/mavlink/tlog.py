@@ -74,6 +74,7 @@ class TrafficLog:
     def heard(self, client: Client, message: WireMessage) -> None:
         """Start a client's log at its first frame."""
         main = self._main
+        # The limit bounds the open files during a flood of clients.
         if main is None or client in self._logged or len(self._logged) > MAX_LOGS:
             return
         name = client.link.name
@@ -84,12 +85,14 @@ class TrafficLog:
         except OSError:
             self._main = None  # disk full: the flight continues without new logs
             return
+        # The client's first frame came before the tap was set.
         tlog.write(self._now_us(), bytes(message.get_msgbuf()))
         self._tap(client, tlog)
 
     def end(self) -> None:
         """Stop logging and close the additional logs."""
         for client, tlog in self._logged.items():
+            # The tap ends first, so that no frame reaches a closed file.
             client.link.tap = None
             if tlog is not self._main:
                 tlog.close()

@@ -88,6 +88,7 @@ def bind_device_links(
     """
     links: list[LinkConfig] = []
     for link, ports in DEVICE_PORTS.items():
+        # As in PX4 SITL, each instance shifts all ports by its number.
         local, remote = (port + instance for port in ports)
         try:
             end = UdpEndpoint(
@@ -101,6 +102,7 @@ def bind_device_links(
             say(f"UDP port {local} is taken: no {link.__name__.replace('_', ' ')}")
             continue
         except Exception:
+            # A usage error ends the program: release the ports bound so far.
             for bound in links:
                 bound.endpoint.close()
             raise

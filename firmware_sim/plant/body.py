@@ -87,9 +87,11 @@ def walls_of(arena: Arena) -> list[tuple[str, Vec, Vec]]:
     The inner faces are on the bounds.
     """
     b = arena.bounds
+    # `t` is half the thickness, `h` half the height.
     t, h = 0.5 * WALL_THICKNESS_M, 0.5 * b.height
     north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
     half_n, half_e = 0.5 * (b.north_max - b.north_min), 0.5 * (b.east_max - b.east_min)
+    # Walls overlap at the corners, so that no gap remains.
     along_east, along_north = (t, half_e + 2 * t, h), (half_n + 2 * t, t, h)
     centers = (
         (b.north_max + t, east, -h),

@@ -49,8 +49,10 @@ from firmware_sim.plant.solids import place_at, tour_arrays
 @contextlib.contextmanager
 def silenced_output() -> Iterator[None]:
     """Redirect standard output and standard error of C libraries to the null device."""
+    # Flush Python's buffers first, or their content goes to the null device.
     sys.stdout.flush()
     sys.stderr.flush()
+    # C libraries write to descriptors 1 and 2, not to sys.stdout.
     kept = [(number, os.dup(number)) for number in (1, 2)]
     null = os.open(os.devnull, os.O_WRONLY)
     try:
@@ -129,6 +131,7 @@ def _due(
     for i in range(len(leg)):
         north, east = place_at(time_us, times_s, points, leg, i)
         north_off, east_off = north - vehicle[0], east - vehicle[1]
+        # Also the stored position: a body left near the vehicle must be moved away.
         north_stands, east_stands = place[i, 0] - vehicle[0], place[i, 1] - vehicle[1]
         away = min(
             north_off * north_off + east_off * east_off,
@@ -164,6 +167,7 @@ class Movers:
         self._times_s, self._points = tour_arrays(arena)
         half = obstacles.half_size[first:]
         is_box = obstacles.shape[first:] == Shape.BOX
+        # Boxes may have any heading: use their horizontal diagonal.
         bounding = np.where(is_box, np.hypot(half[:, 0], half[:, 1]), half[:, 0])
         self._reach = bounding + radius_m + MARGIN_M
         self._place = np.array(obstacles.center[first:, :2], order="C")
@@ -227,6 +231,7 @@ class BulletWorld:
         self.names: dict[int, str] = {}
         """Name of each body in a collision event."""
         self._movers: Movers | None = None
+        # Body 0 is the floor, with or without an arena.
         floor = self.client.createCollisionShape(pybullet.GEOM_PLANE)
         self._add(floor, np.zeros(3), LEVEL, FLOOR)
         if arena is not None:
@@ -240,6 +245,7 @@ class BulletWorld:
 
     def state(self) -> WorldState:
         """Return the state, including contacts."""
+        # pybullet saves its state only to files.
         with TemporaryDirectory() as folder:
             path = Path(folder) / "world.bullet"
             with silenced_output():
@@ -258,6 +264,7 @@ class BulletWorld:
     def close(self) -> None:
         """Release the physics server."""
         if self.number != NO_CLIENT:
+            # Keep the client: the next world resets it.
             _idle.append(self.client)
             self.client, self.number = None, NO_CLIENT
 
@@ -365,10 +372,12 @@ class BulletBody:
         """Move the body by one tick; see `PlantBody`."""
         world, number = self.world, self.number
         client = world.number
+        # NED to ENU: swap the first two axes, negate the third.
         here = (at[1], at[0], -at[2])
         pushed, turned = (force[1], force[0], -force[2]), (torque[1], torque[0], -torque[2])
         pybullet.applyExternalForce(number, -1, pushed, here, pybullet.WORLD_FRAME, client)
         pybullet.applyExternalTorque(number, -1, turned, pybullet.WORLD_FRAME, client)
+        # Obstacles move before the step, so that contacts use their new position.
         world.move_obstacles(moving_us, before)
         pybullet.stepSimulation(client)
         contacts = pybullet.getContactPoints(number, -1, _ANY_LINK, _ANY_LINK, client)
@@ -378,6 +387,7 @@ class BulletBody:
             close.add(contact[2])
             if contact[9] > 0.0:
                 pressed.add(contact[2])
+        # Reuse the object while contacts last: most ticks change nothing.
         if close != self.touch.close or pressed != self.touch.pressed:
             self.touch = Touch(frozenset(close), frozenset(pressed)) if close else NOTHING
         return self._read(before)
@@ -416,6 +426,7 @@ class BulletBody:
         at, orientation = pybullet.getBasePositionAndOrientation(number, client)
         linear, angular = pybullet.getBaseVelocity(number, client)
         row = np.empty(WIDTH)
+        # Without a motion before, difference from the current velocity: zero acceleration.
         if before is None:
             before = row
             before[3], before[4], before[5] = linear[1], linear[0], -linear[2]
@@ -441,11 +452,14 @@ class BulletBody:
                 airframe.inertia_yy,
                 airframe.inertia_zz,
             ),
+            # Drag is modelled outside; damping in pybullet would add to it.
             linearDamping=0.0,
             angularDamping=0.0,
             restitution=0.0,
+            # pybullet multiplies it with the other body's 0.5; see `contacts.solver.FRICTION`.
             lateralFriction=0.8,
             rollingFriction=0.0,
+            # A sleeping body does not move.
             activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
         )
         return int(number)

@@ -136,6 +136,7 @@ class CameraProcess:
             raise self._lost()
         answer = self._answers.get()
         if isinstance(answer, EOFError):
+            # Keep the end in the queue: every later call must raise as well.
             self._answers.put(answer)
             raise self._lost()
         return answer
@@ -153,6 +154,7 @@ class CameraProcess:
         if self._line is not None and self._process is not None and self._reading is not None:
             self._process.kill()
             self._process.wait()
+            # The reader ends with the process's end of the pipe.
             self._reading.join()
             self._line.close()
         self._line = self._process = self._reading = None
@@ -188,9 +190,11 @@ class SlowCamera:
         """
         if self._busy and self._process.answers:
             taken, self._busy = self._process.receive(), False
+            # A frame of an earlier episode has another time and is dropped.
             if taken is not None and taken.frame.capture_time_us == self._taken_us:
                 self._taken_us, self._next_us = None, taken.next_us
                 publish(taken.frame)
+        # At most one frame is in progress, so a slow renderer cannot build up a queue.
         if not self._busy and time_us >= self._next_us:
             self._process.send(_Take(time_us, motion))
             self._busy, self._taken_us = True, time_us

@@ -59,6 +59,7 @@ class _Eye:
         image: NDArray[Any]
         jpeg = None
         if self._forming is not None:
+            # `ImageFormation` makes the image and its JPEG file.
             image, jpeg = self._forming.take(self._arena, elapsed_us, motion, seed, number)
         else:
             at, attitude = camera_pose(motion.position, motion.quaternion, self._mount)
@@ -83,6 +84,7 @@ class ExposedFrame(Frame):
     ) -> None:
         """Store the fields and the renderer of images by camera; "" is the main camera."""
         exposed = {"sequence": sequence, "capture_time_us": capture_time_us}
+        # Frame is frozen: write its fields past its `__setattr__`.
         vars(self).update(exposed, intrinsics=intrinsics, draw=draw)
 
     @cached_property
@@ -233,6 +235,7 @@ class CameraServer:
         try:
             self._socket.bind(endpoint)
         except zmq.ZMQError as error:
+            # The constructor fails, so no other code closes the socket.
             self.close()
             if error.errno == zmq.EADDRINUSE:
                 port = endpoint.rsplit(":", 1)[-1]

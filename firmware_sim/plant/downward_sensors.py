@@ -44,6 +44,7 @@ class DownwardRay:
         self._image = np.empty((1, 1), np.float32)
         bounds = _ENDLESS if arena is None else arena.bounds
         self._bounds = bounds.as_array()
+        # Empty arrays, so that the compiled ray caster has one signature.
         if arena is None:
             self._shapes = np.zeros(0, np.int8), np.zeros((0, 3)), np.zeros(0)
             self._still = np.zeros((0, 3))
@@ -69,6 +70,7 @@ class DownwardRay:
             centers = arena.centers_at(elapsed_us)
         at, attitude = camera_pose(position, quaternion, self._mount)
         shape, half_size, yaw = self._shapes
+        # One pixel of the depth camera is the ray.
         render_depth(
             self._image,
             at,
@@ -148,6 +150,7 @@ def _pass(row: Vector, place: Vector, tick_s: float, since: Vector) -> None:
         tick_s: Length of the tick [s].
         since: (5,) sums since the last measurement, updated.
     """
+    # Flow is measured in body axes, at the sensor's place: v + w x r.
     v, w = rotate(conjugate(quaternion(row)), velocity(row)), rates(row)
     since[_TURN_X] += w[0] * tick_s
     since[_TURN_Y] += w[1] * tick_s
@@ -198,11 +201,13 @@ class PlantOpticalFlow:
         self._since[:] = 0.0
         now_m = self._ray.length_m(row[POSITION], row[QUATERNION], elapsed_us)
         before_m, self._before_m = self._before_m, now_m
+        # The sensor lacks a gyro: the estimator uses the vehicle's.
         turned = np.full(3, math.nan)
         if now_m is None or before_m is None or min(now_m, before_m) < profile.least_m:
             return FlowReading(np.zeros(2), passed_s, INVALID, turned)
         # Over a few hundredths of a second, the distance changes linearly.
         mean_m = 0.5 * (now_m + before_m)
+        # Rotation plus translation over distance, with the signs of the sensor.
         flow = np.array([turn_x - way_y / mean_m, turn_y + way_x / mean_m])
         if math.hypot(*flow.tolist()) > profile.greatest_rad_s * passed_s:
             return FlowReading(np.zeros(2), passed_s, INVALID, turned)

@@ -56,10 +56,12 @@ def _find_contacts(
 ) -> int:
     """Find the vehicle's contacts; return the number of contacts in `state.rows`."""
     count = 0
+    # Stored floor points must be updated even when the vehicle has left the floor.
     if state.many[0] > 0 or -p[2] - radius < close:
         count = touch_floor(p, q, half, close, state.kept, state.many, state.rows, 0)
     if near_ground(solids.relief, p, radius, close):
         count = touch_ground(p, q, half, close, solids.relief, state.rows, count)
+    # `room` is a lower bound: no solid can be close yet.
     if state.room[0] > close:
         return count
     n, moving = len(solids.shape), len(solids.leg)
@@ -70,6 +72,7 @@ def _find_contacts(
     state.room[0] = room_among(solids, p, radius)
     if state.room[0] > close:
         return count
+    # Only solids whose bounding sphere is near need the exact test.
     for i in range(n):
         center = (solids.center[i, 0], solids.center[i, 1], solids.center[i, 2])
         size = (solids.size[i, 0], solids.size[i, 1], solids.size[i, 2])
@@ -130,8 +133,10 @@ def advance(
     """
     a, q = airframe_of(airframe), quaternion(before)
     radius, close = box
+    # Obstacles may approach: reduce the room before the search.
     state.room[0] -= obstacle_speed * tick_s
     count = _find_contacts(at, q, half, radius, close, moving_us, solids, state)
+    # Contacts see the velocity after all other forces.
     turn = rotate(conjugate(q), torque)
     v, spin = accelerate(velocity(before), q, rates(before), force, turn, a, tick_s)
     if count > 0:
@@ -140,6 +145,7 @@ def advance(
     if q_new[0] < 0.0:
         q_new = (-q_new[0], -q_new[1], -q_new[2], -q_new[3])
     write(p, v, q_new, omega, before, tick_s, row)
+    # The vehicle's own motion uses up the room, too.
     state.room[0] -= tick_s * math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     return count
 
@@ -163,6 +169,7 @@ class KernelBody:
         self._state = ContactState(
             np.zeros((KEPT, 7)),
             np.zeros(1, np.int64),
+            # -inf: the first tick measures the room.
             np.full(1, -math.inf),
             np.zeros((MOST, ROW)),
             np.zeros(MOST),

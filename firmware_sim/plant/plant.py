@@ -145,6 +145,7 @@ class Plant:
         airframe = airframe or Airframe.from_profile(profile)
         self.record = record = new_aircraft()
         """Record of body, rotors, battery and sensors."""
+        # Separate streams: wind does not depend on the sensors.
         noise, gusts = sensors_and_gusts(rng)
         self._sensors = SensorSuite(
             profile.sensors, noise, tick_s, asked.sensors.navigation_noise, record
@@ -162,6 +163,7 @@ class Plant:
         self._flow = None
         if flow is not None:
             self._flow = PlantOpticalFlow(flow, arena, noise.spawn(1)[0], times, tick_s)
+        # These sensors measure in Python, so every tick needs Python.
         self._measures_compiled = fitted is None and flow is None and profile.sensors.vision is None
         model = PowerModel.from_profile(profile)
         self.rotor_lag = lag(airframe, tick_s)
@@ -170,6 +172,7 @@ class Plant:
         self.body: PlantBody = new_body(asked.plant, arena, profile.body, airframe, tick_s)
         """Vehicle body among the bodies of the arena."""
         self._room = Room(arena, profile.body)
+        # All names are fields of `engine.record.AIRCRAFT`.
         for name, value in (
             ("airframe", airframe),
             ("power_model", model),
@@ -228,6 +231,7 @@ class Plant:
     @property
     def _elapsed_us(self) -> int:
         """Time since the moving obstacles started [µs]."""
+        # Before the start, and while obstacles are held, the tours stay at their start.
         return max(0, self.record["time_us"].item(0) - self.record["moves_us"].item(0))
 
     def hold_obstacles(self) -> None:
@@ -279,6 +283,7 @@ class Plant:
         """
         done = 0
         while True:
+            # Read the blocks again: `_refill` replaces them.
             inertial, compass, barometer, gps = self._sensors.noise
             told = stretch(
                 *(self.record, self._sensors.record, controller, ticks - done),
@@ -287,12 +292,15 @@ class Plant:
             flew, event = told >> EVENT_BITS, told & EVENT_MASK
             done += flew
             if not self.record["resting"][0]:
+                # Compiled ticks move only the record; the body must follow before its next step.
                 self._away = self._away or flew > 0 or event == FUSE
             if event == NOISE:
                 self._refill()
+            # NOISE and ROOM are handled here; other events need the caller.
             elif event != ROOM:
                 return done, event
             elif not self._measure_room():
+                # Complete ticks are reported first; contacts follow in the next call.
                 if done:
                     return done, NONE
                 return self.touch(controller, ticks, truths, flown)
@@ -325,6 +333,7 @@ class Plant:
                 return k + 1, COLLIDED
             if event:
                 return k + 1, event
+            # Out of reach of everything: compiled ticks can take over.
             if not self._touching and self._measure_room():
                 return k + 1, NONE
             if record["held"][0] and self._has_come_to_rest():
@@ -353,8 +362,10 @@ class Plant:
     def _measure_room(self) -> bool:
         """Measure the distance to all solids; return True if contacts are impossible."""
         record = self.record
+        # The vehicle may have been moved: rest must be proven again.
         record["resting"] = 0
         record["room_m"] = -math.inf if self._touching else self._room.above_floor_m(self._motion)
+        # Floor first: it is cheap, and decides near the ground.
         if not is_clear_record(record):
             return False
         solids_m = self._room.among_solids_m(self._motion, self._elapsed_us)
@@ -384,16 +395,19 @@ class Plant:
     def _moved(self, here: Vec, force: Vec, torque: Vec) -> Vector:
         """Move the body by a tick; return the motion after it (16,), and update its contacts."""
         body, record, before = self.body, self.record, self._motion
+        # `before` comes from compiled ticks, which the body has not seen.
         if self._away:
             body.follow(before)
             self._away = False
         elif record["resting"][0]:
             body.look_around()
+        # From the tick count: periods of some rates are not whole microseconds.
         ticks, rate_hz = record["ticks"].item(0) + 1, record["rate_hz"].item(0)
         time_us = record["start_us"].item(0) + ticks * US_PER_S // rate_hz
         after = body.move(here, force, torque, before, max(0, time_us - record["moves_us"].item(0)))
         if body.touch.close or self._touching:
             self._watch(body.touch, before, time_us)
+        # Contact physics has moved the body: room and rest are unknown.
         record["room_m"], record["resting"] = -math.inf, 0
         return after
 
@@ -401,8 +415,10 @@ class Plant:
         """Mark the vehicle as resting if it is at rest on the floor alone; return the result."""
         record, motion = self.record, self._motion
         names = [self.body.names[other] for other in self._touching]
+        # Only the floor holds a vehicle at rest: obstacles may move.
         if names != [FLOOR]:
             return False
+        # Velocity and rates; position and attitude do not matter.
         if np.maximum.reduce(np.abs(motion[[3, 4, 5, 10, 11, 12]])) > STILL:
             return False
         record["room_m"] = self._room.among_solids_m(self._motion, self._elapsed_us)
@@ -416,6 +432,7 @@ class Plant:
         if finder is not None and finder.rate.due(self.time_us):
             sample = sample._replace(distance=finder.read(self.motion, self._elapsed_us))
         if flow is not None:
+            # Flow integrates every tick, also between its samples.
             flow.pass_tick(self.motion)
             if flow.rate.due(self.time_us):
                 sample = sample._replace(flow=flow.read(self.motion, self._elapsed_us))

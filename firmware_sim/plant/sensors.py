@@ -97,16 +97,20 @@ class _Vision:
         if self._start is None:
             self._start, self._last = (place.copy(), frame_at(attitude)), place.copy()
         start, frame = self._start
+        # Drift grows with the square root of the way: independent steps per metre.
         way = float(np.linalg.norm(place - self._last))
         self._last = place.copy()
         self._drift += times * profile.position_drift_m_sqrt_m * math.sqrt(way) * white[0:3]
         period_s = 1.0 / profile.rate_hz
+        # Heading drift grows with the square root of time.
         walk = times * profile.yaw_drift_rad_sqrt_s * math.sqrt(period_s)
         self._turned += walk * white.item(3)
         half = 0.5 * self._turned
+        # From NED into the drifted start frame.
         into = multiply((math.cos(half), 0.0, 0.0, math.sin(half)), conjugate(tuple(frame)))
         seen = rotate(into, tuple(place - start))
         moving = rotate(into, tuple(velocity))
+        # Attitude noise is a small rotation.
         error = exponential(tuple(times * profile.angle_noise_rad * white[4:7]))
         odometry = Odometry(
             position=np.array(seen) + self._drift + times * profile.position_noise_m * white[7:10],
@@ -114,10 +118,12 @@ class _Vision:
             quaternion=np.array(multiply(multiply(into, attitude), error)),
             pose_frame="frd",
             velocity_frame="frd",
+            # Reported variances are the profile's, without the factor `times`.
             position_variance=np.full(3, profile.position_noise_m**2),
             velocity_variance=np.full(3, profile.velocity_noise_m_s**2),
             orientation_variance=np.full(3, profile.angle_noise_rad**2),
         )
+        # Deliver later: the pose is measured now.
         self._late.append((time_us + profile.delay_s * US_PER_S, odometry))
 
     @property
@@ -166,8 +172,10 @@ class SensorSuite:
         """Newest sample of the compiled sensors."""
         imu, gps, barometer = profile.imu, profile.gps, profile.barometer
         self._gps = gps
+        # One stream per sensor, so that rates of one do not shift the noise of others.
         streams = rng.spawn(5)
         inertial, vision = streams[0], streams[4]
+        # Random walk: steps grow with the square root of the tick.
         walk = math.sqrt(tick_s)
         # The profile gives the noise at the base tick; the noise density is constant.
         white = math.sqrt(TICK_S / tick_s)
@@ -185,9 +193,11 @@ class SensorSuite:
         record["mag_sigma"] = times * profile.magnetometer.noise_gauss
         record["baro_noise_pa"] = times * barometer.noise_pa
         record["baro_step_pa"] = times * barometer.drift_pa_sqrt_s / math.sqrt(barometer.rate_hz)
+        # First-order Gauss-Markov process: share kept per fix, and its stationary deviation.
         keep = math.exp(-1.0 / (gps.rate_hz * gps.drift_time_constant_s))
         sigma = gps.drift_m_sqrt_s * math.sqrt(0.5 * gps.drift_time_constant_s)
         record["gps_fitted"], record["gps_keep"] = gps.fitted, keep
+        # The drive keeps the variance constant.
         record["gps_drive"] = times * sigma * math.sqrt(1.0 - keep**2)
         noise = (gps.horizontal_noise_m, gps.horizontal_noise_m, gps.vertical_noise_m)
         record["gps_noise_m"] = times * np.array(noise)

@@ -49,8 +49,10 @@ def place_at(
         leg: (n,) index of the last waypoint passed; updated.
         i: Index of the obstacle.
     """
+    # Tours repeat with their period.
     t = (time_us / US_PER_S) % times_s[i, 0]
     passed = times_s[i, 1:]
+    # Start at the last waypoint passed; a new tour starts at the first.
     k = leg[i] if passed[leg[i]] <= t else 0
     while passed[k + 1] <= t:
         k += 1
@@ -110,6 +112,7 @@ def greatest_speed(solids: Solids) -> float:
     """Return the maximum speed of a moving obstacle [m/s]."""
     fastest = 0.0
     for times, points in zip(solids.times_s, solids.points, strict=True):
+        # Unused entries are inf.
         passed = times[1:][np.isfinite(times[1:])]
         ways = np.hypot(*np.diff(points[: len(passed)], axis=0).T)
         took = np.diff(passed)
@@ -125,10 +128,12 @@ def room_among(solids: Solids, p: Vec, radius: float) -> float:
     for i in range(len(solids.shape)):
         c, s = math.cos(solids.yaw[i]), math.sin(solids.yaw[i])
         dx, dy = p[0] - solids.center[i, 0], p[1] - solids.center[i, 1]
+        # Distance per axis in the solid's own axes; 0 inside.
         x = max(0.0, abs(c * dx + s * dy) - solids.size[i, 0])
         y = max(0.0, abs(c * dy - s * dx) - solids.size[i, 1])
         z = max(0.0, abs(p[2] - solids.center[i, 2]) - solids.size[i, 2])
         room = min(room, math.sqrt(x * x + y * y + z * z))
+    # A lower bound: a sphere contains the vehicle's box.
     return room - radius
 
 
@@ -150,6 +155,7 @@ class Room:
     def above_floor_m(self, motion: Vector) -> float:
         """Return the height of the box's lowest corner above floor and hills [m]; motion (16,)."""
         lowest_m: float = _lowest(motion, self._half)
+        # Conservative: height above the highest hill, wherever it is.
         return lowest_m - self._top_m
 
     def among_solids_m(self, motion: Vector, moving_us: int) -> float:

@@ -225,7 +225,7 @@ MODE_OFFBOARD = _check(
     "check_modes_offboard_signal",
     "No offboard signal",
     _SYSTEM,
-    description="Setpoints are not sent, or what they ask for is not estimated.",
+    description="Setpoints are not sent, or the commanded quantity is not estimated.",
 )
 MODE_HOME = _check("check_modes_home_position", "Home position not set", _SYSTEM, _L.INFO)
 MODE_MANUAL = _check(

@@ -50,9 +50,11 @@ class MotorFailure:
             limits: Undercurrent thresholds.
         """
         for motor, (throttle, output) in enumerate(zip(told, outputs, strict=True)):
+            # PX4 expects a minimum current in proportion to the command.
             least_a = throttle * limits.per_throttle_a
             if not (throttle > limits.throttle and current_a(output) < least_a):
                 self._since_us.pop(motor, None)
+            # The duration counts from the first tick of undercurrent.
             elif time_us - self._since_us.setdefault(motor, time_us) > (
                 limits.lasting_ms * US_PER_MS
             ):
@@ -101,10 +103,12 @@ class Endurance:
         if self._current_a is None:
             self._current_a = expected_a
         elif armed:
+            # Exponential mean for any step: 1 - exp(-dt / tau).
             share = -math.expm1(-(time_us - self._time_us) / (AVERAGE_S * US_PER_S))
             self._current_a += share * (max(battery.current_a, 0.0) - self._current_a)
         self._time_us = time_us
         left_mah = battery.remaining * capacity_mah
+        # mAh divided by mA gives hours.
         return left_mah / max(self._current_a * _MA_PER_A, 1e-6) * _S_PER_H
 
 
@@ -128,6 +132,7 @@ class Validity:
 
     def update(self, now_us: int, *, good: bool, accuracy: float, needed: float) -> bool:
         """Update with the newest estimate: its standard deviation `accuracy`, limit `needed`."""
+        # A valid estimate stays valid up to a wider limit.
         if good and accuracy < (HYSTERESIS * needed if self.valid else needed):
             failed_us = self._failed_us
             self.valid = self.valid or failed_us is None or now_us > failed_us + VALID_AFTER_US
@@ -144,6 +149,7 @@ class Lasting:
 
     def update(self, now_us: int, seconds: float, *, true: bool) -> bool:
         """Return whether the condition has been true at every update for `seconds`."""
+        # Any gap restarts the duration.
         if not true:
             self.since_us = None
             return False
@@ -183,6 +189,7 @@ class AttitudeFailure:
     ) -> bool:
         """Return whether roll or pitch of the nominal state exceeds its limit [deg], 0 = off."""
         roll, pitch = roll_and_pitch(*state[Q : Q + 4].tolist())
+        # A limit of 0 disables the check.
         roll_max, pitch_max = math.radians(abs(limits_deg[0])), math.radians(abs(limits_deg[1]))
         self.roll = self._roll.update(now_us, lasting_s[0], true=0.0 < roll_max < roll)
         self.pitch = self._pitch.update(now_us, lasting_s[1], true=0.0 < pitch_max < pitch)

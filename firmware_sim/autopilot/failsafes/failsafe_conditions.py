@@ -45,6 +45,7 @@ class FailsafeSettings(NamedTuple):
         defaults = cls._field_defaults.values()
         return cls(
             *(
+                # The default's type keeps integer parameters integers.
                 type(default)(min(max(value(name.upper()), -LONGEST_S), LONGEST_S))
                 for name, default in zip(cls._fields, defaults, strict=True)
             )

@@ -65,6 +65,7 @@ def possible(action: FailsafeAction, conditions: Conditions) -> FailsafeAction:
     """Return the action, or the next possible one in the chain, which ends at Terminate."""
     if action not in MODE_OF_ACTION:
         return action
+    # Actions in ascending order: from the requested one to Terminate.
     chain = (a for a in MODE_OF_ACTION if a >= action)
     return next(
         (a for a in chain if can_run(MODE_OF_ACTION[a], conditions)), FailsafeAction.TERMINATE
@@ -76,6 +77,7 @@ def mode_fallback(
 ) -> FailsafeAction:
     """Return the replacement of an intended mode that cannot run; NONE = it can."""
     action, mode = FailsafeAction.NONE, intended
+    # Replacements in sequence: offboard loss first, then modes that cannot run.
     if conditions.offboard_control_signal_lost and NEEDS[mode] & Need.OFFBOARD_SIGNAL:
         action, next_mode = OFFBOARD_LOSS.get(settings.com_obl_rc_act, OFFBOARD_LOSS[0])
         if next_mode is None:
@@ -84,6 +86,7 @@ def mode_fallback(
     if settings.com_posctl_navl == 0:
         if mode is Mode.POSITION and not can_run(mode, conditions):
             action, mode = FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE
+        # The replacement itself may be impossible: continue to the next one.
         if mode is Mode.ALTITUDE and not can_run(mode, conditions):
             action, mode = FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED
     elif settings.com_posctl_navl == 1 and mode is Mode.POSITION and not can_run(mode, conditions):
@@ -231,6 +234,7 @@ def _manual_control(s: Situation) -> bool:
 
 def _links_lost_after_mission(s: Situation) -> bool:
     """Return whether a finished mission has no link and no link failsafe applies."""
+    # COM_RC_IN_MODE 4, or the exception for missions: a loss of the sticks does not act.
     unwatched = s.settings.com_rc_in_mode == _STICKS_OFF or bool(
         s.settings.com_rcl_except & _EXCEPT_MISSION
     )
@@ -261,6 +265,7 @@ def _terminates(s: Situation) -> bool:
 
 def _battery_action(s: Situation) -> int:
     """Return COM_LOW_BAT_ACT; 0 unless the battery warning is worse than at arming."""
+    # A battery that was low at arming warns, but does not act.
     worse = s.conditions.battery_warning > s.battery_at_arming
     return s.settings.com_low_bat_act if worse else 0
 
@@ -475,6 +480,7 @@ def answers(situation: Situation) -> list[tuple[Trigger, Options]]:
         for trigger, options in found
         if options.action is not FailsafeAction.NONE
     ]
+    # The fallback of a mode is not a table row: it depends on several parameters.
     fallback = mode_fallback(situation.conditions, situation.settings, situation.intended)
     if fallback is not FailsafeAction.NONE:
         options = Options(fallback, takeover=Takeover.ALWAYS)

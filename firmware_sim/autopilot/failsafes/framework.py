@@ -70,7 +70,9 @@ def announcement(
         intended: Mode requested by the user.
         delay_us: Remaining delay [µs].
     """
+    # The text counts the delay only while Hold precedes another action.
     waits = action is FailsafeAction.HOLD and delayed is not FailsafeAction.NONE
+    # Rounded to whole seconds.
     seconds = (delay_us + US_PER_S // 2) // US_PER_S
     text = "Failsafe activated"
     if waits:
@@ -203,20 +205,24 @@ def update(
         intervention: User actions since the last update.
     """
     elapsed_us = 0 if state.time_us is None else time_us - state.time_us
+    # A changed intended mode is a selection, too.
     chosen = intervention.mode_chosen or (
         state.intended is not None and state.intended is not vehicle.intended
     )
     state = _begin(state, time_us, elapsed_us, vehicle, conditions)
+    # Arming and disarming end actions that last until a mode change.
     if state.armed is not vehicle.armed:
         state = state._replace(held=_released(state.held), taken_over=False)
     if chosen or state.taken_over:
         state = state._replace(held=_released(state.held))
     state, warned = _hold(state, time_us, vehicle, conditions, settings)
+    # No delay without Hold: a stronger action, a takeover, or Hold is impossible.
     if state.action > FailsafeAction.HOLD or state.taken_over or not can_run(Mode.HOLD, conditions):
         state = state._replace(delay_us=0)
     intervention = intervention._replace(mode_chosen=chosen)
     choice = _select(state, vehicle, conditions, settings, intervention)
     text = None
+    # Announce stronger actions, and new warnings of an unchanged action.
     if choice.action > state.action or (choice.action is not FailsafeAction.NONE and warned):
         text = announcement(
             choice.action, choice.delayed, choice.cause, vehicle.intended, state.delay_us
@@ -255,6 +261,7 @@ def _begin(
     elif not vehicle.armed:
         # Nothing is added while disarmed.
         state = state._replace(armed_us=None, manual_control_lost_at_arming=lost)
+    # Manual control that returns is required from then on.
     if not lost:
         state = state._replace(manual_control_lost_at_arming=False)
     return state
@@ -283,6 +290,7 @@ def _hold(
         state.manual_control_lost_at_arming,
         state.battery_at_arming,
     )
+    # One action per trigger; rows of one trigger exclude each other.
     failing = dict(answers(situation))
     held: list[Held] = []
     for item in state.held:
@@ -293,6 +301,7 @@ def _hold(
         elif item.options.clear is not Clear.WITH_CONDITION:
             held.append(item._replace(failing=False))
     warned = False
+    # COM_FAIL_ACT_T up to 0.1 s means no delay, as in PX4.
     waits = settings.com_fail_act_t > 0.1
     delay_us = state.delay_us
     for trigger, options in failing.items():
@@ -303,6 +312,7 @@ def _hold(
             options = options._replace(takeover=takeover)
         held.append(Held(trigger, options, True))
         warned = warned or options.action is FailsafeAction.WARN
+        # A new failsafe ends the takeover: the user must confirm it again.
         if options.action >= FailsafeAction.HOLD:
             state = state._replace(taken_over=False)
     return state._replace(held=tuple(held), delay_us=delay_us), warned
@@ -320,6 +330,7 @@ def _start_delay(
     left = _next_delay(state, settings)
     if delayed is not FailsafeAction.NONE:
         return max(0, left - elapsed_us)
+    # Used delay does not return at once: it recovers at a quarter of real time.
     left += elapsed_us // 4
     return None if left >= settings.com_fail_act_t * US_PER_S else left
 
@@ -331,10 +342,12 @@ def _select(
     settings: FailsafeSettings,
     intervention: Intervention,
 ) -> _Choice:
+    # Termination is final.
     if state.action is FailsafeAction.TERMINATE:
         return _Choice(FailsafeAction.TERMINATE, vehicle.intended)
     if not vehicle.armed:
         return _Choice(FailsafeAction.NONE, vehicle.intended)
+    # Highest action and strictest takeover rule of all held failsafes.
     worst = Options(FailsafeAction.NONE, takeover=Takeover.ALWAYS)
     strictest = Takeover.ALWAYS
     for item in state.held:
@@ -343,6 +356,7 @@ def _select(
             worst = item.options
     action, cause, intended = worst.action, worst.cause, vehicle.intended
     delayed = FailsafeAction.NONE
+    # During the delay the vehicle waits in Hold, and any mode selection takes over.
     if (
         state.delay_us > 0
         and not state.taken_over
@@ -361,9 +375,11 @@ def _select(
         and strictest < Takeover.AUTO
         and wanted
     ):
+        # Sticks take over into Position; a mode selection keeps the selected mode.
         if not state.taken_over and intervention.sticks_moved:
             intended = Mode.POSITION
         action, taken_over, delayed = FailsafeAction.WARN, True, FailsafeAction.NONE
+        # The user's mode may be impossible: then its fallback acts.
         action = max(action, mode_fallback(conditions, settings, intended))
     possible_now = possible(action, conditions)
     if possible_now is not action:

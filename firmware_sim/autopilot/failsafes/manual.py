@@ -75,6 +75,7 @@ def _failsafe(row: Row) -> Sequence[str]:
 
 def _shown(row: Row) -> Options | None:
     """Return the response listed with its end: the default, or the mildest active one."""
+    # Prefer the default; else Return, else any active response.
     value = 0 if row.parameter is None else int(SPEC_BY_NAME[row.parameter].default)
     acting = [options for options in row.answers.values() if options.action > FailsafeAction.WARN]
     chosen = row.answers.get(value)

@@ -106,6 +106,7 @@ class Supervisor:
         self.watch.read_parameters()
         self._settings = FailsafeSettings.read(self._value)
         self._arming = ArmingSettings.read(self._value)
+        # Changed limits may change every result.
         self.next_us, self._calm_flight = 0, None
 
     # --- inputs
@@ -113,6 +114,7 @@ class Supervisor:
     def setpoint(self, setpoint: Setpoint | None, time_us: int) -> None:
         """Record a valid offboard setpoint; None = attitude or body rates."""
         self.watch.hear_setpoint(setpoint, time_us)
+        # Regained signals end a failsafe at once instead of at the next check.
         if self.conditions.offboard_control_signal_lost:
             self.next_us = 0
 
@@ -135,6 +137,7 @@ class Supervisor:
 
     def is_unchanged(self, now_us: int, flight: CommanderState) -> bool:
         """Return whether a check would repeat the newest result; if so, it counts as done."""
+        # A new flight state object means that the commander's state has changed.
         if flight is not self._calm_flight or not self.watch.is_unchanged(now_us):
             self._calm_flight = None
             return False
@@ -148,10 +151,12 @@ class Supervisor:
         before = self.conditions
         self.conditions, texts = self.watch.look(sample, flight.phase)
         self._tell_of_pilot(now_us, was_lost=before.manual_control_signal_lost)
+        # Arming rules depend on the phase.
         changed = self.conditions != before or flight.phase is not self._checked
         if now_us >= self._check_us or changed:
             self._check_us, self._checked = now_us + CHECK_US, flight.phase
             readiness = self.readiness(sample, flight, flight.mode)
+            # The checks are pure: equal input gives an equal result.
             if readiness != self._ready:
                 self.changes += 1
                 self._ready, self.failing = readiness, prearm.failing(readiness)
@@ -217,6 +222,7 @@ class Supervisor:
 
     def _report(self, now_us: int, flight: CommanderState) -> list[OperatorText]:
         """Return the newly failing checks once the vehicle has been ready."""
+        # During boot any check may fail: reporting starts when the vehicle is ready.
         if self._told is None:
             if flight.phase is FlightPhase.BOOT:
                 self._asked = False
@@ -225,6 +231,7 @@ class Supervisor:
         unchanged = self.failing == self._told or now_us < self._told_us + REPORT_US
         if unchanged and not self._asked:
             return []
+        # A requested report repeats known checks.
         known = () if self._asked else self._told
         new = [check for check in self.failing if check.said and check not in known]
         self._told, self._told_us, self._asked = self.failing, now_us, False
@@ -239,6 +246,7 @@ class Supervisor:
 
     def available(self, mode: Mode) -> bool:
         """Return whether a mode's requirements are met for a user request, pilot input aside."""
+        # The caller checks pilot input.
         return not lacking(mode, self.conditions) & ~(Need.NOT_ARMING | Need.MANUAL_CONTROL)
 
     # --- deciding
@@ -249,6 +257,7 @@ class Supervisor:
         """Return the failsafes' decision for a flight; None = no change."""
         state, finished = self._state, self.watch.reports.mission_finished
         armed = flight.phase >= _GROUND
+        # Equal inputs need no new decision.
         seen = (self.conditions, armed, flight.intended, finished, self._settings)
         # Time-dependent inputs: delays, and rows with a time limit after arming.
         waiting = state.delay_us > 0 or state.start_delay_us is not None

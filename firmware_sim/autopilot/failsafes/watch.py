@@ -64,6 +64,7 @@ def is_calm(controller: Record, limits: Vector) -> bool:
     now_us, s, seen = c.time_us, c.state, c.looked_at
     fused_us = min(c.gps_horizontal_us, c.baro_fused_us)
     roll, pitch = roll_and_pitch(s[Q], s[Q + 1], s[Q + 2], s[Q + 3])
+    # Any value near a limit needs the full check.
     calm = (
         c.healthy != 0
         and fused_us >= 0
@@ -74,13 +75,16 @@ def is_calm(controller: Record, limits: Vector) -> bool:
         and pitch <= limits[_PITCH]
         and c.battery_left >= limits[_BATTERY]
     )
+    # Compass, barometer and GPS must have changed recently.
     for row in range(MAG_ROW, WATCHES):
         calm = calm and now_us - c.watch[row, CHANGED] < CALM_US
+    # IMU samples always differ; equal ones may come from a frozen sensor.
     felt = turned = False
     for i in range(3):
         felt, turned = felt or c.accel[i] != seen[i], turned or c.gyro[i] != seen[3 + i]
     if not (calm and felt and turned):
         return False
+    # A calm check counts as a sample of the sensor monitor.
     for i in range(3):
         seen[i], seen[3 + i] = c.accel[i], c.gyro[i]
     for row in (GYRO_ROW, ACCEL_ROW):
@@ -172,9 +176,11 @@ class Watch:
         """Read the parameters again."""
         self.settings = p = WatchSettings.read(self._value)
         self._calm = None
+        # 0 disables the check: no limit.
         tilts = (math.radians(abs(d)) or math.inf for d in (p.fd_fail_r, p.fd_fail_p))
         self._limits = np.array(
             [
+                # The earliest of several timeouts.
                 min(self._value("EKF2_NOAID_TOUT"), GPS_GONE_US),
                 HYSTERESIS * (p.com_pos_fs_eph if p.com_pos_fs_eph >= 0.0 else math.inf),
                 HYSTERESIS * p.com_vel_fs_evh,
@@ -202,6 +208,7 @@ class Watch:
         setpoint = self._setpoint
         if _silent(self._setpoint_us, time_us, self.settings.com_of_loss_t):
             return True
+        # Attitude and rate setpoints need no position estimate.
         if setpoint is None:
             return False
         by_position = not math.isnan(setpoint.position[0])
@@ -219,6 +226,7 @@ class Watch:
     ) -> tuple[Conditions, list[OperatorText]]:
         """Return the current conditions and the messages for the operator."""
         seen, now_us = self._estimator.record["looked_at"][0], sample.time_us
+        # Calm checks have skipped the sensor monitor: bring it up to date first.
         if self._calm is not None:
             self.sensors.looked_at(seen[:3], seen[3:])
         texts = self.sensors.judge(sample, flying=phase is _AIR)
@@ -242,6 +250,7 @@ class Watch:
         return is_calm(self._estimator.record, self._limits)
 
     def _reported(self, now_us: int) -> tuple[object, ...]:
+        # Everything that can change without a measurement.
         reports, recovery, p = self.reports, self._estimator.recovery, self.settings
         setpoint_us, manual_us, gcs_us = self._setpoint_us, self._manual_us, self._gcs_us
         return (
@@ -258,6 +267,7 @@ class Watch:
         """Return whether neither time nor another check would change the result."""
         p = self.settings
         return (
+            # These optional failsafes depend on time or accuracy, so no check stays valid.
             max(p.com_flt_time_max, p.com_pos_low_eph, p.bat1_capacity) <= 0.0
             and self._local.valid
             and self._relaxed.valid
@@ -278,6 +288,7 @@ class Watch:
         armed = phase >= _GROUND
         estimator.flying = phase is _AIR
         if phase is _AIR:
+            # The first moment in the air counts.
             self._takeoff_us = now_us if self._takeoff_us is None else self._takeoff_us
         elif not armed:
             self._takeoff_us = None
@@ -286,6 +297,7 @@ class Watch:
         accuracy, speed_accuracy = estimator.accuracy()
         position = estimator.knows_position(now_us, flying=phase is _AIR)
         needed = p.com_pos_fs_eph if p.com_pos_fs_eph >= 0.0 else math.inf
+        # Before alignment the first good estimate must not be marked as failed.
         if estimator.aligned:
             for validity, sigma, limit in (
                 (self._local, accuracy, needed),
@@ -375,6 +387,7 @@ class Watch:
     def _charge(self, battery: BatterySample, *, armed: bool) -> BatteryWarning:
         """Return the battery warning level, which cannot decrease while armed."""
         p, left = self.settings, battery.remaining
+        # The levels are nested: each limit passed adds one.
         below = (left < p.bat_low_thr) + (left < p.bat_crit_thr) + (left < p.bat_emergen_thr)
         warning = _WARNINGS[below]
         return max(warning, self._battery) if armed else warning

@@ -52,6 +52,7 @@ def _at_rest(
     """Return the steps of a calibration that needs no rotation of the vehicle."""
     yield _started(sensor)
     for percent in percents:
+        # Motion makes the calibration fail, as in PX4 SITL.
         if needs_rest and _moving(context.port.sample):
             yield _critical("ERROR: Motion during calibration")
             yield failed(sensor)
@@ -84,6 +85,7 @@ def _one_side(context: Context, sensor: str) -> Iterator[CalibrationText]:
     if _moving(context.port.sample):
         yield failed(sensor)
         return
+    # QGroundControl parses these texts literally.
     yield _info("[cal] detected rest position, hold still...", _REST_S)
     yield _info("[cal] down orientation detected")
 
@@ -149,15 +151,19 @@ _ESC = 7
 def _calibrate(command: VehicleCommand, context: Context) -> Result:
     """Handle PREFLIGHT_CALIBRATION: one parameter selects the sensor; all zero cancels."""
     running = context.calibration
+    # NaN counts as 0: the parameter is not set.
     asked = {number: command.integer(number) or 0 for number in range(1, 8)}
     if context.port.state().status.arming is Arming.ARMED:
         return Result.TEMPORARILY_REJECTED
     if running.active:
+        # A second calibration request does not replace the running one.
         if any(asked.values()):
             return Result.TEMPORARILY_REJECTED
+        # Cancelling replaces the running steps with the two final texts.
         cancelled = (_critical("[cal] calibration cancelled"), failed(running.sensor))
         running.start(running.sensor, iter(cancelled), context.now_us)
         return Result.ACCEPTED
+    # The first match wins: PX4 evaluates the parameters in this order.
     for (number, value), (sensor, routine) in ROUTINES.items():
         if asked[number] == value:
             running.start(sensor, routine(context), context.now_us)
@@ -169,6 +175,7 @@ def _calibrate(command: VehicleCommand, context: Context) -> Result:
         return Result.DENIED
     if command.integer(4) != 0:
         return Result.UNSUPPORTED  # NaN does not cancel
+    # Parameter 4 = 0 ends a radio calibration, which never ends automatically.
     if running.radio:
         running.radio = False
         context.announce(OperatorText.of(Severity.INFO, events.RC_CALIBRATED))

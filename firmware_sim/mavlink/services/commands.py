@@ -51,11 +51,13 @@ _LOWEST_M, _HIGHEST_M = -12_000.0, 100_000.0
 
 def _reposition(command: VehicleCommand, context: Context) -> Result:
     """Handle parameters 1: speed [m/s], 2: flags, 4: heading [rad], 5..7: position; NaN = keep."""
+    # PX4 1.16 supports DO_REPOSITION only with the change-mode flag.
     if command.integer(2) != _CHANGE_MODE:
         return Result.UNSUPPORTED
     speed, yaw = command.params[0], command.params[3]
     speed = speed if math.isfinite(speed) and speed > 0.0 else NAN
     place = PositionYaw(local_place(command, context), yaw if math.isfinite(yaw) else NAN)
+    # A command without any value means: hold here.
     if all(map(math.isnan, (*place.position, place.yaw))):
         return context.port.set_mode(Mode.HOLD)
     return context.port.set_mode(Mode.HOLD, Reposition(place, speed))
@@ -94,9 +96,11 @@ def local_place(command: VehicleCommand, context: Context) -> Vec:
     origin = state.origin
     if origin is None:
         return NAN, NAN, NAN
+    # NED: down is positive, so the altitude changes sign.
     down = origin.altitude_m - altitude if math.isfinite(altitude) else NAN
     if not (math.isfinite(latitude) and math.isfinite(longitude)):
         return NAN, NAN, down
+    # Only the horizontal part is used, so the altitude of this point does not matter.
     north, east, _ = geodetic_to_local(
         Geodetic(latitude, longitude, origin.altitude_m), origin
     ).tolist()
@@ -114,6 +118,7 @@ def _start(command: VehicleCommand, context: Context) -> Result:
 def _start_landing(_command: VehicleCommand, context: Context) -> Result:
     """Go to the mission's landing: DO_LAND_START, or the first landing; CANCELLED without one."""
     commands = [item.command for item in context.port.plans.mission]
+    # DO_LAND_START has precedence; without one the first LAND item marks the landing.
     for marker in (NavCommand.DO_LAND_START, NavCommand.LAND):
         if marker in commands:
             return context.port.start_mission(commands.index(marker))
@@ -133,6 +138,7 @@ def _set_home(command: VehicleCommand, context: Context) -> Result:
 def _look(command: VehicleCommand, context: Context) -> Result:
     """Handle DO_SET_ROI_LOCATION, DO_SET_ROI (parameter 1: MAV_ROI) and DO_SET_ROI_NONE."""
     place = Geodetic(*command.params[4:7])
+    # DO_SET_ROI carries the region type in parameter 1.
     located = command.number == NavCommand.DO_SET_ROI_LOCATION or (
         command.number != NavCommand.DO_SET_ROI_NONE and command.params[0] == _ROI_LOCATION
     )
@@ -147,6 +153,7 @@ def handle_set_origin(message: WireMessage, context: Context) -> bool:
     Requires this system id and a valid position. Like PX4 1.16, always reply GPS_GLOBAL_ORIGIN.
     """
     meant: bool = message.target_system == context.system_id
+    # The message has 1e-7 degrees and millimetres.
     place = Geodetic(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
     if meant and _is_on_the_globe(place):
         context.port.set_origin(place)
@@ -205,6 +212,7 @@ GREATEST_MOTOR = 8
 def _inject(command: VehicleCommand, context: Context) -> Result | None:
     """Handle INJECT_FAILURE, parameters: unit, type, instance (0 = all)."""
     enabled = context.port.parameters.by_name(ENABLED)
+    # PX4 requires SYS_FAILURE_EN against accidental failures in flight.
     if enabled is None or not enabled.value:
         return Result.DENIED
     unit, kind, instance = command.integer(1), command.integer(2), command.integer(3) or 0
@@ -214,6 +222,7 @@ def _inject(command: VehicleCommand, context: Context) -> Result | None:
         part, known = SENSORS[unit]
         if kind not in known:
             return Result.UNSUPPORTED
+        # The vehicle has one of each sensor: another instance has no effect.
         meant = part is not None and (part in WITHOUT_INSTANCE or instance in (0, 1))
         _act(context, (part,) if part is not None and meant else (), kind)
         return Result.ACCEPTED
@@ -231,6 +240,7 @@ def _motor(context: Context, kind: int, instance: int) -> Result:
     if kind not in (OK, OFF, WRONG) or (kind == OK and not 0 <= instance <= GREATEST_MOTOR):
         return Result.UNSUPPORTED
     if kind != WRONG:  # WRONG would affect the readings alone
+        # Instances start at 1; a number above the motors gives an empty slice.
         motors = MOTORS if instance == 0 else MOTORS[instance - 1 : instance]
         _act(context, motors if instance >= 0 else (), kind)
     return Result.ACCEPTED
@@ -240,6 +250,7 @@ def _act(context: Context, parts: tuple[Part, ...], kind: int) -> None:
     failures = context.port.failures
     if failures is None:
         return
+    # A new fault replaces the old one of the same part.
     for part in parts:
         failures.clear(part)
         if kind != OK:
@@ -310,6 +321,7 @@ def _arm_disarm(command: VehicleCommand, context: Context) -> Result | None:
         return context.port.arm(force=force)
     if command.integer(1) == 0:
         return context.port.disarm(force=force)
+    # Other values are an error with a text, without an acknowledgement, as in PX4.
     asked = command.params[0]
     text = f"Unsupported ARM_DISARM param: {asked:.3f}"
     context.announce(OperatorText.of(Severity.CRITICAL, events.ARM_PARAMETER, asked, text=text))
@@ -327,6 +339,7 @@ def _takeoff(command: VehicleCommand, context: Context) -> Result:
         return context.port.takeoff(None, place)
     if command.frame in _RELATIVE_FRAMES:
         return context.port.takeoff(altitude, place)
+    # Without a home the altitude above sea level has no reference.
     home = context.port.state().home
     if home is None:
         return Result.TEMPORARILY_REJECTED
@@ -345,6 +358,7 @@ def _change_mode(base: int, main: int, sub: int, context: Context) -> Result:
 def _set_standard_mode(command: VehicleCommand, context: Context) -> Result:
     """Handle DO_SET_STANDARD_MODE, parameter 1: MAV_STANDARD_MODE; FAILED if unsupported."""
     asked = command.integer(1) or 0
+    # NON_STANDARD is 0, also the value of an unset parameter.
     if asked != dialect.MAV_STANDARD_MODE_NON_STANDARD:
         for known in KNOWN:
             if known.standard == asked:
@@ -418,6 +432,7 @@ def handle_command_long(message: WireMessage, context: Context) -> bool:
 
 def handle_command_int(message: WireMessage, context: Context) -> bool:
     """Execute and acknowledge a COMMAND_INT."""
+    # COMMAND_INT has five floats and a position in 1e-7 degrees.
     four = (message.param1, message.param2, message.param3, message.param4)
     given = (message.x, message.y) != (INT32_MAX, INT32_MAX)  # INT32_MAX = unset
     place = (message.x / 1e7, message.y / 1e7) if given else (math.nan, math.nan)
@@ -429,12 +444,14 @@ def handle_set_mode(message: WireMessage, context: Context) -> bool:
     """Execute a SET_MODE, the legacy message without acknowledgement."""
     if message.target_system != context.system_id:
         return False
+    # PX4's custom_mode holds the main mode in byte 2 and the sub mode in byte 3.
     main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
     _change_mode(message.base_mode, main, sub, context)
     return True
 
 
 def _handle(command: VehicleCommand, context: Context) -> bool:
+    # None means no COMMAND_ACK at all: PX4 leaves some commands unanswered.
     action = ACTIONS.get(command.number)
     result = Result.UNSUPPORTED if action is None else action(command, context)
     if result is not None:

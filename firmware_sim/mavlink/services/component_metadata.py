@@ -36,6 +36,7 @@ _EVENTS = "all_events.json.xz"
 @functools.cache
 def files() -> dict[str, bytes]:
     """Return the files by name. Created on first use."""
+    # The general file contains the checksums of the others, so it comes last.
     parameters = _compressed({"version": 1, "parameters": [_parameter_described(s) for s in SPECS]})
     events = _compressed(_event_document())
     entries = [
@@ -91,6 +92,7 @@ def _compressed(document: dict[str, Any]) -> bytes:
 
 
 def _parameter_described(spec: ParameterSpec) -> dict[str, Any]:
+    # PX4 has two parameter types: INT32 and FLOAT.
     whole = isinstance(spec.default, int)
     kind = int if whole else float
     described: dict[str, Any] = {
@@ -102,6 +104,7 @@ def _parameter_described(spec: ParameterSpec) -> dict[str, Any]:
     }
     if spec.unit:
         described["units"] = spec.unit
+    # An infinite limit is no limit: the schema expects the key to be absent.
     described |= {
         key: kind(limit)
         for key, limit in (("min", spec.low), ("max", spec.high))
@@ -126,6 +129,7 @@ def definitions() -> Iterator[Definition]:
 def _event_document() -> dict[str, Any]:
     """Return the content of the file with the event texts."""
     groups: dict[str, dict[str, Any]] = {}
+    # Event keys are the sub ids within the component's namespace.
     for definition in definitions():
         group = groups.setdefault(definition.group, {"events": {}})
         group["events"][str(sub_id(definition.name))] = _event_described(definition)
@@ -166,6 +170,7 @@ def _enumeration(listed: Enumeration) -> dict[str, Any]:
 def _modes_of_groups() -> dict[str, list[int]]:
     """Return the custom modes by bit number of the mode groups in checks."""
     groups = {group.value for group in ModeGroup}
+    # A mode can have several bits in the checks; its lowest bit names the group.
     lowest = {mode: bits & -bits for mode, bits in STATE_BITS.items()}
     return {
         str(bit.bit_length() - 1): [custom_mode(mode)]

@@ -51,10 +51,12 @@ def _list(request: FtpRequest, _session: Session, storage: Storage) -> bytes:
     if not folder.is_dir():
         raise RefusedError(Code.FILE_NOT_FOUND)
     with os.scandir(folder) as scanned:
+        # Sorted: offsets must stay valid between the requests of one listing.
         entries = sorted(scanned, key=lambda entry: entry.name)
     found = bytearray()
     for entry in entries[request.offset :]:
         line = _line(entry)
+        # An entry never spans two messages; the client continues at the next offset.
         if len(found) + len(line) > DATA_BYTES:
             break
         found += line
@@ -74,6 +76,7 @@ def _line(entry: os.DirEntry[str]) -> bytes:
 
 def _open_to_read(request: FtpRequest, session: Session, storage: Storage) -> bytes:
     path = storage.path(request.name)
+    # One session per client, as in PX4.
     _check_free(session)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
@@ -94,7 +97,9 @@ def _open_to_write(request: FtpRequest, session: Session, storage: Storage, flag
     path = _writable(request.name, storage)
     _check_free(session)
     storage.check_room(0)
+    # O_NOFOLLOW: a link could point outside the vehicle's storage.
     number = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW | flags, 0o666)
+    # Unbuffered: other clients read the data at once.
     session.file = os.fdopen(number, "r+b", buffering=0)
     session.size = path.stat().st_size
     return _SIZE.pack(session.size)
@@ -117,6 +122,7 @@ def _write(request: FtpRequest, session: Session, storage: Storage) -> bytes:
     file = session.opened(request)
     end = request.offset + len(request.data)
     if end > session.size:
+        # The room is checked once per chunk of growth, because the check scans the storage.
         if end // CHUNK_BYTES != session.size // CHUNK_BYTES:
             storage.check_room(end - session.size)
         session.size = end
@@ -150,6 +156,7 @@ def _on_path(change: Callable[[Path], object], *, more: bool = False) -> Operati
 
 def _truncate(request: FtpRequest, _session: Session, storage: Storage) -> bytes:
     path = _writable(request.name, storage)
+    # Only growth needs room.
     more = request.offset - path.stat().st_size
     if more > 0:
         storage.check_room(more)
@@ -158,6 +165,7 @@ def _truncate(request: FtpRequest, _session: Session, storage: Storage) -> bytes
 
 
 def _rename(request: FtpRequest, _session: Session, storage: Storage) -> bytes:
+    # RENAME has two names, each terminated by NUL.
     old, separator, rest = request.data.partition(b"\0")
     new = rest.split(b"\0", 1)[0]
     if not separator or not new:
@@ -179,6 +187,7 @@ def _check_free(session: Session) -> None:
 def _writable(name: str, storage: Storage) -> Path:
     """Return the path of a file that clients may change. Raises RefusedError otherwise."""
     path = storage.path(name)
+    # The root and the vehicle's own files are protected.
     parts = path.relative_to(storage.folder).parts
     if not parts or parts[0] == READ_ONLY:
         raise RefusedError(Code.FILE_PROTECTED)
@@ -227,15 +236,19 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     """Execute a request and reply."""
     payload = bytes(message.payload)
     sequence, session, opcode, size, _, _, offset = _HEADER.unpack_from(payload)
+    # Replies from another FTP server on the link.
     if opcode in (_ACK, _NAK):
         return False
     client, asker = context.ftp, sender(message)
+    # The client repeats a request whose reply was lost: resend, do not execute twice.
     if sequence == client.last_sequence:
         _send(client.last_answer, asker, context)
         return True
     if client.summing is not None and client.summing.asked.sequence == sequence:
         return True  # repeated while the checksum is running
+    # A new request ends a running checksum, since a client has one request at a time.
     client.stop_summing()
+    # A client that crashed leaves its session open.
     if client.session.file is not None and context.now_us - client.used_us > _IDLE_US:
         client.session.close()
     client.used_us = context.now_us
@@ -245,10 +258,12 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     try:
         if size > DATA_BYTES:
             raise RefusedError(Code.INVALID_DATA_SIZE)
+        # A burst read has no separate reply: `send_pending` sends the data.
         if opcode == _BURST:
             client.session.opened(request)
             client.burst = Burst((sequence + 1) & 0xFFFF, offset, asker)
             return True
+        # Checksums of large files take several ticks.
         if opcode == _CRC32:
             component_metadata.provide(context.storage)
             checksum = Checksum(context.storage.path(request.name))
@@ -260,6 +275,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
         kind = _ACK
     except (RefusedError, OSError) as error:
         answer, kind = _error(error), _NAK
+    # Any other request ends a burst.
     client.burst = None
     _answer(asked, kind, answer, context)
     return True
@@ -273,6 +289,7 @@ def _answer(request: Answered, kind: int, answer: bytes, context: Context) -> No
     session = SESSION if opened else request.session
     body = _packed(sequence, session, kind, request.opcode, request.offset, answer)
     small = len(answer) <= _SMALL_BYTES
+    # Large replies are not kept: the client reads again by offset.
     client.last_sequence, client.last_answer = (request.sequence, body) if small else (None, b"")
     _send(body, request.asker, context)
 
@@ -296,6 +313,7 @@ def send_pending(context: Context) -> None:
         _sum(client.summing, context)
     if client.burst is None:
         return
+    # The file can end, or the session close, within this loop.
     for _ in range(BURST_MESSAGES):
         burst = client.burst
         if burst is None:
@@ -306,6 +324,7 @@ def send_pending(context: Context) -> None:
                 raise RefusedError(Code.INVALID_SESSION)
             data = read_at(file, offset, DATA_BYTES)
             burst.offset += len(data)
+        # END_OF_FILE as a NAK ends the burst, as the protocol requires.
         except (RefusedError, OSError) as error:
             data, kind, client.burst = _error(error), _NAK, None
         body = _packed(burst.sequence, SESSION, kind, _BURST, offset, data)
@@ -326,6 +345,7 @@ def _error(error: RefusedError | OSError) -> bytes:
     """Return the data of a NAK."""
     if isinstance(error, RefusedError):
         return bytes([error.code])
+    # Codes with a name come first; other errors carry their errno.
     number = error.errno or 0
     code = {
         errno.EEXIST: Code.FILE_EXISTS,

@@ -51,10 +51,12 @@ def handle_list(message: WireMessage, context: Context) -> bool:
     """Start sending the entries from `start` to `end`."""
     entries = context.port.logs.entries()
     total = len(entries)
+    # An empty list is one entry with count 0.
     if total == 0:
         number, size, utc_s, last = 0, 0, 0, 0
         context.link.send(dialect.MAVLink_log_entry_message(number, 0, last, utc_s, size))
         return True
+    # Clients request up to 65535: the range ends at the last log.
     first, last = (min(number, total - 1) for number in (message.start, message.end))
     context.log_listing = LogListing(entries, first, last)
     return True
@@ -103,6 +105,7 @@ def _send_data(context: Context, download: LogDownload) -> None:
             "LOG_DATA", _LOG_DATA.pack(download.offset + at, download.number, len(part), part)
         )
     download.offset += len(data)
+    # A short read is the end of the file.
     if len(data) < wanted or download.offset >= download.end:
         context.log_download = None
 
@@ -140,8 +143,10 @@ def handle_ack(message: WireMessage, context: Context) -> bool:
 
 def _stream(context: Context, stream: LogStream) -> None:
     if stream.waiting is not None:
+        # No retry before the timeout: the acknowledgement may be on its way.
         if context.now_us - stream.sent_us < _ACK_TIMEOUT_US:
             return
+        # PX4 also stops the stream after this number of tries.
         if stream.tries >= _ACK_TRIES:
             context.log_stream = None
             return
@@ -149,6 +154,7 @@ def _stream(context: Context, stream: LogStream) -> None:
         return
     logs = context.port.logs
     for _ in range(PIECES_PER_TICK):
+        # The header is sent reliably, one piece at a time; the data is not.
         if stream.in_head:
             piece = stream.next_piece(logs.read)
             if piece is not None:

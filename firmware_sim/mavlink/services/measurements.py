@@ -53,6 +53,7 @@ _UNIT_TOLERANCE = 1e-5
 def handle_odometry(message: WireMessage, context: Context) -> bool:
     """Handle ODOMETRY: store its valid parts; report an unsupported estimator type once."""
     kind = message.estimator_type
+    # PX4 publishes motion capture separately; EKF2 does not use it.
     if kind == dialect.MAV_ESTIMATOR_TYPE_MOCAP:
         return False
     if kind not in _FUSED:
@@ -63,6 +64,7 @@ def handle_odometry(message: WireMessage, context: Context) -> bool:
     naive = kind == dialect.MAV_ESTIMATOR_TYPE_NAIVE
     place = _finite(message.x, message.y, message.z)
     pose, twist = _POSES.get(message.frame_id), _VELOCITIES.get(message.child_frame_id)
+    # NAIVE estimators send no covariance, so their variances are unknown.
     position, of_pose = _in_our_axes(pose, place, message.pose_covariance, naive=naive)
     moving = _finite(message.vx, message.vy, message.vz)
     velocity, of_twist = _in_our_axes(twist, moving, message.velocity_covariance, naive=naive)
@@ -71,12 +73,14 @@ def handle_odometry(message: WireMessage, context: Context) -> bool:
             position,
             velocity,
             _rotation(np.array(message.q)),
+            # The frame has no effect where the vector is None.
             pose[0] if pose is not None else "ned",
             twist[0] if twist is not None else "ned",
             of_pose[:3],
             of_twist[:3],
             of_pose[3:],
             message.reset_counter,
+            # A negative quality means a failed estimate; 0 means unknown.
             max(0, message.quality),
         ),
         context,
@@ -130,6 +134,7 @@ def _in_our_axes(
     variances = _NOT_TOLD if naive else _diagonal(covariance)
     if not other_axes:
         return vector, variances
+    # ENU to NED swaps the first two axes; signs do not affect variances.
     if name == "ned":
         variances = variances[[1, 0, 2, 3, 4, 5]]
     return None if vector is None else _ours(name, vector), variances
@@ -160,6 +165,7 @@ def _rotation(quaternion: Vector) -> Vector | None:
 
 def handle_distance(message: WireMessage, context: Context) -> bool:
     """Handle DISTANCE_SENSOR: the estimator uses downward-facing sensors only."""
+    # Centimetres to metres; the variance [cm²] by the square of that.
     context.port.measure_distance(
         DistanceReading(
             message.current_distance * 1e-2,
@@ -184,6 +190,7 @@ def quality_of(signal_quality: int) -> int:
 
 def handle_optical_flow(message: WireMessage, context: Context) -> bool:
     """Handle OPTICAL_FLOW_RAD. Ignores distance and temperature."""
+    # Rotation of the sensor during the integration time, which the estimator removes.
     turned = (message.integrated_xgyro, message.integrated_ygyro, message.integrated_zgyro)
     context.port.look_down(
         FlowReading(
@@ -203,12 +210,14 @@ _IN_BODY = dialect.MAV_FRAME_BODY_FRD
 def handle_obstacle_distance(message: WireMessage, context: Context) -> bool:
     """Handle OBSTACLE_DISTANCE. Like PX4, report an unknown frame only if CP_DIST is set."""
     frame = message.frame
+    # CP_DIST > 0 enables collision prevention.
     if frame not in _IN_WORLD and frame != _IN_BODY:
         if context.port.parameters.value("CP_DIST") > 0.0:
             text = f"Obstacle message received in unsupported frame {frame}"
             event = events.OBSTACLE_FRAME
             context.announce_once(OperatorText.of(Severity.CRITICAL, event, frame, text=text))
         return False
+    # `increment_f` overrides the integer field if set.
     increment = message.increment_f if message.increment_f > 0.0 else float(message.increment)
     if not (0.0 < increment <= 360.0 and math.isfinite(message.angle_offset)):
         return False

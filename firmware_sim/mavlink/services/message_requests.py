@@ -54,6 +54,7 @@ GROUPS: dict[int, tuple[str, ...]] = {
 def _set_message_interval(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 1: message id; 2: interval [µs], 0 or unset = default, negative = off."""
     number = command.integer(1)
+    # PX4 accepts the rate of a missing device without effect.
     if number is None or number in OF_MISSING_DEVICES:
         return Result.ACCEPTED
     name = _stream_name(number, context)
@@ -62,8 +63,10 @@ def _set_message_interval(command: VehicleCommand, context: Context) -> Result:
     interval = command.params[1]
     scheduler = context.link.scheduler
     if interval < 0.0:
+        # MAVLink: -1 disables the message, 0 restores the default rate.
         interval_us = OFF
     elif interval > 0.0:
+        # The upper limit keeps the value in the reply's int32 field; 1 µs is sent every tick.
         interval_us = max(1, round(min(interval, INT32_MAX)))
     else:
         interval_us = scheduler.default_us(name)
@@ -78,6 +81,7 @@ def _get_message_interval(command: VehicleCommand, context: Context) -> Result:
 def _request_message(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 1: message id; 2: parameter of the message."""
     number = command.integer(1) or 0
+    # Some messages take a parameter or are not streams.
     special = _SPECIAL.get(number)
     if special is not None:
         return special(command, context)
@@ -96,6 +100,7 @@ def _request_modes(command: VehicleCommand, context: Context) -> Result:
     modes = information.available_modes()
     if not 0 <= asked <= len(modes):
         return Result.DENIED
+    # Modes are numbered from 1.
     for fields in modes if asked == 0 else modes[asked - 1 : asked]:
         context.link.send(dialect.MAVLink_available_modes_message(*fields))
     return Result.ACCEPTED
@@ -107,6 +112,7 @@ def _request_storage(command: VehicleCommand, context: Context) -> Result:
     if command.integer(2) not in (None, 0, number):
         return Result.DENIED
     disk = shutil.disk_usage(context.storage.folder)
+    # STORAGE_INFORMATION has mebibytes.
     sizes = (size / _MIB for size in (disk.total, disk.used, disk.free))
     no_speed = 0.0
     context.link.send(
@@ -175,6 +181,7 @@ def handle_data_stream(message: WireMessage, context: Context) -> bool:
             continue
         asked_us = US_PER_S // message.req_message_rate
         present_us = scheduler.interval_us(name)
+        # Only a shorter interval is set: a request must not slow another client's stream.
         if present_us == OFF or max(asked_us, 1) < present_us:
             scheduler.set_interval(name, max(asked_us, 1), context.now_us)
     return bool(names)
@@ -186,6 +193,7 @@ def handle_event(request: WireMessage, context: Context) -> bool:
     # Limited: the first error reply already contains the oldest available number.
     wanted = min((last - first) % NUMBERS + 1, KEPT)
     for number in range(first, first + wanted):
+        # Sequence numbers wrap around at 65536.
         sequence = number % NUMBERS
         sent = context.events.get(sequence)
         if sent is not None:

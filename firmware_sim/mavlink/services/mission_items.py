@@ -105,6 +105,7 @@ def parse(message: WireMessage) -> PlanItem | int:
     params = (message.param1, message.param2, message.param3, message.param4)
     x, y = float(message.x), float(message.y)
     roi = command in (_N.ROI, _N.DO_SET_ROI)
+    # Integer frames are valid only in MISSION_ITEM_INT.
     if frame in _GLOBAL_FRAMES or (integer and frame in _INT_FRAMES):
         if command not in _PLACES:
             return int(dialect.MAV_MISSION_UNSUPPORTED)
@@ -117,12 +118,14 @@ def parse(message: WireMessage) -> PlanItem | int:
         if integer:
             x, y = x * 1e-7, y * 1e-7
     elif frame == PlanFrame.MISSION:
+        # The frame MISSION marks commands without a position.
         if command not in _WITHOUT_PLACE:
             return int(dialect.MAV_MISSION_UNSUPPORTED)
         if roi and _region(message.param1) not in (_ROI_NONE, _ROI_WPNEXT, _ROI_WPINDEX):
             return int(dialect.MAV_MISSION_INVALID_PARAM1)
     else:
         return int(dialect.MAV_MISSION_UNSUPPORTED_FRAME)
+    # PX4 stores NAV_ROI as DO_SET_ROI.
     if command == _N.ROI:
         command = int(_N.DO_SET_ROI)
     return PlanItem(command, frame, params, x, y, float(message.z), bool(message.autocontinue))
@@ -151,6 +154,7 @@ def format_item(
     y: float = item.y
     if item.frame == PlanFrame.MISSION:
         frame, params = int(PlanFrame.MISSION), item.params
+        # PX4 stores the jump's target and count as integers.
         if item.command == _N.DO_JUMP:
             params = (_whole(params[0]), _whole(params[1]), params[2], params[3])
         x, y = (_fit(x), _fit(y)) if integer else (x, y)
@@ -159,6 +163,7 @@ def format_item(
         frame = _frame(
             relative=item.altitude_is_relative and kind is not MissionType.FENCE, integer=integer
         )
+        # PX4's storage keeps only the parameters that it uses; downloads show the others as 0.
         kept = _PLACES[item.command]
         first, second, third, fourth = (f(p) for f, p in zip(kept, item.params, strict=True))
         params = (first, second, third, fourth)
@@ -190,5 +195,6 @@ def checksum(message: WireMessage, previous: int) -> int:
     pack = struct.Struct("<i" if is_int(message) else "<f").pack
     four = (message.param1, message.param2, message.param3, message.param4)
     head = (message.frame, message.command, message.autocontinue)
+    # Little-endian fields in PX4's order, integers of x and y only in MISSION_ITEM_INT.
     covered = _CHECKED.pack(*head, *four, pack(message.x), pack(message.y), message.z)
     return crc32part(covered, previous)

@@ -46,6 +46,7 @@ def handle_list(message: WireMessage, context: Context) -> bool:
     transfer = context.transfer
     partner = sender(message)
     _settle(transfer)
+    # A repeated request from the same client restarts the download: the count was lost.
     again = (
         transfer.activity is _SENDING
         and transfer.kind == message.mission_type
@@ -54,6 +55,7 @@ def handle_list(message: WireMessage, context: Context) -> bool:
     if transfer.activity is not _IDLE and not again:
         context.announce(OperatorText.of(Severity.INFO, events.DOWNLOAD_IGNORED))
         return True
+    # `heard_us` starts the transfer's timeout.
     transfer.activity, transfer.kind = _SENDING, message.mission_type
     transfer.index, transfer.partner = 0, partner
     transfer.count = len(_items(context, transfer.kind))
@@ -79,10 +81,12 @@ def handle_request(message: WireMessage, context: Context) -> bool:
         return False
     transfer.heard_us = context.now_us
     index = message.seq
+    # Accept the next item, or the previous one again (its reply was lost).
     if index == transfer.index < transfer.count:
         transfer.index += 1
     elif index != transfer.index - 1:
         return _break_off(context, events.REQUEST_UNEXPECTED)
+    # The list may have changed during the download.
     if index >= len(_items(context, transfer.kind)):
         return _break_off(context, events.REQUEST_BEYOND_END)
     _send_item(context, index)
@@ -120,10 +124,12 @@ def handle_count(message: WireMessage, context: Context) -> bool:
         _complain(context, "WPM: IGN MISSION_COUNT: Busy", events.COUNT_WHILE_SENDING)
         _acknowledge(context, partner, _ERROR)
         return True
+    # Renewed for any sender; the partner is checked below.
     transfer.heard_us = context.now_us
     if transfer.activity is _RECEIVING:
         if partner != transfer.partner:
             _acknowledge(context, partner, _ERROR)
+        # An upload that has received items is not restarted.
         elif transfer.index:
             _complain(context, "WPM: REJ. CMD: Busy", events.COUNT_WHILE_RECEIVING)
             _acknowledge(context, partner, _ERROR)
@@ -135,6 +141,7 @@ def handle_count(message: WireMessage, context: Context) -> bool:
 
 def _begin_upload(message: WireMessage, context: Context) -> bool:
     transfer, partner, plans = context.transfer, sender(message), context.port.plans
+    # `plans.receiving` is common to all links: one upload at a time.
     if plans.receiving:
         _acknowledge(context, partner, _ERROR)
         return True
@@ -142,6 +149,7 @@ def _begin_upload(message: WireMessage, context: Context) -> bool:
         # Another client may support only floats (dronekit): request floats first.
         transfer.integer = False
     transfer.partner, transfer.kind, transfer.checksum = partner, message.mission_type, 0
+    # An unknown list type has room for 0 items.
     known = transfer.kind in MOST_ITEMS
     if message.count > (MOST_ITEMS[MissionType(transfer.kind)] if known else 0):
         _acknowledge(context, partner, dialect.MAV_MISSION_NO_SPACE)
@@ -169,6 +177,7 @@ def handle_item(message: WireMessage, context: Context) -> bool:
         _acknowledge(context, partner, _ERROR)
         return True
     if transfer.activity is _SENDING:
+        # PX4 answers with an error, unlike to an item out of sequence.
         _complain(context, "IGN MISSION_ITEM: Busy", events.ITEM_WHILE_SENDING)
         _acknowledge(context, partner, _ERROR)
         return True
@@ -181,6 +190,7 @@ def handle_item(message: WireMessage, context: Context) -> bool:
             _acknowledge(context, partner, _ERROR)
         return True
     transfer.heard_us = context.now_us
+    # PX4 ignores an item out of sequence; the request is repeated after a timeout.
     if message.seq != transfer.index:
         return False
     return _take_item(message, context)
@@ -194,6 +204,7 @@ def _take_item(message: WireMessage, context: Context) -> bool:
         _acknowledge(context, transfer.partner, item)
         _end_upload(context)
         return True
+    # The checksum also covers an item that is rejected below.
     transfer.checksum = mission_items.checksum(message, transfer.checksum)
     if not mission_items.belongs(item, kind):
         _acknowledge(context, transfer.partner, _ERROR)
@@ -207,9 +218,11 @@ def _take_item(message: WireMessage, context: Context) -> bool:
         _request(context)
         return True
     plans = context.port.plans
+    # The checksum identifies the list, so equal checksums mean equal lists.
     if transfer.checksum != plans.stored(kind).identity:
         # An identical list has no effect: the current item stays.
         plans.store(kind, tuple(transfer.items), transfer.checksum, transfer.current)
+    # Releases the lock of all links before the acknowledgement.
     _end_upload(context)
     _acknowledge(context, transfer.partner, _ACCEPTED, transfer.checksum)
     return True
@@ -225,6 +238,7 @@ def handle_clear(message: WireMessage, context: Context) -> bool:
     if transfer.activity is not _IDLE:
         _complain(context, "WPM: IGN CLEAR CMD: Busy", events.CLEAR_WHILE_BUSY)
         return True
+    # MISSION_ACK contains the type of the last transfer.
     transfer.kind = kind
     for cleared in MissionType:
         if kind in (cleared, ALL):
@@ -243,6 +257,7 @@ def handle_set_current(message: WireMessage, context: Context) -> bool:
         _complain(context, "WPM: WP CURR CMD: Not in list", events.CURRENT_NOT_LISTED)
     else:
         plans.set_current(message.seq)
+        # -1 forces a MISSION_CURRENT in the next tick.
         context.transfer.told_current = -1
     return True
 
@@ -255,11 +270,13 @@ def send_pending(context: Context) -> None:
     if plans.current != transfer.told_current:
         transfer.told_current = plans.current
         context.link.send_stream("MISSION_CURRENT", context.port.state())
+    # -1 because `_tell_reached` counts the first message as a repetition.
     if plans.reached != transfer.told_reached:
         transfer.told_reached, transfer.repeats = plans.reached, -1
         transfer.repeated_us = context.now_us - REPEAT_US
     if transfer.told_reached >= 0 and transfer.repeats < REPEATS:
         _tell_reached(context)
+    # After a DO_JUMP, the link's last partner receives the item again.
     jumped = (plans.jumped, plans.jumps_done.get(plans.jumped, 0))
     if jumped != transfer.told_jumped:
         transfer.told_jumped = jumped
@@ -270,6 +287,7 @@ def send_pending(context: Context) -> None:
 
 def _check_timeouts(context: Context) -> None:
     transfer, now_us = context.transfer, context.now_us
+    # PX4's timeout applies to uploads and downloads.
     if now_us - transfer.heard_us > TIMEOUT_US:
         _complain(context, "Operation timeout", events.TIMED_OUT)
         _end_upload(context)
@@ -348,6 +366,7 @@ def _break_off(context: Context, why: Definition) -> bool:
 
 def _end_upload(context: Context) -> None:
     transfer = context.transfer
+    # Only the link that receives may release the lock of all links.
     if transfer.activity is _RECEIVING:
         context.port.plans.receiving = False
     transfer.activity = _IDLE

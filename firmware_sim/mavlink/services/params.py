@@ -29,6 +29,7 @@ def send_pending(context: Context) -> None:
         return
     store = context.port.parameters
     for _ in range(PARAMETERS_PER_TICK):
+        # Index -1 is the hash: with it a ground station can skip the list.
         if context.next_parameter < 0:
             context.link.send_payload(*_hash_message(store))
         else:
@@ -51,6 +52,7 @@ def handle_read(message: WireMessage, context: Context) -> bool:
     """Send one parameter, by index or by name."""
     store = context.port.parameters
     index: int = message.param_index
+    # The hash has no index.
     if index < 0 and message.param_id == HASH_NAME:
         context.link.send_payload(*_hash_message(store))
         return True
@@ -71,6 +73,7 @@ def handle_set(message: WireMessage, context: Context) -> bool:
     present = store.by_name(message.param_id)
     if present is None:
         error = dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
+    # PX4 rejects a value of the wrong type: its bytes would be misread.
     elif message.param_type != _kind(present.value):
         error = _ERROR_TYPE_MISMATCH
     elif not math.isfinite(value := _received_value(message)):
@@ -78,6 +81,7 @@ def handle_set(message: WireMessage, context: Context) -> bool:
     elif (stored := store.set(present.name, value)) is None:
         error = dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
     else:
+        # All clients receive the new value, as in PX4.
         context.broadcast(*_value_message(stored, len(store)))
         return True
     _send_error(message, -1, error, context)
@@ -144,6 +148,7 @@ def _store(command: VehicleCommand, context: Context) -> Result | None:
         return Result.TEMPORARILY_REJECTED
     parameters = context.port.parameters
     asked = command.integer(1)
+    # Both resets restore the defaults.
     if asked in (_RESET, _FACTORY_RESET):
         parameters.reset()
     elif asked == _LOAD:

@@ -20,6 +20,7 @@ def handle_heartbeat(message: WireMessage, context: Context) -> bool:
 
 def handle_ping(message: WireMessage, context: Context) -> bool:
     """Return a request (target 0/0) to its sender. Replies to our requests need no action."""
+    # Other targets are replies, or requests to another system.
     if (message.target_system, message.target_component) != (ANY, ANY):
         return False
     context.link.send(
@@ -59,6 +60,7 @@ def handle_setup(message: WireMessage, context: Context) -> bool:
         text = f"Signing key not stored: {error.strerror}"
         context.announce(OperatorText(Severity.CRITICAL, text))
     else:
+        # Other operators must notice a change of the key.
         what = "set" if any(key) else "removed"
         system, component = sender(message)
         text = f"Signing key {what} by system {system} component {component}"

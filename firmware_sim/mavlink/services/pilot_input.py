@@ -39,6 +39,7 @@ def handle_manual_control(message: WireMessage, context: Context) -> bool:
     sticks = Sticks(
         roll=_share(message.y),
         pitch=_share(message.x),
+        # 0..1000 becomes -1..1: PX4's throttle stick is centred at 500.
         throttle=2.0 * message.z / 1000.0 - 1.0 if 0 <= message.z <= 1000 else 0.0,
         yaw=_share(message.r),
     )
@@ -58,6 +59,7 @@ def handle_channels(message: WireMessage, context: Context) -> bool:
     roll, pitch, throttle, yaw = (
         min(1.0, max(-1.0, (width - _CENTRE_US) / _HALF_US)) for width in raw
     )
+    # A pulled pitch stick raises the nose, so the pulse width has the opposite sign.
     context.port.manual_control(Sticks(roll, -pitch, throttle, yaw), Source.RADIO, context.now_us)
     return True
 
@@ -65,6 +67,7 @@ def handle_channels(message: WireMessage, context: Context) -> bool:
 def handle_follow_target(message: WireMessage, context: Context) -> bool:
     """Handle FOLLOW_TARGET: position, and velocity if available."""
     origin = context.port.state().origin
+    # PX4 treats latitude and longitude 0 as no position.
     if origin is None or (message.lat, message.lon) == (0, 0):
         return False
     place = Geodetic(message.lat / 1e7, message.lon / 1e7, message.alt)

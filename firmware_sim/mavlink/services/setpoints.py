@@ -41,11 +41,13 @@ def handle_local(message: WireMessage, context: Context) -> bool:
     mask, frame = message.type_mask, message.coordinate_frame
     velocity = _masked((message.vx, message.vy, message.vz), mask >> _VELOCITY_SHIFT)
     acceleration = _NOTHING
+    # Acceleration is optional: a fully ignored vector stays NaN.
     if mask >> _ACCELERATION_SHIFT & 0b111 != 0b111:
         acceleration = _masked((message.afx, message.afy, message.afz), mask >> _ACCELERATION_SHIFT)
     if frame == dialect.MAV_FRAME_LOCAL_NED:
         position = _masked((message.x, message.y, message.z), mask >> _POSITION_SHIFT)
     elif frame == dialect.MAV_FRAME_BODY_NED:
+        # PX4 ignores positions in the body frame.
         position = _NOTHING
         q = context.port.attitude
         # All or none, as in PX4; velocities are rotated by the heading only.
@@ -71,6 +73,7 @@ def handle_global(message: WireMessage, context: Context) -> bool:
     velocity = _masked((message.vx, message.vy, message.vz), mask >> _VELOCITY_SHIFT)
     acceleration = _masked((message.afx, message.afy, message.afz), mask >> _ACCELERATION_SHIFT)
     position: Vector | None = _NOTHING
+    # The position is optional as well; a partly ignored one counts as ignored.
     if not mask >> _POSITION_SHIFT & 0b111:
         frame = message.coordinate_frame
         if frame not in _FRAMES_ABOVE:
@@ -91,6 +94,7 @@ def handle_attitude(message: WireMessage, context: Context) -> bool:
     demand: AttitudeDemand | RateDemand
     wire: Wire
     if not mask & dialect.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE:
+        # A quaternion without direction cannot be normalized; NaN fails the comparison, too.
         q = np.array(message.q, np.float64)
         norm = float(np.linalg.norm(q))
         if not norm > _LEAST_QUATERNION or not math.isfinite(norm):
@@ -99,12 +103,14 @@ def handle_attitude(message: WireMessage, context: Context) -> bool:
         ignored = mask & dialect.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE
         yaw_rate = 0.0 if ignored else _or_zero(message.body_yaw_rate)
         demand = AttitudeDemand((w, x, y, z), yaw_rate, thrust)
+        # The wire tuple repeats what the client sent, for records.
         wire = (*quat_to_euler(q / norm), thrust)
     elif not mask & (
         dialect.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE
         | dialect.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
     ):
         ignored = mask & dialect.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE
+        # NaN leaves the yaw rate to the flight controller.
         yaw_rate = math.nan if ignored else _finite(message.body_yaw_rate)
         rates = _or_zero(message.body_roll_rate), _or_zero(message.body_pitch_rate), yaw_rate
         demand = RateDemand(rates, thrust)
@@ -125,6 +131,7 @@ def _offer(
 ) -> bool:
     mask: int = message.type_mask
     forced = mask & dialect.POSITION_TARGET_TYPEMASK_FORCE_SET
+    # Force setpoints are accepted only without a finite acceleration, as in PX4.
     if forced and np.isfinite(acceleration).any():
         event = events.LOCAL_FORCE if _is_local(message) else events.GLOBAL_FORCE
         text = f"{message.get_type()} force not supported"
@@ -133,6 +140,7 @@ def _offer(
     yaw_rate = (
         math.nan if mask & dialect.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE else message.yaw_rate
     )
+    # The record has one yaw value: the rate if given, otherwise the angle.
     wire_yaw = message.yaw if math.isnan(yaw_rate) else yaw_rate
     wire = (message.vx, message.vy, message.vz, wire_yaw)
     context.port.offer_setpoint(
@@ -164,6 +172,7 @@ def _from_globe(message: WireMessage, above: int, context: Context) -> Vector | 
     origin, home = state.origin, state.home
     if origin is None or home is None or above == _ABOVE_TERRAIN:
         return None
+    # The altitude is above sea level, or above home in the relative frame.
     altitude = message.alt + (home.altitude_m if above == _ABOVE_HOME else 0.0)
     place = Geodetic(message.lat_int / 1e7, message.lon_int / 1e7, altitude)
     return geodetic_to_local(place, origin)
@@ -174,6 +183,7 @@ def _thrust(message: WireMessage) -> float:
     mask: int = message.type_mask
     thrust = message.thrust
     if mask & _THRUST_BODY_SET:
+        # `thrust_body` is FRD: upward thrust is negative z.
         thrust = -message.thrust_body[2]
     elif mask & dialect.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE:
         thrust = 0.0

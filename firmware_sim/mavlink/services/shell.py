@@ -41,6 +41,7 @@ def handle_input(message: WireMessage, context: Context) -> bool:
     ):
         return False
     shell = context.shell
+    # The client may send a line in several messages, or several lines in one.
     for byte in bytes(message.data[: message.count]):
         if byte not in b"\r\n":
             if len(shell.line) < _LONGEST_LINE:
@@ -48,6 +49,7 @@ def handle_input(message: WireMessage, context: Context) -> bool:
             continue
         line = shell.line.decode("ascii", errors="replace")
         shell.line.clear()
+        # A client that never reads must not grow the buffer without limit.
         if len(shell.output) < _LONGEST_OUTPUT:
             printed = run(line.split(), context.port, context.now_us)
             shell.output += f"{line}\n{printed}{PROMPT}".encode("ascii", errors="replace")
@@ -98,6 +100,7 @@ def _uptime(_words: Sequence[str], _port: AutopilotPort, now_us: int) -> str:
 
 def _parameters(words: Sequence[str], port: AutopilotPort, _now_us: int) -> str:
     """Run param show [NAME, with * and ?]."""
+    # Only `show` is supported: the shell is read-only.
     if not words or words[0] != "show" or len(words) > 2:
         return "usage: param show [NAME]\n"
     pattern = words[1] if len(words) == 2 else "*"
@@ -107,6 +110,7 @@ def _parameters(words: Sequence[str], port: AutopilotPort, _now_us: int) -> str:
         found = store.by_index(index)
         if found is not None and fnmatch.fnmatchcase(found.name, pattern):
             value = found.value
+            # PX4 prints floats with four decimals.
             shown = f"{value}" if isinstance(value, int) else f"{value:.4f}"
             lines.append(f"x   {found.name} [{index},{index}] : {shown}")
     return "\n".join([*lines, "", f" {len(store)}/{len(store)} parameters used.", ""])

@@ -126,6 +126,7 @@ class Checksum:
         """Read the next part; return the reply's data after the last. Raises OSError."""
         chunk = self._file.read(CHUNK_BYTES)
         self._crc = crc32part(chunk, self._crc)
+        # A full chunk means that more data may follow, possibly empty.
         if len(chunk) == CHUNK_BYTES:
             return None
         return self._crc.to_bytes(4, "little")
@@ -239,12 +240,14 @@ class LogStream:
         """Return the next piece, read by `LogStore.read`; None until enough data is written."""
         room = PIECE_BYTES
         if self.in_head:
+            # A piece does not mix header and data: only header pieces are acknowledged.
             room = min(room, self._head_bytes - self._offset)
         data = read(self.number, self._offset, room)
         if len(data) < room:
             return None
         piece = Piece(self._sequence, self._boundaries.first_in(data), data)
         self._offset += len(data)
+        # The sequence number has 16 bits and wraps around.
         self._sequence = self._sequence + 1 & 0xFFFF
         return piece
 
@@ -262,6 +265,7 @@ class MessageBoundaries:
         """Return the offset of the first message that starts in a piece; `NO_MESSAGE` if absent."""
         first, at = NO_MESSAGE, self._skip
         if self._head:
+            # `_head` holds a message header that was split between two pieces.
             # The rest of the header is at the start of this piece.
             lacking = _MESSAGE_HEAD_BYTES - len(self._head)
             head = self._head + data[:lacking]
@@ -270,6 +274,7 @@ class MessageBoundaries:
                 return first
             at = lacking + int.from_bytes(head[:2], "little")
             self._head = b""
+        # Walk from message to message by the size in each header.
         while at < len(data):
             first = at if first == NO_MESSAGE else first
             head = data[at : at + _MESSAGE_HEAD_BYTES]
@@ -278,6 +283,7 @@ class MessageBoundaries:
                 self._skip = 0
                 return first
             at += _MESSAGE_HEAD_BYTES + int.from_bytes(head[:2], "little")
+        # The next message starts this many bytes into the next piece.
         self._skip = at - len(data)
         return first
 

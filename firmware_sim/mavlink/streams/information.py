@@ -48,6 +48,7 @@ def time_estimate_to_target(state: AutopilotState, value: Callable[[str], float]
     if home is None or origin is None:
         return None
     took = 0.0
+    # On the ground the return takes no time.
     if state.status.landed is not Landed.ON_GROUND:
         target = geodetic_to_local(home, origin).tolist()
         north, east, down = (
@@ -115,6 +116,7 @@ def existing() -> tuple[KnownMode, ...]:
 def available_modes() -> list[tuple[int, int, int, int, int, bytes]]:
     """Return the fields of AVAILABLE_MODES for each supported mode, in order."""
     modes = existing()
+    # The count and the number of each mode, starting at 1, in every message.
     return [
         (len(modes), number, known.standard, known.custom_mode, known.properties, name)
         for number, known in enumerate(modes, start=1)

@@ -37,6 +37,7 @@ def home_position(state: AutopilotState) -> Values | None:
     home, origin = state.home, state.origin
     if home is None:
         return None
+    # Without an origin the home position has no local coordinates.
     local = (
         [math.nan, math.nan, math.nan]
         if origin is None

@@ -36,6 +36,7 @@ def scaled_imu(state: AutopilotState) -> Values:
     return (
         units.boot_ms(state.time_us),
         *(
+            # m/s² to milli-g, rad/s to mrad/s, gauss to milligauss.
             units.int16(a * 1e3 / GRAVITY_M_S2)
             for a in (state.accel - estimate.accel_bias).tolist()
         ),
@@ -55,6 +56,7 @@ def mag_cal_report(value: Callable[[str], float]) -> Values | None:
     """Return the compass calibration [gauss] from the parameters; None if uncalibrated."""
     if not value("CAL_MAG0_ID"):
         return None
+    # Confidence and scale are constant; the orientation is a parameter.
     number, being_calibrated, autosaved, fitness = 0, 0, 0, 0.0
     confidence, scale, turned = 1.0, 1.0, max(0, int(value("CAL_MAG0_ROT")))
     return (
@@ -74,6 +76,7 @@ def mag_cal_report(value: Callable[[str], float]) -> Values | None:
 def battery_status(state: AutopilotState, parameters: ParameterStore) -> Values:
     """Return battery 0: pack voltage in the first slot (cells unmeasured), current, charge."""
     battery = state.battery
+    # -1 and INT16_MAX are MAVLink's values for unknown.
     number, no_temperature, no_energy, no_time_remaining = 0, units.INT16_MAX, -1, 0
     return (
         number,
@@ -94,6 +97,7 @@ def battery_status(state: AutopilotState, parameters: ParameterStore) -> Values:
 def _charge_state(remaining: float, parameters: ParameterStore) -> int:
     """Return the MAV_BATTERY_CHARGE_STATE of a charge 0..1, from PX4's warning thresholds."""
     state: int = dialect.MAV_BATTERY_CHARGE_STATE_OK
+    # Thresholds descend, so the last match is the most severe state.
     for name, warning in _CHARGE_WARNINGS:
         threshold = parameters.by_name(name)
         if threshold is None:
@@ -199,8 +203,10 @@ def _filter(memory: Vector, time_us: int, gyro: Vector, accel: Vector) -> None:
     """Filter one sample into `memory` (11,); gyro (3,) FRD [rad/s], accel (3,) FRD [m/s²]."""
     clipped = False
     last_gyro, last_accel = memory[_LAST_GYRO:_LAST_ACCEL], memory[_LAST_ACCEL:_SIZE]
+    # The first sample has no predecessor.
     if not math.isnan(memory[_LAST_US]):
         dt = (time_us - memory[_LAST_US]) / US_PER_S
+        # Coning: |delta angle x previous delta angle| grows with dt², see the line after the loop.
         cross, gyro_step, accel_step = 0.0, 0.0, 0.0
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
@@ -244,6 +250,7 @@ def distance_sensor(state: AutopilotState) -> Values | None:
         told.kind if told.kind in _KINDS else _LASER,
         _FIRST,
         told.orientation,
+        # The variance [cm²] is one byte on the wire and saturates.
         units.saturate(math.floor(told.variance_m2 * _CM2), 0, 255, 0),
         *_NO_FIELD_OF_VIEW,
         *_NO_QUATERNION,

@@ -112,6 +112,7 @@ def manual_control(state: AutopilotState, system_id: int) -> Values | None:
         system_id,
         *(
             units.int16(share * 1e3)
+            # The wire order is x (pitch), y (roll), z (throttle), r (yaw).
             for share in (sticks.pitch, sticks.roll, sticks.throttle, sticks.yaw)
         ),
         *(buttons, more_buttons, _ALL_AUXILIARY, no_axis, no_axis),
@@ -130,6 +131,7 @@ def sensor_bits(state: AutopilotState) -> tuple[int, int, int]:
     Source: PX4 1.16, streams/SYS_STATUS.hpp: a part is enabled when it is present or unhealthy.
     """
     present: int = _PRESENT
+    # PX4 starts logging when it arms.
     if state.status.arming is Arming.ARMED:
         present |= _LOGGED
     if state.sticks is not None:
@@ -138,6 +140,7 @@ def sensor_bits(state: AutopilotState) -> tuple[int, int, int]:
         present |= _RANGES
     healthy: int = _NEVER_WRONG
     unhealthy: int = 0
+    # A part is healthy or unhealthy; absent parts appear in neither set.
     for good, bit in _health(state):
         if good:
             healthy |= bit
@@ -151,12 +154,14 @@ def sensor_bits(state: AutopilotState) -> tuple[int, int, int]:
 def _health(state: AutopilotState) -> Sequence[tuple[bool, int]]:
     """Return the health and SYS_STATUS bit of each part that can fail."""
     health = state.health
+    # GPS counts as healthy only with a 3D fix.
     fixed = state.gps is not None and state.gps.fix_type >= dialect.GPS_FIX_TYPE_3D_FIX
     known = _knows(state)
     attitude = health.attitude and known
     parts = [
         (health.gyro, dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO),
         (health.accel, dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL),
+        # An all-zero field means that no compass sample has arrived.
         (health.mag and bool(state.mag.any()), dialect.MAV_SYS_STATUS_SENSOR_3D_MAG),
         (
             health.baro and state.pressure_hpa > 0.0,
@@ -177,11 +182,13 @@ def _health(state: AutopilotState) -> Sequence[tuple[bool, int]]:
 def estimator_status(state: AutopilotState) -> Values:
     """Return output flags, innovation test ratios (1 = rejection gate), accuracies [m]."""
     estimate = state.estimate
+    # Before the estimator converges, no output is valid.
     flags = _estimator_flags(state) if _knows(state) else 0
     horizontal, height, mag, vertical = estimate.innovation_ratio.tolist()
     north, east, down = estimate.sigma[:3].tolist()
     airspeed, ground = math.nan, state.clearance
     terrain = math.nan if ground is None else ground.ratio
+    # The velocity ratio is the larger of both directions.
     ratios = (max(horizontal, vertical), horizontal, height, mag, terrain, airspeed)
     return estimate.time_us, flags, *ratios, math.hypot(north, east), down
 
@@ -239,6 +246,7 @@ def fence_status(state: AutopilotState) -> Values:
     """Return geofence breaches. PX4 has no such stream; sent on request only."""
     fence = state.fence
     kind = dialect.FENCE_BREACH_NONE
+    # Distance and custom fences are boundaries; MAVLink has no separate type for a custom fence.
     if fence.distance or fence.custom:
         kind = dialect.FENCE_BREACH_BOUNDARY
     elif fence.altitude:
@@ -321,6 +329,7 @@ def high_latency2(state: AutopilotState) -> Values:
         units.boot_ms(state.time_us),
         dialect.MAV_TYPE_QUADROTOR,
         dialect.MAV_AUTOPILOT_PX4,
+        # The message has room for main and sub mode only: the upper 16 bits of custom_mode.
         custom_mode(state.status.mode) >> 16,
         *_place(state),
         _NO_TARGET[0],
@@ -329,11 +338,14 @@ def high_latency2(state: AutopilotState) -> Values:
         _NO_TARGET[1],
         percent(state.thrust_setpoint) if armed else 0,
         *_NO_AIRSPEEDS,
+        # The unit of speed is 0.2 m/s, hence the factor 5.
         _uint8(math.hypot(north, east) * 5.0),
         *_NO_WIND,
         _UINT8_MAX if gps is None else _uint8(gps.eph_m * 10.0),
         _UINT8_MAX if gps is None else _uint8(gps.epv_m * 10.0),
+        # -128 marks the unknown temperature.
         _INT8_MIN,
+        # The climb rate has no sign here: [0.1 m/s] in one byte.
         units.saturate(abs(down) * 10.0, 0, 127, 0),
         percent(state.battery.remaining),
         state.mission.current if state.mission.total else _NO_MISSION,
@@ -367,6 +379,7 @@ def _uint8(value: float) -> int:
 def _failures(state: AutopilotState) -> int:
     """Return the HL_FAILURE_FLAG bits of failed parts."""
     health, status = state.health, state.status
+    # Offboard counts as lost when the failsafe replaces the intended mode.
     offboard_lost = status.failsafe and status.intended_mode is Mode.OFFBOARD
     failed = {
         dialect.HL_FAILURE_FLAG_GPS: not health.gps,

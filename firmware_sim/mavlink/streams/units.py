@@ -18,6 +18,7 @@ TWO_PI: Final = 2.0 * math.pi
 
 def saturate(value: float, low: int, high: int, unknown: int) -> int:
     """Return `value` rounded and clamped to low..high; `unknown` for NaN."""
+    # NaN is the only value that differs from itself.
     if value != value:
         return unknown
     if value >= high:

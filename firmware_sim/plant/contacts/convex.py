@@ -125,6 +125,7 @@ def separation(kind: int, size: Vec, d: Vec, q: Quat, half: Vector) -> tuple[flo
         half: (3,) half extents of the vehicle [m].
     """
     axes = np.zeros((_MOST_AXES, 3))
+    # Axes of the obstacle's faces; a cylinder has only the vertical one.
     axes[0, 2] = axes[1, 0] = axes[2, 1] = 1.0
     count = 3 if kind == _BOX else 1
     edges = (
@@ -134,6 +135,7 @@ def separation(kind: int, size: Vec, d: Vec, q: Quat, half: Vector) -> tuple[flo
     )
     for i in range(3):
         e = edges[i]
+        # Axes of the vehicle's faces, and their cross products with the obstacle's axes.
         axes[count, 0], axes[count, 1], axes[count, 2] = e
         axes[count + 1, 0], axes[count + 1, 1] = -e[1], e[0]
         count += 2
@@ -141,6 +143,7 @@ def separation(kind: int, size: Vec, d: Vec, q: Quat, half: Vector) -> tuple[flo
             axes[count, 1], axes[count, 2] = -e[2], e[1]
             axes[count + 1, 0], axes[count + 1, 2] = e[2], -e[0]
             count += 2
+    # A cylinder's round side has no finite set of axes: use its nearest points to the corners.
     if kind == _CYLINDER:
         for i in range(8):
             c = rotate(q, corner_of(i, half))
@@ -154,12 +157,15 @@ def separation(kind: int, size: Vec, d: Vec, q: Quat, half: Vector) -> tuple[flo
     for j in range(count):
         x, y, z = axes[j, 0], axes[j, 1], axes[j, 2]
         length = math.sqrt(x * x + y * y + z * z)
+        # Parallel edges give a zero axis.
         if length < _PARALLEL:
             continue
+        # Point the axis from the obstacle to the vehicle.
         along = (x * d[0] + y * d[1] + z * d[2]) / length
         k = 1.0 / length if along >= 0.0 else -1.0 / length
         a = (k * x, k * y, k * z)
         apart = abs(along) - _support(kind, size, a) - reach_along(q, half, a)
+        # The largest separation decides; if all are negative, it is the smallest penetration.
         if apart > best:
             best, n = apart, a
     return best, n
@@ -173,9 +179,11 @@ def _meeting_point(
 
     The vehicle is first moved along the normal until the bodies just touch.
     """
+    # Move the vehicle along the normal until the bodies just touch.
     at = (d[0] - apart * n[0], d[1] - apart * n[1], d[2] - apart * n[2])
     back = conjugate(q)
     arm = (0.0, 0.0, 0.0)
+    # Alternate: nearest point of the obstacle, then nearest point of the vehicle.
     for _ in range(_STEPS):
         o = nearest_point(kind, size, (at[0] + arm[0], at[1] + arm[1], at[2] + arm[2]))
         b = rotate(back, (o[0] - at[0], o[1] - at[1], o[2] - at[2]))
@@ -244,6 +252,7 @@ def touch_obstacle(
     Returns:
         New number of contacts.
     """
+    # Work in the obstacle's axes: only yaw turns it.
     turn = (math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))
     d = rotate(conjugate(turn), (p[0] - center[0], p[1] - center[1], p[2] - center[2]))
     q = multiply(conjugate(turn), q)
@@ -255,6 +264,7 @@ def touch_obstacle(
     apart, n = separation(kind, size, d, q, half)
     if apart >= (0.0 if kind == _BOX else close):
         return count
+    # Collect the corners that are about as deep as the deepest one.
     normal, face, before = rotate(turn, n), _support(kind, size, n), count
     for k in range(8):
         arm = rotate(q, corner_of(k, half))
@@ -262,11 +272,13 @@ def touch_obstacle(
         off = n[0] * x[0] + n[1] * x[1] + n[2] * x[2] - face
         if off > apart + _LEVEL_M or off > close:
             continue
+        # The foot of the corner must lie on the obstacle's surface, not beside it.
         under = (x[0] - off * n[0], x[1] - off * n[1], x[2] - off * n[2])
         o = nearest_point(kind, size, under)
         beside = (under[0] - o[0]) ** 2 + (under[1] - o[1]) ** 2 + (under[2] - o[2]) ** 2
         if beside < _BESIDE_M * _BESIDE_M:
             count = note(rows, count, rotate(turn, arm), normal, off, owner)
+    # No corner touches: an edge or a face meets an edge or point of the obstacle.
     if count == before:
         arm = _meeting_point(kind, size, d, q, half, apart, n)
         count = note(rows, count, rotate(turn, arm), normal, apart, owner)

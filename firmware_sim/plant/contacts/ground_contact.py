@@ -60,12 +60,14 @@ def _spread(a: Vector | tuple[float, ...], b: Vector, c: Vector, d: Vector) -> f
 @kernel
 def _least_needed(new: Vector | tuple[float, ...], deep: float, kept: Vector) -> int:
     """Return the index of the point to replace: keeps the deepest, and maximizes the area."""
+    # The deepest point always stays (Bullet: btPersistentManifold::sortCachedPoints).
     stays, deepest = -1, deep
     for i in range(KEPT):
         if kept[i, 6] < deepest:
             stays, deepest = i, kept[i, 6]
     best, widest = 0, -1.0
     for i in range(KEPT):
+        # The other three points, for the area with the new one.
         one = 1 if i == 0 else 0
         two = 2 if i <= 1 else 1
         three = 2 if i == 3 else 3
@@ -101,12 +103,14 @@ def touch_floor(
     Returns:
         New number of contacts.
     """
+    # Bullet finds one new point per tick: the deepest corner.
     corner = deepest_corner(q, half)
     turned = rotate(q, corner)
     height = -(p[2] + turned[2])
     n = many[0]
     if height < close:
         new = corner[0], corner[1], corner[2], p[0] + turned[0], p[1] + turned[1], 0.0, height
+        # A stored point within `close` is the same point, now updated.
         at, nearest = -1, close * close
         for i in range(n):
             x, y, z = kept[i, 0] - new[0], kept[i, 1] - new[1], kept[i, 2] - new[2]
@@ -121,9 +125,11 @@ def touch_floor(
                 at = _least_needed(new, height, kept)
         for k in range(7):
             kept[at, k] = new[k]
+    # Update the distances of stored points to the motion since.
     for i in range(n):
         arm = rotate(q, (kept[i, 0], kept[i, 1], kept[i, 2]))
         kept[i, 6] = -(p[2] + arm[2] - kept[i, 5])
+    # Drop points that have lifted off or slid away; backwards, since the last one fills the gap.
     for i in range(n - 1, -1, -1):
         arm = rotate(q, (kept[i, 0], kept[i, 1], kept[i, 2]))
         x, y = kept[i, 3] - p[0] - arm[0], kept[i, 4] - p[1] - arm[1]
@@ -151,6 +157,7 @@ _PARALLEL = 1e-3
 @kernel
 def near_ground(relief: Relief, p: Vec, radius: float, close: float) -> bool:
     """Return True if a sphere around the vehicle may be close to hills."""
+    # First the highest hill of all, then the hills below the vehicle.
     if len(relief.heights) == 0 or -p[2] - radius - close > relief.grid[TOP]:
         return False
     return bool(-p[2] - radius < extreme_within(relief, p[0], p[1], radius + close, 1.0) + close)
@@ -177,19 +184,23 @@ def touch_ground(
     for k in range(8):
         arm = rotate(q, corner_of(k, half))
         height, up, across = plane_at(relief, p[0] + arm[0], p[1] + arm[1])
+        # Level at height 0 is the floor, which has its own contacts.
         if height == 0.0 and up == 0.0 and across == 0.0:
             continue
+        # Height above a slope is measured along its normal.
         per = 1.0 / math.sqrt(1.0 + up * up + across * across)
         apart = per * (-(p[2] + arm[2]) - height)
         if apart < close:
             normal = (-per * up, -per * across, -per)
             count = note(rows, count, arm, normal, apart, FLOOR_ID)
     count = _touch_points(p, q, half, close, relief, rows, count)
+    # Every edge of the box once: corners that differ in one axis.
     for k in range(8):
         for axis in range(3):
             other = k ^ (1 << axis)
             if k < other:
                 a, b = rotate(q, corner_of(k, half)), rotate(q, corner_of(other, half))
+                # Ground edges have three directions: rows, columns, diagonals of the cells.
                 for family in range(3):
                     count = _touch_ridges(p, a, b, family, close, relief, rows, count)
     return count
@@ -209,6 +220,7 @@ def _touch_points(
     x, y = p[0] - grid[0], p[1] - grid[1]
     back = conjugate(q)
     down = rotate(back, (0.0, 0.0, 1.0))
+    # Vertices of the grid within the vehicle's radius.
     first_row = max(math.ceil((x - radius) / grid[2]), 0)
     last_row = min(math.floor((x + radius) / grid[2]), n_rows - 1)
     first_column = max(math.ceil((y - radius) / grid[3]), 0)
@@ -216,6 +228,7 @@ def _touch_points(
     for i in range(first_row, last_row + 1):
         for j in range(first_column, last_column + 1):
             height = heights[i * n_columns + j]
+            # Vertices at height 0 belong to the floor.
             if height == 0.0:
                 continue
             arm = (i * grid[2] - x, j * grid[3] - y, -height - p[2])
@@ -224,6 +237,7 @@ def _touch_points(
             for axis in range(3):
                 side = 1.0 if down[axis] >= 0.0 else -1.0
                 depth = half[axis] - side * b[axis]
+                # Beyond the opposite face: the box does not contain the vertex.
                 if side * b[axis] < -half[axis]:
                     best, face = math.inf, -1
                     break
@@ -232,6 +246,7 @@ def _touch_points(
                     best, face = depth, axis
             if face < 0 or best < -close:
                 continue
+            # The vertex must lie within the face's edges.
             inside = True
             for axis in range(3):
                 if axis != face and abs(b[axis]) > half[axis]:
@@ -274,6 +289,7 @@ def _touch_ridges(
         at, step, beside, along = x, dx, (grid[2], 0.0), (0.0, grid[3])
     elif family == 1:
         at, step, beside, along = y, dy, (0.0, grid[3]), (grid[2], 0.0)
+    # Parallel to this family: no crossing.
     if abs(step) < 1e-12:
         return count
     for line in range(math.ceil(min(at, at + step)), math.floor(max(at, at + step)) + 1):
@@ -284,11 +300,13 @@ def _touch_ridges(
         gap = -(p[2] + arm[2]) - height
         if height == 0.0 or gap >= close:
             continue
+        # Compare heights on both sides: only convex edges, ridges, can be touched.
         k = _BESIDE_M / math.sqrt(beside[0] ** 2 + beside[1] ** 2)
         one = plane_at(relief, n + k * beside[0], e + k * beside[1])[0]
         other = plane_at(relief, n - k * beside[0], e - k * beside[1])[0]
         if height - 0.5 * (one + other) < _RIDGE * _BESIDE_M:
             continue
+        # Slope along the ridge gives its direction in space.
         k = _BESIDE_M / math.sqrt(along[0] ** 2 + along[1] ** 2)
         rise = plane_at(relief, n + k * along[0], e + k * along[1])[0]
         rise -= plane_at(relief, n - k * along[0], e - k * along[1])[0]
@@ -299,9 +317,12 @@ def _touch_ridges(
         size = math.sqrt(cx * cx + cy * cy + cz * cz)
         lengths = math.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2)
         lengths *= math.sqrt(ridge[0] ** 2 + ridge[1] ** 2 + ridge[2] ** 2)
+        # Parallel edges, and nearly horizontal normals, belong to other contacts.
         if size < _PARALLEL * lengths or abs(cz) < 0.1 * size:
             continue
+        # The normal points up.
         per = (-1.0 if cz > 0.0 else 1.0) / size
         normal = (per * cx, per * cy, per * cz)
+        # The gap is vertical: project it on the normal.
         count = note(rows, count, arm, normal, -normal[2] * gap, FLOOR_ID)
     return count

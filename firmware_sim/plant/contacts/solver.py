@@ -36,6 +36,7 @@ angular), 1 / (direction . response), right-hand side, impulse so far."""
 @kernel
 def _sides(n: Vec) -> tuple[Vec, Vec]:
     """Return two unit vectors normal to n and to each other; on the floor south, then east."""
+    # Same choice as Bullet's btPlaneSpace1, to match its friction directions.
     if abs(n[2]) > math.sqrt(0.5):
         k = 1.0 / math.sqrt(n[0] * n[0] + n[2] * n[2])
         a = (n[2] * k, 0.0, -n[0] * k)
@@ -56,6 +57,7 @@ def _describe(
         arm[2] * d[0] - arm[0] * d[2],
         arm[0] * d[1] - arm[1] * d[0],
     )
+    # The inertia is diagonal in body axes: rotate, divide, rotate back.
     b = rotate(conjugate(q), t)
     turned = (b[0] / airframe.inertia_xx, b[1] / airframe.inertia_yy, b[2] / airframe.inertia_zz)
     w = rotate(q, turned)
@@ -64,6 +66,7 @@ def _describe(
     row[3], row[4], row[5] = t
     row[6], row[7], row[8] = d[0] / m, d[1] / m, d[2] / m
     row[9], row[10], row[11] = w
+    # Velocity along d per unit impulse at this arm.
     response = 1.0 / m + t[0] * w[0] + t[1] * w[1] + t[2] * w[2]
     row[12] = 1.0 / response
     row[14] = 0.0
@@ -94,7 +97,9 @@ def _rub(a: Vector, b: Vector, change: Vector, limit: float) -> float:
     """Solve both friction directions of a contact in a cone; return the velocity's change."""
     more_a, more_b = _wanted(a, change), _wanted(b, change)
     sum_a, sum_b = a[14] + more_a, b[14] + more_b
+    # Both directions share one friction cone.
     if sum_a * sum_a + sum_b * sum_b >= limit * limit:
+        # Bullet limits each direction by the angle of the impulse.
         angle = math.atan2(sum_a, sum_b)
         most_a, most_b = abs(limit * math.sin(angle)), abs(limit * math.cos(angle))
         sum_a = min(max(sum_a, -most_a), most_a)
@@ -138,15 +143,18 @@ def resolve(
     for j in range(count):
         c = contacts[j]
         arm, n = (c[0], c[1], c[2]), (c[3], c[4], c[5])
+        # Three rows per contact: normal, then two friction directions.
         one, two = _sides(n)
         closing = _describe(rows[3 * j], n, arm, v, spin, q, airframe)
         distance = c[6] + SLOP_M
+        # An open gap may close within the tick; a penetration is removed slowly.
         share = 1.0 if distance > 0.0 else ERP
         aim = -closing - distance * share / tick_s
         rows[3 * j, 13] = aim * rows[3 * j, 12]
         for k in range(2):
             row = rows[3 * j + 1 + k]
             side = _describe(row, one if k == 0 else two, arm, v, spin, q, airframe)
+            # Friction aims at no sliding.
             row[13] = -side * row[12]
     for _ in range(ITERATIONS):
         most = 0.0
@@ -157,10 +165,12 @@ def resolve(
             row[14] = max(0.0, before + _wanted(row, change))
             _push(row, change, row[14] - before)
             most = max(most, ((row[14] - before) / row[12]) ** 2)
+        # Friction after all normals: its limit depends on the normal impulse.
         for j in range(count):
             limit = FRICTION * rows[3 * j, 14]
             rubbed = _rub(rows[3 * j + 1], rows[3 * j + 2], change, limit)
             most = max(most, rubbed * rubbed)
+        # Converged: the largest change of any row is small enough.
         if most <= ENOUGH:
             break
     for j in range(count):
