@@ -1,13 +1,11 @@
-"""Notifications about kernel compilation, which takes a minute at the first start.
-
-Listeners are called by the compiling process, or on behalf of another one. numba is not imported
-here; `kernels` reports when numba starts and ends compiling.
-"""
+"""Compilation of kernels: reports of its begin and end, folders for compiled code."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 COMPILING = "compiling kernels (first start, up to a minute)"
 """Status text during compilation; `benchmarks/bench_compiling.py` measures the time."""
@@ -37,3 +35,21 @@ def report_compiling(*, begins: bool) -> None:
     if _depth == (1 if begins else 0):
         for tell in tuple(_listeners):
             tell(begins)
+
+
+def writable_folder(name: str) -> Path | None:
+    """Return a folder with a given name for generated files, created if necessary.
+
+    The folder is beside the package's byte code, or in the user's cache if the package is
+    read-only. Returns None if both are read-only.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for parent in (package / "__pycache__", Path.home() / ".cache" / "airl-mav"):
+        folder = parent / name
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return folder
+    return None

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from airl_mav.core.cache import writable_folder
 from airl_mav.core.child_process import ChildProcess, Exited
 from airl_mav.core.clock import WallClock
+from airl_mav.core.compiling import writable_folder
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.files import replace_file
 from airl_mav.core.progress import Bar, Progress

@@ -18,8 +18,7 @@ from numba.core import event
 from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 
-from airl_mav.core.cache import writable_folder
-from airl_mav.core.compiling import report_compiling
+from airl_mav.core.compiling import report_compiling, writable_folder
 
 F = TypeVar("F", bound=Callable[..., Any])
 

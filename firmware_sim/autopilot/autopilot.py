@@ -39,8 +39,7 @@ from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.flight_commander import AutoDisarm, Commanded, FlightCommander
 from firmware_sim.autopilot.fusion_horizon import NewFilter
-from firmware_sim.autopilot.guidance import Guidance
-from firmware_sim.autopilot.home import Home
+from firmware_sim.autopilot.guidance import Guidance, Home
 from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.manual_control import ManualControl, Source, Sticks
 from firmware_sim.autopilot.navigation.flown_item import ExecutorState

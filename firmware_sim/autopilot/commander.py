@@ -23,8 +23,8 @@ from firmware_sim.autopilot.autopilot_state import (
     Severity,
 )
 from firmware_sim.autopilot.events import flight_events as events
+from firmware_sim.autopilot.events.definition import ArmingReason, NavigationMode, words
 from firmware_sim.autopilot.events.definition import MavlinkEvent as Told
-from firmware_sim.autopilot.events.enumerations import ArmingReason, NavigationMode, words
 
 MAIN_POSCTL, MAIN_AUTO, MAIN_ACRO, MAIN_OFFBOARD, MAIN_TERMINATION = 3, 4, 5, 6, 10
 

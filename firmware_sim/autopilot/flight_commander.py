@@ -19,8 +19,7 @@ from firmware_sim.autopilot.commander import (
 )
 from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
-from firmware_sim.autopilot.guidance import Guidance
-from firmware_sim.autopilot.home import Home
+from firmware_sim.autopilot.guidance import Guidance, Home
 from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.requests import ModeRequest
 from firmware_sim.autopilot.sensor_monitor import NewestSensors

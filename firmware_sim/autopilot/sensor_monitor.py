@@ -21,8 +21,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import HOME, Vector, local_to_geodetic
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import MavlinkEvent
-from firmware_sim.autopilot.events.enumerations import SensorFailure, SensorType
+from firmware_sim.autopilot.events.definition import MavlinkEvent, SensorFailure, SensorType
 from firmware_sim.engine.record import CHANGED, FIRST, GPS_ROW, SEEN, WATCHES, Record
 from firmware_sim.engine.record import GPS as GPS_BIT
 from firmware_sim.engine.record import MAG as MAG_BIT

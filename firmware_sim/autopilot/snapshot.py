@@ -23,8 +23,7 @@ from firmware_sim.autopilot.autopilot_state import (
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.flight_commander import FlightCommander
-from firmware_sim.autopilot.guidance import Guidance
-from firmware_sim.autopilot.home import Home
+from firmware_sim.autopilot.guidance import Guidance, Home
 from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.navigation.plan import MissionType, Plans
 from firmware_sim.autopilot.sensor_monitor import NewestSensors

@@ -20,7 +20,7 @@ from xml.etree import ElementTree as Xml
 
 import pymavlink
 
-from airl_mav.core.cache import writable_folder
+from airl_mav.core.compiling import writable_folder
 
 NEWER = Path(__file__).with_name("newer_messages.xml")
 """Messages missing from pymavlink's definitions."""

@@ -20,7 +20,7 @@ from firmware_sim.autopilot.commander import (
     MAIN_SUB,
     MAIN_TERMINATION,
 )
-from firmware_sim.autopilot.events.enumerations import NavigationMode
+from firmware_sim.autopilot.events.definition import NavigationMode
 from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, MODE_NOT_AVAILABLE
 from firmware_sim.mavlink.codec import dialect
 

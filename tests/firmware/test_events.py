@@ -22,16 +22,14 @@ from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Result, S
 from firmware_sim.autopilot.commander import STATE_BITS, custom_mode
 from firmware_sim.autopilot.events import flight_events
 from firmware_sim.autopilot.events.definition import (
-    FORMATS,
-    Level,
-    MavlinkEvent,
-    sub_id,
-)
-from firmware_sim.autopilot.events.enumerations import (
     ENUMERATIONS,
+    FORMATS,
     ArmingReason,
     Component,
+    Level,
+    MavlinkEvent,
     ModeGroup,
+    sub_id,
 )
 from firmware_sim.autopilot.events.health_report import ALL_MODES, HealthReport, health_report
 from firmware_sim.autopilot.failsafes.failsafe_actions import FailsafeAction as FailsafeAction

@@ -502,7 +502,7 @@ def test_a_row_knows_its_fields() -> None:
 @pytest.fixture
 def live(gym: Path) -> Iterator[Any]:
     pytest.importorskip("foxglove", reason="needs the [export] extra")
-    from airl_mav.addons.export_log.files import LiveFlight
+    from airl_mav.addons.export_log.mcap_export import LiveFlight
 
     served = LiveFlight(recorded(gym), 0)
     yield served

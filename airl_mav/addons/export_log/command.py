@@ -97,7 +97,7 @@ def _stream(run: ReplayedRun, numbers: tuple[int, ...], port: int, console: Cons
     if len(numbers) != 1:
         raise FieldError("flights", len(numbers), "one flight, with --stream")
     # Imported here: the streaming server is an extra.
-    from airl_mav.addons.export_log.files import LiveFlight
+    from airl_mav.addons.export_log.mcap_export import LiveFlight
 
     live = LiveFlight(flight_of(run, numbers[0]), port)
     try:

@@ -8,18 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 from pydantic import Field
 
 from airl_mav.addons.sweep.config import (
     SweepConfig,
-    TrainedTrial,
     Trial,
     TrialResult,
     load_sweep,
-    result_of,
     size_of,
-    training_of,
     trials,
 )
 from airl_mav.addons.sweep.summary import (
@@ -36,48 +32,13 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import optional, quantity, switch, validated
 from airl_mav.core.progress import Bar, Progress
-from airl_mav.envs.evaluation import SLOTS, EpisodeResult, LearnedPilots, fly_seeds
-from airl_mav.envs.navigation import Navigation
 from airl_mav.experiments.campaign_store import open_campaign
 from airl_mav.experiments.executors import Executor, ExecutorSettings, Stop, WorkerError, never
-from airl_mav.policy.learned import load_learned
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
-from airl_mav.rehearsal.run_folder import locked
 from airl_mav.scenario.model import Workers
-from airl_mav.training.config import TrainingConfig
-from airl_mav.training.training_folder import TrainingFolder, TrainingProgress
-from airl_mav.training.training_run import export_best, fit, nominal
-
-
-def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> TrialResult:
-    """Run or resume a trial on cpu or cuda; return its result. Raises UsageError."""
-    config, path = training_of(folder.config, trial), folder.trial_path(trial)
-    # Waits for an ending worker to release the trial.
-    with locked(path, lambda _: None):
-        training = TrainingFolder.begin(path, config, command, resume=True)
-        # Checked under the lock: its previous owner may have ended the trial.
-        if (done := folder.result(trial)) is not None:
-            return done
-        best = fit(config, training, TrainingProgress(), device)
-        export_best(training, config, trial.name)
-        seeds = folder.config.evaluation
-        flown = fly_best(training, config, range(seeds.seed, seeds.seed + seeds.episodes))
-        last = training.evaluations()[-1]
-        trained = TrainedTrial(last.steps, best.steps, best.success_rate, last.seconds)
-        size = size_of(folder.config, trial)
-        result = result_of(trial, size.parameters, size.macs, trained, flown)
-        folder.finish(result, training.checkpoints)
-    return result
-
-
-def fly_best(training: TrainingFolder, config: TrainingConfig, seeds: range) -> list[EpisodeResult]:
-    """Fly the exported policy of a training like `airl evaluate`, at level gym."""
-    policy = load_learned(training.policy, trust=True)
-    navigation = Navigation(nominal(config.environment), min(SLOTS, len(seeds)))
-    pilots = LearnedPilots(policy, lambda seed: np.random.default_rng(seed))
-    return [flown for _, flown in fly_seeds(navigation, pilots, seeds)]
+from airl_mav.training.training_folder import TrainingFolder
 
 
 class SweepRequest(Workers):
@@ -185,7 +146,7 @@ def _worker(
 ) -> Callable[[Trial], list[TrialResult]]:
     """Return the function that runs a trial."""
     # Imported late: the learner takes two seconds to load, and only a worker needs it.
-    from airl_mav.addons.sweep.run import run_trial
+    from airl_mav.addons.sweep.trial_run import run_trial
 
     return lambda trial: [run_trial(folder, trial, command, device)]
 

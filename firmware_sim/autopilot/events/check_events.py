@@ -7,8 +7,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from firmware_sim.autopilot.events.definition import Argument, Definition, Level, arguments
-from firmware_sim.autopilot.events.enumerations import Component
+from firmware_sim.autopilot.events.definition import (
+    Argument,
+    Component,
+    Definition,
+    Level,
+    arguments,
+)
 
 _ABOUT = arguments("navigation_mode_group_t modes, uint8_t health_component_index")
 """First arguments of every check: affected modes and component."""

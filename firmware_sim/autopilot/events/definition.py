@@ -8,11 +8,222 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping
 from enum import IntEnum
 from functools import partial
 from typing import NamedTuple
 
-from firmware_sim.autopilot.events.enumerations import ENUMERATIONS
+
+class ModeGroup(IntEnum):
+    """Flight modes affected by a check, as bits: 1 << PX4's navigation state."""
+
+    MANUAL = 1 << 0
+    ALTCTL = 1 << 1
+    POSCTL = 1 << 2
+    MISSION = 1 << 3
+    LOITER = 1 << 4
+    RTL = 1 << 5
+    ACRO = 1 << 10
+    OFFBOARD = 1 << 14
+    STAB = 1 << 15
+    TAKEOFF = 1 << 17
+    LAND = 1 << 18
+    FOLLOW_TARGET = 1 << 19
+    PRECLAND = 1 << 20
+    ORBIT = 1 << 21
+    VTOL_TAKEOFF = 1 << 22
+
+
+class Component(IntEnum):
+    """Components of the vehicle; the argument of a check is the bit index."""
+
+    NONE = 1 << 0
+    ABSOLUTE_PRESSURE = 1 << 1
+    DIFFERENTIAL_PRESSURE = 1 << 2
+    GPS = 1 << 3
+    OPTICAL_FLOW = 1 << 4
+    VISION_POSITION = 1 << 5
+    DISTANCE_SENSOR = 1 << 6
+    REMOTE_CONTROL = 1 << 7
+    MOTORS_ESCS = 1 << 8
+    UTM = 1 << 9
+    LOGGING = 1 << 10
+    BATTERY = 1 << 11
+    COMMUNICATION_LINKS = 1 << 12
+    RATE_CONTROLLER = 1 << 13
+    ATTITUDE_CONTROLLER = 1 << 14
+    POSITION_CONTROLLER = 1 << 15
+    ATTITUDE_ESTIMATE = 1 << 16
+    LOCAL_POSITION_ESTIMATE = 1 << 17
+    MISSION = 1 << 18
+    AVOIDANCE = 1 << 19
+    SYSTEM = 1 << 20
+    CAMERA = 1 << 21
+    GIMBAL = 1 << 22
+    PAYLOAD = 1 << 23
+    GLOBAL_POSITION_ESTIMATE = 1 << 24
+    STORAGE = 1 << 25
+    PARACHUTE = 1 << 26
+    MAGNETOMETER = 1 << 27
+    ACCEL = 1 << 28
+    GYRO = 1 << 29
+    OPEN_DRONE_ID = 1 << 30
+
+    @property
+    def place(self) -> int:
+        """Bit index of the component."""
+        return self.value.bit_length() - 1
+
+
+ArmingReason = IntEnum(
+    "ArmingReason",
+    "TRANSITION_TO_STANDBY STICK_GESTURE RC_SWITCH COMMAND_INTERNAL COMMAND_EXTERNAL "
+    "MISSION_START AUTO_DISARM_LAND AUTO_DISARM_PREFLIGHT KILL_SWITCH LOCKDOWN "
+    "FAILURE_DETECTOR SHUTDOWN UNIT_TEST RC_BUTTON FAILSAFE",
+    start=0,
+)
+"""Reason of arming or disarming."""
+
+
+class NavigationMode(IntEnum):
+    """Flight modes in texts."""
+
+    MANUAL = 0
+    ALTCTL = 1
+    POSCTL = 2
+    AUTO_MISSION = 3
+    AUTO_LOITER = 4
+    AUTO_RTL = 5
+    ACRO = 6
+    OFFBOARD = 7
+    STAB = 8
+    POSITION_SLOW = 9
+    AUTO_TAKEOFF = 10
+    AUTO_LAND = 11
+    AUTO_FOLLOW_TARGET = 12
+    AUTO_PRECLAND = 13
+    ORBIT = 14
+    AUTO_VTOL_TAKEOFF = 15
+    EXTERNAL1 = 16
+    EXTERNAL2 = 17
+    EXTERNAL3 = 18
+    EXTERNAL4 = 19
+    EXTERNAL5 = 20
+    EXTERNAL6 = 21
+    EXTERNAL7 = 22
+    EXTERNAL8 = 23
+    UNKNOWN = 255
+
+
+FailsafeAction = IntEnum(
+    "FailsafeAction",
+    "NONE WARN FALLBACK_POSCTRL FALLBACK_ALTCTRL FALLBACK_STABILIZED HOLD RTL LAND DESCEND "
+    "DISARM TERMINATE",
+    start=0,
+)
+"""Actions of a failsafe, numbered as in `failsafe_actions.FailsafeAction`."""
+
+
+SensorType = IntEnum("SensorType", "ACCEL GYRO MAG", start=0)
+"""Inertial sensors in texts."""
+
+
+class SensorFailure(IntEnum):
+    """Reasons of a sensor failure, as bits."""
+
+    NO_DATA = 1
+    STALE_DATA = 2
+    TIMEOUT = 4
+    HIGH_ERROR_COUNT = 8
+    HIGH_ERROR_DENSITY = 16
+
+
+FailsafeCause = IntEnum(
+    "FailsafeCause",
+    "GENERIC MANUAL_CONTROL_LOSS GCS_CONNECTION_LOSS LOW_BATTERY_LEVEL CRITICAL_BATTERY_LEVEL "
+    "EMERGENCY_BATTERY_LEVEL LOW_REMAINING_FLIGHT_TIME",
+    start=0,
+)
+"""Causes in a failsafe's text, in the order of `failsafe_actions.FailsafeReason`."""
+
+
+class Enumeration(NamedTuple):
+    """Enumeration of the event metadata."""
+
+    base: str
+    """Type on the wire."""
+    members: type[IntEnum]
+    meaning: str
+    bitfield: bool = False
+
+
+ENUMERATIONS: Mapping[str, Enumeration] = {
+    "navigation_mode_group_t": Enumeration("uint32_t", ModeGroup, "Flight modes", bitfield=True),
+    "health_component_t": Enumeration("uint32_t", Component, "Parts of the vehicle", bitfield=True),
+    "sensor_type_t": Enumeration("uint8_t", SensorType, "Sensors"),
+    "sensor_failover_reason_t": Enumeration(
+        "uint16_t", SensorFailure, "Why a sensor has failed", bitfield=True
+    ),
+    "arm_disarm_reason_t": Enumeration("uint8_t", ArmingReason, "Why it was armed or disarmed"),
+    "navigation_mode_t": Enumeration("uint8_t", NavigationMode, "Flight mode"),
+    "failsafe_action_t": Enumeration("uint8_t", FailsafeAction, "What a failsafe does"),
+    "failsafe_cause_t": Enumeration("uint8_t", FailsafeCause, "Why a failsafe acts"),
+}
+
+_WORDS: Mapping[tuple[type[IntEnum], int], str] = {
+    (type(member), member.value): words
+    for member, words in (
+        (ModeGroup.ALTCTL, "Altitude"),
+        (ModeGroup.POSCTL, "Position"),
+        (ModeGroup.LOITER, "Hold"),
+        (ModeGroup.RTL, "Return"),
+        (ModeGroup.STAB, "Stabilized"),
+        (ModeGroup.PRECLAND, "Precision land"),
+        (ModeGroup.VTOL_TAKEOFF, "VTOL takeoff"),
+        (Component.GPS, "GPS"),
+        (SensorType.ACCEL, "Accelerometer"),
+        (SensorType.GYRO, "Gyroscope"),
+        (SensorType.MAG, "Magnetometer"),
+        (Component.MOTORS_ESCS, "Motors and ESCs"),
+        (Component.UTM, "UTM"),
+        (Component.ACCEL, "Accelerometer"),
+        (Component.GYRO, "Gyroscope"),
+        (ArmingReason.LOCKDOWN, "lockdown"),
+        (ArmingReason.FAILSAFE, "failsafe"),
+        (ArmingReason.COMMAND_INTERNAL, "internal command"),
+        (ArmingReason.COMMAND_EXTERNAL, "external command"),
+        (ArmingReason.AUTO_DISARM_LAND, "landing"),
+        (ArmingReason.AUTO_DISARM_PREFLIGHT, "auto preflight disarming"),
+        (NavigationMode.ALTCTL, "Altitude"),
+        (NavigationMode.POSCTL, "Position"),
+        (NavigationMode.AUTO_MISSION, "Mission"),
+        (NavigationMode.AUTO_LOITER, "Hold"),
+        (NavigationMode.AUTO_RTL, "Return"),
+        (NavigationMode.STAB, "Stabilized"),
+        (NavigationMode.AUTO_TAKEOFF, "Takeoff"),
+        (NavigationMode.AUTO_LAND, "Land"),
+        (NavigationMode.AUTO_FOLLOW_TARGET, "Follow Target"),
+        (NavigationMode.AUTO_PRECLAND, "Precision Landing"),
+        (NavigationMode.AUTO_VTOL_TAKEOFF, "VTOL Takeoff"),
+        *((NavigationMode[f"EXTERNAL{n}"], f"External {n}") for n in range(1, 9)),
+        (FailsafeAction.FALLBACK_POSCTRL, "Position mode"),
+        (FailsafeAction.FALLBACK_ALTCTRL, "Altitude mode"),
+        (FailsafeAction.FALLBACK_STABILIZED, "Stabilized mode"),
+        (FailsafeAction.RTL, "Return"),
+        (FailsafeAction.WARN, "warning"),
+        (FailsafeAction.DISARM, "disarming"),
+        (FailsafeAction.TERMINATE, "termination"),
+        (FailsafeCause.GCS_CONNECTION_LOSS, "GCS connection loss"),
+    )
+}
+"""Texts that differ from the member's name; keyed by type, as numbers are not unique."""
+
+
+def words(member: IntEnum) -> str:
+    """Return the operator text of an enumeration member."""
+    named = member.name.replace("_", " ").capitalize()
+    return _WORDS.get((type(member), member.value), named)
+
 
 _AUTOPILOT = 1
 """Component id in the most significant byte of an event's id."""

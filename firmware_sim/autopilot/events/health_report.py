@@ -14,8 +14,7 @@ from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import STATE_BITS
 from firmware_sim.autopilot.events.check_events import ARMING_SUMMARY, HEALTH_SUMMARY
-from firmware_sim.autopilot.events.definition import Level, MavlinkEvent
-from firmware_sim.autopilot.events.enumerations import Component
+from firmware_sim.autopilot.events.definition import Component, Level, MavlinkEvent
 from firmware_sim.autopilot.failsafes.failsafe_conditions import NEEDS, Need, lacking
 from firmware_sim.autopilot.prearm import CHECKS, SUPPLY_CHECK_OFF, PrearmCheck, Readiness
 

@@ -13,8 +13,7 @@ from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Severity
 from firmware_sim.autopilot.commander import custom_mode
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import MavlinkEvent
-from firmware_sim.autopilot.events.enumerations import FailsafeCause
+from firmware_sim.autopilot.events.definition import FailsafeCause, MavlinkEvent
 from firmware_sim.autopilot.failsafes.failsafe_actions import (
     Clear,
     FailsafeAction,

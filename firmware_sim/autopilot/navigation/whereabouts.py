@@ -7,7 +7,7 @@ from collections.abc import Callable
 from airl_mav.core.frames import Geodetic, local_to_geodetic
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.estimator import Estimator
-from firmware_sim.autopilot.home import Home
+from firmware_sim.autopilot.guidance import Home
 from firmware_sim.autopilot.modes.interface import here, triple
 from firmware_sim.autopilot.navigation.flown_item import ExecutorState
 from firmware_sim.autopilot.sensor_monitor import NewestSensors

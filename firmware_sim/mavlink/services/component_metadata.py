@@ -20,8 +20,14 @@ from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import STATE_BITS, custom_mode
 from firmware_sim.autopilot.events import check_events, flight_events
 from firmware_sim.autopilot.events.check_events import CheckEvent
-from firmware_sim.autopilot.events.definition import Definition, sub_id
-from firmware_sim.autopilot.events.enumerations import ENUMERATIONS, Enumeration, ModeGroup, words
+from firmware_sim.autopilot.events.definition import (
+    ENUMERATIONS,
+    Definition,
+    Enumeration,
+    ModeGroup,
+    sub_id,
+    words,
+)
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.services.context import Context, VehicleCommand
 from firmware_sim.mavlink.services.transfers import crc32part
