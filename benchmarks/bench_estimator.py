@@ -43,9 +43,10 @@ from airl_mav.core.frames import (
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.vehicle.atmosphere import altitude_m, pressure_hpa
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint
+from firmware_sim.autopilot.autopilot_state import Result, Setpoint
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.estimator import BIAS_STEP_S
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.engine.ticks import PA_PER_HPA
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 

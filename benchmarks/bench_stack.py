@@ -33,8 +33,9 @@ from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Mode, Setpoint
+from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.estimator import Estimator
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import LinkConfig, gcs_link
 from firmware_sim.mavlink.server import MavlinkServer

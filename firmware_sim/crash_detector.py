@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import CommanderState, FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.plant.body import FLOOR
 from firmware_sim.plant.plant import Collision
 from firmware_sim.simulation import Simulation

@@ -27,8 +27,9 @@ from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.vehicle.airframe import Airframe, draw_airframe
 from airl_mav.vehicle.wind import wind_of_episode
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Mode, Result
+from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.parameter_store import Keeper, Parameters
 from firmware_sim.engine.dynamics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK

@@ -29,7 +29,8 @@ from airl_mav.core.provenance import provenance
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.table import NONE, Column, TableView, print_table, write_table
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint
+from firmware_sim.autopilot.autopilot_state import Result, Setpoint
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 STEPS = {"north": np.array([2.0, 0.0, 0.0]), "up": np.array([0.0, 0.0, -2.0])}

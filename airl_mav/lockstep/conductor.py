@@ -18,7 +18,7 @@ from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.lockstep.digest import FlightDigest
 from airl_mav.lockstep.turns import Partner, Turn
 from airl_mav.lockstep.vehicle_end import VehicleEnd, acknowledged, command_of
-from firmware_sim.autopilot.commander import MAIN_OFFBOARD
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.mavlink.codec import (
     Decoder,
@@ -217,7 +217,7 @@ def _encoder(encoders: Encoders, sender: tuple[int, int]) -> Encoder:
 
 def _enters_offboard(command: WireMessage) -> bool:
     mode = command.command == dialect.MAV_CMD_DO_SET_MODE
-    return bool(mode and command.param2 == MAIN_OFFBOARD)
+    return bool(mode and command.param2 == Mode.OFFBOARD.spec.main)
 
 
 FEED_US = US_PER_S

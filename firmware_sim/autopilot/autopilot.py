@@ -12,9 +12,7 @@ from airl_mav.core.constants import TICK_HZ
 from airl_mav.core.frames import Geodetic, Vector
 from firmware_sim.autopilot.autopilot_state import (
     UNTOLD,
-    WITH_STICKS,
     AutopilotState,
-    Mode,
     OperatorText,
     Result,
     Setpoint,
@@ -38,6 +36,7 @@ from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Interven
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.flight_commander import AutoDisarm, Commanded, FlightCommander
+from firmware_sim.autopilot.flight_modes import WITH_STICKS, Mode
 from firmware_sim.autopilot.fusion_horizon import NewFilter
 from firmware_sim.autopilot.guidance import Guidance, Home
 from firmware_sim.autopilot.land_detector import LandDetector

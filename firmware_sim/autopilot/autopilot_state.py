@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.events.definition import Definition, MavlinkEvent
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.interfaces import (
     BatterySample,
@@ -34,58 +35,6 @@ class Arming(IntEnum):
     """Estimator not converged: arming is disabled."""
     STANDBY = 1
     ARMED = 2
-
-
-class Mode(IntEnum):
-    """Flight modes."""
-
-    HOLD = 0
-    TAKEOFF = 1
-    OFFBOARD = 2
-    LAND = 3
-    RETURN = 4
-    POSITION = 5
-    """Requires pilot input, like all stick modes. Without input, PX4 brakes and descends to the
-    ground (measured): the offboard-loss fallback."""
-    MISSION = 6
-    MANUAL = 7
-    """Same as Stabilized for a multicopter."""
-    STABILIZED = 8
-    ACRO = 9
-    ALTITUDE = 10
-    ORBIT = 11
-    FOLLOW = 12
-    DESCEND = 13
-    """Level descent without a position estimate; selected by failsafes only."""
-    TERMINATION = 14
-    """The motors are stopped permanently."""
-    PRECISION_LAND = 15
-    """Landing on a reported landing target."""
-
-
-MODE_NAMES = {
-    Mode.HOLD: "Hold",
-    Mode.TAKEOFF: "Takeoff",
-    Mode.OFFBOARD: "Offboard",
-    Mode.LAND: "Land",
-    Mode.RETURN: "Return",
-    Mode.POSITION: "Position",
-    Mode.MISSION: "Mission",
-    Mode.MANUAL: "Manual",
-    Mode.STABILIZED: "Stabilized",
-    Mode.ACRO: "Acro",
-    Mode.ALTITUDE: "Altitude",
-    Mode.ORBIT: "Orbit",
-    Mode.FOLLOW: "Follow Target",
-    Mode.DESCEND: "Descend",
-    Mode.TERMINATION: "Termination",
-    Mode.PRECISION_LAND: "Precision Landing",
-}
-"""Mode names in PX4's texts."""
-
-
-WITH_STICKS = frozenset({Mode.POSITION, Mode.MANUAL, Mode.STABILIZED, Mode.ACRO, Mode.ALTITUDE})
-"""Modes that require pilot input."""
 
 
 class Landed(IntEnum):

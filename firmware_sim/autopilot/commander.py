@@ -7,74 +7,22 @@ behaviour of each mode.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, auto
 from typing import NamedTuple
 
 from firmware_sim.autopilot.autopilot_state import (
-    MODE_NAMES,
     Arming,
     CommanderStatus,
     Landed,
-    Mode,
     OperatorText,
     Result,
     Severity,
 )
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import ArmingReason, NavigationMode, words
+from firmware_sim.autopilot.events.definition import ArmingReason, words
 from firmware_sim.autopilot.events.definition import MavlinkEvent as Told
-
-MAIN_POSCTL, MAIN_AUTO, MAIN_ACRO, MAIN_OFFBOARD, MAIN_TERMINATION = 3, 4, 5, 6, 10
-
-_N = NavigationMode
-
-_NUMBERS: Mapping[Mode, tuple[int, int, int, NavigationMode]] = {
-    Mode.HOLD: (MAIN_AUTO, 3, 4, _N.AUTO_LOITER),
-    Mode.TAKEOFF: (MAIN_AUTO, 2, 17, _N.AUTO_TAKEOFF),
-    Mode.LAND: (MAIN_AUTO, 6, 18, _N.AUTO_LAND),
-    Mode.RETURN: (MAIN_AUTO, 5, 5, _N.AUTO_RTL),
-    Mode.OFFBOARD: (MAIN_OFFBOARD, 0, 14, _N.OFFBOARD),
-    Mode.POSITION: (MAIN_POSCTL, 0, 2, _N.POSCTL),
-    Mode.MISSION: (MAIN_AUTO, 4, 3, _N.AUTO_MISSION),
-    Mode.ORBIT: (MAIN_POSCTL, 1, 21, _N.ORBIT),
-    Mode.FOLLOW: (MAIN_AUTO, 8, 19, _N.AUTO_FOLLOW_TARGET),
-    Mode.MANUAL: (1, 0, 0, _N.MANUAL),
-    Mode.ALTITUDE: (2, 0, 1, _N.ALTCTL),
-    Mode.ACRO: (MAIN_ACRO, 0, 10, _N.ACRO),
-    Mode.STABILIZED: (7, 0, 15, _N.STAB),
-    Mode.DESCEND: (MAIN_AUTO, 6, 12, _N.UNKNOWN),  # PX4 reports it as Land
-    Mode.TERMINATION: (MAIN_TERMINATION, 0, 13, _N.UNKNOWN),
-    Mode.PRECISION_LAND: (MAIN_AUTO, 9, 20, _N.AUTO_PRECLAND),
-}
-"""Main mode, sub mode, navigation state (VehicleStatus.nav_state), number in messages."""
-
-MAIN_SUB = {mode: (main, sub) for mode, (main, sub, _, _) in _NUMBERS.items()}
-"""Main and sub mode."""
-
-NAVIGATION_STATES = {mode: state for mode, (_, _, state, _) in _NUMBERS.items()}
-
-_MORE_STATES = {
-    Mode.POSITION: 1 << 6,  # its slow variant
-    Mode.TAKEOFF: 1 << 22,  # a VTOL's, which no multicopter flies
-}
-
-STATE_BITS = {
-    mode: 1 << state | _MORE_STATES.get(mode, 0) for mode, state in NAVIGATION_STATES.items()
-}
-"""Navigation states of each mode as bits, as in the mode masks of checks."""
-
-
-def custom_mode(mode: Mode) -> int:
-    """Return PX4's custom_mode: main mode << 16 | sub mode << 24."""
-    main, sub = MAIN_SUB[mode]
-    return main << 16 | sub << 24
-
-
-def named(mode: Mode) -> NavigationMode:
-    """Return the number of a mode in messages."""
-    return _NUMBERS[mode][3]
+from firmware_sim.autopilot.flight_modes import Mode
 
 
 class FlightPhase(IntEnum):
@@ -191,8 +139,8 @@ def _ask(mode: Mode) -> TransitionCell:
 
 
 def _unavailable(mode: Mode) -> TransitionCell:
-    text = f"Switching to {MODE_NAMES[mode]} is currently not available"
-    event = events.MODE_NOT_AVAILABLE.event(custom_mode(mode), named(mode))
+    text = f"Switching to {mode.spec.title} is currently not available"
+    event = events.MODE_NOT_AVAILABLE.event(mode.spec.custom_mode, mode.spec.event)
     return TransitionCell(result=_TEMP, text=_critical(text, event))
 
 
@@ -214,9 +162,9 @@ def _disarm(reason: ArmingReason) -> TransitionCell:
 
 
 COMMANDED = {
-    Mode.LAND: OperatorText.of(Severity.INFO, events.LANDING_HERE),
-    Mode.PRECISION_LAND: _info("Precision landing", events.LANDING_PRECISELY.event()),
-    Mode.RETURN: OperatorText.of(Severity.INFO, events.RETURNING),
+    mode: OperatorText.of(Severity.INFO, mode.spec.command_event, text=mode.spec.command_text)
+    for mode in Mode
+    if mode.spec.command_event is not None
 }
 """Texts for modes with a separate MAVLink command, armed or not; DO_SET_MODE has no text."""
 
@@ -267,12 +215,6 @@ READINESS = tuple(
 """[phase][estimator healthy]: event to handle, None if the table ignores it. Looked up in every
 tick."""
 
-# Modes that are not restored after disarming, see `after_disarm`.
-_PASSING = {
-    *(Mode.TAKEOFF, Mode.LAND, Mode.PRECISION_LAND, Mode.RETURN),
-    *(Mode.ORBIT, Mode.FOLLOW, Mode.DESCEND),
-}
-
 
 @dataclass(frozen=True, slots=True)
 class EventOutcome:
@@ -296,7 +238,7 @@ def transition(flight: CommanderState, event: Ask | CommanderEvent) -> EventOutc
     phase = flight.phase if row.phase is None else row.phase
     moved = replace(flight, phase=phase)
     if row.choice is Choice.ASK:
-        lasting = flight.after_disarm if row.mode in _PASSING else row.mode
+        lasting = row.mode if row.mode.spec.lasting else flight.after_disarm
         moved = replace(
             moved, mode=row.mode, intended=row.mode, after_disarm=lasting, failsafe=False
         )

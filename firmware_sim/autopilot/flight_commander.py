@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
-from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Result, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.autopilot.commander import (
     Ask,
     CommanderEvent,
@@ -19,6 +19,7 @@ from firmware_sim.autopilot.commander import (
 )
 from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.guidance import Guidance, Home
 from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.requests import ModeRequest

@@ -10,12 +10,13 @@ import numpy as np
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, RateDemand
 from airl_mav.core.frames import Geodetic, Vector, geodetic_to_local, local_to_geodetic
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.error_state import SIGMA, P, V
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes import MODES
 from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, here
 from firmware_sim.autopilot.requests import ModeRequest

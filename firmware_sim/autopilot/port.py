@@ -13,13 +13,13 @@ from airl_mav.faults.kinds import Part
 from firmware_sim.autopilot.autopilot_state import (
     UNTOLD,
     AutopilotState,
-    Mode,
     OperatorText,
     Result,
     Setpoint,
     Wire,
 )
 from firmware_sim.autopilot.events.definition import MavlinkEvent
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, ModeRequest, ObstacleBins

@@ -11,16 +11,12 @@ from enum import IntFlag, auto
 from functools import lru_cache
 from typing import NamedTuple
 
-from firmware_sim.autopilot.autopilot_state import Mode, Severity
+from firmware_sim.autopilot.autopilot_state import Severity
 from firmware_sim.autopilot.events import check_events as events
 from firmware_sim.autopilot.events.check_events import CheckEvent
 from firmware_sim.autopilot.events.definition import Level
-from firmware_sim.autopilot.failsafes.failsafe_conditions import (
-    NEEDS,
-    BatteryWarning,
-    Conditions,
-    Need,
-)
+from firmware_sim.autopilot.failsafes.failsafe_conditions import BatteryWarning, Conditions
+from firmware_sim.autopilot.flight_modes import Mode, Need
 
 SUPPLY_CHECK_OFF = 894281
 """Value of CBRK_SUPPLY_CHK that disables the battery checks."""
@@ -134,7 +130,7 @@ def never(_readiness: Readiness) -> bool:
 
 
 def _needs(r: Readiness, need: Need) -> bool:
-    return bool(NEEDS[r.mode] & need)
+    return bool(r.mode.spec.needs & need)
 
 
 # Before convergence, another check explains the missing position.

@@ -16,13 +16,13 @@ from firmware_sim.autopilot.autopilot_state import (
     CommanderStatus,
     Health,
     MissionProgress,
-    Mode,
     OrbitStatus,
     Setpoint,
 )
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.flight_commander import FlightCommander
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.guidance import Guidance, Home
 from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.navigation.plan import MissionType, Plans

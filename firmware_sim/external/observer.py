@@ -9,17 +9,15 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Severity
-from firmware_sim.autopilot.commander import CommanderState, FlightPhase, custom_mode
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
+from firmware_sim.autopilot.commander import CommanderState, FlightPhase
+from firmware_sim.autopilot.flight_modes import BY_CUSTOM_MODE, Mode
 from firmware_sim.external.parameter_client import ParameterClient
 from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect, message_id
 from firmware_sim.mavlink.endpoint import Endpoint
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.streams import units
 from firmware_sim.mavlink.tlog import TlogWriter
-
-# PX4 reports Descend as Land.
-_PX4_MODES = {custom_mode(mode): mode for mode in Mode if mode is not Mode.DESCEND}
 
 # ArduCopter's mode numbers: ArduCopter/mode.h, enum class Number.
 GUIDED = 4
@@ -49,7 +47,7 @@ def flight_of(
         if mode is Mode.OFFBOARD and landed_state == dialect.MAV_LANDED_STATE_TAKEOFF:
             mode = Mode.TAKEOFF
     else:
-        mode = _PX4_MODES.get(custom_mode, Mode.POSITION)
+        mode = BY_CUSTOM_MODE.get(custom_mode, Mode.POSITION)
     if not armed:
         phase = FlightPhase.STANDBY if ready else FlightPhase.BOOT
     else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,19 +11,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.streams import Stream, stream
 from airl_mav.faults.fault import FOREVER_US, Fault, active, next_change_us
 from airl_mav.faults.kinds import Part
-from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import CommanderState, FlightPhase
-
-PHASE_OF_MODE: Mapping[Mode, str] = {
-    Mode.TAKEOFF: "climb",
-    Mode.HOLD: "hold",
-    Mode.OFFBOARD: "offboard",
-    Mode.MISSION: "mission",
-    Mode.RETURN: "return",
-    Mode.LAND: "landing",
-    Mode.PRECISION_LAND: "landing",
-}
-"""Flight phase in the air, by flight mode."""
 
 
 class Acting(NamedTuple):
@@ -49,7 +37,7 @@ class Acted(NamedTuple):
 def phase_of(flight: CommanderState) -> str | None:
     """Return the flight phase by the name used in faults; None = no fault starts in it."""
     if flight.phase is FlightPhase.AIR:
-        return PHASE_OF_MODE.get(flight.mode)
+        return flight.mode.spec.phase
     return None if flight.phase is FlightPhase.BOOT else "ground"
 
 

@@ -15,7 +15,6 @@ from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic, quat_yaw
 from airl_mav.vehicle import atmosphere
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
-from firmware_sim.autopilot.commander import NAVIGATION_STATES
 from firmware_sim.autopilot.optical_flow import (
     GREATEST_HEIGHT_M,
     GREATEST_RAD_S,
@@ -447,8 +446,8 @@ def status(moment: Moment) -> Values:
     status = moment.state.status
     return (
         ARMED if status.arming is Arming.ARMED else DISARMED,
-        NAVIGATION_STATES[status.intended_mode],
-        NAVIGATION_STATES[status.mode],
+        status.intended_mode.spec.state,
+        status.mode.spec.state,
         ROTARY_WING,
         status.failsafe,
         status.arming is not Arming.BOOT,

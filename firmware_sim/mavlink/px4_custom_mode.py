@@ -6,22 +6,10 @@ src/modules/mavlink/streams/HEARTBEAT.hpp, checked against a running PX4 1.16.
 
 from __future__ import annotations
 
-from firmware_sim.autopilot.autopilot_state import (
-    WITH_STICKS,
-    Arming,
-    CommanderStatus,
-    Mode,
-    OperatorText,
-    Severity,
-)
-from firmware_sim.autopilot.commander import (
-    MAIN_AUTO,
-    MAIN_POSCTL,
-    MAIN_SUB,
-    MAIN_TERMINATION,
-)
+from firmware_sim.autopilot.autopilot_state import Arming, CommanderStatus, OperatorText, Severity
 from firmware_sim.autopilot.events.definition import NavigationMode
 from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, MODE_NOT_AVAILABLE
+from firmware_sim.autopilot.flight_modes import MAIN_AUTO, MAIN_POSCTL, WITH_STICKS, Mode
 from firmware_sim.mavlink.codec import dialect
 
 _CRITICAL = Severity.CRITICAL
@@ -35,40 +23,28 @@ def _unavailable(name: str, mode: NavigationMode, main: int, sub: int) -> Operat
     return OperatorText.of(_CRITICAL, MODE_NOT_AVAILABLE, number, mode, text=text)
 
 
-# Modes that clients can request, by main mode; in AUTO and POSCTL by sub mode. Messages stand for
-# modes that a real PX4 knows by name but never makes available.
-_MAIN_MODES: dict[int, Mode | OperatorText] = {
-    main: mode
-    for mode, (main, sub) in MAIN_SUB.items()
-    if main not in (MAIN_AUTO, MAIN_TERMINATION) and sub == 0
-}
-_POSITION_MODES: dict[int, Mode | OperatorText] = {
-    **{sub: mode for mode, (main, sub) in MAIN_SUB.items() if main == MAIN_POSCTL},
-    2: _unavailable("Position Slow", NavigationMode.POSITION_SLOW, MAIN_POSCTL, 2),
-}
-_AUTO_MODES: dict[int, Mode | OperatorText] = {
-    **{
-        sub: mode
-        for mode, (main, sub) in MAIN_SUB.items()
-        if main == MAIN_AUTO and mode is not Mode.DESCEND
-    },
-    # Sub mode 0 of AUTO means Mission.
-    0: Mode.MISSION,
+# Modes by main and sub mode. Texts stand for modes that a real PX4 knows by name but never makes
+# available; a mode of the table replaces them.
+_REQUESTABLE: dict[tuple[int, int], Mode | OperatorText] = {
+    (MAIN_AUTO, 0): Mode.MISSION,
+    (MAIN_POSCTL, 2): _unavailable("Position Slow", NavigationMode.POSITION_SLOW, MAIN_POSCTL, 2),
     # External modes exist in PX4 only after a ROS 2 node registers them.
     **{
-        10 + n: _unavailable(f"External {n}", NavigationMode(15 + n), MAIN_AUTO, 10 + n)
+        (MAIN_AUTO, 10 + n): _unavailable(
+            f"External {n}", NavigationMode(15 + n), MAIN_AUTO, 10 + n
+        )
         for n in range(1, 9)
     },
+    **{(mode.spec.main, mode.spec.sub): mode for mode in Mode if mode.spec.requestable},
 }
 
 
 def base_mode(status: CommanderStatus) -> int:
     """Return the MAV_MODE_FLAG bits of HEARTBEAT."""
     bits: int = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-    # Acro alone does not stabilize the attitude.
-    if status.mode is not Mode.ACRO:
+    if status.mode.spec.stabilized:
         bits |= dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
-    if MAIN_SUB[status.mode][0] == MAIN_AUTO:
+    if status.mode.spec.main == MAIN_AUTO:
         bits |= dialect.MAV_MODE_FLAG_AUTO_ENABLED | dialect.MAV_MODE_FLAG_GUIDED_ENABLED
     if status.mode in WITH_STICKS:
         bits |= dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
@@ -101,22 +77,17 @@ def requested_mode(base: int, main: int, sub: int) -> Mode | OperatorText | None
     if not base & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
         # Clients without custom modes describe the mode by bits.
         return _from_base_mode(base)
-    if main == MAIN_AUTO:
-        return _AUTO_MODES.get(sub, _UNSUPPORTED)
-    if main == MAIN_POSCTL:
-        # PX4 treats an unknown sub mode of POSCTL as Position.
-        return _POSITION_MODES.get(sub, Mode.POSITION)
-    return _MAIN_MODES.get(main)
+    # PX4 treats an unknown sub mode of POSCTL as Position.
+    other = _UNSUPPORTED if main == MAIN_AUTO else _REQUESTABLE.get((main, 0))
+    return _REQUESTABLE.get((main, sub), other)
 
 
-def _from_base_mode(base: int) -> Mode | OperatorText | None:
+def _from_base_mode(base: int) -> Mode | None:
     """Return the mode that PX4 derives from the bits of clients without custom modes."""
     if base & dialect.MAV_MODE_FLAG_AUTO_ENABLED:
-        # Sub mode 4 is AUTO_MISSION in px4_custom_mode.h.
-        return _AUTO_MODES[4]
+        return Mode.MISSION
     if not base & dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED:
         return None
     if base & dialect.MAV_MODE_FLAG_GUIDED_ENABLED:
         return Mode.POSITION
-    # Main mode 7 is STABILIZED, 1 is MANUAL.
-    return _MAIN_MODES[7 if base & dialect.MAV_MODE_FLAG_STABILIZE_ENABLED else 1]
+    return Mode.STABILIZED if base & dialect.MAV_MODE_FLAG_STABILIZE_ENABLED else Mode.MANUAL

@@ -25,15 +25,15 @@ from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.vehicle import atmosphere
 from airl_mav.vehicle.rotation import rotate, yaw_of
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot import esc
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
+from firmware_sim.autopilot.failsafes import detectors
 from firmware_sim.engine.record import FLOWN_TICK, POSITION, TRAJECTORY, Fields, Record
 from firmware_sim.mavlink.codec import COMPONENT_ID, dialect, message_id
 from firmware_sim.mavlink.streams import units
 from firmware_sim.mavlink.streams.sensor_streams import clearance
 from firmware_sim.mavlink.streams.status import sensor_bits
 
-register_jitable(esc.current_a)
+register_jitable(detectors.current_a)
 
 Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
@@ -457,11 +457,11 @@ def _speed_controllers(v: Vector, row: Fields, context: Vector) -> None:
         if told:
             # Without feedback the output follows the command; a disarmed motor is off.
             output = row.motors[i] if armed else 0.0
-        v[_ESC_CDEG_1 + i] = units.int16((esc.IDLE_C + esc.SPAN_C * output) * 100.0)
-        v[_RPM_1 + i] = round(esc.RPM * output)
+        v[_ESC_CDEG_1 + i] = units.int16((detectors.IDLE_C + detectors.SPAN_C * output) * 100.0)
+        v[_RPM_1 + i] = round(detectors.RPM * output)
         # As in PX4, an armed motor draws its idle current, turning or not.
-        idle_a = esc.IDLE_A if told and armed else 0.0
-        v[_AMPERE_1 + i] = esc.current_a(output) if output > 0.0 else idle_a
+        idle_a = detectors.IDLE_A if told and armed else 0.0
+        v[_AMPERE_1 + i] = detectors.current_a(output) if output > 0.0 else idle_a
     v[_VOLT] = row.battery[0]
 
 

@@ -9,7 +9,8 @@ import pytest
 
 from airl_mav.core.frames import quat_to_euler
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed, Mode
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.parameter_store import Parameters
 from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
 

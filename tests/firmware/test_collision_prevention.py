@@ -10,7 +10,8 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Mode, Result
+from firmware_sim.autopilot.autopilot_state import Result
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.modes.collision_prevention import (
     BINS,

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_sim.autopilot.autopilot_state import MODE_NAMES, Mode, Result, Severity
+from firmware_sim.autopilot.autopilot_state import Result, Severity
 from firmware_sim.autopilot.commander import (
     READINESS,
     TABLE,
@@ -18,6 +18,7 @@ from firmware_sim.autopilot.commander import (
     FlightPhase,
     transition,
 )
+from firmware_sim.autopilot.flight_modes import Mode
 
 BOOT, STANDBY, GROUND, AIR = (
     FlightPhase.BOOT,
@@ -63,7 +64,7 @@ def disarmed(text: tuple[Severity, str]) -> Expected:
 
 
 def unavailable(mode: Mode) -> tuple[Severity, str]:
-    return (Severity.CRITICAL, f"Switching to {MODE_NAMES[mode]} is currently not available")
+    return (Severity.CRITICAL, f"Switching to {mode.spec.title} is currently not available")
 
 
 EXPECTED: dict[tuple[Ask | CommanderEvent, FlightPhase], Expected] = {

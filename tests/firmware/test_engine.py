@@ -18,9 +18,10 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Mode, Setpoint
+from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.failsafes.watch import Watch
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK, Record
 from firmware_sim.mavlink.codec import message_id
 from firmware_sim.mavlink.endpoint import MemoryEndpoint

@@ -19,10 +19,11 @@ from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.profiles.conditions import WindSettings
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Mode, Result
+from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.filter_filterpy import FilterpyFilter
 from firmware_sim.autopilot.filter_kernel import KernelFilter
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.fusion_horizon import NewFilter
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import ActuatorControls, SensorSample

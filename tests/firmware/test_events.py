@@ -18,8 +18,7 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Result, Severity
-from firmware_sim.autopilot.commander import STATE_BITS, custom_mode
+from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events
 from firmware_sim.autopilot.events.definition import (
     ENUMERATIONS,
@@ -34,8 +33,9 @@ from firmware_sim.autopilot.events.definition import (
 from firmware_sim.autopilot.events.health_report import ALL_MODES, HealthReport, health_report
 from firmware_sim.autopilot.failsafes.failsafe_actions import FailsafeAction as FailsafeAction
 from firmware_sim.autopilot.failsafes.failsafe_actions import FailsafeReason
-from firmware_sim.autopilot.failsafes.failsafe_conditions import NEEDS, Conditions, Need
+from firmware_sim.autopilot.failsafes.failsafe_conditions import Conditions
 from firmware_sim.autopilot.failsafes.framework import announcement
+from firmware_sim.autopilot.flight_modes import Mode, Need
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.prearm import ArmingSettings, Readiness, can_arm
 from firmware_sim.autopilot.sensor_monitor import ACCEL, BARO, GPS, GYRO, MAG, SensorWatch
@@ -116,7 +116,9 @@ def test_the_words_on_board_describe_every_event_and_enumeration() -> None:
     assert described == {sub_id(d.name): d.name for d in definitions()}
     assert component["enums"].keys() == ENUMERATIONS.keys()
     groups = component["navigation_mode_groups"]["groups"]
-    assert groups["4"] == [custom_mode(Mode.HOLD)] and groups["18"] == [custom_mode(Mode.LAND)]
+    assert groups["4"] == [Mode.HOLD.spec.custom_mode] and groups["18"] == [
+        Mode.LAND.spec.custom_mode
+    ]
     assert component["supported_protocols"] == ["health_and_arming_check"]
 
 
@@ -200,7 +202,7 @@ def test_a_failsafes_event_names_its_cause_and_what_follows(
     assert told.event is not None
     words, values = read(told.event)
     assert words == expected
-    assert not values or values[0] == custom_mode(Mode.OFFBOARD)
+    assert not values or values[0] == Mode.OFFBOARD.spec.custom_mode
 
 
 # --- the report
@@ -244,7 +246,7 @@ def test_a_check_of_the_position_leaves_modes_without_it() -> None:
 
 @pytest.mark.parametrize("mode", Mode)
 def test_the_report_agrees_with_what_arming_is_refused_for(mode: Mode) -> None:
-    if NEEDS[mode] & Need.NOT_ARMING:
+    if mode.spec.needs & Need.NOT_ARMING:
         pytest.skip("what no mode of its kind can do is told only in that mode")
     for faulty in (
         READY,
@@ -255,7 +257,9 @@ def test_the_report_agrees_with_what_arming_is_refused_for(mode: Mode) -> None:
         READY._replace(conditions=Conditions(offboard_control_signal_lost=False)),
     ):
         report, here = health_report(faulty), faulty._replace(mode=mode)
-        assert (report.can_arm & STATE_BITS[mode] == STATE_BITS[mode]) is not bool(can_arm(here))
+        assert (report.can_arm & mode.spec.state_bits == mode.spec.state_bits) is not bool(
+            can_arm(here)
+        )
 
 
 def test_a_vehicle_tells_what_has_changed_and_no_more() -> None:
@@ -392,7 +396,7 @@ def test_a_mode_that_is_not_available_is_refused_with_an_event() -> None:
     (refused,) = rig.ap.take_events()
     words, values = read(refused)
     assert words == "Switching to mode 'Offboard' is currently not possible"
-    assert values[0] == custom_mode(Mode.OFFBOARD)
+    assert values[0] == Mode.OFFBOARD.spec.custom_mode
     rig.close()
 
 

@@ -15,8 +15,8 @@ from mavsdk.plugins.action import Action
 from mavsdk.plugins.telemetry import Telemetry
 
 from airl_mav.core.clock import SimClock, WallClock
-from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.external.airframe_check import HITL_OUTPUT, px4_airframe
 from firmware_sim.external.boot_sequence import ExternalFlightController, ExternalFlightStack

@@ -18,8 +18,9 @@ from airl_mav.core.frames import HOME, Vector, geodetic_to_local, quat_wxyz_to_x
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from firmware_sim.autopilot.autopilot_state import Mode, Result
+from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.external_vision import Control, yaw_by_turn
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.crash_detector import TOUCHDOWN_M_S
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.interfaces import BatterySample, Odometry

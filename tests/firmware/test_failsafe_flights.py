@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from firmware_sim.autopilot.autopilot_state import Mode, Result
+from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from tests.support.flight_rig import Rig, flight, velocity_setpoint
 

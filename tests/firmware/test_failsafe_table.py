@@ -14,10 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.failsafes.failsafe_actions import FailsafeAction
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
-    NEEDS,
     BatteryWarning,
     Conditions,
     FailsafeSettings,
@@ -40,6 +38,7 @@ from firmware_sim.autopilot.failsafes.framework import (
     Intervention,
     update,
 )
+from firmware_sim.autopilot.flight_modes import Mode
 
 MS, S = 1_000, 1_000_000
 FINE = Conditions(
@@ -259,10 +258,6 @@ def test_every_trigger_has_a_row_and_every_value_of_its_parameter_an_answer() ->
             assert set(row.answers) == {0}
         else:
             assert row.parameter.lower() in FailsafeSettings._fields
-
-
-def test_every_mode_needs_something_known() -> None:
-    assert set(NEEDS) == set(Mode)
 
 
 _BAD: dict[str, Any] = {

@@ -19,8 +19,7 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import parameter_values
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.commander import NAVIGATION_STATES
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.flight_log.flight_log import GRID_US
 from firmware_sim.flight_log.topics import TOPICS
@@ -106,10 +105,6 @@ def test_a_killed_writer_leaves_a_readable_part(tmp_path: Path) -> None:
     times = topic(ULog(str(path) + ".part"), "t")["timestamp"]
     assert len(times) > 4_700
     assert np.all(np.diff(times) == 4_000)
-
-
-def test_every_mode_has_its_number() -> None:
-    assert set(NAVIGATION_STATES) == set(Mode)
 
 
 def test_parameters_that_change_after_the_log_was_closed_go_nowhere(tmp_path: Path) -> None:
@@ -201,7 +196,7 @@ def test_states_texts_and_parameters(flown: tuple[Path, ULog]) -> None:
     states = status["nav_state"][status["arming_state"] == 2]
     order = [int(state) for state, _ in groupby(states)]
     flown_modes = (Mode.TAKEOFF, Mode.HOLD, Mode.OFFBOARD, Mode.LAND)
-    assert order == [NAVIGATION_STATES[mode] for mode in flown_modes]
+    assert order == [mode.spec.state for mode in flown_modes]
     texts = [text.message for text in log.logged_messages]
     assert "Takeoff detected" in texts
     assert texts[-1] == "Disarmed by landing"

@@ -11,7 +11,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Result
+from firmware_sim.autopilot.autopilot_state import OperatorText, Result
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.navigation.fence import (
     PERIOD_US,
     Circle,

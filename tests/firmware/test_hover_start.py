@@ -16,8 +16,8 @@ from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
-from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.simulation import EpisodeSetup, HoverStart, Simulation
 
 ALTITUDE_M = 2.5

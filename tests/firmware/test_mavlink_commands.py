@@ -7,8 +7,8 @@ import math
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.autopilot.autopilot_state import Arming, Mode, Result
-from firmware_sim.autopilot.commander import custom_mode
+from firmware_sim.autopilot.autopilot_state import Arming, Result
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.navigation.plan import MissionType
 from tests.support.kinematic_autopilot import ORIGIN
 from tests.support.mavlink_clients import RawClient, Rig, text_of
@@ -137,7 +137,7 @@ def test_modes_for_a_pilot_and_round_a_target(
 ) -> None:
     assert rig.command(176, *params)[0] == ACCEPTED
     assert rig.autopilot.mode is mode
-    assert custom_mode(mode) >> 16 & 0xFF == params[1] or params[1] == 0
+    assert mode.spec.custom_mode >> 16 & 0xFF == params[1] or params[1] == 0
 
 
 def test_an_unknown_main_mode_is_accepted_and_changes_nothing(rig: Rig) -> None:

@@ -26,7 +26,8 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import HOME
-from firmware_sim.autopilot.autopilot_state import Arming, Mode, OperatorText, Setpoint, Severity
+from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Setpoint, Severity
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from tests.support.kinematic_autopilot import DEFAULT_PARAMETERS, ORIGIN, KinematicAutopilot

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from airl_mav.core.frames import local_to_geodetic
-from firmware_sim.autopilot.autopilot_state import Mode, Result
+from firmware_sim.autopilot.autopilot_state import Result
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.manual_control import ManualControl, Source, Sticks
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.requests import OrbitRequest, Reposition

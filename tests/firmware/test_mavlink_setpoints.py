@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.control.demand import AttitudeDemand, RateDemand
 from airl_mav.core.frames import local_to_geodetic
-from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.flight_modes import Mode
 from tests.support.kinematic_autopilot import ORIGIN
 from tests.support.mavlink_clients import Rig, text_of
 

@@ -14,15 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import EARTH_RADIUS_M, GRAVITY_M_S2, TICK_US, US_PER_S
 from airl_mav.profiles.parameters import SPECS
-from firmware_sim.autopilot.autopilot_state import (
-    Arming,
-    AutopilotState,
-    Health,
-    Landed,
-    Mode,
-    Setpoint,
-)
-from firmware_sim.autopilot.commander import custom_mode
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Health, Landed, Setpoint
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.interfaces import BatterySample
 from firmware_sim.mavlink.px4_custom_mode import (
     base_mode,
@@ -511,7 +504,7 @@ def test_heartbeat(
     autopilot.arming, autopilot.mode, autopilot.failsafe = arming, mode, failsafe
     snapshot = autopilot.state().status
     state = system_status(snapshot, can_arm=True)
-    assert (base_mode(snapshot), custom_mode(mode), state) == (
+    assert (base_mode(snapshot), mode.spec.custom_mode, state) == (
         base,
         custom,
         status,
@@ -524,7 +517,7 @@ def test_heartbeat(
 @pytest.mark.parametrize("mode", list(Mode))
 def test_a_requested_mode_is_the_reported_one(mode: Mode) -> None:
     """PX4: Descend is shown as Land, and termination cannot be requested as a mode."""
-    number = custom_mode(mode)
+    number = mode.spec.custom_mode
     requested = requested_mode(129, number >> 16 & 0xFF, number >> 24)
     alike = {Mode.DESCEND: Mode.LAND, Mode.TERMINATION: None}
     assert requested is alike.get(mode, mode)

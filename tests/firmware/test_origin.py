@@ -7,7 +7,8 @@ import pytest
 from mavsdk.plugins.action import Action
 
 from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic
-from firmware_sim.autopilot.autopilot_state import Mode, Result
+from firmware_sim.autopilot.autopilot_state import Result
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.mavlink.codec import dialect
 from tests.support.flight_rig import Rig
 from tests.support.kinematic_autopilot import ORIGIN

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from airl_mav.profiles.parameters import SPECS, ParameterSpec
-from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import onboard_link

@@ -19,8 +19,9 @@ from airl_mav.faults.kinds import FITTED_CASES, STANDS, Case
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from firmware_sim.autopilot.autopilot_state import Clearance, Mode, Result
+from firmware_sim.autopilot.autopilot_state import Clearance, Result
 from firmware_sim.autopilot.error_state import V
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.modes.land import landing_speed

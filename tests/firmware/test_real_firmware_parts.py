@@ -25,8 +25,8 @@ from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, RealFirmware
 from airl_mav.scenario.checks import check_firmware
 from airl_mav.scenario.model import LevelName
-from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.external.airframe_check import (
     SITL_OUTPUT,
     RequiredAirframe,

@@ -13,7 +13,8 @@ import pytest
 
 from airl_mav.core.constants import TICK_US
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Mode, Setpoint
+from firmware_sim.autopilot.autopilot_state import Setpoint
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import onboard_link

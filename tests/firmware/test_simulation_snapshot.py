@@ -21,8 +21,8 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import HAS_PYBULLET, Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.simulation import EpisodeSetup, HoverStart, Simulation
 from tests.support.flight_rig import velocity_setpoint
 

@@ -11,7 +11,7 @@ from tests.support.processes import run_alone
 PROGRAM = """
 import gc
 from numba.core.dispatcher import Dispatcher
-from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.flight_modes import Mode
 from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.warm_up import warm_up
 from tests.support.flight_rig import flight, velocity_setpoint

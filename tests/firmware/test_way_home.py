@@ -6,8 +6,9 @@ import math
 
 import pytest
 
-from firmware_sim.autopilot.autopilot_state import Mode, Result
+from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand, PlanItem, Plans
 from firmware_sim.autopilot.navigation.way_home import along_mission, landing_start, onwards
 from tests.support.flight_rig import Rig

@@ -14,8 +14,8 @@ from airl_mav.addons.fault_matrix.matrix import fly_fault
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
 from airl_mav.core.frames import quat_wxyz_to_xyzw, quat_yaw
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.recovery import EXPLAINED, EmergencyYaw, turn_to
 from firmware_sim.autopilot.yaw_estimator import WEIGHT, YAW, YawEstimator
 from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint

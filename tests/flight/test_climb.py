@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from airl_mav.core.constants import TICK_US
-from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.climb import Climb, ClimbLimits
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.smooth_trajectory import braking_speed
 from firmware_sim.engine.record import SETTLING
 from tests.support.flight_rig import flight

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import CommanderState, FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.crash_detector import is_crash
 from firmware_sim.plant.body import FLOOR
 from firmware_sim.plant.plant import Collision

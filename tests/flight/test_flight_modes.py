@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from airl_mav.core.frames import geodetic_to_local, quat_yaw
-from firmware_sim.autopilot.autopilot_state import Arming, Mode, Result, Setpoint
+from firmware_sim.autopilot.autopilot_state import Arming, Result, Setpoint
 from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.streams.status import heartbeat
 from tests.support.flight_rig import NAN, Rig, flight, quad, velocity_setpoint

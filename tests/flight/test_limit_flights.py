@@ -16,8 +16,8 @@ from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.piloting import TRANSPORT_US
 from companion.offboard_mission import MissionResult
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.lockstep_kit import demo_scenario, fly_as_companion
 

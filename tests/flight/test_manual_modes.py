@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from airl_mav.core.frames import quat_yaw
-from firmware_sim.autopilot.autopilot_state import Mode, Result
+from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.requests import FollowedTarget, OrbitRequest
 from tests.support.flight_rig import NAN, Rig, flight, velocity_setpoint

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from firmware_sim.autopilot.autopilot_state import Mode, Result
+from firmware_sim.autopilot.autopilot_state import Result
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand, PlanItem
 from tests.support.flight_rig import Rig, flight
 from tests.support.mission_kit import at, do

@@ -10,7 +10,8 @@ import pytest
 from airl_mav.control.demand import KIND_US, AttitudeDemand, RateDemand
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import quat_yaw
-from firmware_sim.autopilot.autopilot_state import Mode, Setpoint
+from firmware_sim.autopilot.autopilot_state import Setpoint
+from firmware_sim.autopilot.flight_modes import Mode
 from tests.support.flight_rig import NAN, Rig, flight, velocity_setpoint
 
 NOTHING = np.full(3, NAN)

@@ -23,8 +23,9 @@ from airl_mav.scenario.model import PilotSettings
 from airl_mav.scenario.piloting import TRANSPORT_US
 from companion.offboard_mission import MissionResult
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Mode, Result
+from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.lockstep_kit import demo_scenario, fly_as_companion
 from tests.support.ports import LOOPBACK, choose_ports

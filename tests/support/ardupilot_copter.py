@@ -22,7 +22,8 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.atmosphere import pressure_hpa, temperature_c
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Landed, Mode, Result, Setpoint
+from firmware_sim.autopilot.autopilot_state import Landed, Result, Setpoint
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 from tests.support.ardupilot_wire import State

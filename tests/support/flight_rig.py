@@ -18,7 +18,8 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint
+from firmware_sim.autopilot.autopilot_state import Result, Setpoint
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.interfaces import ActuatorControls, SensorSample, TrueState
 from firmware_sim.simulation import EpisodeSetup, Simulation
 

@@ -25,7 +25,6 @@ from firmware_sim.autopilot.autopilot_state import (
     Health,
     Landed,
     MissionProgress,
-    Mode,
     OperatorText,
     OrbitStatus,
     Result,
@@ -36,6 +35,7 @@ from firmware_sim.autopilot.autopilot_state import (
     Wire,
 )
 from firmware_sim.autopilot.events.definition import MavlinkEvent
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs, ParameterValue

@@ -12,7 +12,8 @@ from typing import Any
 from mavsdk import ComponentType, Configuration, Mavsdk
 
 from airl_mav.core.constants import TICK_US, US_PER_S
-from firmware_sim.autopilot.autopilot_state import Mode, Result
+from firmware_sim.autopilot.autopilot_state import Result
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, SharedEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link

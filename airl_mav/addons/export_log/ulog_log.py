@@ -17,8 +17,7 @@ from airl_mav.flight.quality import commanded_velocity
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import ATTITUDE, RATES, SETPOINT
 from airl_mav.report.replay.replayed_flight import INFO, STANDING_M, WARNING
-from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.commander import NAVIGATION_STATES
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.flight_log.flight_log import DESCRIBED
 from firmware_sim.flight_log.topics import ARMED, DISARMED, ON_CHANGE_US, ROTARY_WING, TOPICS
 from firmware_sim.flight_log.ulog_writer import Topic, UlogWriter, Values
@@ -220,7 +219,7 @@ def _states(flight: RecordedFlight, path: Trajectory) -> Iterator[Sample]:
         if (navigates, flies) == last and time_us < due_us:
             continue
         last, due_us = (navigates, flies), time_us + ON_CHANGE_US
-        mode = NAVIGATION_STATES[Mode.OFFBOARD if navigates else Mode.HOLD]
+        mode = (Mode.OFFBOARD if navigates else Mode.HOLD).spec.state
         status = row(
             "vehicle_status",
             arming_state=ARMED if flies else DISARMED,

@@ -11,17 +11,16 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.commander import STATE_BITS
 from firmware_sim.autopilot.events.check_events import ARMING_SUMMARY, HEALTH_SUMMARY
 from firmware_sim.autopilot.events.definition import Component, Level, MavlinkEvent
-from firmware_sim.autopilot.failsafes.failsafe_conditions import NEEDS, Need, lacking
+from firmware_sim.autopilot.failsafes.failsafe_conditions import lacking
+from firmware_sim.autopilot.flight_modes import Mode, Need
 from firmware_sim.autopilot.prearm import CHECKS, SUPPLY_CHECK_OFF, PrearmCheck, Readiness
 
 ALL_MODES = 0xFFFFFFFF
 
-EXTERNAL_MODES = 0xFF << 23
-"""Eight external modes, which are not supported."""
+EXTERNAL_MODES = 0xFF << 23 & ~sum(mode.spec.state_bits for mode in Mode)
+"""PX4's eight external modes, except those of the table."""
 
 REPORT_US = 2 * US_PER_S
 """Minimum time between two reports of changes [µs] (PX4's reporting interval)."""
@@ -115,14 +114,14 @@ def _cannot_run(readiness: Readiness) -> int:
 
 
 def _modes_needing(need: Need) -> int:
-    modes = [mode for mode in Mode if NEEDS[mode] & need]
+    modes = [mode for mode in Mode if mode.spec.needs & need]
     return ALL_MODES if len(modes) == len(Mode) else _bits(modes)
 
 
 def _bits(modes: Iterable[Mode]) -> int:
     bits = 0
     for mode in modes:
-        bits |= STATE_BITS[mode]
+        bits |= mode.spec.state_bits
     return bits
 
 

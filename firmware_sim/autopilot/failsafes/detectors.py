@@ -10,8 +10,21 @@ from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from firmware_sim.autopilot.error_state import Q
-from firmware_sim.autopilot.esc import current_a
 from firmware_sim.interfaces import BatterySample
+
+RPM = 6_000
+"""Motor speed at full command, as reported by the speed controllers [rpm].
+
+Source: PX4 1.16, SimulatorMavlink::send_esc_telemetry. Like PX4, the simulation does not model it.
+"""
+IDLE_A, SPAN_A = 1.0, 15.0
+IDLE_C, SPAN_C = 20.0, 40.0
+"""Current [A] and temperature [°C] of a motor at minimum speed, and their rise at full command."""
+
+
+def current_a(output: float) -> float:
+    """Return the current [A] of a healthy motor at this command 0..1."""
+    return IDLE_A + SPAN_A * output if output > 0.0 else 0.0
 
 
 class Undercurrent(NamedTuple):

@@ -6,10 +6,10 @@ Source: PX4 1.16, msg/FailsafeFlags.msg and commander/ModeUtil/mode_requirements
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import IntEnum, IntFlag, auto
+from enum import IntEnum
 from typing import NamedTuple
 
-from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.flight_modes import Mode, Need
 
 LONGEST_S = 1e6
 """Limit of every value, so that times in microseconds do not overflow [s]."""
@@ -116,53 +116,9 @@ class Conditions(NamedTuple):
     fd_motor_failure: bool = False
 
 
-class Need(IntFlag):
-    """Requirements of flight modes."""
-
-    ANGULAR_VELOCITY = auto()
-    ATTITUDE = auto()
-    ALTITUDE = auto()
-    LOCAL_POSITION = auto()
-    LOCAL_POSITION_RELAXED = auto()
-    GLOBAL_POSITION = auto()
-    HOME = auto()
-    MISSION = auto()
-    OFFBOARD_SIGNAL = auto()
-    MANUAL_CONTROL = auto()
-    """Pilot input. Its loss does not end a mode: a separate failsafe handles it."""
-    CALM_AND_TIME = auto()
-    """Wind and flight time within limits; separate failsafes handle violations."""
-    NOT_ARMING = auto()
-    """Arming is not possible in this mode."""
-
-
-_LEVEL = Need.ANGULAR_VELOCITY | Need.ATTITUDE
-_GUIDED = _LEVEL | Need.LOCAL_POSITION | Need.ALTITUDE
-_PILOTED = _LEVEL | Need.LOCAL_POSITION_RELAXED | Need.ALTITUDE
-
-NEEDS: dict[Mode, Need] = {
-    Mode.HOLD: _GUIDED | Need.GLOBAL_POSITION | Need.CALM_AND_TIME,
-    Mode.TAKEOFF: _GUIDED,
-    Mode.OFFBOARD: _LEVEL | Need.OFFBOARD_SIGNAL,
-    Mode.LAND: _PILOTED | Need.NOT_ARMING,
-    Mode.RETURN: _GUIDED | Need.GLOBAL_POSITION | Need.HOME | Need.NOT_ARMING,
-    Mode.POSITION: _PILOTED | Need.MANUAL_CONTROL,
-    Mode.ALTITUDE: _LEVEL | Need.ALTITUDE | Need.MANUAL_CONTROL,
-    Mode.STABILIZED: _LEVEL | Need.MANUAL_CONTROL,
-    Mode.MISSION: _GUIDED | Need.GLOBAL_POSITION | Need.MISSION | Need.CALM_AND_TIME,
-    Mode.ORBIT: _GUIDED | Need.NOT_ARMING | Need.CALM_AND_TIME,
-    Mode.FOLLOW: _GUIDED | Need.NOT_ARMING | Need.CALM_AND_TIME,
-    Mode.MANUAL: Need.MANUAL_CONTROL,
-    Mode.ACRO: Need.ANGULAR_VELOCITY | Need.MANUAL_CONTROL,
-    Mode.DESCEND: _LEVEL | Need.NOT_ARMING,
-    Mode.TERMINATION: Need.NOT_ARMING,
-    Mode.PRECISION_LAND: _GUIDED | Need.NOT_ARMING,
-}
-"""Requirements of each mode."""
-
 # Plain integers: combining flag members is slow.
 _FLYING = int(~(Need.MANUAL_CONTROL | Need.CALM_AND_TIME | Need.NOT_ARMING))
-_NEEDS = {mode: int(needs) for mode, needs in NEEDS.items()}
+_NEEDS = {mode: int(mode.spec.needs) for mode in Mode}
 _LACKED_BY: dict[str, int] = {
     "angular_velocity_invalid": Need.ANGULAR_VELOCITY.value,
     "attitude_invalid": Need.ATTITUDE.value,

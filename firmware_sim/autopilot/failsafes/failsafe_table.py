@@ -12,7 +12,6 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.failsafes.failsafe_actions import (
     Clear,
     FailsafeAction,
@@ -22,13 +21,12 @@ from firmware_sim.autopilot.failsafes.failsafe_actions import (
 )
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     FLIGHT_TERMINATION_OFF,
-    NEEDS,
     BatteryWarning,
     Conditions,
     FailsafeSettings,
-    Need,
     can_run,
 )
+from firmware_sim.autopilot.flight_modes import Mode, Need
 
 MODE_OF_ACTION = {
     FailsafeAction.FALLBACK_POSITION: Mode.POSITION,
@@ -78,7 +76,7 @@ def mode_fallback(
     """Return the replacement of an intended mode that cannot run; NONE = it can."""
     action, mode = FailsafeAction.NONE, intended
     # Replacements in sequence: offboard loss first, then modes that cannot run.
-    if conditions.offboard_control_signal_lost and NEEDS[mode] & Need.OFFBOARD_SIGNAL:
+    if conditions.offboard_control_signal_lost and mode.spec.needs & Need.OFFBOARD_SIGNAL:
         action, next_mode = OFFBOARD_LOSS.get(settings.com_obl_rc_act, OFFBOARD_LOSS[0])
         if next_mode is None:
             return action

@@ -10,8 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Severity
-from firmware_sim.autopilot.commander import custom_mode
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import FailsafeCause, MavlinkEvent
 from firmware_sim.autopilot.failsafes.failsafe_actions import (
@@ -35,6 +34,7 @@ from firmware_sim.autopilot.failsafes.failsafe_table import (
     mode_of,
     possible,
 )
+from firmware_sim.autopilot.flight_modes import Mode
 
 _WARNINGS = {
     FailsafeReason.BATTERY_LOW: events.FAILSAFE_BATTERY_LOW,
@@ -76,11 +76,11 @@ def announcement(
     text = "Failsafe activated"
     if waits:
         text = f"{text}: entering Hold for {seconds} seconds"
-        event = _wait(delayed, cause, custom_mode(intended), seconds)
+        event = _wait(delayed, cause, intended.spec.custom_mode, seconds)
     elif action is FailsafeAction.WARN:
-        event = _warning(cause, custom_mode(intended))
+        event = _warning(cause, intended.spec.custom_mode)
     else:
-        event = _beginning(action, cause, custom_mode(intended))
+        event = _beginning(action, cause, intended.spec.custom_mode)
     return OperatorText(Severity.CRITICAL, text, event)
 
 

@@ -6,20 +6,19 @@ from collections.abc import Iterable, Sequence
 
 from airl_mav.profiles.parameters import SPEC_BY_NAME
 from firmware_sim.autopilot import prearm
-from firmware_sim.autopilot.autopilot_state import MODE_NAMES, Mode
 from firmware_sim.autopilot.failsafes.failsafe_actions import (
     Clear,
     FailsafeAction,
     Options,
     Takeover,
 )
-from firmware_sim.autopilot.failsafes.failsafe_conditions import NEEDS
 from firmware_sim.autopilot.failsafes.failsafe_table import (
     MODE_OF_ACTION,
     OFFBOARD_LOSS,
     TABLE,
     Row,
 )
+from firmware_sim.autopilot.flight_modes import Mode
 
 ACTION_NAMES = {
     FailsafeAction.NONE: "nothing",
@@ -115,10 +114,10 @@ def needs() -> str:
     """Return the requirements of each mode."""
 
     def words(mode: Mode) -> str:
-        names = [need.name or "" for need in NEEDS[mode]]
+        names = [need.name or "" for need in mode.spec.needs]
         return ", ".join(name.lower().replace("_", " ") for name in names)
 
-    return _table(("mode", "needs"), ((MODE_NAMES[mode], words(mode)) for mode in NEEDS))
+    return _table(("mode", "needs"), ((mode.spec.title, words(mode)) for mode in Mode))
 
 
 def checks() -> str:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot import prearm
-from firmware_sim.autopilot.autopilot_state import Health, Mode, OperatorText, Setpoint, Severity
+from firmware_sim.autopilot.autopilot_state import Health, OperatorText, Setpoint, Severity
 from firmware_sim.autopilot.commander import CommanderState, FlightPhase
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
@@ -23,7 +23,6 @@ from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
     Conditions,
     FailsafeSettings,
-    Need,
     lacking,
 )
 from firmware_sim.autopilot.failsafes.framework import (
@@ -34,6 +33,7 @@ from firmware_sim.autopilot.failsafes.framework import (
     update,
 )
 from firmware_sim.autopilot.failsafes.watch import Watch
+from firmware_sim.autopilot.flight_modes import Mode, Need
 from firmware_sim.autopilot.prearm import ArmingSettings, PrearmCheck, Readiness
 from firmware_sim.autopilot.sensor_monitor import NO_DATA_US
 from firmware_sim.interfaces import SensorSample

@@ -8,12 +8,13 @@ from __future__ import annotations
 from airl_mav.control.demand import RateDemand
 from airl_mav.core.constants import DEG
 from airl_mav.core.frames import Vector
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode
 from firmware_sim.autopilot.modes.stabilized import IDLE_THROTTLE, RELEASED
 from firmware_sim.autopilot.modes.stick_motion import superexpo
 
 
-class Acro(FlightMode):
+class Acro(FlightMode, modes=(Mode.ACRO,)):
     """Body rates proportional to the sticks, and thrust linear in the throttle stick."""
 
     def __init__(self, context: FlightContext, /) -> None:

@@ -6,13 +6,14 @@ import math
 
 from airl_mav.core.constants import DEG, GRAVITY_M_S2
 from airl_mav.core.frames import Vector
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.autopilot.modes.interface import NAN
 from firmware_sim.autopilot.modes.piloted import Piloted
 from firmware_sim.autopilot.modes.stick_motion import AxisDemand
 
 
-class Altitude(Piloted):
+class Altitude(Piloted, modes=(Mode.ALTITUDE,)):
     """Tilt proportional to the sticks."""
 
     def _steer(

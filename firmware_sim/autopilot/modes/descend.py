@@ -8,11 +8,12 @@ from __future__ import annotations
 from airl_mav.control.demand import Demand
 from airl_mav.core.frames import Vector, quat_yaw
 from firmware_sim.autopilot.error_state import RATES, Q
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes.interface import FREE, NAN, FlightContext, FlightMode
 from firmware_sim.autopilot.requests import ModeRequest
 
 
-class Descend(FlightMode):
+class Descend(FlightMode, modes=(Mode.DESCEND,)):
     """Level descent at MPC_LAND_SPEED with constant heading."""
 
     def __init__(self, context: FlightContext, /) -> None:

@@ -12,6 +12,7 @@ from airl_mav.control.demand import AnyDemand
 from airl_mav.core.constants import DEG, US_PER_S
 from airl_mav.core.frames import Vector, quat_yaw
 from firmware_sim.autopilot.error_state import RATES, P, Q
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes.hold import Hold
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
 from firmware_sim.autopilot.requests import ModeRequest
@@ -24,7 +25,7 @@ WALKS_M_S = 1.0
 """Minimum speed at which a target has a course; below it, the last course applies [m/s]."""
 
 
-class Follow(FlightMode):
+class Follow(FlightMode, modes=(Mode.FOLLOW,)):
     """Follow mode: keeps a position relative to the target's course, nose towards the target."""
 
     def __init__(self, context: FlightContext, /) -> None:

@@ -9,6 +9,7 @@ from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.climb import SETTLED_M
 from firmware_sim.autopilot.error_state import P, V
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes.interface import (
     FREE,
     NAN,
@@ -26,7 +27,7 @@ STANDING_M_S = 0.3
 """Speed below which the vehicle counts as stopped, and Hold keeps the position [m/s]."""
 
 
-class Hold(FlightMode):
+class Hold(FlightMode, modes=(Mode.HOLD,)):
     """Hold mode: brakes, then holds the position of the stop."""
 
     def __init__(self, context: FlightContext, /) -> None:

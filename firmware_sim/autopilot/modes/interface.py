@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, RateDemand
 from airl_mav.core.constants import US_PER_S
@@ -14,6 +14,7 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Clearance, OperatorText, OrbitStatus, Setpoint
 from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.error_state import RATES, P, Q
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.autopilot.navigation.plan import STANDING, Triplet
 from firmware_sim.autopilot.requests import (
@@ -105,12 +106,21 @@ class FlightContext:
         return self.height(state) if math.isnan(ground_m) else ground_m
 
 
+IMPLEMENTATIONS: dict[Mode, type[FlightMode]] = {}
+"""Implementations of the flight modes imported so far."""
+
+
 class FlightMode(Protocol):
     """Interface of a flight mode, created once per vehicle and entered repeatedly.
 
     Modes inherit the defaults. `state` is always the estimator's newest nominal state
     (`error_state`).
     """
+
+    def __init_subclass__(cls, modes: tuple[Mode, ...] = (), **options: Any) -> None:
+        """Register the class as the implementation of flight modes."""
+        super().__init_subclass__(**options)
+        IMPLEMENTATIONS.update(dict.fromkeys(modes, cls))
 
     def __init__(self, context: FlightContext, /) -> None: ...
 

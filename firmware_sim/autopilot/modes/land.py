@@ -9,6 +9,7 @@ from airl_mav.control.demand import Demand
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.error_state import P, V
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes.interface import (
     FREE,
     NAN,
@@ -28,7 +29,7 @@ SLOW_BELOW_M = 0.5
 """Margin below MPC_LAND_ALT2 that exceeds the estimate's error [m]."""
 
 
-class Land(FlightMode):
+class Land(FlightMode, modes=(Mode.LAND,)):
     """Land mode: descends at the position of the stop, with PX4's decreasing speed."""
 
     def __init__(self, context: FlightContext, /) -> None:

@@ -8,6 +8,7 @@ from airl_mav.control.demand import AnyDemand
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.error_state import P, V
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
 from firmware_sim.autopilot.modes.land import landing_speed
 from firmware_sim.autopilot.modes.precision_land import PrecisionLand
@@ -25,7 +26,7 @@ _MOVES_M_S = 0.5
 """Minimum speed to turn the nose along the path [m/s] (MPC_YAW_MODE = 3)."""
 
 
-class Mission(FlightMode):
+class Mission(FlightMode, modes=(Mode.MISSION,)):
     """Mission mode: follows `FlightContext.triplet` with PX4's speeds at and between waypoints."""
 
     def __init__(self, context: FlightContext, /) -> None:

@@ -16,6 +16,7 @@ from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.error_state import RATES
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes.hold import Hold
 from firmware_sim.autopilot.modes.interface import (
     FREE,
@@ -36,7 +37,7 @@ HOVER = Demand(FREE, (0.0, 0.0, 0.0), NAN, NAN)
 """PX4's fallback for a setpoint with an uncommanded axis (PositionControl::inputValid)."""
 
 
-class Offboard(FlightMode):
+class Offboard(FlightMode, modes=(Mode.OFFBOARD,)):
     """Offboard mode: flies the newest setpoint; holds position before the first."""
 
     def __init__(self, context: FlightContext, /) -> None:

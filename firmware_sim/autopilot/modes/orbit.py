@@ -15,6 +15,7 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import OperatorText, OrbitStatus, Severity
 from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.events import flight_events as events
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes.interface import (
     NAN,
     FlightContext,
@@ -45,7 +46,7 @@ class Facing(IntEnum):
     UNCHANGED = 5
 
 
-class Orbit(FlightMode):
+class Orbit(FlightMode, modes=(Mode.ORBIT,)):
     """Orbit mode: flies to the circle, then along it."""
 
     def __init__(self, context: FlightContext, /) -> None:

@@ -6,6 +6,7 @@ from functools import partial
 
 from airl_mav.core.frames import Vector, quat_yaw
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.autopilot.modes.collision_prevention import CollisionPrevention
 from firmware_sim.autopilot.modes.interface import FlightContext, triple
@@ -14,7 +15,7 @@ from firmware_sim.autopilot.modes.stick_motion import AxisDemand, HorizontalStic
 from firmware_sim.autopilot.requests import ModeRequest
 
 
-class Position(Piloted):
+class Position(Piloted, modes=(Mode.POSITION,)):
     """Motion commanded by the sticks."""
 
     def __init__(self, context: FlightContext, /) -> None:

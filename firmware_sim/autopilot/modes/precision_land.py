@@ -13,6 +13,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.error_state import P
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
 from firmware_sim.autopilot.modes.land import landing_speed
 from firmware_sim.autopilot.requests import LandingTarget, ModeRequest
@@ -52,7 +53,7 @@ class _State(Enum):
 _DOWNWARDS = (_State.DESCEND, _State.FINAL, _State.FALLBACK)
 
 
-class PrecisionLand(FlightMode):
+class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
     """Precision landing mode: finds the target and lands on it; without one, lands in place."""
 
     def __init__(self, context: FlightContext, /) -> None:

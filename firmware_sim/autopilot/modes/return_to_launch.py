@@ -15,6 +15,7 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.events import flight_events as events
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, triple
 from firmware_sim.autopilot.modes.land import landing_speed
 from firmware_sim.autopilot.modes.mission import Mission
@@ -36,7 +37,7 @@ class _Stage(Enum):
     LAND = auto()
 
 
-class ReturnToLaunch(FlightMode):
+class ReturnToLaunch(FlightMode, modes=(Mode.RETURN,)):
     """Return mode: climbs, flies home and lands."""
 
     def __init__(self, context: FlightContext, /) -> None:

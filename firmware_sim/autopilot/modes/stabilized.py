@@ -13,6 +13,7 @@ from airl_mav.core.constants import DEG
 from airl_mav.core.frames import Vector, quat_yaw, wrap_pi
 from airl_mav.vehicle.rotation import multiply
 from firmware_sim.autopilot.error_state import RATES, Q
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, since
 from firmware_sim.autopilot.requests import ModeRequest
@@ -24,7 +25,7 @@ RELEASED = Sticks(0.0, 0.0, 0.0, 0.0)
 """Centred sticks, used after stick loss until the failsafe acts."""
 
 
-class Stabilized(FlightMode):
+class Stabilized(FlightMode, modes=(Mode.MANUAL, Mode.STABILIZED)):
     """Tilt proportional to the sticks, thrust from the throttle stick."""
 
     def __init__(self, context: FlightContext, /) -> None:

@@ -7,6 +7,7 @@ from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.climb import ClimbLimits
 from firmware_sim.autopilot.error_state import V
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes.interface import (
     FREE,
     NAN,
@@ -23,7 +24,7 @@ LEAST_CLIMB_M = 0.1
 """Minimum height of a take-off above the standing vehicle; below it, the vehicle stays [m]."""
 
 
-class Takeoff(FlightMode):
+class Takeoff(FlightMode, modes=(Mode.TAKEOFF,)):
     """Take-off mode: climbs to `FlightContext.takeoff_altitude_m`, slowly near the ground."""
 
     def __init__(self, context: FlightContext, /) -> None:

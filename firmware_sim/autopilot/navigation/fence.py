@@ -16,9 +16,10 @@ import numpy as np
 
 from airl_mav.core.frames import Geodetic, local_to_geodetic
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import FenceStatus, Mode, OperatorText, Severity
+from firmware_sim.autopilot.autopilot_state import FenceStatus, OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Definition
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.navigation.flown_item import ExecutorState
 from firmware_sim.autopilot.navigation.plan import (
     MissionType,

@@ -9,11 +9,12 @@ import numpy as np
 
 from airl_mav.core.frames import Geodetic, local_to_geodetic
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Mode, OperatorText, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.failsafes.failsafe_conditions import FenceBreach
 from firmware_sim.autopilot.failsafes.watch import Reports
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes.interface import FlightContext
 from firmware_sim.autopilot.navigation.executor import PERIOD_US, Crew, MissionExecutor
 from firmware_sim.autopilot.navigation.feasibility import FeasibilityResult, check

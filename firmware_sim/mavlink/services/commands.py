@@ -20,8 +20,9 @@ from airl_mav.core.frames import Geodetic, geodetic_to_local
 from airl_mav.faults.fault import Fault
 from airl_mav.faults.kinds import MOTORS, Part
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Arming, Mode, OperatorText, Result, Severity
+from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.navigation.plan import NavCommand
 from firmware_sim.autopilot.requests import OrbitRequest, PositionYaw, Reposition
 from firmware_sim.mavlink.codec import WireMessage, dialect
@@ -35,7 +36,6 @@ from firmware_sim.mavlink.services.context import (
     for_vehicle,
     sender,
 )
-from firmware_sim.mavlink.streams.information import KNOWN
 from firmware_sim.mavlink.streams.units import INT32_MAX
 
 NAN = math.nan
@@ -357,14 +357,12 @@ def _change_mode(base: int, main: int, sub: int, context: Context) -> Result:
 
 def _set_standard_mode(command: VehicleCommand, context: Context) -> Result:
     """Handle DO_SET_STANDARD_MODE, parameter 1: MAV_STANDARD_MODE; FAILED if unsupported."""
-    asked = command.integer(1) or 0
+    asked, custom = command.integer(1) or 0, dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     # NON_STANDARD is 0, also the value of an unset parameter.
     if asked != dialect.MAV_STANDARD_MODE_NON_STANDARD:
-        for known in KNOWN:
-            if known.standard == asked:
-                return _change_mode(
-                    dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, known.main, known.sub, context
-                )
+        for mode in Mode:
+            if mode.spec.standard == asked:
+                return _change_mode(custom, mode.spec.main, mode.spec.sub, context)
     return Result.FAILED
 
 

@@ -17,7 +17,6 @@ from typing import Any
 
 from airl_mav.profiles.parameters import SPECS, ParameterSpec
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.autopilot.commander import STATE_BITS, custom_mode
 from firmware_sim.autopilot.events import check_events, flight_events
 from firmware_sim.autopilot.events.check_events import CheckEvent
 from firmware_sim.autopilot.events.definition import (
@@ -28,6 +27,7 @@ from firmware_sim.autopilot.events.definition import (
     sub_id,
     words,
 )
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.services.context import Context, VehicleCommand
 from firmware_sim.mavlink.services.transfers import crc32part
@@ -177,9 +177,9 @@ def _modes_of_groups() -> dict[str, list[int]]:
     """Return the custom modes by bit number of the mode groups in checks."""
     groups = {group.value for group in ModeGroup}
     # A mode can have several bits in the checks; its lowest bit names the group.
-    lowest = {mode: bits & -bits for mode, bits in STATE_BITS.items()}
+    lowest = {mode: mode.spec.state_bits & -mode.spec.state_bits for mode in Mode}
     return {
-        str(bit.bit_length() - 1): [custom_mode(mode)]
+        str(bit.bit_length() - 1): [mode.spec.custom_mode]
         for mode, bit in lowest.items()
         if bit in groups
     }

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 from airl_mav.core.frames import geodetic_to_local
-from firmware_sim.autopilot.autopilot_state import AutopilotState, Landed, Mode
-from firmware_sim.autopilot.commander import custom_mode
+from firmware_sim.autopilot.autopilot_state import AutopilotState, Landed
+from firmware_sim.autopilot.flight_modes import BY_CUSTOM_MODE, ModeSpec
 from firmware_sim.autopilot.navigation.return_path import return_time_s
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams.units import boot_ms
@@ -59,73 +58,29 @@ def time_estimate_to_target(state: AutopilotState, value: Callable[[str], float]
     return int(took) if math.isfinite(took) else _UNKNOWN_TIME, *unknown
 
 
-class KnownMode(NamedTuple):
-    """Flight mode of PX4."""
-
-    main: int
-    """Main mode of custom_mode."""
-    sub: int
-    standard: int = dialect.MAV_STANDARD_MODE_NON_STANDARD
-    """Value of MAV_STANDARD_MODE."""
-    name: str = ""
-    """Name of the mode; empty if the standard mode implies it."""
-    properties: int = dialect.MAV_MODE_PROPERTY_ADVANCED
-    """Bits of MAV_MODE_PROPERTY."""
-
-    @property
-    def custom_mode(self) -> int:
-        """Value of PX4's custom_mode."""
-        return self.main << 16 | self.sub << 24
-
-
-KNOWN = (
-    KnownMode(1, 0, name="Manual"),
-    KnownMode(2, 0, dialect.MAV_STANDARD_MODE_ALTITUDE_HOLD, properties=0),
-    KnownMode(3, 0, dialect.MAV_STANDARD_MODE_POSITION_HOLD, properties=0),
-    KnownMode(4, 4, dialect.MAV_STANDARD_MODE_MISSION),
-    KnownMode(4, 3, name="Hold"),
-    KnownMode(4, 5, dialect.MAV_STANDARD_MODE_SAFE_RECOVERY),
-    KnownMode(3, 2, name="Position Slow"),
-    KnownMode(5, 0, name="Acro"),
-    KnownMode(
-        10,
-        0,
-        name="Termination",
-        properties=dialect.MAV_MODE_PROPERTY_ADVANCED
-        | dialect.MAV_MODE_PROPERTY_NOT_USER_SELECTABLE,
-    ),
-    KnownMode(6, 0, name="Offboard"),
-    KnownMode(7, 0, name="Stabilized"),
-    KnownMode(4, 2, dialect.MAV_STANDARD_MODE_TAKEOFF),
-    KnownMode(4, 6, dialect.MAV_STANDARD_MODE_LAND),
-    KnownMode(4, 8, name="Follow Target"),
-    KnownMode(4, 9, name="Precision Landing"),
-    KnownMode(3, 1, dialect.MAV_STANDARD_MODE_ORBIT),
-)
-"""PX4's multicopter modes, in PX4's order (vehicle_status.nav_state)."""
-
-_STANDARD = {known.custom_mode: known.standard for known in KNOWN}
-
-
-def existing() -> tuple[KnownMode, ...]:
-    """Return the modes supported here."""
-    ours = {custom_mode(mode) for mode in Mode}
-    return tuple(known for known in KNOWN if known.custom_mode in ours)
+AVAILABLE = tuple(sorted(BY_CUSTOM_MODE.values(), key=lambda mode: mode.spec.state))
+"""Modes as clients distinguish them, in the order of AVAILABLE_MODES."""
 
 
 def available_modes() -> list[tuple[int, int, int, int, int, bytes]]:
-    """Return the fields of AVAILABLE_MODES for each supported mode, in order."""
-    modes = existing()
+    """Return the fields of AVAILABLE_MODES for each mode, in order."""
     # The count and the number of each mode, starting at 1, in every message.
     return [
-        (len(modes), number, known.standard, known.custom_mode, known.properties, name)
-        for number, known in enumerate(modes, start=1)
-        for name in (known.name.encode("ascii"),)
+        (len(AVAILABLE), number, spec.standard, spec.custom_mode, _properties(spec), name)
+        for number, spec in enumerate((mode.spec for mode in AVAILABLE), start=1)
+        # A standard mode implies its name.
+        for name in (b"" if spec.standard else spec.title.encode("ascii"),)
     ]
+
+
+def _properties(spec: ModeSpec) -> int:
+    """Return the bits of MAV_MODE_PROPERTY."""
+    advanced: int = dialect.MAV_MODE_PROPERTY_ADVANCED if spec.advanced else 0
+    hidden: int = 0 if spec.requestable else dialect.MAV_MODE_PROPERTY_NOT_USER_SELECTABLE
+    return advanced | hidden
 
 
 def current_mode(state: AutopilotState) -> Values:
     """Return the active mode and the mode requested by the user."""
-    status = state.status
-    intended = custom_mode(status.intended_mode)
-    return _STANDARD.get(intended, 0), custom_mode(status.mode), intended
+    active, intended = state.status.mode.spec, state.status.intended_mode.spec
+    return intended.standard, active.custom_mode, intended.custom_mode

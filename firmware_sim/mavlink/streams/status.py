@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from airl_mav.core.frames import local_to_geodetic, quat_yaw
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed, Mode
-from firmware_sim.autopilot.commander import custom_mode
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.px4_custom_mode import base_mode, system_status
 from firmware_sim.mavlink.streams import units
@@ -96,7 +96,7 @@ def heartbeat(state: AutopilotState) -> Values:
         dialect.MAV_TYPE_QUADROTOR,
         dialect.MAV_AUTOPILOT_PX4,
         base_mode(status),
-        custom_mode(status.mode),
+        status.mode.spec.custom_mode,
         system_status(status, can_arm=state.health.armable),
         _MAVLINK_VERSION,
     )
@@ -330,7 +330,7 @@ def high_latency2(state: AutopilotState) -> Values:
         dialect.MAV_TYPE_QUADROTOR,
         dialect.MAV_AUTOPILOT_PX4,
         # The message has room for main and sub mode only: the upper 16 bits of custom_mode.
-        custom_mode(state.status.mode) >> 16,
+        state.status.mode.spec.custom_mode >> 16,
         *_place(state),
         _NO_TARGET[0],
         _heading(quat_yaw(estimate.quaternion)),
