@@ -57,9 +57,21 @@ class Section:
     """Function that draws the pictures; called only for output with pictures."""
     sheet: str = ""
     """File name of a PNG with all pictures; empty = one PNG per picture."""
+    columns: int | None = None
+    """Number of pictures in a row, 1 = full width; None = 2 for four pictures, else 3."""
     note: str = ""
-    """Explanation of the pictures, or of the tables without pictures."""
+    """Explanation of the pictures, or of the tables without pictures; one paragraph per line."""
     in_terminal: bool = True
+    template: str = "section.html.j2"
+    """File in `templates`; its variables are `section`, `pictures` and, for a run, `page`."""
+    data: Any = None
+    """Further input of the template."""
+
+
+def tables_section(*views: table.TableView | None, **fields: Any) -> tuple[Section, ...]:
+    """Return a section titled as its first table, with its other fields; empty without tables."""
+    tables = tuple(view for view in views if view is not None)
+    return (Section(tables[0].title, tables=tables, **fields),) if tables else ()
 
 
 @dataclass(frozen=True)
@@ -157,22 +169,25 @@ def provenance_facts(
     return (*rows, *sorted(versions.items()))
 
 
-def write_document(document: Document, folder: Path) -> Path:
-    """Write page, Markdown and PNG files, each atomically; return the page's path."""
+def draw_section(section: Section, folder: Path) -> tuple[Section, tuple[FigureImage, ...]]:
+    """Draw a section's pictures and write their PNG files; return the section and the pictures."""
     from airl_mav.report.theme import montage
 
+    pictures = () if section.draw is None else tuple(section.draw())
+    if section.sheet and pictures:
+        columns = section.columns or (2 if len(pictures) == 4 else SHEET_COLUMNS)
+        replace_file(folder / section.sheet, montage(pictures, columns))
+    else:
+        for picture in pictures:
+            replace_file(folder / f"{picture.name}.png", picture.png)
+    return section, pictures
+
+
+def write_document(document: Document, folder: Path) -> Path:
+    """Write page, Markdown and PNG files, each atomically; return the page's path."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        drawn = []
-        for section in document.sections:
-            pictures = () if section.draw is None else tuple(section.draw())
-            drawn.append((section, pictures))
-            if section.sheet and pictures:
-                columns = 2 if len(pictures) == 4 else SHEET_COLUMNS
-                replace_file(folder / section.sheet, montage(pictures, columns))
-            else:
-                for picture in pictures:
-                    replace_file(folder / f"{picture.name}.png", picture.png)
+        drawn = [draw_section(section, folder) for section in document.sections]
         replace_file(folder / f"{document.name}.md", markdown(document).encode())
         template = environment().get_template("document.html.j2")
         path = folder / f"{document.name}.html"

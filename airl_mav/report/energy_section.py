@@ -15,10 +15,10 @@ from airl_mav.flight.quality import Quality
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
-from airl_mav.report.run_tables import failures_first
+from airl_mav.report.document import Section, tables_section
+from airl_mav.report.run_tables import MAX_FLIGHTS, failures_first
+from airl_mav.report.shown_flights import ReportInput
 from airl_mav.report.table import NONE, Column, TableView, columns_of
-
-ENERGY_NAME = "energy"
 
 COMPUTER_COLOUR = "#a35bb8"
 """Colour of medium lightness, legible on light and dark backgrounds."""
@@ -42,6 +42,20 @@ PARTS = (
     ("computer_j", "computer", COMPUTER_COLOUR),
 )
 """Drawn parts of the energy, from bottom to top."""
+
+
+def energy_section(page: ReportInput) -> tuple[Section, ...]:
+    """Return the energy by part; empty without measured flights."""
+    flights = flight_energies(page.run, page.vehicle)
+    ground = page.run.info.setup.computer_on_ground
+    if not flights:
+        return ()
+    return tables_section(
+        energy_table(flights, on_ground=ground),
+        energy_flights_table(flights, MAX_FLIGHTS),
+        draw=lambda: [energy_figure(flights, on_ground=ground)],
+        template="energy.html.j2",
+    )
 
 
 @dataclass(frozen=True)
@@ -194,7 +208,7 @@ def energy_figure(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -
     )  # fmt: skip
     titles = ", ".join(title for _, title, _ in PARTS) if whole else "airframe, computer"
     alt = f"Energy of each of {len(flights)} flights by part: {titles}"
-    return theme.render(figure, ENERGY_NAME, alt)
+    return theme.render(figure, "energy", alt)
 
 
 def _joules(flight: FlightEnergy, name: str) -> float:

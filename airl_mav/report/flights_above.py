@@ -24,8 +24,6 @@ from airl_mav.report import theme
 from airl_mav.report.run_figures import OUTCOME_COLOURS, OUTCOME_MARKERS
 from airl_mav.report.table import OUTCOME_LABELS
 
-OVERVIEW_NAME = "trajectories"
-
 PATH_POINTS = 120
 """Maximum number of points of a path; more are not visible among hundreds of paths."""
 
@@ -84,7 +82,7 @@ def overview_picture(run: LoadedRun, arenas: Mapping[int, Arena]) -> theme.Figur
     arena = next(iter(arenas.values())) if len(bounds) == 1 else None
     panel = RunFlights("", "", run.episodes, run.trajectories, arena)
     alt = f"The paths of {len(run.episodes)} flights from above, coloured by how they ended"
-    return _draw_panel(OVERVIEW_NAME, alt, panel, _extent([panel]), width_in=4.6)
+    return _draw_panel("trajectories", alt, panel, _extent([panel]), width_in=4.6)
 
 
 def _extent(panels: Sequence[RunFlights]) -> _Extent:

@@ -35,6 +35,9 @@ from airl_mav.report.tracking import TrackedFlight
 
 BYTES_PER_MIB = 1 << 20
 
+MAX_FLIGHTS = 200
+"""Maximum number of flights in a table of the page, failed flights preferred."""
+
 
 def setup_rows(run: LoadedRun) -> tuple[tuple[str, str], ...]:
     """Return the setup of a run as (term, text)."""
@@ -182,8 +185,10 @@ def _estimate_row(measure: QualityMeasure, mean: Estimate, median: Estimate) -> 
     return measure.title, value, interval(mean), middle, interval(median), f"{mean.n}"
 
 
-def real_time_table(run: LoadedRun, summary: RunSummary) -> table.TableView:
-    """Return real-time pace and the companion's resource use."""
+def real_time_table(run: LoadedRun, summary: RunSummary) -> table.TableView | None:
+    """Return real-time pace and the companion's resource use; None for runs in simulated time."""
+    if not summary.timed:
+        return None
     columns = table.columns_of("<measure | value | n")
     nothing: NDArray[np.int64] = np.zeros(0, np.int64)
     lateness = [stamps.get(TICK_LATENESS, nothing) for stamps in run.latency.values()]

@@ -1,12 +1,13 @@
-"""Single flights of a page: still pictures of the worst, and the data of the page's script."""
+"""Input of a run's page, its sections of single flights, and the data of its script."""
 
 from __future__ import annotations
 
 import base64
 import gzip
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypedDict
 
 import numpy as np
@@ -21,11 +22,14 @@ from airl_mav.latency.stages import STAGES, decision_series
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.document import Section, tables_section
 from airl_mav.report.forensics.evidence import Cause, ranked
-from airl_mav.report.forensics.worst import flown_path
+from airl_mav.report.forensics.worst import ExaminedFlight, examine_worst, flown_path
+from airl_mav.report.measures import RunSummary, summarize_run
 from airl_mav.report.plotly_scene import ALL_FLIGHTS, SceneFlight, scene_json, top_speed
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision, policy_again, seen_decisions
 from airl_mav.report.run_figures import map_figure
+from airl_mav.report.run_tables import MAX_FLIGHTS, episodes_table
 from airl_mav.report.theme import FigureImage, palette, shades
 from airl_mav.report.tracking import EstimateErrors, TrackedFlight, TrackedMotion, track
 from airl_mav.report.tracking_figure import IMAGES, tracking_figure
@@ -161,17 +165,6 @@ MAX_SHOWN = 24
 
 
 @dataclass(frozen=True)
-class PicturedFlight:
-    """Flight with still pictures."""
-
-    record: EpisodeRecord
-    cause: Cause | None
-    pictures: tuple[FigureImage, ...]
-    scene: int | None
-    """Number in the view of single flights; None without a path."""
-
-
-@dataclass(frozen=True)
 class ShownFlight:
     """Flight in the view of single flights."""
 
@@ -182,30 +175,23 @@ class ShownFlight:
 
 
 @dataclass(frozen=True)
-class ShownFlights:
-    """Flights of the view, worst first."""
+class ReportInput:
+    """Run and data derived from it, for the sections of its page."""
 
-    flights: tuple[ShownFlight, ...]
+    run: LoadedRun
+    arenas: Mapping[int, Arena]
+    """Arenas by episode index; flights without pictures and cause may be missing."""
+    vehicle: VehicleProfile | None
+    summary: RunSummary
+    worst: Sequence[ExaminedFlight]
+    view: Sequence[ShownFlight]
+    """Flights in the view of single flights, worst first."""
     policy: PolicyAgain | None
-    numbers: dict[int, int] = field(init=False)
-    """Number of each flight in the view, by episode index."""
 
-    def __post_init__(self) -> None:
-        """Number the flights."""
-        numbers = {flight.scene.record.index: k for k, flight in enumerate(self.flights)}
-        object.__setattr__(self, "numbers", numbers)
-
-    @property
-    def note(self) -> str:
-        """Note on the source of the policy's images and scores."""
-        told = "Rendered again from the recorded path, without the camera's noise."
-        asked = [d.again for flight in self.flights for d in flight.seen if d.again is not None]
-        if asked:
-            told += (
-                f" The policy, asked again, chose the flown action in {sum(asked):,} of "
-                f"{len(asked):,} decisions."
-            )
-        return told
+    @cached_property
+    def numbers(self) -> dict[int, int]:
+        """Number of each flight in the view, by episode index."""
+        return {flight.scene.record.index: k for k, flight in enumerate(self.view)}
 
 
 def pictured(run: LoadedRun) -> list[EpisodeRecord]:
@@ -218,10 +204,10 @@ def shown(run: LoadedRun) -> list[EpisodeRecord]:
     return ranked(run)[:MAX_SHOWN]
 
 
-def shown_flights(
+def report_input(
     run: LoadedRun, arenas: Mapping[int, Arena], vehicle: VehicleProfile | None
-) -> ShownFlights:
-    """Return the flights of the view; flights without a path are skipped."""
+) -> ReportInput:
+    """Return the input of a run's page; the view skips flights without a path."""
     again = None if vehicle is None else policy_again(run.info)
     flights = []
     for record in shown(run):
@@ -232,38 +218,48 @@ def shown_flights(
         if arena is not None and vehicle is not None:
             seen = tuple(seen_decisions(run, record, arena, vehicle, again))
         flights.append(ShownFlight(SceneFlight(record, path, arena), tracked, seen))
-    return ShownFlights(tuple(flights), again)
+    worst = examine_worst(run, arenas, vehicle)
+    return ReportInput(run, arenas, vehicle, summarize_run(run), worst, flights, again)
 
 
-def pictured_flights(
-    run: LoadedRun,
-    arenas: Mapping[int, Arena],
-    view: ShownFlights,
-    causes: Mapping[int, Cause],
-    range_m: float,
-) -> list[PicturedFlight]:
-    """Draw the still pictures of flights, worst first."""
-    top = top_speed([flight.scene for flight in view.flights])
-    found = []
-    for episode in pictured(run):
-        number = view.numbers.get(episode.index)
-        flight = None if number is None else view.flights[number]
+def by_flight_section(page: ReportInput) -> tuple[Section, ...]:
+    """Return the view of single flights; empty without recorded paths."""
+    note = "Rendered again from the recorded path, without the camera's noise."
+    asked = [d.again for flight in page.view for d in flight.seen if d.again is not None]
+    if asked:
+        chosen_again = f"{sum(asked):,} of {len(asked):,} decisions"
+        note += f" The policy, asked again, chose the flown action in {chosen_again}."
+    data = {"together": min(len(page.run.episodes), ALL_FLIGHTS), "best": BEST}
+    section = Section("Flight by flight", note=note, template="by_flight.html.j2", data=data)
+    return (section,) if page.view else ()
+
+
+def flights_section(page: ReportInput) -> tuple[Section, ...]:
+    """Return the table of flights, and still pictures of the worst."""
+    top = top_speed([flight.scene for flight in page.view])
+    range_m = 0.0 if page.vehicle is None else page.vehicle.camera.range_m
+    causes = {each.record.index: each.cause for each in page.worst}
+    drawn: list[tuple[EpisodeRecord, Cause | None, list[FigureImage]]] = []
+    for record in pictured(page.run):
+        number = page.numbers.get(record.index)
+        flight = None if number is None else page.view[number]
         path = None if flight is None else flight.scene.path
-        pictures = [map_figure(episode, path, arenas.get(episode.index), top)]
+        pictures = [map_figure(record, path, page.arenas.get(record.index), top)]
         if flight is not None:
             seen = [flight.seen[k] for k in chosen(len(flight.seen), IMAGES, 2)]
             pictures.append(tracking_figure(flight.tracked, seen, range_m))
-        found.append(PicturedFlight(episode, causes.get(episode.index), tuple(pictures), number))
-    return found
+        drawn.append((record, causes.get(record.index), pictures))
+    return tables_section(
+        episodes_table(page.run, MAX_FLIGHTS),
+        draw=lambda: [picture for *_, pictures in drawn for picture in pictures],
+        template="flights.html.j2",
+        data=drawn,
+    )
 
 
-def page_data(
-    run: LoadedRun,
-    view: ShownFlights,
-    pictures: Sequence[FigureImage],
-    vehicle: VehicleProfile | None,
-) -> str:
+def page_data(page: ReportInput, pictures: Iterable[FigureImage]) -> str:
     """Return the data of the page's script as JSON: pictures, views and flights."""
+    run, vehicle = page.run, page.vehicle
     fov, range_m = (0.0, 0.0) if vehicle is None else (
         vehicle.camera.horizontal_fov_deg, vehicle.camera.range_m,
     )  # fmt: skip
@@ -277,14 +273,14 @@ def page_data(
                     run.latency.get(flight.scene.record.index, {}),
                     flight.seen,
                     range_m,
-                    view.policy,
+                    page.policy,
                 ),
                 "faults": flight.scene.record.fault_spans_s(),
             }
-            for flight in view.flights
+            for flight in page.view
         ],
         "palette": palette(),
     }
-    views = scene_json(run, [flight.scene for flight in view.flights], everyone, fov)
+    views = scene_json(run, [flight.scene for flight in page.view], everyone, fov)
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return f'{text[:-1]},"views":{views}}}'

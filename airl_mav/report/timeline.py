@@ -1,4 +1,4 @@
-"""Latency timeline of a run: each stage of every decision in flown order, with outliers."""
+"""Decision latency of a run: each stage of every decision in flown order, with outliers."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from airl_mav.latency.stages import (
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report import theme
-from airl_mav.report.run_figures import long_tail
+from airl_mav.report import run_tables, theme
+from airl_mav.report.document import SHEET_COLUMNS, Section, tables_section
+from airl_mav.report.run_figures import latency_figure, long_tail
+from airl_mav.report.shown_flights import ReportInput
 from airl_mav.report.table import TableView, columns_of, ms
-
-TIMELINE_NAME = "latency-timeline"
 
 COLUMNS = 320
 """Maximum number of columns per row; longer runs have several decisions per column."""
@@ -57,6 +57,35 @@ OUTLIER_NOTE = (
     "(Tukey's outer fence, Exploratory Data Analysis, 1977). A stage of which more than 5 % lie "
     "above it has two kinds of decisions, and no marks."
 )
+
+
+def latency_section(page: ReportInput) -> tuple[Section, ...]:
+    """Return the latency by stage, every decision, and outliers."""
+    run, summary, decisions = page.run, page.summary, timeline_of(page.run)
+    measured = [stage for stage in summary.shown_stages if summary.stages[stage.key].n]
+    # Constant stages need no figure: the table already shows their value.
+    drawn = [stage for stage in measured if np.ptp(summary.samples[stage.key])]
+    timeline = Section(
+        "Every decision, in the order flown",
+        level=3,
+        draw=lambda: [timeline_figure(decisions, drawn)],
+        columns=1,
+        note="\n".join([*sawtooth_notes(decisions, page.vehicle), OUTLIER_NOTE]),
+    )
+    return (
+        *tables_section(
+            run_tables.latency_table(summary),
+            run_tables.ages_table(run_tables.run_ages(run), summary.stages["end_to_end"]),
+            draw=lambda: [
+                latency_figure(s, summary.samples[s.key], summary.stages[s.key]) for s in drawn
+            ],
+            sheet="latency.png",
+            columns=SHEET_COLUMNS,
+            template="latency.html.j2",
+        ),
+        *((timeline,) if drawn and len(decisions) else ()),
+        *tables_section(slowest_table(decisions, measured), level=3),
+    )
 
 
 @dataclass(frozen=True)
@@ -122,7 +151,7 @@ def timeline_figure(timeline: Timeline, stages: Sequence[Stage]) -> theme.Figure
     alt = "Duration of each stage of every decision in the order flown, outliers marked: " + (
         ", ".join(stage.title for stage in stages)
     )
-    return theme.render(figure, TIMELINE_NAME, alt)
+    return theme.render(figure, "latency-timeline", alt)
 
 
 def _draw_bands(rows: NDArray[np.object_], timeline: Timeline) -> int:
@@ -240,10 +269,8 @@ def sawtooth_notes(timeline: Timeline, vehicle: VehicleProfile | None) -> list[s
     return notes
 
 
-def slowest_table(
-    timeline: Timeline, stages: Sequence[Stage]
-) -> tuple[TableView, list[tuple[int, float]]] | None:
-    """Return the table of outliers from frame to motors, with flight and navigation time [s]."""
+def slowest_table(timeline: Timeline, stages: Sequence[Stage]) -> TableView | None:
+    """Return the table of outliers from frame to motors; None without outliers."""
     whole = timeline.stages["end_to_end"]
     there = np.flatnonzero(whole != NO_STAMP)
     limit = fence(whole[there])
@@ -261,8 +288,8 @@ def slowest_table(
         f"{limit.beyond:,} of {limit.n:,} decisions above {ms(limit.limit_us)} ms; "
         f"the {len(rows)} longest. Times from the start of navigation.",
     )
-    places = [(timeline.flight_of(int(k)), float(timeline.since_us[k]) / US_PER_S) for k in beyond]
-    return TableView("slowest", "Decisions that stand out", columns, rows, notes), places
+    links = [(timeline.flight_of(int(k)), float(timeline.since_us[k]) / US_PER_S) for k in beyond]
+    return TableView("slowest", "Decisions that stand out", columns, rows, notes, links=links)
 
 
 def _slow_row(

@@ -36,7 +36,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profiles_dir
 from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, load
-from airl_mav.report import run_report, shown_flights
+from airl_mav.report import shown_flights
 from airl_mav.report.comparison import show
 from airl_mav.report.run_arenas import arena_of
 from airl_mav.report.run_report import write_report
@@ -411,7 +411,7 @@ def test_a_long_table_is_cut_short_and_says_so(
 ) -> None:
     run_, text = greedy
     assert f"25 of {EPISODES} flights, those that failed first; all: episodes.jsonl." in text
-    monkeypatch.setattr(run_report, "MAX_LISTED", 5)
+    monkeypatch.setattr(shown_flights, "MAX_FLIGHTS", 5)
     monkeypatch.setattr(shown_flights, "MAX_PICTURED", 1)
     shutil.copytree(run_.path, tmp_path / "copy")
     path = write_report(tmp_path / "copy")

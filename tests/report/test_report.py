@@ -130,6 +130,7 @@ def test_percentiles_appear_once_there_are_enough(
 def test_the_real_time_table(demo: tuple[LoadedRun, dict[int, Arena]]) -> None:
     run, _ = demo
     view = real_time_table(run, summarize_run(run))
+    assert view is not None
     lateness = np.concatenate([s["tick_lateness_us"] for s in run.latency.values()])
     p99 = np.percentile(lateness, 99, method="inverted_cdf") / 1e3
     assert cells(view, "tick lateness, p99")["value"] == f"{p99:.2f} ms"
@@ -144,7 +145,9 @@ def test_the_real_time_table(demo: tuple[LoadedRun, dict[int, Arena]]) -> None:
     power = cells(view, "mean power of the machine")
     assert (power["value"], power["n"]) == ("6.2 W (INA monitor: VDD_IN)", "4")
     older = replace(run, episodes=tuple(replace(e, companion_use=None) for e in run.episodes))
-    assert len(real_time_table(older, summarize_run(run)).rows) == len(view.rows) - 3
+    fewer = real_time_table(older, summarize_run(run))
+    assert fewer is not None
+    assert len(fewer.rows) == len(view.rows) - 3
     assert cells(view, "real-time factor")["value"] == f"{flown / wall:.3f} (asked 1)"
 
 
@@ -382,7 +385,7 @@ def test_decisions_that_stand_out_are_named(demo: tuple[LoadedRun, dict[int, Are
     timeline = timeline_of(replace(run, latency={**run.latency, 1: slow}))
     found = slowest_table(timeline, SHOWN_STAGES)
     assert found is not None
-    (row,), (place,) = found[0].rows, found[1]
+    (row,), (place,) = found.rows, found.links
     assert row[0] == "1"
     assert row[4] == "t2 infer"
     at_us = slow["capture_us"][3] - (run.episodes[1].navigation_us or 0)
@@ -464,6 +467,7 @@ def test_the_terminal_shows_the_same_tables_in_80_columns(
     assert "…" not in text.replace(" … ", "")
     summary = summarize_run(run)
     for view in (latency_table(summary), episodes_table(run), real_time_table(run, summary)):
+        assert view is not None
         for row in view.rows:
             shown = [
                 cell for cell, column in zip(row, view.columns, strict=True) if not column.page_only

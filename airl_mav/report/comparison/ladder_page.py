@@ -13,7 +13,7 @@ from airl_mav.report.comparison import tables
 from airl_mav.report.comparison.build import compare, comparison_document, split_seeds, widest_seeds
 from airl_mav.report.comparison.comparison_model import ComparedRun, Comparison, Contrast, RunEntry
 from airl_mav.report.comparison.figures import contrast_pictures
-from airl_mav.report.document import Document, Section
+from airl_mav.report.document import Document, Section, tables_section
 from airl_mav.report.measures import MEASURES, count_successes
 from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView, columns_of, ms
 
@@ -170,13 +170,9 @@ def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: P
     reference = comparison.runs[0].mark
     contrasts = comparison.contrasts
     levels = tables.runs_table(comparison.runs, title="Levels", head="level", measures=MEASURES)
-    latency, start, split = (
-        tables.stages_table(comparison.runs),
-        start_table(comparison),
-        split_table(comparison),
-    )
+    split = split_table(comparison)
     sections = [
-        Section(levels.title, tables=(levels,)),
+        *tables_section(levels),
         *(
             Section(
                 view.title,
@@ -194,12 +190,11 @@ def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: P
             f"{reference}.",
             in_terminal=False,
         ),
-        Section(latency.title, tables=(latency,)),
-        Section(start.title, tables=(start,)),
+        *tables_section(tables.stages_table(comparison.runs)),
+        *tables_section(start_table(comparison)),
         Section("What else differs", sentences=other_differences(comparison)),
+        *tables_section(split if split.rows else None),
     ]
-    if split.rows:
-        sections.append(Section(split.title, tables=(split,)))
     hashes = [(f"sha256 at {run.mark}", run.sha256) for run in comparison.runs if run.sha256]
     return comparison_document(
         comparison,

@@ -327,8 +327,10 @@ def examine_worst(
     return examined
 
 
-def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView:
-    """Return the worst flights with their causes."""
+def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView | None:
+    """Return the worst flights with their causes; None without flights."""
+    if not judged:
+        return None
     columns = columns_of(
         "# | seed | <outcome | after [s] | time lost [s] | way [x straight] | <cause"
     )
@@ -339,7 +341,8 @@ def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView:
     ]
     if len(shown) < total:
         notes.append(f"The {len(shown)} worst of {total:,} flights.")
-    return TableView("worst", "Worst flights", columns, tuple(map(_row, shown)), tuple(notes))
+    rows, links = tuple(map(_row, shown)), [(each.record.index, None) for each in shown]
+    return TableView("worst", "Worst flights", columns, rows, tuple(notes), links=links)
 
 
 def _row(judged: ExaminedFlight) -> tuple[str, ...]:
