@@ -119,7 +119,8 @@ def _show(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voic
     from airl_mav.flight.episode_record import run_sha256
     from airl_mav.rehearsal.run_folder import load
     from airl_mav.report.document import REPORT_FILE
-    from airl_mav.report.run_report import show_report, verdict_of
+    from airl_mav.report.run_tables import show_report
+    from airl_mav.report.run_verdict import verdict_of
 
     code = EXIT_CODES[flown.ended]
     if not flown.episodes:

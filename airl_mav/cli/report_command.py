@@ -80,7 +80,8 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
             raise FieldError(field, f"{value}", "with two runs or more")
     if kind_of(first) is None:
         # Imported here and below: options do not need the figures.
-        from airl_mav.report.run_report import show_report, verdict_of
+        from airl_mav.report.run_tables import show_report
+        from airl_mav.report.run_verdict import verdict_of
 
         loaded = load(first)
         show_report(loaded, verdict_of(loaded), console)

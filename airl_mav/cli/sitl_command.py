@@ -95,7 +95,8 @@ def conclude(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], v
         return 0
     # Imported here: the figures take seconds to load, which flights do not need.
     from airl_mav.rehearsal.run_folder import load
-    from airl_mav.report.run_report import show_report, verdict_of
+    from airl_mav.report.run_tables import show_report
+    from airl_mav.report.run_verdict import verdict_of
 
     run = load(flown.path)
     verdict = verdict_of(run, requirements)

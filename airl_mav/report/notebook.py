@@ -19,8 +19,8 @@ from airl_mav.report.measures import MEASURES, summarize_run
 from airl_mav.report.plotly_scene import SceneFlight, top_speed
 from airl_mav.report.run_arenas import arenas_of, vehicle_of
 from airl_mav.report.run_figures import map_figure
-from airl_mav.report.run_report import run_headlines, verdict_of
-from airl_mav.report.run_verdict import OverallVerdict, load_verdict
+from airl_mav.report.run_report import run_headlines
+from airl_mav.report.run_verdict import OverallVerdict, load_verdict, verdict_of
 from airl_mav.report.shown_flights import pictured
 from airl_mav.report.table import TableView, columns_of
 from airl_mav.report.theme import FigureImage

@@ -1,41 +1,28 @@
-"""Report of a run on a page and in the terminal."""
+"""Page of a run: its sections in order."""
 
 from __future__ import annotations
 
 import gc
 import json
-import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from rich.console import Console
-
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.files import replace_file
-from airl_mav.core.progress import DRAWING, Progress
-from airl_mav.flight.requirements import Requirement
-from airl_mav.flight.statistics import aggregate
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report import document, run_tables
-from airl_mav.report.document import Section, print_place, print_verdict, tables_section
+from airl_mav.report.document import Section, tables_section
 from airl_mav.report.energy_section import energy_section
 from airl_mav.report.flights_above import overview_picture
 from airl_mav.report.forensics.evidence import ranked
 from airl_mav.report.forensics.worst import EXAMINED, causes_table, worst_table
-from airl_mav.report.measures import RunSummary, conduct_table, rate_digits, summarize_run
+from airl_mav.report.measures import RunSummary, conduct_table, rate_digits
 from airl_mav.report.plotly_scene import plotly_script
 from airl_mav.report.run_arenas import arenas_of, vehicle_of
-from airl_mav.report.run_verdict import (
-    OverallVerdict,
-    judge_run,
-    requirements_of,
-    save_verdict,
-    unchecked,
-)
+from airl_mav.report.run_verdict import OverallVerdict, save_verdict, verdict_of
 from airl_mav.report.shown_flights import (
     ReportInput,
     by_flight_section,
@@ -45,7 +32,7 @@ from airl_mav.report.shown_flights import (
     report_input,
     shown,
 )
-from airl_mav.report.table import count_outcomes, ms, print_facts, print_table
+from airl_mav.report.table import ms
 from airl_mav.report.timeline import latency_section
 
 YOUNG_OBJECTS = 50_000
@@ -68,75 +55,17 @@ def seldom_collected() -> Iterator[None]:
         gc.set_threshold(*before)
 
 
-MAX_PRINTED = 25
-"""Maximum number of flights listed in the terminal."""
-
-
-def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None) -> OverallVerdict:
-    """Return a run's verdict; `requirements` default to the requirements of `verdict.json`."""
-    if requirements is None:
-        requirements = requirements_of(run.path)
-    verdict = judge_run(run.info.setup, aggregate(run.episodes), run.episodes, requirements)
-    return replace(verdict, sentences=verdict.sentences + unchecked([run.info]))
-
-
 @seldom_collected()
 def write_report(
     run: LoadedRun | Path, out: Path | None = None, verdict: OverallVerdict | None = None
 ) -> Path:
     """Write a run's `report.html`, `verdict.json` and PNG files; return the page's path."""
-    if isinstance(run, Path):
-        run = load(run)
+    run = load(run) if isinstance(run, Path) else run
     vehicle = vehicle_of(run.info)
     arenas = arenas_of([*ranked(run)[:EXAMINED], *shown(run)], vehicle)
     verdict = verdict or verdict_of(run)
     page = build_page(run, arenas, out, vehicle=vehicle, verdict=verdict)
     save_verdict(verdict, page.parent)
-    return page
-
-
-def print_report(run: LoadedRun, console: Console, verdict: OverallVerdict) -> None:
-    """Print the verdict, the setup and the tables."""
-    print_verdict(verdict.lines, console)
-    console.print()
-    summary, feeds = summarize_run(run), not run.info.setup.computer_on_ground
-    flights = count_outcomes([episode.outcome for episode in run.episodes])
-    print_facts([*run_tables.setup_rows(run), ("flights", flights)], console)
-    for view in (
-        run_tables.latency_table(summary),
-        run_tables.episodes_table(run, MAX_PRINTED),
-        run_tables.quality_table(summary, computer=feeds),
-        conduct_table(run, summary),
-        run_tables.faults_table(run),
-        run_tables.real_time_table(run, summary),
-    ):
-        if view is not None:
-            console.print()
-            print_table(view, console)
-
-
-def show_report(
-    run: LoadedRun,
-    verdict: OverallVerdict,
-    console: Console,
-    progress: Progress | None = None,
-    *,
-    draw: bool = True,
-) -> Path | None:
-    """Print the report of a run, then draw its page or print the command that draws it."""
-    progress = progress or Progress()
-    if run.episodes:
-        save_verdict(verdict, run.path)
-    print_report(run, console, verdict)
-    if not run.episodes:
-        return None
-    if not draw:
-        print_place("report", f"airl report {shlex.quote(str(run.path))}", console)
-        return None
-    progress.status(DRAWING)
-    page = write_report(run, verdict=verdict)
-    progress.status(None)
-    print_place("report", page, console)
     return page
 
 

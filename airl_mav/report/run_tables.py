@@ -1,16 +1,20 @@
-"""Tables of a run's report, shared by the terminal and the page."""
+"""Tables of a run's report, shared by the terminal and the page, and the report in the terminal."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.process_use import ProcessUse
+from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.episode_record import EpisodeRecord, Part, Setup, run_sha256
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import NO_ESTIMATE, Estimate
@@ -18,6 +22,7 @@ from airl_mav.latency.percentiles import CommandAges, Summary, command_ages, sum
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, TICK_LATENESS, LoadedRun
 from airl_mav.report import table
+from airl_mav.report.document import print_place, print_verdict
 from airl_mav.report.measures import (
     COMPUTER_ENERGY,
     DISTANCE,
@@ -29,8 +34,11 @@ from airl_mav.report.measures import (
     SUCCESS_RATE,
     QualityMeasure,
     RunSummary,
+    conduct_table,
     rate_digits,
+    summarize_run,
 )
+from airl_mav.report.run_verdict import OverallVerdict, save_verdict
 from airl_mav.report.tracking import TrackedFlight
 
 BYTES_PER_MIB = 1 << 20
@@ -346,3 +354,55 @@ def faults_table(run: LoadedRun) -> table.TableView | None:
         notes.append(f"{MAX_LISTED} of {len(lines):,} lines; all: {EPISODES_FILE}.")
     columns = table.columns_of("# | <fault | from [s] | to [s] | <outcome of the flight")
     return table.TableView("faults", "Faults", columns, tuple(lines[:MAX_LISTED]), tuple(notes))
+
+
+MAX_PRINTED = 25
+"""Maximum number of flights listed in the terminal."""
+
+
+def print_report(run: LoadedRun, console: Console, verdict: OverallVerdict) -> None:
+    """Print the verdict, the setup and the tables."""
+    print_verdict(verdict.lines, console)
+    console.print()
+    summary, feeds = summarize_run(run), not run.info.setup.computer_on_ground
+    flights = table.count_outcomes([episode.outcome for episode in run.episodes])
+    table.print_facts([*setup_rows(run), ("flights", flights)], console)
+    for view in (
+        latency_table(summary),
+        episodes_table(run, MAX_PRINTED),
+        quality_table(summary, computer=feeds),
+        conduct_table(run, summary),
+        faults_table(run),
+        real_time_table(run, summary),
+    ):
+        if view is not None:
+            console.print()
+            table.print_table(view, console)
+
+
+def show_report(
+    run: LoadedRun,
+    verdict: OverallVerdict,
+    console: Console,
+    progress: Progress | None = None,
+    *,
+    draw: bool = True,
+) -> Path | None:
+    """Print the report of a run, then draw its page or print the command that draws it."""
+    progress = progress or Progress()
+    if run.episodes:
+        save_verdict(verdict, run.path)
+    print_report(run, console, verdict)
+    if not run.episodes:
+        return None
+    if not draw:
+        print_place("report", f"airl report {shlex.quote(str(run.path))}", console)
+        return None
+    # Imported here: pages need matplotlib, which takes longer to load than ten flights take.
+    from airl_mav.report.run_report import write_report
+
+    progress.status(DRAWING)
+    page = write_report(run, verdict=verdict)
+    progress.status(None)
+    print_place("report", page, console)
+    return page

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -21,8 +21,8 @@ from airl_mav.flight.episode_record import EpisodeRecord, Setup
 from airl_mav.flight.paired import PairedComparison
 from airl_mav.flight.requirements import Finding, Requirement, find
 from airl_mav.flight.sequential import RequirementDecision
-from airl_mav.flight.statistics import Aggregate, Estimate
-from airl_mav.rehearsal.run_folder import RunInfo
+from airl_mav.flight.statistics import Aggregate, Estimate, aggregate
+from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
 from airl_mav.report.document import environment
 
 SCHEMA = 1
@@ -248,3 +248,11 @@ def write_badge(verdict: OverallVerdict, path: Path) -> None:
         )
     )
     replace_file(path, svg.encode())
+
+
+def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None) -> OverallVerdict:
+    """Return a run's verdict; `requirements` default to the requirements of `verdict.json`."""
+    if requirements is None:
+        requirements = requirements_of(run.path)
+    verdict = judge_run(run.info.setup, aggregate(run.episodes), run.episodes, requirements)
+    return replace(verdict, sentences=verdict.sentences + unchecked([run.info]))

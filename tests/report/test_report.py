@@ -24,15 +24,17 @@ from airl_mav.report.energy_section import energy_flights_table, energy_table, f
 from airl_mav.report.forensics.worst import examine_worst
 from airl_mav.report.measures import conduct_table, summarize_run
 from airl_mav.report.plotly_scene import plotly_script
-from airl_mav.report.run_report import build_page, print_report, verdict_of
+from airl_mav.report.run_report import build_page
 from airl_mav.report.run_tables import (
     ages_table,
     episodes_table,
     latency_table,
+    print_report,
     quality_table,
     real_time_table,
     run_ages,
 )
+from airl_mav.report.run_verdict import verdict_of
 from airl_mav.report.shown_flights import MAX_PICTURED
 from airl_mav.report.table import TableView
 from airl_mav.report.theme import DARK
