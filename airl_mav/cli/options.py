@@ -38,7 +38,7 @@ from airl_mav.core.progress import RichProgress
 from airl_mav.faults.fault import Fault
 from airl_mav.scenario.aircraft import IN_WORDS
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.resolved import read_scenario_file
+from airl_mav.scenario.scenario_file import read_scenario_file
 
 Options = TypeVar("Options", bound=BaseModel)
 

@@ -25,11 +25,11 @@ from airl_mav.vehicle.airframe import (
     Airframe,
     airframe_of,
     command_for,
+    drag_force,
     hover_speeds,
     lag,
 )
 from airl_mav.vehicle.power import PowerModel
-from airl_mav.vehicle.rigid_body import drag_force
 from airl_mav.vehicle.rotation import Quat, Vec
 
 

@@ -95,7 +95,7 @@ from airl_mav.envs.fleet import (
     unload,
     vec,
 )
-from airl_mav.vehicle.airframe import airframe_of, settle, wrench
+from airl_mav.vehicle.airframe import airframe_of, drag_force, settle, step, wrench
 from airl_mav.vehicle.power import (
     drain,
     felt,
@@ -104,7 +104,6 @@ from airl_mav.vehicle.power import (
     open_circuit,
     terminal_voltage,
 )
-from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Vec, rotate
 
 REPEAT_US = 50_000

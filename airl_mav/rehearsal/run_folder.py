@@ -28,7 +28,7 @@ from airl_mav.flight.episode_record import SCHEMA as LINE_SCHEMA
 from airl_mav.flight.episode_record import EpisodeRecord, Setup
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.scenario.model import free_fields
-from airl_mav.scenario.resolved import SCENARIO_FILE, save_scenario
+from airl_mav.scenario.scenario_file import SCENARIO_FILE, save_scenario
 
 if TYPE_CHECKING:
     from airl_mav.scenario.resolved import ResolvedScenario

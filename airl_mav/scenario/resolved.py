@@ -1,24 +1,19 @@
-"""Resolved scenario with all referenced content loaded, and scenario files."""
+"""Resolved scenario with all referenced content loaded."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import tomli_w
 from pydantic import BaseModel
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
-from airl_mav.core.errors import UsageError
-from airl_mav.core.files import replace_file
 from airl_mav.core.frames import Goal
-from airl_mav.core.plugins import names_file
 from airl_mav.flight.episode_record import BUILT_IN, EpisodeRecord, Part, Setup
 from airl_mav.flight.judge import Task
 from airl_mav.latency.injection import FixedSampler, Injection, LatencySampler, latency_generator
@@ -39,48 +34,7 @@ from airl_mav.scenario.piloting import (
     between_commands,
     load_asked_policy,
 )
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
-SCENARIO_FILE = "scenario.toml"
-"""Scenario file in a run folder."""
-
-
-def read_scenario_file(path: Path) -> dict[str, Any]:
-    """Return the contents of a scenario file. Raises UsageError if unreadable or invalid TOML."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise UsageError(f"{path}: not valid TOML: {error}") from None
-
-
-def save_scenario(scenario: Scenario, path: Path) -> None:
-    """Write a scenario with absolute paths; fields at None are omitted."""
-    data = anchored(scenario).model_dump(mode="json", exclude_none=True)
-    replace_file(path, tomli_w.dumps(data).encode())
-
-
-def anchored(scenario: Scenario) -> Scenario:
-    """Return a scenario with absolute paths, independent of the working directory."""
-    # Late import: reading a command line or a run folder needs no policy.
-    from airl_mav.policy.registry import policy_names
-
-    policy, latency = scenario.policy, scenario.latency or ""
-    named = {name: getattr(scenario, name) for name in ("vehicle", "arena", "computer")}
-    paths = {name: value for name, value in named.items() if value.endswith(".toml")}
-    if names_file(policy) or (policy not in policy_names() and Path(policy).is_dir()):
-        paths["policy"] = policy
-    if ".toml/" in latency or Path(latency).is_file():
-        paths["latency"] = latency
-    real = {name: value.absolute() for name, value in scenario.real if isinstance(value, Path)}
-    changes: dict[str, Any] = {name: f"{Path(value).absolute()}" for name, value in paths.items()}
-    return scenario.model_copy(update={**changes, "real": scenario.real.model_copy(update=real)})
-
+from airl_mav.scenario.scenario_file import anchored
 
 HOVER_START_S = 0.3
 """Time from the start in a hover to navigation: connection and switch to offboard [s]."""

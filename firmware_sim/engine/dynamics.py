@@ -11,7 +11,7 @@ from airl_mav.core.frames import Vector, geodetic_to_local, local_to_geodetic
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import Battery
 from airl_mav.vehicle import atmosphere
-from airl_mav.vehicle.airframe import airframe_of, settle, wrench
+from airl_mav.vehicle.airframe import airframe_of, drag_force, settle, wrench
 from airl_mav.vehicle.power import (
     drain,
     felt,
@@ -22,7 +22,6 @@ from airl_mav.vehicle.power import (
     standing_power_w,
     terminal_voltage,
 )
-from airl_mav.vehicle.rigid_body import drag_force
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
 
 # Kernels call these functions as Python does.

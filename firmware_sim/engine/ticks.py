@@ -35,8 +35,7 @@ from airl_mav.core.frames import (
 )
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.vehicle import atmosphere
-from airl_mav.vehicle.airframe import airframe_of
-from airl_mav.vehicle.rigid_body import accelerate, drift
+from airl_mav.vehicle.airframe import accelerate, airframe_of, drift
 from airl_mav.vehicle.rotation import Vec, conjugate, rotate
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.alignment import ALIGN_US, FIXES, add

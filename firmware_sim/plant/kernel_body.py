@@ -13,8 +13,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
-from airl_mav.vehicle.airframe import Airframe, airframe_of
-from airl_mav.vehicle.rigid_body import accelerate, drift
+from airl_mav.vehicle.airframe import Airframe, accelerate, airframe_of, drift
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
 from firmware_sim.engine.dynamics import WIDTH, quaternion, rates, velocity, write
 from firmware_sim.plant.body import FLOOR, NOTHING, Touch

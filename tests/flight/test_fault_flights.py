@@ -24,7 +24,7 @@ from airl_mav.rehearsal.episode import faults_of
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.run_tables import faults_table
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.resolved import read_scenario_file
+from airl_mav.scenario.scenario_file import read_scenario_file
 from firmware_sim.simulation import EpisodeSetup
 from tests.support.lockstep_kit import SEED, demo_scenario
 

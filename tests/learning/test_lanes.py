@@ -22,9 +22,16 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import Spread
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.vehicle.airframe import airframe_of, draw_airframe, lag, settle, wrench
+from airl_mav.vehicle.airframe import (
+    airframe_of,
+    drag_force,
+    draw_airframe,
+    lag,
+    settle,
+    step,
+    wrench,
+)
 from airl_mav.vehicle.power import PowerModel, flight_power_w
-from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Vec, rotate
 from firmware_sim.autopilot.parameter_store import Parameters
 

@@ -18,7 +18,7 @@ from airl_mav.faults.fault import FOREVER_US, Fault, active, gust_share, next_ch
 from airl_mav.faults.kinds import KINDS, Part, Phase
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import read_scenario_file, save_scenario
+from airl_mav.scenario.scenario_file import read_scenario_file, save_scenario
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 
 TIMES = st.floats(min_value=0.0, max_value=99_999.0, allow_nan=False)

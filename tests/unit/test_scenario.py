@@ -22,7 +22,8 @@ from airl_mav.profiles.conditions import Payload, WindSettings
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import ResolvedScenario, anchored, read_scenario_file, save_scenario
+from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.scenario_file import anchored, read_scenario_file, save_scenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion, StandAloneVehicle
 from tests.support.processes import ROOT
 

@@ -22,14 +22,15 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import (
     Airframe,
     airframe_of,
+    drag_force,
     hover_speeds,
     lag,
     settle,
     steady_speed,
+    step,
     wrench,
 )
 from airl_mav.vehicle.power import drain, open_circuit, terminal_voltage
-from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Quat, Vec
 
 QUAD = Airframe.from_profile(load_profile("vehicles", "quad", VehicleProfile))
