@@ -260,7 +260,8 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
 
 def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
     """Parse a command line and run its command with `more`; return the exit status."""
-    if module.rpartition(".")[2] not in LIGHT:
+    package, _, name = module.removesuffix("_command").rpartition(".")
+    if name not in LIGHT and not hasattr(importlib.import_module(package), "LIGHT"):
         # Before the import, which fails without the packages.
         check_installed("sim")
     command = importlib.import_module(module)
@@ -302,10 +303,8 @@ EXTRAS = {
 }
 """Packages of the extras, by their names in pyproject.toml."""
 
-LIGHT = (
-    *("companion", "computers", "conformance", "export", "listing", "profile", "train", "video"),
-)
-"""Commands that can be imported without the simulator."""
+LIGHT = ("companion", "computers", "export", "list", "train", "video")
+"""Commands that can be imported without the simulator; light add-ons define `LIGHT` themselves."""
 
 
 def check_installed(*extras: str) -> None:

@@ -4,6 +4,7 @@ The `__init__` of an add-on is light and may define:
 
     COMMANDS: {command of `airl`: (purpose, module with OPTIONS and run)}
     EXECUTORS: {value of `--executor`: module with `connected`}
+    LIGHT: the commands can be imported without the simulator
 """
 
 from __future__ import annotations

@@ -14,3 +14,5 @@ COMMANDS = {
         "airl_mav.addons.profiling.command",
     )
 }
+
+LIGHT = True

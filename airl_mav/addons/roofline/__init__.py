@@ -1,7 +1,6 @@
 """Roofline: safe velocity against reaction time, and the stage that limits it.
 
-Flies straight towards an obstacle in the vectorized simulator at several reaction times, and
-compares with the F-1 model of safe velocity.
+Flies towards an obstacle at several reaction times; compares with the F-1 model.
 
 Command: `airl roofline`. From Python: `roofline.roofline.roofline`.
 Depends on: the vectorized simulator (`airl_mav.envs`), computer profiles, report pages.
