@@ -261,7 +261,7 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
 def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
     """Parse a command line and run its command with `more`; return the exit status."""
     package, _, name = module.removesuffix("_command").rpartition(".")
-    if name not in LIGHT and not hasattr(importlib.import_module(package), "LIGHT"):
+    if name not in LIGHT and not hasattr(sys.modules.get(package), "LIGHT"):
         # Before the import, which fails without the packages.
         check_installed("sim")
     command = importlib.import_module(module)
