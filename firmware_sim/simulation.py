@@ -348,7 +348,7 @@ class Simulation:
         if self._sample is not None:
             autopilot.take(self._sample)
             self._sample = None
-        plant, done = self.plant, 0
+        plant, record, done = self.plant, autopilot.record, 0
         most = max(1, math.ceil(min((until_us - self.time_us) / TICK_US, MOST_TICKS)))
         arrives_us = math.inf if arrivals is None else arrivals.next_us
         while done < most:
@@ -359,7 +359,11 @@ class Simulation:
                     self.recorder.before_controls(done)
             due_us = min(autopilot.decide_if_due(), arrives_us)
             ticks = max(1, math.ceil(min((due_us - self.time_us) / TICK_US, most - done)))
-            flown, event = self._glide(autopilot, done, done + ticks)
+            log = slice(self._logged + done, self._logged + done + ticks)
+            flown, event = plant.glide(record, ticks, self._truths[log], self._flown[log])
+            if event == FUSE:
+                flown += 1
+                autopilot.fuse(plant.newest(), record["left"].item(0))
             done += flown
             # Texts about a landing bear the time of the tick that detects it.
             self.time_us += (flown - 1) * TICK_US
@@ -369,18 +373,6 @@ class Simulation:
             if changed or event in _ENDS or (event == FUSE and not autopilot.estimator.compiled):
                 break
         return done
-
-    def _glide(self, autopilot: BuiltinAutopilot, first: int, end: int) -> tuple[int, int]:
-        """Fly ticks at a constant demand into the logs; return their number and the last event."""
-        plant, record = self.plant, autopilot.record
-        first, end = self._logged + first, self._logged + end
-        flown, event = plant.glide(
-            record, end - first, self._truths[first:end], self._flown[first:end]
-        )
-        if event == FUSE:
-            flown += 1
-            autopilot.fuse(plant.newest(), record["left"].item(0))
-        return flown, event
 
     @property
     def next_frame_us(self) -> float:

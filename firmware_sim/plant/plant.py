@@ -281,13 +281,15 @@ class Plant:
         Returns:
             Number of complete ticks, and the event that ended them (`engine.ticks`).
         """
-        done = 0
+        done = flew = 0
         while True:
             # Read the blocks again: `_refill` replaces them.
             inertial, compass, barometer, gps = self._sensors.noise
+            if done:
+                truths, flown = truths[flew:], flown[flew:]
             told = stretch(
                 *(self.record, self._sensors.record, controller, ticks - done),
-                *(inertial, compass, barometer, gps, self._winds, truths[done:], flown[done:]),
+                *(inertial, compass, barometer, gps, self._winds, truths, flown),
             )
             flew, event = told >> EVENT_BITS, told & EVENT_MASK
             done += flew

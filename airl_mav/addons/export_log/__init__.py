@@ -1,7 +1,6 @@
 """Export of flights: MCAP for Foxglove and rerun, ULog for PX4's tools.
 
 Writes the flights of a run as files, or sends the flights of a run in progress.
-
 Command: `airl export-log`.
 Depends on: `airl_mav.black_box`, `airl_mav.report.replay`, `firmware_sim.flight_log`.
 Guide: docs/how-to/export-log.md.

@@ -1,7 +1,6 @@
 """Fault matrix: every fault in every phase of a flight, and its outcome.
 
 Flies each fault of the table at each phase in lockstep and tabulates how the flights ended.
-
 Command: `airl faults`.
 Depends on: `airl_mav.faults`, `firmware_sim.faults`, lockstep, experiments.
 Guide: docs/how-to/faults.md.

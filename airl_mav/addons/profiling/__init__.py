@@ -2,7 +2,6 @@
 
 Measures bare decisions, decisions in flight (sitl) and decisions in the loop with a vehicle (hil),
 under sustained load and with the power drawn.
-
 Command: `airl profile`. From Python: `profiling.profile.profile`.
 Depends on: policies, `airl_mav.rehearsal` for flights. Needs no other add-on.
 Guide: docs/how-to/profile.md.

@@ -1,7 +1,6 @@
 """Executor on a Ray cluster, or on a Ray instance of this machine.
 
 Runs the flights and trainings of experiments as Ray tasks. Restarts lost tasks.
-
 Option: `--executor ray` of `airl evaluate`, `gap`, `degrade`, `ladder` and `sweep`.
 Depends on: `airl_mav.experiments.executors` and the extra `ray`.
 Guide: docs/how-to/ray.md.

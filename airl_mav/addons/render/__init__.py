@@ -1,7 +1,6 @@
 """Pictures of an arena, films and ground truth of a flight, from a colour camera.
 
 Renders depth, segmentation, optical flow and colour, in real time or path traced.
-
 Command: `airl render`.
 Depends on: `airl_mav.camera`, `airl_mav.report.replay`; the extra `render` for path tracing.
 Guide: docs/how-to/camera.md.
