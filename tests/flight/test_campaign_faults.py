@@ -307,7 +307,7 @@ def test_an_evaluation_dies_at_every_moment_of_saving(tmp_path: Path) -> None:
 @pytest.mark.nightly
 def test_two_do_not_fly_into_one_folder(tmp_path: Path) -> None:
     campaign = Campaign(tmp_path, episodes=2)
-    impatient = "from airl_mav.rehearsal import lock\nlock.WAIT_S = 0.2"
+    impatient = "from airl_mav.rehearsal import run_folder\nrun_folder.WAIT_S = 0.2"
     with campaign.flying() as first:
         first.find_children("firmware", "companion")
         # Stopped: it must outlast the start of the second, on a slow machine too.
