@@ -81,7 +81,7 @@ WINDOWS = {
     "no scenario file": "before(atomic, 'sync', lambda p: p.name == 'scenario.toml.partial')",
     "nothing saved": "before(run_folder.RunFolder, 'save_episodes')",
     "half an archive": "before(atomic, 'sync', lambda p: p.name == 'latency.npz.partial')",
-    "one archive": "after(run_folder, 'add_arrays')",
+    "one archive": "after(atomic, 'add_arrays')",
     "half a line": "os.fsync = tear",
     "a line": "after(run_folder.RunFolder, 'save_episodes')",
 }
