@@ -28,8 +28,8 @@ class Intrinsics:
       along the optical axis.
     - cylindrical: (sin a, (v - cy) / focal, cos a) with a = (u - cx) / focal [rad], clockwise seen
       from above. Depth is measured in the camera's horizontal plane, perpendicular to the axis of
-      the cylinder. Upright edges are upright in the image, and the column of the optical axis is
-      that of a pinhole of the same focal length.
+      the cylinder. Upright edges are upright in the image. The column of the optical axis
+      equals a pinhole's with the same focal length.
     - fisheye: (sin b cos c, sin b sin c, cos b), at the angle b [rad] from the optical axis given
       by r / focal and `profiles.distortion`, with r the distance from (cx, cy) to the pixel and c
       its direction. Without coefficients b = r / focal (equidistant). Depth is measured along that

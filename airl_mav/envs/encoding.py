@@ -171,8 +171,7 @@ def _shrink(
     line, least = np.empty(depth_mm.shape[2], np.uint16), np.empty((rows, columns), np.uint16)
     for i in range(len(out)):
         for row in range(rows):
-            # Unsigned: 0 (no return) minus 1 wraps to 65,535, the farthest value, so min ignores
-            # it.
+            # Unsigned: 0 (no return) minus 1 wraps to 65,535, the maximum, so min ignores it.
             for u in range(len(line)):
                 line[u] = depth_mm[i, row * tall, u] - np.uint16(1)
             for k in range(1, tall):

@@ -324,7 +324,7 @@ def open_executor(settings: Workers, *, in_process: bool = False) -> Iterator[ex
     if settings.executor != "process":
         known = addon_executors()
         if settings.executor not in known:
-            raise FieldError("executor", settings.executor, f"process, {', '.join(known)}")
+            raise FieldError("executor", settings.executor, ", ".join(("process", *known)))
         gpus = settings.ray_gpus if isinstance(settings, executors.ExecutorSettings) else 0.0
         module = importlib.import_module(known[settings.executor])
         with module.connected(settings, cores, gpus) as executor:

@@ -225,7 +225,7 @@ class Wire:
         if count == self._told:
             return
         now_us = self._clock.time_us()
-        # The first report is immediate, further ones at intervals.
+        # The first report is immediate, later reports come at intervals.
         if self._tell_us is not None and now_us < self._tell_us:
             return
         self._told, self._tell_us = count, now_us + TELL_EVERY_US
