@@ -1,4 +1,4 @@
-"""The core works without add-ons: each folder of `airl_mav/addons` is removed in turn."""
+"""The core works without add-ons: each folder of an `addons` is removed in turn."""
 
 from __future__ import annotations
 
@@ -12,42 +12,57 @@ from pathlib import Path
 import pytest
 
 from airl_mav.cli.main import SUBCOMMANDS
+from airl_mav.core.addons import PACKAGES
 from tests.support.processes import ROOT
 
-ADDONS = sorted(each.parent.name for each in (ROOT / "airl_mav" / "addons").glob("*/__init__.py"))
+ADDONS = sorted(
+    f"{package}.addons.{each.parent.name}"
+    for package in PACKAGES
+    for each in (ROOT / package / "addons").glob("*/__init__.py")
+)
 
 MODULES = """
 import importlib, pkgutil, airl_mav, companion, firmware_sim
 for package in (airl_mav, companion, firmware_sim):
     for each in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
-        if not each.name.startswith(("airl_mav.addons.", "companion.cameras.")):
+        if not each.name.startswith((package.__name__ + ".addons.", "companion.cameras.")):
             importlib.import_module(each.name)
 """
 
 
 CUSTOMIZE = """
 import importlib.util, sys
+from pathlib import Path
 class Finder:
     @staticmethod
     def find_spec(name, path=None, target=None):
-        if name == "airl_mav.addons":
+        folder = Path({kept!r}) / name
+        if name.endswith(".addons") and folder.is_dir():
+            init = folder / "__init__.py"
             return importlib.util.spec_from_file_location(
-                name, {init!r}, submodule_search_locations=[{folder!r}]
+                name, init, submodule_search_locations=[str(folder)]
             )
 sys.meta_path.insert(0, Finder)
 """
-"""Replaces the folder of the add-ons before anything is imported."""
+"""Replaces the folders of the add-ons before anything is imported."""
+
+FOUND = """
+from airl_mav.core.addons import PACKAGES, names
+print(*(f"{package}.addons.{name}" for package in PACKAGES for name in names(package)))
+"""
 
 
 def remove(folder: Path, removed: Sequence[str]) -> dict[str, str]:
     """Return an environment for Python in which some add-ons do not exist."""
     kept = folder / "addons"
-    kept.mkdir()
-    for name in ADDONS:
-        if name not in removed:
-            (kept / name).symlink_to(ROOT / "airl_mav" / "addons" / name)
-    init = str(ROOT / "airl_mav" / "addons" / "__init__.py")
-    (folder / "sitecustomize.py").write_text(CUSTOMIZE.format(init=init, folder=str(kept)))
+    for package in PACKAGES:
+        source = ROOT / package / "addons"
+        (kept / f"{package}.addons").mkdir(parents=True)
+        (kept / f"{package}.addons" / "__init__.py").symlink_to(source / "__init__.py")
+        for name in (each.parent.name for each in source.glob("*/__init__.py")):
+            if f"{package}.addons.{name}" not in removed:
+                (kept / f"{package}.addons" / name).symlink_to(source / name)
+    (folder / "sitecustomize.py").write_text(CUSTOMIZE.format(kept=str(kept)))
     return {**os.environ, "PYTHONPATH": str(folder)}
 
 
@@ -69,7 +84,7 @@ def python(folder: Path, environment: dict[str, str], *words: str) -> str:
 def fly_without(folder: Path, removed: Sequence[str], *, whole: bool = True) -> None:
     """List the commands and fly, without some add-ons; if `whole`, import all and report too."""
     run = partial(python, folder, remove(folder, removed))
-    found = run("-c", "from airl_mav.core.addons import names; print(*names())").split()
+    found = run("-c", FOUND).split()
     assert found == [name for name in ADDONS if name not in removed]
     listed = run("-m", "airl_mav.cli.main", "--help")
     assert all(f"\n  {name} " in listed for name in SUBCOMMANDS)
@@ -83,7 +98,7 @@ def fly_without(folder: Path, removed: Sequence[str], *, whole: bool = True) -> 
 
 
 def test_there_are_addons() -> None:
-    assert "refit" in ADDONS
+    assert "airl_mav.addons.refit" in ADDONS
 
 
 def test_the_core_flies_without_addons(tmp_path: Path) -> None:
