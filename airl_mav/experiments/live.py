@@ -60,7 +60,7 @@ def fly_live(
     asked = scenario.scenario
     if asked.level == "gym":
         raise FieldError("level", asked.level, "lockstep or sitl; airl evaluate flies the twin")
-    check_program(asked.real)
+    check_program(asked)
     say = partial(progress.note, style="yellow")
     known = out is not None and (out / RUN_FILE).exists()
     with ExitStack() as held, terminated_as_interrupted():
@@ -119,7 +119,7 @@ def _watched(
 ) -> Iterator[tuple[ViewEnds, Observer]]:
     """Start a viewer; yield its connections and an observer that also notifies `onwards`."""
     # Imported here: only runs with a viewer need it.
-    from airl_mav.rehearsal.view_observer import ViewObserver
+    from airl_mav.rehearsal.observer import ViewObserver
     from airl_mav.view.viewer import Viewer, ViewError, request_of
 
     onwards.waiting("starting the view")

@@ -36,7 +36,7 @@ from airl_mav.addons.refit.quantity import Array, FittedQuantity
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.latency.percentiles import integrated_time
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.vehicle_log.ulog_reader import VehicleLog
+from airl_mav.vehicle_log import VehicleLog
 
 WINDOW = 13
 """Samples of a window: half a second of telemetry."""

@@ -18,7 +18,7 @@ from airl_mav.addons.refit.quantity import Array, FittedQuantity, mean_interval
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.flight.statistics import QUANTILE
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
-from airl_mav.vehicle_log.ulog_reader import VehicleLog
+from airl_mav.vehicle_log import VehicleLog
 
 Known = Literal["thrust", "mass"]
 """Quantity that the profile has right."""
