@@ -119,7 +119,7 @@ def _watched(
 ) -> Iterator[tuple[ViewEnds, Observer]]:
     """Start a viewer; yield its connections and an observer that also notifies `onwards`."""
     # Imported here: only runs with a viewer need it.
-    from airl_mav.rehearsal.observer import ViewObserver
+    from airl_mav.rehearsal.view_observer import ViewObserver
     from airl_mav.view.viewer import Viewer, ViewError, request_of
 
     onwards.waiting("starting the view")

@@ -12,9 +12,10 @@ import pytest
 
 from airl_mav.flight.validity import BY_HAND
 from airl_mav.lockstep.lockstep_flight import fly
-from airl_mav.rehearsal.observer import Observer, ViewObserver
+from airl_mav.rehearsal.observer import Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal
 from airl_mav.rehearsal.run_folder import FlownEpisode, load, open_folder
+from airl_mav.rehearsal.view_observer import ViewObserver
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.view.ends import ViewEnds
