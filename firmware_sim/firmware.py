@@ -25,7 +25,7 @@ from firmware_sim.flight_log.flight_log import ULOG_SUFFIX, FlightLog, LogFolder
 from firmware_sim.interfaces import FlightController, TrueState
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
-from firmware_sim.mavlink.tlog import TlogWriter
+from firmware_sim.mavlink.traffic import TlogWriter
 from firmware_sim.pacing import Pacing
 from firmware_sim.plant.camera_process import CameraProcess
 from firmware_sim.plant.camera_server import SimulatedCamera
