@@ -150,11 +150,11 @@ if TYPE_CHECKING:
     from pymavlink.dialects.v20 import development
 
     dialect = development
+    WireMessage = development.MAVLink_message
 else:
     dialect = load_dialect()
-
-WireMessage: TypeAlias = dialect.MAVLink_message
-"""Received message, or a message to pack."""
+    WireMessage = dialect.MAVLink_message
+    """Received message, or a message to pack."""
 
 Values: TypeAlias = Sequence[float]
 """Fields of a message in order of definition, with int values for integer fields. Arrays are

@@ -25,8 +25,8 @@ from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import NavigationMode
 from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, MODE_NOT_AVAILABLE
 from firmware_sim.autopilot.flight_modes import MAIN_AUTO, MAIN_POSCTL, Mode
+from firmware_sim.autopilot.inputs import OrbitRequest, PositionYaw, Reposition
 from firmware_sim.autopilot.navigation.plan import NavCommand
-from firmware_sim.autopilot.requests import OrbitRequest, PositionYaw, Reposition
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services import calibration, connection, logs, params
 from firmware_sim.mavlink.services.context import (
