@@ -150,7 +150,7 @@ if TYPE_CHECKING:
     from pymavlink.dialects.v20 import development
 
     dialect = development
-    WireMessage = development.MAVLink_message
+    WireMessage: TypeAlias = development.MAVLink_message
 else:
     dialect = load_dialect()
     WireMessage = dialect.MAVLink_message

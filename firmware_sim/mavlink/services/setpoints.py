@@ -21,8 +21,7 @@ from airl_mav.core.frames import (
 from airl_mav.vehicle.rotation import rotate, yaw_of
 from firmware_sim.autopilot.autopilot_state import OperatorText, Setpoint, Severity, Vector, Wire
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.manual_control import Source, Sticks
-from firmware_sim.autopilot.requests import FollowedTarget
+from firmware_sim.autopilot.inputs import FollowedTarget, Source, Sticks
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context
 

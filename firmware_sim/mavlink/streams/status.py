@@ -27,7 +27,7 @@ from firmware_sim.autopilot.flight_modes import (
     Mode,
     ModeSpec,
 )
-from firmware_sim.autopilot.navigation.return_path import return_time_s
+from firmware_sim.autopilot.modes.return_to_launch import return_time_s
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams import units
