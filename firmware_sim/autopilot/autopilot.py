@@ -36,21 +36,22 @@ from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.flight_commander import AutoDisarm, Commanded, FlightCommander
 from firmware_sim.autopilot.flight_modes import WITH_STICKS, Mode
 from firmware_sim.autopilot.guidance import Guidance, Home
-from firmware_sim.autopilot.land_detector import LandDetector
-from firmware_sim.autopilot.manual_control import ManualControl, Source, Sticks
-from firmware_sim.autopilot.navigation.flown_item import ExecutorState
-from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator
-from firmware_sim.autopilot.navigation.plan import Plans
-from firmware_sim.autopilot.navigation.whereabouts import Whereabouts
-from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
-from firmware_sim.autopilot.requests import (
+from firmware_sim.autopilot.inputs import (
     FollowedTarget,
     LandingTarget,
+    ManualControl,
     ModeRequest,
     ObstacleBins,
     PositionYaw,
+    Source,
+    Sticks,
 )
+from firmware_sim.autopilot.land_detector import LandDetector
+from firmware_sim.autopilot.navigation.flown_item import ExecutorState
+from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator, Whereabouts
+from firmware_sim.autopilot.navigation.plan import Plans
+from firmware_sim.autopilot.parameter_store import Parameters
+from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
 from firmware_sim.autopilot.snapshot import Parts, Snapshot
 from firmware_sim.engine.controller import Controller
