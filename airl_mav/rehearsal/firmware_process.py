@@ -32,7 +32,7 @@ from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, bind_udp_links
 from firmware_sim.mavlink.server import udp_server
 from firmware_sim.pacing import Pacing, WallPacing
-from firmware_sim.plant.camera_server import CameraServer
+from firmware_sim.plant.camera import CameraServer
 from firmware_sim.simulation import CrashDetector, Simulation
 from firmware_sim.warm_up import warm_up
 
