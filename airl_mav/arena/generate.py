@@ -9,15 +9,6 @@ from functools import cached_property
 import numpy as np
 
 from airl_mav.arena.finishes import Statics
-from airl_mav.arena.gates import (
-    Openings,
-    behind,
-    closed_from_above,
-    draw_openings,
-    frames,
-    with_gates,
-    with_walls,
-)
 from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
 from airl_mav.arena.ground import Ground
 from airl_mav.arena.passage import Hills, free_share, least_gap_m, passage_exists
@@ -35,8 +26,20 @@ from airl_mav.arena.placement import (
     zone_radius_m,
 )
 from airl_mav.arena.relief import draw_ground, stand_on
-from airl_mav.arena.room_plan import Plan, draw_plan, room_walls, standing_on_the_floor
 from airl_mav.arena.tours import draw_tours
+from airl_mav.arena.walls import (
+    Openings,
+    Plan,
+    behind,
+    closed_from_above,
+    draw_openings,
+    draw_plan,
+    frames,
+    room_walls,
+    standing_on_the_floor,
+    with_gates,
+    with_walls,
+)
 from airl_mav.core.errors import UsageError
 from airl_mav.core.seeding import seeded
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec

@@ -16,10 +16,10 @@ from airl_mav.arena.finishes import FLOOR, OBSTACLE, TEXTURES, WALLS, Finish, Li
 from airl_mav.arena.geometry import Arena, PlacedMesh, Shape
 from airl_mav.arena.ground import Ground
 from airl_mav.arena.triangles import standing, triangles_of
-from airl_mav.camera.colour import RANGE_M
 from airl_mav.camera.cube_faces import FACES, Cube, cube_of, resampled, side_for
-from airl_mav.camera.gloss import GLASS, GLOSSY, INDEX, METAL, is_smooth
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.picture import RANGE_M
+from airl_mav.camera.shading import GLASS, GLOSSY, INDEX, METAL, is_smooth
 from airl_mav.camera.textures import mean_of, periods, texels
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_to_matrix

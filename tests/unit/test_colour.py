@@ -14,9 +14,8 @@ from airl_mav.arena.finishes import FLOOR, OBSTACLE, TEXTURES, linear_of, srgb_o
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera import primitives
-from airl_mav.camera.colour import unpack
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import Picture, grey, render_picture
+from airl_mav.camera.picture import Picture, grey, render_picture, unpack
 from airl_mav.camera.render import render
 from airl_mav.camera.textures import PERIOD, SIDE, atlas, pattern
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
