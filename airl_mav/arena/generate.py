@@ -11,17 +11,20 @@ import numpy as np
 from airl_mav.arena.finishes import Statics
 from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
 from airl_mav.arena.ground import Ground
-from airl_mav.arena.passage import Hills, free_share, least_gap_m, passage_exists
 from airl_mav.arena.placed_assets import AssetBodies, Things, draw_bodies, draw_things, generate_own
 from airl_mav.arena.placement import (
     TRIES,
     Boxes,
     Floats,
+    Hills,
     NoRoomError,
     bounding_boxes,
     draw_goal,
     footprint_areas,
+    free_share,
     join,
+    least_gap_m,
+    passage_exists,
     place_all,
     zone_radius_m,
 )
@@ -43,7 +46,7 @@ from airl_mav.arena.walls import (
 from airl_mav.core.errors import UsageError
 from airl_mav.core.seeding import seeded
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
-from airl_mav.profiles.rooms import HEADROOM_M
+from airl_mav.profiles.walls import HEADROOM_M
 
 LAYOUTS = 20
 """Layouts drawn before generation fails."""

@@ -1,8 +1,10 @@
-"""Rooms: interior walls with doors; every room is reachable from every other.
+"""Walls within an arena: rooms with doors, and gates with an opening to fly through.
 
 The floor is halved until there are enough rooms; or a corridor runs along it, with a row of rooms
-on either side. Doors join rooms along a random spanning tree, and some other neighbours. Walls and
-the lintels above doors are boxes; all other code treats them as obstacles.
+on either side. Doors join rooms along a random spanning tree, and some other neighbours. Every room
+is reachable from every other. A gate is four boxes around its opening: west and east of it up to
+the top, below and above it between these. All other code treats the boxes of walls, lintels and
+gates as obstacles.
 """
 
 from __future__ import annotations
@@ -16,8 +18,8 @@ from airl_mav.arena.finishes import Statics
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.arena.placement import Boxes, Floats
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.arena import GATE, ArenaSpec
-from airl_mav.profiles.rooms import EDGE_M, ROOM_WALL, Rooms
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.walls import EDGE_M, GATE, ROOM_WALL, Rooms
 
 TRIES = 500
 """Plans drawn before generation fails."""

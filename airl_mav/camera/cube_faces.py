@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics, finer, rays_of
-from airl_mav.profiles.distortion import sees_to, steepness
+from airl_mav.profiles.projections import sees_to, steepness
 
-Floats = NDArray[np.float64]
 
+Floats2 = 0
 FACES = tuple((axis, sign) for axis in range(3) for sign in (1.0, -1.0))
 """Camera axis (forward, right, down) perpendicular to a face, and the side of the face."""
 

@@ -1,12 +1,15 @@
-"""Inverse depth of a mesh along the lines of an image; all rays traverse the tree together.
+"""Inverse depth of meshes along the lines of an image, and hits of single rays.
 
-All rays of an image share one origin, so a node of the tree is tested against all of them at once.
-Candidate rays form the rectangle of the node's projected box, cut to the parent's. A node is
+All rays of an image share one origin, so a node of a mesh's tree is tested against all of them at
+once. Candidate rays form the rectangle of the node's projected box, cut to the parent's. A node is
 skipped if its rectangle is empty, as for most of a fine distant mesh, or if all of its rays hit
 something nearer. Near nodes come before far ones. A single remaining ray traverses the rest alone.
 A fisheye's rays are not affine along lines, so each traverses the whole tree alone.
 
-`mesh_triangles` projects boxes and intersects rays with triangles.
+A triangle with the corners a, b and c, relative to the camera, is hit by the ray d if the volumes
+d.(b x c), d.(c x a) and d.(a x b) have one sign. A rounding tolerance closes shared edges. Each
+volume is affine along a line of the image. The inverse depth is n.d / n.a, n = (b - a) x (c - a).
+Both sides are visible.
 """
 
 from __future__ import annotations
@@ -17,20 +20,23 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera import projection
 from airl_mav.camera.bvh import STACK, Bvh, Meshes
 from airl_mav.camera.primitives import OBSTACLE, Ids, Rectangles, turned
 from airl_mav.camera.projection import (
+    Bent,
     Image,
     ImageProjection,
     Line,
     Lines,
+    Optics,
     Pose,
     Rectangle,
     Span,
     cut,
     cylinder_span,
     dot,
+    fisheye_rectangle,
+    ray_of,
 )
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
@@ -43,25 +49,23 @@ _MOST_LOOKED_AT: Final = 256
 
 
 @borrowing_kernel
-def seen_from(optics: projection.Optics, pose: NDArray[np.float64], k: int) -> projection.Pose:
+def seen_from(optics: Optics, pose: NDArray[np.float64], k: int) -> Pose:
     """Return the camera's axes in mesh k's frame, and the mesh's origin, in units of the mesh."""
     axes, camera = optics.axes, optics.camera
     per = 1.0 / pose[k, 4]
     offset = (pose[k, 0] - camera[0], pose[k, 1] - camera[1], pose[k, 5] - camera[2])
     at = (per * offset[0], per * offset[1], per * offset[2])
-    return turned(
-        projection.Pose(axes.forward, axes.across, axes.along, at), pose[k, 2], pose[k, 3]
-    )
+    return turned(Pose(axes.forward, axes.across, axes.along, at), pose[k, 2], pose[k, 3])
 
 
 @large_kernel
 def draw_meshes(
-    out: projection.Image,
+    out: Image,
     ids: Ids | None,
     faces: Faces | None,
     drawn_in: Rectangles | None,
-    optics: projection.Optics,
-    bent: projection.Bent | None,
+    optics: Optics,
+    bent: Bent | None,
     meshes: Meshes,
 ) -> None:
     """Draw the meshes of an arena over the present image; arguments as in `raycast.draw_bodies`.
@@ -82,11 +86,11 @@ def draw_meshes(
 
 @large_borrowing_kernel
 def _draw_mesh(
-    out: projection.Image,
+    out: Image,
     ids: Ids | None,
     faces: Faces | None,
     drawn_in: Rectangles | None,
-    optics: projection.Optics,
+    optics: Optics,
     meshes: Meshes,
     k: int,
     waiting: NDArray[np.int32],
@@ -97,7 +101,7 @@ def _draw_mesh(
     number, scale = OBSTACLE + meshes.first[k], meshes.pose[k, 4]
     pose = seen_from(optics, meshes.pose, k)
     # The range in units of the mesh.
-    own = projection.ImageProjection(
+    own = ImageProjection(
         view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, view.cylindrical
     )
     per = 1.0 / scale
@@ -156,12 +160,12 @@ def _draw_mesh(
 
 @large_borrowing_kernel
 def _cast_mesh(
-    out: projection.Image,
+    out: Image,
     ids: Ids | None,
     faces: Faces | None,
     drawn_in: Rectangles | None,
-    optics: projection.Optics,
-    bent: projection.Bent,
+    optics: Optics,
+    bent: Bent,
     meshes: Meshes,
     k: int,
     waiting: NDArray[np.int32],
@@ -171,23 +175,21 @@ def _cast_mesh(
     number, scale = OBSTACLE + meshes.first[k], meshes.pose[k, 4]
     pose = seen_from(optics, meshes.pose, k)
     # The last argument (cylindrical) disables `met`'s limits, which hold for pinhole depth only.
-    own = projection.ImageProjection(
-        view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, True
-    )
+    own = ImageProjection(view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, True)
     per = 1.0 / scale
     box, c = bvh.boxes[root], pose.center
     half = (float(box[3]), float(box[4]), float(box[5]))
     middle = (c[0] + box[0], c[1] + box[1], c[2] + box[2])
-    at = projection.Pose(pose.forward, pose.across, pose.along, middle)
-    part = projection.fisheye_rectangle(out, own, bent, at, half, False)
+    at = Pose(pose.forward, pose.across, pose.along, middle)
+    part = fisheye_rectangle(out, own, bent, at, half, False)
     if drawn_in is not None:
         for side in range(4):
             drawn_in[side] = part[side]
     nowhere = (0.0, 0.0, 0.0)
     for v in range(part[0], part[1]):
         for u in range(part[2], part[3]):
-            ray = projection.ray_of(pose, bent, v, u, nowhere, 0.0)
-            if projection.dot(ray, ray) == 0.0:
+            ray = ray_of(pose, bent, v, u, nowhere, 0.0)
+            if dot(ray, ray) == 0.0:
                 # A pixel beyond the lens's image circle.
                 continue
             _cast(out, ids, faces, number, v, u, ray, 0.0, own, pose, bvh, root, per, waiting, 0)
@@ -200,7 +202,7 @@ def _wait(
     at: int,
     node: int,
     near: float,
-    part: projection.Rectangle,
+    part: Rectangle,
 ) -> None:
     """Push a node, its minimum depth, and its candidate rays."""
     waiting[at, 0] = node
@@ -210,7 +212,7 @@ def _wait(
 
 
 @borrowing_kernel
-def _hidden(out: projection.Image, part: projection.Rectangle, greatest: float) -> bool:
+def _hidden(out: Image, part: Rectangle, greatest: float) -> bool:
     """Return True if all pixels of a small part see something nearer than an inverse depth."""
     if (part[1] - part[0]) * (part[3] - part[2]) > _MOST_LOOKED_AT:
         return False
@@ -223,7 +225,7 @@ def _hidden(out: projection.Image, part: projection.Rectangle, greatest: float) 
 
 @borrowing_kernel
 def _cast(
-    out: projection.Image,
+    out: Image,
     ids: Ids | None,
     faces: Faces | None,
     number: int,
@@ -231,8 +233,8 @@ def _cast(
     u: int,
     start: Vec,
     x: float,
-    view: projection.ImageProjection,
-    pose: projection.Pose,
+    view: ImageProjection,
+    pose: Pose,
     bvh: Bvh,
     root: int,
     per: float,

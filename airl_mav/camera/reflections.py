@@ -2,9 +2,12 @@
 
 Pixels of varnish, metal or glass are rendered again. A tree of rays starts at the camera: varnish,
 metal and glass mirror them, glass also transmits them, until all hits are matt or contribute too
-little. A rough surface directly visible to the camera mirrors `gloss.SAMPLES` directions. Rough
+little. A rough surface directly visible to the camera mirrors `shading.SAMPLES` directions. Rough
 surfaces in reflections count as smooth, except for the sun's highlight, which has a closed form.
 Matt surfaces are shaded as in `shading.paint`, with a shadow ray to the sun.
+
+Images are drawn body by body (`raycast`, `shadows`), all rays of the camera at once; these few rays
+have other origins. Computes in float64; a ray is a unit vector.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.finishes import FLOOR as FLOOR_ROW
 from airl_mav.arena.finishes import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.finishes import WALLS as WALLS_ROW
-from airl_mav.camera import primitives, shading
+from airl_mav.camera import shading
 from airl_mav.camera.bvh import STACK, Meshes, is_owned, material_row
 from airl_mav.camera.meshes import distance_to, inverse_of, stopped_by
 from airl_mav.camera.primitives import (
@@ -29,8 +32,10 @@ from airl_mav.camera.primitives import (
     GROUND,
     OBSTACLE,
     SKY,
+    WALL_EAST_WEST,
     WALL_NORTH_SOUTH,
     Ids,
+    turn_axes,
 )
 from airl_mav.camera.projection import Scene, dot
 from airl_mav.camera.shadows import ABOVE_M
@@ -424,11 +429,11 @@ def bodies_of(scene: Scene) -> Bodies:
     for i in range(n):
         turn[i, 0], turn[i, 1] = 1.0, 0.0
         a, b, c = half_size[i, 0], half_size[i, 1], half_size[i, 2]
-        if shape[i] == primitives.BOX:
+        if shape[i] == BOX:
             turn[i, 0], turn[i, 1] = math.cos(yaw[i]), math.sin(yaw[i])
             reach[i] = a * a + b * b + c * c
         else:
-            reach[i] = a * a + c * c if shape[i] == primitives.CYLINDER else a * a
+            reach[i] = a * a + c * c if shape[i] == CYLINDER else a * a
     return Bodies(bounds, shape, center, half_size, turn, reach)
 
 
@@ -452,13 +457,13 @@ def _span(bodies: Bodies, i: int, origin: Vec, ray: Vec) -> tuple[float, float]:
     if apart > 0.0 and (ahead > 0.0 or ahead * ahead < apart):
         return math.inf, -math.inf
     cos, sin = bodies.turn[i, 0], bodies.turn[i, 1]
-    o, d = primitives.turn_axes(away, cos, sin), primitives.turn_axes(ray, cos, sin)
-    if bodies.shape[i] == primitives.BOX:
+    o, d = turn_axes(away, cos, sin), turn_axes(ray, cos, sin)
+    if bodies.shape[i] == BOX:
         i0, i1, i2 = inverse_of(d[0]), inverse_of(d[1]), inverse_of(d[2])
         a, b, c = -o[0] * i0, -o[1] * i1, -o[2] * i2
         w0, w1, w2 = half[0] * abs(i0), half[1] * abs(i1), half[2] * abs(i2)
         return max(max(a - w0, b - w1), c - w2), min(min(a + w0, b + w1), c + w2)
-    if bodies.shape[i] == primitives.CYLINDER:
+    if bodies.shape[i] == CYLINDER:
         level = max(d[0] * d[0] + d[1] * d[1], 1e-18)
         toward = -(o[0] * d[0] + o[1] * d[1])
         rest = level * (half[0] * half[0] - o[0] * o[0] - o[1] * o[1]) + toward * toward
@@ -478,7 +483,7 @@ def _span(bodies: Bodies, i: int, origin: Vec, ray: Vec) -> tuple[float, float]:
 @borrowing_kernel
 def _room(bounds: NDArray[np.float64], origin: Vec, ray: Vec) -> tuple[float, int]:
     """Return a ray's first hit of floor, walls and ceiling: distance and number."""
-    best, seen = math.inf, primitives.SKY
+    best, seen = math.inf, SKY
     for side in range(4):
         axis = side // 2
         t = (bounds[side] - origin[axis]) * inverse_of(ray[axis])
@@ -488,14 +493,14 @@ def _room(bounds: NDArray[np.float64], origin: Vec, ray: Vec) -> tuple[float, in
         other = 1 - axis
         inside = bounds[2 * other] <= p[other] <= bounds[2 * other + 1]
         if inside and -bounds[4] <= p[2] <= 0.0:
-            best, seen = t, primitives.WALL_NORTH_SOUTH if axis == 0 else primitives.WALL_EAST_WEST
+            best, seen = t, WALL_NORTH_SOUTH if axis == 0 else WALL_EAST_WEST
     for lid in range(2 if bounds[5] > 0.0 else 1):
         t = ((-bounds[4] if lid else 0.0) - origin[2]) * inverse_of(ray[2])
         if t <= LEAST_M or t >= best:
             continue
         p = advanced(origin, ray, t)
         if bounds[0] <= p[0] <= bounds[1] and bounds[2] <= p[1] <= bounds[3]:
-            best, seen = t, primitives.CEILING if lid else primitives.FLOOR
+            best, seen = t, CEILING if lid else FLOOR
     return best, seen
 
 
@@ -508,7 +513,7 @@ def _from_mesh(meshes: Meshes, k: int, origin: Vec, ray: Vec) -> tuple[Vec, Vec]
         per * (origin[1] - meshes.pose[k, 1]),
         per * (origin[2] - meshes.pose[k, 5]),
     )
-    return primitives.turn_axes(offset, cos, sin), primitives.turn_axes(ray, cos, sin)
+    return turn_axes(offset, cos, sin), turn_axes(ray, cos, sin)
 
 
 @large_borrowing_kernel
@@ -527,7 +532,7 @@ def meet(
         # A ray that starts inside a body, as in glass, hits the far side.
         t = enter if enter > LEAST_M else leave
         if LEAST_M < t < best:
-            best, seen = t, primitives.OBSTACLE + i
+            best, seen = t, OBSTACLE + i
     if meshes is not None:
         for k in range(len(meshes.root)):
             scale = meshes.pose[k, 4]
@@ -536,7 +541,7 @@ def meet(
                 meshes.bvh, meshes.root[k], at, way, LEAST_M / scale, best / scale, waiting
             )
             if which >= 0:
-                best, seen, mesh, face = t * scale, primitives.OBSTACLE + meshes.first[k], k, which
+                best, seen, mesh, face = t * scale, OBSTACLE + meshes.first[k], k, which
     return Met(best, seen, mesh, face)
 
 
@@ -548,11 +553,9 @@ def place_of(
     p = advanced(origin, ray, met.distance)
     if meshes is not None and met.mesh >= 0:
         return _on_mesh(meshes, met, p, ray)
-    if met.seen >= primitives.OBSTACLE:
-        return _on_obstacle(bodies, met.seen - primitives.OBSTACLE, p, ray)
-    axis = (
-        2 if met.seen == primitives.FLOOR else (0 if met.seen == primitives.WALL_NORTH_SOUTH else 1)
-    )
+    if met.seen >= OBSTACLE:
+        return _on_obstacle(bodies, met.seen - OBSTACLE, p, ray)
+    axis = 2 if met.seen == FLOOR else (0 if met.seen == WALL_NORTH_SOUTH else 1)
     sign = -1.0 if ray[axis] > 0.0 else 1.0
     return SurfacePoint(p, _scaled_axis(axis, sign), axis)
 
@@ -580,7 +583,7 @@ def _on_mesh(meshes: Meshes, met: Met, p: Vec, ray: Vec) -> SurfacePoint:
     k, n = met.mesh, meshes.bvh.normals[met.face]
     scale, cos, sin = meshes.pose[k, 4], meshes.pose[k, 2], meshes.pose[k, 3]
     at, _ = _from_mesh(meshes, k, p, ray)
-    normal = primitives.turn_axes((float(n[0]), float(n[1]), float(n[2])), cos, -sin)
+    normal = turn_axes((float(n[0]), float(n[1]), float(n[2])), cos, -sin)
     return SurfacePoint((scale * at[0], scale * at[1], scale * at[2]), _towards(normal, ray), 3)
 
 
@@ -589,23 +592,23 @@ def _on_obstacle(bodies: Bodies, i: int, p: Vec, ray: Vec) -> SurfacePoint:
     """Return the point p on obstacle i, with its normal."""
     center, half = bodies.center[i], bodies.half_size[i]
     cos, sin = bodies.turn[i, 0], bodies.turn[i, 1]
-    a, b, c = primitives.turn_axes((p[0] - center[0], p[1] - center[1], p[2] - center[2]), cos, sin)
+    a, b, c = turn_axes((p[0] - center[0], p[1] - center[1], p[2] - center[2]), cos, sin)
     side = 3
-    if bodies.shape[i] == primitives.BOX:
+    if bodies.shape[i] == BOX:
         # The face has the largest coordinate relative to the half size.
         qa, qb, qc = abs(a) / half[0], abs(b) / half[1], abs(c) / half[2]
         side = 2 if qc >= max(qa, qb) else (0 if qa >= qb else 1)
         outward = c if side == 2 else (a if side == 0 else b)
         normal = _scaled_axis(side, math.copysign(1.0, outward))
-    elif bodies.shape[i] == primitives.CYLINDER and abs(c) / half[2] * half[0] >= math.hypot(a, b):
+    elif bodies.shape[i] == CYLINDER and abs(c) / half[2] * half[0] >= math.hypot(a, b):
         side = 2
         normal = _scaled_axis(side, math.copysign(1.0, c))
     else:
-        height = 0.0 if bodies.shape[i] == primitives.CYLINDER else c
+        height = 0.0 if bodies.shape[i] == CYLINDER else c
         per = 1.0 / max(math.sqrt(a * a + b * b + height * height), 1e-9)
         normal = (per * a, per * b, per * height)
     # Inside glass the far side is visible from within.
-    return SurfacePoint((a, b, c), _towards(primitives.turn_axes(normal, cos, -sin), ray), side)
+    return SurfacePoint((a, b, c), _towards(turn_axes(normal, cos, -sin), ray), side)
 
 
 @large_borrowing_kernel
@@ -639,7 +642,7 @@ def sunlight(
         # An opaque body ends the search.
         if share == 0.0:
             return 0.0
-        if is_owned(meshes, i) or own == primitives.OBSTACLE + i:
+        if is_owned(meshes, i) or own == OBSTACLE + i:
             continue
         enter, leave = _span(bodies, i, at, to_sun)
         if leave >= max(enter, 0.0):

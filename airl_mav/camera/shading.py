@@ -1,4 +1,11 @@
-"""Light, texture, fog and sRGB of one point, in branch-free float32 for vectorized loops."""
+"""Light, texture, fog and sRGB of one point, in branch-free float32 for vectorized loops.
+
+Reflection models in addition to Lambert's law are Fresnel's equations and microfacets. Rough
+surfaces follow Walter et al., Microfacet models for refraction through rough surfaces, 2007: facets
+with GGX-distributed slopes and Smith's shadowing, separately for both directions. Reflected
+directions are sampled from the visible facets (Heitz, Sampling the GGX distribution of visible
+normals, 2018).
+"""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.projections import CameraKind
 
 
 def compile_vectorized(kind: CameraKind) -> None:

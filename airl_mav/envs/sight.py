@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from airl_mav.camera.imaging_checks import check_noise, check_twin_imaging
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.spec import EnvironmentSpec
@@ -16,7 +15,7 @@ from airl_mav.policy.observation_spec import (
     camera_mismatch,
     further_mismatch,
 )
-from airl_mav.profiles.camera import Camera
+from airl_mav.profiles.camera import Camera, check_noise, check_twin_imaging
 from airl_mav.profiles.vehicle import VehicleProfile
 
 

@@ -23,8 +23,8 @@ from airl_mav.camera.frame import Frame
 from airl_mav.camera.render import Motion
 from airl_mav.core.scheduling import give_way
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import SensorNoise
+from airl_mav.profiles.projections import Renderer
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.plant.camera_server import SimulatedCamera
 

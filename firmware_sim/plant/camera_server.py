@@ -21,8 +21,8 @@ from airl_mav.camera.render import Motion, Mount, camera_pose
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import SensorNoise
+from airl_mav.profiles.projections import Renderer
 from firmware_sim.plant.sensors import Rate
 
 

@@ -9,8 +9,8 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.render import Motion
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import SensorNoise
+from airl_mav.profiles.projections import Renderer
 
 
 class OnboardCamera(Protocol):

@@ -21,8 +21,8 @@ from airl_mav.camera.textures import PERIOD, SIDE, atlas, pattern
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera_kind import Projection
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import Projection
 from tests.support.lenses import AT_NIGHT_THE_FISHEYE, rays_of_fisheye
 
 LEVEL = quat_from_euler(0.0, 0.0, 0.0)

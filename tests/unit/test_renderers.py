@@ -22,8 +22,8 @@ from airl_mav.camera.render import render
 from airl_mav.camera.shading import MATT, Gloss
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera_kind import Projection
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import Projection
 
 _of = ColourArrays.of
 
