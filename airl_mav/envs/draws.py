@@ -33,8 +33,8 @@ from airl_mav.latency.injection import Injection, LatencySampler, latency_genera
 from airl_mav.policy.observation import Kinematics, Rows
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.vehicle import Estimation
-from airl_mav.vehicle.wind import BLOCK as WIND_BLOCK
-from airl_mav.vehicle.wind import Wind, wind_of_episode
+from airl_mav.vehicle.atmosphere import BLOCK as WIND_BLOCK
+from airl_mav.vehicle.atmosphere import Wind, wind_of_episode
 
 BLOCK = 32
 """Number of decisions drawn at a time."""

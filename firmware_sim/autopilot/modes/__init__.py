@@ -1,4 +1,4 @@
-"""Flight modes, one file each, found by itself: `class Hold(FlightMode, modes=(Mode.HOLD,))`."""
+"""Flight modes, found by themselves: `class Hold(FlightMode, modes=(Mode.HOLD,))`."""
 
 from __future__ import annotations
 

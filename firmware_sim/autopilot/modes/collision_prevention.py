@@ -16,7 +16,7 @@ import numpy as np
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
-from firmware_sim.autopilot.requests import ObstacleBins
+from firmware_sim.autopilot.inputs import ObstacleBins
 from firmware_sim.autopilot.smooth_trajectory import braking_speed
 
 BINS = 72

@@ -9,12 +9,11 @@ from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.inputs import ModeRequest
+from firmware_sim.autopilot.modes.automatic import gentle, landing_speed, leave_ground
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
-from firmware_sim.autopilot.modes.land import landing_speed
 from firmware_sim.autopilot.modes.precision_land import PrecisionLand
-from firmware_sim.autopilot.modes.takeoff import gentle, leave_ground
 from firmware_sim.autopilot.navigation.plan import Triplet, TripletKind
-from firmware_sim.autopilot.requests import ModeRequest
 from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment
 
 _TAKEOFF, _LAND, _IDLE = TripletKind.TAKEOFF, TripletKind.LAND, TripletKind.IDLE

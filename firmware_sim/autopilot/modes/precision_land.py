@@ -14,9 +14,9 @@ from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.inputs import LandingTarget, ModeRequest
+from firmware_sim.autopilot.modes.automatic import landing_speed
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
-from firmware_sim.autopilot.modes.land import landing_speed
-from firmware_sim.autopilot.requests import LandingTarget, ModeRequest
 from firmware_sim.autopilot.smooth_trajectory import PathSegment
 
 PERIOD_US = 50_000
