@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
-from airl_mav.control.gains import Gains
+from airl_mav.control.demand import AnyDemand, AttitudeDemand, Gains, RateDemand
+from airl_mav.control.loops import Motors
 from airl_mav.control.memory import ticks_to_motors
-from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import TICK_HZ
 from airl_mav.core.frames import Geodetic, Vector
 from firmware_sim.autopilot.autopilot_state import (
@@ -29,16 +28,14 @@ from firmware_sim.autopilot.commander import (
     FlightPhase,
     unavailable,
 )
-from firmware_sim.autopilot.error_state import RATES, Q
+from firmware_sim.autopilot.error_state import RATES, KernelFilter, NewFilter, Q
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import MavlinkEvent as Told
 from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
-from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.flight_commander import AutoDisarm, Commanded, FlightCommander
 from firmware_sim.autopilot.flight_modes import WITH_STICKS, Mode
-from firmware_sim.autopilot.fusion_horizon import NewFilter
 from firmware_sim.autopilot.guidance import Guidance, Home
 from firmware_sim.autopilot.inputs import (
     FollowedTarget,
