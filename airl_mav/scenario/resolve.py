@@ -36,7 +36,7 @@ from airl_mav.scenario.piloting import (
 from airl_mav.scenario.resolved import ResolvedScenario
 
 _FLIGHT = "firmware_sim.warm_up"
-_VECTORIZED = "airl_mav.envs.compile_envs"
+_VECTORIZED = "airl_mav.envs.navigation"
 
 
 def plan_of(scenario: ResolvedScenario) -> CompilePlan:
