@@ -26,6 +26,7 @@ from firmware_sim.autopilot.commander import (
     CommanderEvent,
     CommanderState,
     FlightPhase,
+    unavailable,
 )
 from firmware_sim.autopilot.error_state import RATES, KernelFilter, NewFilter, Q
 from firmware_sim.autopilot.estimator import Estimator
@@ -523,6 +524,9 @@ class BuiltinAutopilot:
     def _ask(
         self, mode: Mode, request: ModeRequest | None = None, granted: OperatorText | None = None
     ) -> Result:
+        if not self._guidance.flies(mode):
+            self._say(unavailable(mode))
+            return Result.TEMPORARILY_REJECTED
         self._look_anew(mode)
         # The geofence may forbid the place of the request.
         if self.flight.phase >= _GROUND:

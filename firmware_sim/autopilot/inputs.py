@@ -61,6 +61,16 @@ class OrbitRequest(ModeRequest):
     """ORBIT_YAW_BEHAVIOUR; None = unchanged."""
 
 
+@dataclass(frozen=True, slots=True)
+class PrecisionRequest(ModeRequest):
+    """Precision Landing: place to look for the target, instead of the current position."""
+
+    place: Vec
+    """Place, local NED [m]."""
+    required: bool
+    """True: search for the target if not visible; False: land without it."""
+
+
 class LandingTarget(NamedTuple):
     """Target of a precision landing."""
 

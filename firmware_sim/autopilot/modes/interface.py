@@ -160,6 +160,12 @@ class FlightMode(Protocol):
         return False
 
 
+def optional_mode(mode: Mode, context: FlightContext) -> FlightMode | None:
+    """Return a new mode that may be an add-on; None = not installed."""
+    new = IMPLEMENTATIONS.get(mode)
+    return None if new is None else new(context)
+
+
 FALLBACK_DESCENT_M_S = 0.75
 """Descent rate of stick modes without pilot input (measured on PX4 1.16). The vehicle stays level:
 drag alone slows it, from 1.0 to 0.3 m/s in 7 s (FlightTaskDescend)."""

@@ -9,17 +9,16 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, TrajectoryDemand
 from airl_mav.core.constants import DEG, GRAVITY_M_S2
 from airl_mav.core.frames import Vector, quat_yaw, wrap_pi
 from airl_mav.vehicle.rotation import multiply
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import ModeRequest, Sticks
-from firmware_sim.autopilot.modes.collision_prevention import CollisionPrevention
 from firmware_sim.autopilot.modes.interface import (
     NAN,
     FlightContext,
@@ -332,6 +331,9 @@ class Piloted(FlightMode):
 
     def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
         """Start with the current motion."""
+        self._restart(state)
+
+    def _restart(self, state: Vector) -> None:
         self._vertical.restart(state.item(P + 2), state.item(V + 2))
         self._turning.restart()
         self._terrain.restart()
@@ -343,7 +345,7 @@ class Piloted(FlightMode):
         dt, self._time_us = since(self._time_us, time_us), time_us
         if sticks is None:
             yaw = self._yaw
-            self.enter(state, None)
+            self._restart(state)
             self._yaw = yaw
             return descend(yaw)
         now = quat_yaw(state[Q:RATES])
@@ -408,39 +410,36 @@ class Altitude(Piloted, modes=(Mode.ALTITUDE,)):
 class Position(Piloted, modes=(Mode.POSITION,)):
     """Motion commanded by the sticks."""
 
+    prevents_collisions = False
+    """True if CP_DIST is observed, by an add-on."""
+
     def __init__(self, context: FlightContext, /) -> None:
         super().__init__(context)
         self._horizontal = HorizontalStick(context.value)
-        self._prevention = CollisionPrevention(context.value)
 
     def enter(self, state: Vector, request: ModeRequest | None, /) -> None:
         """Start with the current motion."""
         super().enter(state, request)
+        if not self.prevents_collisions and self._context.value("CP_DIST") > 0.0:
+            text = "CP_DIST has no effect without the add-on extra_modes"
+            self._context.say(OperatorText(Severity.CRITICAL, text))
+
+    def _restart(self, state: Vector) -> None:
+        super()._restart(state)
         north, east, _ = triple(state, V)
         self._horizontal.restart((north, east))
-        self._prevention.rest()
 
     def _steer(
         self, sticks: Sticks, heading: float, state: Vector, dt: float, /
     ) -> tuple[AxisDemand, AxisDemand]:
         north, east, _ = triple(state, P)
-        prevention = self._prevention
-        constrain = None
-        if prevention.is_on:
-            constrain = partial(
-                prevention.constrain,
-                obstacles=self._context.obstacles,
-                yaw=quat_yaw(state[Q:RATES]),
-                now_us=self._time_us or 0,
-            )
-        else:
-            prevention.rest()
         deflected = sticks.pitch, sticks.roll
-        return self._horizontal.move(deflected, heading, (north, east), dt, constrain)
+        limiter = self._limiter(state)
+        return self._horizontal.move(deflected, heading, (north, east), dt, limiter)
 
-    def is_done(self, _state: Vector, /) -> bool:
-        """Return whether obstacle data have been missing too long to permit steering."""
-        return self._prevention.gives_up
+    def _limiter(self, _state: Vector, /) -> Callable[[Pair, Pair], Pair] | None:
+        """Return the limiter of `HorizontalStick.move`; None = unlimited."""
+        return None
 
 
 IDLE_THROTTLE = -0.9
