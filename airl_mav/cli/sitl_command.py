@@ -17,7 +17,7 @@ from airl_mav.cli.telling import Telling, Voice
 from airl_mav.core.addons import load_entry
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
-from airl_mav.profiles.camera_kind import SLOW
+from airl_mav.profiles.projections import SLOW
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario

@@ -17,6 +17,10 @@ In `firmware_sim.addons`:
 
     FIRMWARE: {value of `--firmware`: `firmware_sim.external.programs.FirmwareKind`}
 
+In `firmware_sim.addons`:
+
+    FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
+
 Values are text (`module` or `module:name`); `load` imports what they name, on first use.
 """
 

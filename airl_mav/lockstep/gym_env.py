@@ -21,7 +21,9 @@ from airl_mav.core.constants import TICK_S, US_PER_S, CommandKind
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import goal_distance_m, quat_yaw
 from airl_mav.envs.arena_batch import CEILING, FLOOR, NOTHING, WALL
-from airl_mav.envs.decisions import (
+from airl_mav.envs.draws import source_of
+from airl_mav.envs.fleet import FlightArrays, FlightStatus
+from airl_mav.envs.navigation_env import (
     action_space,
     checked_actions,
     draw_seeds,
@@ -29,11 +31,9 @@ from airl_mav.envs.decisions import (
     observation_space,
     zone_option,
 )
-from airl_mav.envs.draws import source_of
-from airl_mav.envs.fleet import FlightArrays, FlightStatus
+from airl_mav.envs.observations import sight_of
 from airl_mav.envs.rendering import RENDER_MODES, PictureContent, Pictures
 from airl_mav.envs.rewards import Step, costs, reward_of
-from airl_mav.envs.sight import sight_of
 from airl_mav.envs.spec import EnvironmentSpec, gymnasium_spec
 from airl_mav.envs.stopping import bounded, injections_of
 from airl_mav.flight.judge import Outcome, Referee

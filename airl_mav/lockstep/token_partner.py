@@ -24,7 +24,7 @@ from companion.lockstep_turns import Order as Word
 from companion.lockstep_turns import PhaseToken, TurnBack, TurnGiven
 from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect, is_signed, layout
 from firmware_sim.mavlink.endpoint import Peer, Sender, UdpEndpoint
-from firmware_sim.mavlink.scheduler import ONBOARD_HZ
+from firmware_sim.mavlink.px4_links import ONBOARD_HZ
 
 KNOCK_S = 0.1
 """Heartbeat interval before the companion is connected [wall s]."""

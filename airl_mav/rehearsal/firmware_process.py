@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from airl_mav.arena.generate import generate
-from airl_mav.camera.imaging_checks import check_noise, check_renderer
 from airl_mav.core.clock import utc_now
 from airl_mav.core.compiling import heard_compiling
 from airl_mav.core.constants import LOOPBACK, US_PER_S
@@ -23,6 +22,7 @@ from airl_mav.core.signing import StoredSigning
 from airl_mav.faults.fault import Fault, link_fails
 from airl_mav.faults.kinds import PROCESSES
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.camera import check_noise, check_renderer
 from airl_mav.profiles.conditions import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -33,7 +33,6 @@ from airl_mav.scenario.checks import check_fitted
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.autopilot.autopilot_state import OperatorText
-from firmware_sim.crash_detector import CrashDetector
 from firmware_sim.external.flight_stack import FirmwareRequest, real_firmware
 from firmware_sim.external.parameters import KeptParameters
 from firmware_sim.external.programs import how_to_start
@@ -41,11 +40,11 @@ from firmware_sim.faults.fault_timeline import FaultTimeline
 from firmware_sim.faults.faulty_link import FailingEndpoint
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack, fly
 from firmware_sim.interfaces import FirmwareLostError
-from firmware_sim.mavlink.link import LinkConfig
-from firmware_sim.mavlink.udp_links import UdpLinks, bind_device_links, bind_udp_links, udp_server
+from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, bind_device_links, bind_udp_links
+from firmware_sim.mavlink.server import udp_server
 from firmware_sim.pacing import Pacing, Unpaced, WallPacing
-from firmware_sim.plant.camera_server import CameraServer
-from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.plant.camera import CameraServer
+from firmware_sim.simulation import CrashDetector, EpisodeSetup, Simulation
 from firmware_sim.warm_up import warm_up
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from airl_mav.core.errors import FieldError
 from airl_mav.faults.fault import TWIN, Fault, check_twin
 from airl_mav.faults.kinds import LINKS
-from airl_mav.profiles.camera_kind import SLOW, Renderer
+from airl_mav.profiles.projections import SLOW, Renderer
 from airl_mav.profiles.vehicle import Sensors
 from airl_mav.scenario.aircraft import GREATEST_PORT, HAS_PYBULLET, NO_TWIN, Aircraft, Ports
 from airl_mav.scenario.model import LevelName, Scenario

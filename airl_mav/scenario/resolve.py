@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from airl_mav.camera.imaging_checks import check_noise, check_renderer
 from airl_mav.core.errors import FieldError
 from airl_mav.core.first_start import CompileJob, CompilePlan, compile_shown
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.latency.injection import Injection, select_injection, without_timing
 from airl_mav.policy.registry import PolicyInfo, camera_refused, find_policy
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.camera import check_noise, check_renderer
 from airl_mav.profiles.conditions import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import CameraKind
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import PlantName
 from airl_mav.scenario.checks import (
@@ -36,7 +36,7 @@ from airl_mav.scenario.piloting import (
 from airl_mav.scenario.resolved import ResolvedScenario
 
 _FLIGHT = "firmware_sim.warm_up"
-_VECTORIZED = "airl_mav.envs.compile_envs"
+_VECTORIZED = "airl_mav.envs.navigation"
 
 
 def plan_of(scenario: ResolvedScenario) -> CompilePlan:

@@ -28,8 +28,8 @@ from firmware_sim.interfaces import (
 )
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.link import LinkCounters
-from firmware_sim.mavlink.tlog import TlogWriter
-from firmware_sim.mavlink.udp_links import UdpLinks
+from firmware_sim.mavlink.px4_links import UdpLinks
+from firmware_sim.mavlink.traffic import TlogWriter
 from firmware_sim.simulation import EpisodeSetup
 
 ASK_EVERY_S = 0.25

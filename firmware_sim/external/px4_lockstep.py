@@ -29,7 +29,7 @@ from firmware_sim.external.programs import API_LOCAL_PORT, API_PORT, check_free,
 from firmware_sim.external.px4_sitl import Px4Bridge, px4_parts
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.mavlink.codec import Encoder, dialect
-from firmware_sim.mavlink.udp_links import UdpLinks
+from firmware_sim.mavlink.px4_links import UdpLinks
 
 ECHO_S = 60.0
 """Timeout of an echo [wall s, while this process runs]."""

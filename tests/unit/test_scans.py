@@ -18,7 +18,7 @@ from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.encoding import COMPILED
+from airl_mav.envs.observations import COMPILED
 from airl_mav.policy.images import NUMPY
 from airl_mav.policy.layouts import boxes, encode_layout, newest_frame
 from airl_mav.policy.observation import Kinematics, observe

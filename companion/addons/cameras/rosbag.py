@@ -15,7 +15,7 @@ from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.core.clock import NS_PER_US, Clock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.profiles.distortion import MOST_COEFFICIENT, Distortion
+from airl_mav.profiles.projections import MOST_COEFFICIENT, Distortion
 from companion.addons.cameras.drivers import DepthImage, plausible_age_us
 from companion.addons.cameras.fitting import Lens
 
