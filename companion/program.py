@@ -13,10 +13,10 @@ from pydantic import TypeAdapter
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock, WallClock
-from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Goal
-from airl_mav.core.provenance import describe_machine
+from airl_mav.core.machine import describe_machine
+from airl_mav.core.scheduling import held_to
 from airl_mav.flight.episode_record import Part, Setup
 from airl_mav.latency.injection import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy

@@ -8,10 +8,10 @@ import threading
 from rich.console import Console
 
 from airl_mav.cli.options import run_command
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN
 from airl_mav.core.first_start import compile_shown
 from airl_mav.core.frames import Goal
+from airl_mav.core.progress import new_console
 from airl_mav.lockstep.remote import fly_vehicle_in_lockstep
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.profiles.arena import ArenaSpec

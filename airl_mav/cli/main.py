@@ -12,8 +12,8 @@ from rich.table import Table
 
 from airl_mav import __version__
 from airl_mav.core.addons import addon_commands
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_USAGE
+from airl_mav.core.progress import new_console
 
 SUBCOMMANDS: dict[str, str] = {
     # To add one: write cli/<name>_command.py with OPTIONS and run(), and a line here. Add-ons have

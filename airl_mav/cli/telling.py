@@ -12,10 +12,9 @@ from rich.console import Console
 
 from airl_mav import __version__
 from airl_mav.core.clock import utc_now
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
-from airl_mav.core.progress import Event, JsonProgress, Progress, RichProgress
+from airl_mav.core.progress import Event, JsonProgress, Progress, RichProgress, new_console
 
 if TYPE_CHECKING:
     from airl_mav.rehearsal.run_folder import LoadedRun

@@ -25,8 +25,8 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.compiling import writable_folder
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.files import replace_file
+from airl_mav.core.machine import usable_cores
 from airl_mav.core.progress import Bar, Progress
-from airl_mav.core.provenance import usable_cores
 
 LABEL = "compiling kernels (first start only)"
 

@@ -9,10 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from airl_mav.core.cpu_quota import remove_left
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.first_start import compile_first
 from airl_mav.core.progress import Progress
+from airl_mav.core.scheduling import remove_left
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.rehearsal.observer import LiveObserver, Observer

@@ -26,7 +26,7 @@ from typing import Any, ClassVar, Generic, NamedTuple
 from airl_mav.core.addons import addon_executors
 from airl_mav.core.compiling import Heard, heard_compiling
 from airl_mav.core.errors import FieldError
-from airl_mav.core.provenance import usable_cores
+from airl_mav.core.machine import usable_cores
 from airl_mav.experiments import executors
 from airl_mav.scenario.aircraft import GREATEST_INSTANCE, Aircraft
 from airl_mav.scenario.model import GREATEST_WORKERS, Workers

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from airl_mav.core.console import new_console
 from airl_mav.core.files import Arrays
-from airl_mav.core.progress import Progress, RichProgress
+from airl_mav.core.progress import Progress, RichProgress, new_console
 from airl_mav.experiments.campaign import Cell, run_cell
 from airl_mav.experiments.executors import Executor
 from airl_mav.experiments.live import Ended, FlownRun, fly_live, tell_end

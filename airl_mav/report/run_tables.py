@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.process_use import ProcessUse
 from airl_mav.core.progress import DRAWING, Progress
+from airl_mav.core.resource_use import ProcessUse
 from airl_mav.flight.episode_record import EpisodeRecord, Part, Setup, run_sha256
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import NO_ESTIMATE, Estimate

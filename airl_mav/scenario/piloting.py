@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from airl_mav.core.constants import US_PER_MS
-from airl_mav.core.cpu_quota import check_permitted
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Goal
+from airl_mav.core.scheduling import check_permitted
 from airl_mav.latency.injection import Injection, select_injection
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.registry import PolicyInfo, load_policy

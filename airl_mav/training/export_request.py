@@ -16,8 +16,8 @@ from torch import nn
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import optional, switch, validated
+from airl_mav.core.machine import package_versions
 from airl_mav.core.plugins import names_code
-from airl_mav.core.provenance import package_versions
 from airl_mav.envs.sight import further_seen
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import GOAL_RADIUS_M

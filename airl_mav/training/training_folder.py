@@ -19,7 +19,7 @@ from pydantic import TypeAdapter
 
 from airl_mav.core import files
 from airl_mav.core.errors import UsageError
-from airl_mav.core.provenance import provenance
+from airl_mav.core.machine import provenance
 from airl_mav.training.config import TrainingConfig
 
 SCHEMA = 1

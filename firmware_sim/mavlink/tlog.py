@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from airl_mav.core.log_file import LogFile
+from airl_mav.core.files import LogFile
 from firmware_sim.mavlink.clients import Client
 from firmware_sim.mavlink.codec import WireMessage
 

@@ -28,7 +28,7 @@ from airl_mav.addons.sweep.summary import (
 )
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
-from airl_mav.core.provenance import provenance
+from airl_mav.core.machine import provenance
 from airl_mav.experiments.campaign_store import load_campaign, open_campaign
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.layouts import boxes

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from airl_mav import camera, envs
 from airl_mav.camera.colour import Work
-from airl_mav.core import compiling, kernels
+from airl_mav.core import first_start, kernels
 from tests.support.processes import run_alone
 
 FILES = {
@@ -65,7 +65,7 @@ def test_an_edit_compiles_again_what_depends_on_it_and_no_more(tmp_path: Path) -
         file = tmp_path / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text, encoding="utf-8")
-    for module in (compiling, kernels):
+    for module in (first_start, kernels):
         shutil.copy(str(module.__file__), tmp_path / "airl_mav/core")
 
     def run() -> list[str]:
@@ -81,7 +81,7 @@ def test_an_edit_compiles_again_what_depends_on_it_and_no_more(tmp_path: Path) -
 
 
 HEARD = """
-from airl_mav.core.compiling import heard_compiling
+from airl_mav.core.first_start import heard_compiling
 from airl_mav.core.kernels import kernel
 import held
 

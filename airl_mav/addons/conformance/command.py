@@ -8,8 +8,8 @@ from typing import Any
 from pydantic import BaseModel, Field
 from rich.console import Console
 
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
+from airl_mav.core.progress import new_console
 from airl_mav.rehearsal.signals import terminated_as_interrupted
 
 

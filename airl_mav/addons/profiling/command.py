@@ -14,9 +14,8 @@ from airl_mav.addons.profiling.profile import profile
 from airl_mav.addons.profiling.report import print_measurement
 from airl_mav.addons.profiling.request import ProfileRequest
 from airl_mav.cli.options import POSITIONAL, check_installed
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
-from airl_mav.core.progress import RichProgress
+from airl_mav.core.progress import RichProgress, new_console
 
 
 class ProfileOptions(ProfileRequest):

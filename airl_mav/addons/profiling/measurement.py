@@ -17,8 +17,7 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import save_arrays, write_json
-from airl_mav.core.machine import MachineState
-from airl_mav.core.provenance import package_versions
+from airl_mav.core.machine import MachineState, package_versions
 from airl_mav.latency.percentiles import CommandAges, ages_in_closed_loop, command_ages, summarize
 from airl_mav.latency.stages import Samples, pool, stage_samples
 from airl_mav.policy.card import PolicyCard

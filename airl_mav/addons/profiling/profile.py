@@ -16,10 +16,15 @@ from airl_mav.addons.profiling.request import ProfileRequest
 from airl_mav.addons.profiling.soak import MachineReading, Soak, soak
 from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.machine import MachineState, machine_state, mean_frequency_mhz, temperature_c
-from airl_mav.core.power_meter import PowerMeter, PowerSampling, PowerSource, find_power_source
+from airl_mav.core.machine import (
+    MachineState,
+    describe_machine,
+    machine_state,
+    mean_frequency_mhz,
+    temperature_c,
+)
 from airl_mav.core.progress import Bar, Progress
-from airl_mav.core.provenance import describe_machine
+from airl_mav.core.resource_use import PowerMeter, PowerSampling, PowerSource, find_power_source
 from airl_mav.profiles.computer import (
     LONGEST_MS,
     ComputerProfile,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from airl_mav.addons.profiling.soak import Soak
-from airl_mav.core.provenance import package_versions
+from airl_mav.core.machine import package_versions
 from airl_mav.latency.percentiles import summarize
 from airl_mav.report import theme
 from airl_mav.report.document import Document, Section, provenance_facts, write_document

@@ -22,7 +22,7 @@ from airl_mav.addons.refit.thrust import Known, Thrust, fit_thrust, thrust_of
 from airl_mav.black_box.mcap_file import BlackBox, read_black_box
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.provenance import package_versions
+from airl_mav.core.machine import package_versions
 from airl_mav.flight.statistics import QUANTILE
 from airl_mav.latency.percentiles import integrated_time
 from airl_mav.latency.stamps import NO_STAMP

@@ -8,7 +8,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.addons.roofline.roofline import RooflineRequest, roofline
-from airl_mav.core.console import new_console
+from airl_mav.core.progress import new_console
 from airl_mav.report.document import print_document, print_place
 
 

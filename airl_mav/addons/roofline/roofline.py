@@ -23,7 +23,7 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.files import write_json
-from airl_mav.core.provenance import provenance
+from airl_mav.core.machine import provenance
 from airl_mav.envs.stopping import DecisionLoop, StoppingTask
 from airl_mav.experiments.gap import DEFAULT_WORKLOAD
 from airl_mav.latency.injection import ESTIMATE, Injection, choose_injection

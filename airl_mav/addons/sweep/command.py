@@ -12,9 +12,8 @@ from rich.console import Console
 from airl_mav.addons.sweep.document import document_of, print_plan
 from airl_mav.addons.sweep.run import SweepRequest, run_sweep
 from airl_mav.cli.options import POSITIONAL, check_installed
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
-from airl_mav.core.progress import RichProgress
+from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.experiments.process_executor import open_executor
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.document import print_document, print_place, write_document
