@@ -226,6 +226,5 @@ def _signal_group(group: int, number: int) -> None:
         os.killpg(group, number)
 
 
-
 if __name__ == "__main__":
     main()

@@ -1,8 +1,8 @@
 """Progress of long tasks: bars and lines on a terminal, or nothing for callers of the Python API.
 
 Tasks report to a `Progress`: a `Bar` for countable work, the current status, notes for people, and
-events for programs. `RichProgress` draws; `JsonProgress` writes for programs. `new_console` makes the
-console of a command: paths and messages are printed without rich's markup.
+events for programs. `RichProgress` draws; `JsonProgress` writes for programs. `new_console`
+returns the console of a command, without rich's markup in paths and messages.
 """
 
 from __future__ import annotations

@@ -14,19 +14,20 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import MM_PER_M
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.fleet import Fleet
-from airl_mav.policy.images import Bytes, Shrink
-from airl_mav.policy.layouts import DISTANCE_SCALE_M, LEAST_DISTANCE_M, SPEED_SCALE_M_S
-from airl_mav.policy.scans import (
+from airl_mav.policy.images import (
     BAND_M,
     NEAREST_M,
     WIDEST_RAD,
+    Bytes,
     Floats,
     Moved,
     Scanning,
     ScanRays,
+    Shrink,
     Tilt,
     goes_round,
 )
+from airl_mav.policy.layouts import DISTANCE_SCALE_M, LEAST_DISTANCE_M, SPEED_SCALE_M_S
 from airl_mav.vehicle.rotation import Quat, Vec, multiply, yaw_of
 
 

@@ -12,7 +12,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import quantity
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.scenario.model import Workers
-from airl_mav.scenario.resolved import PlannedEpisode
+from airl_mav.scenario.resolve import PlannedEpisode
 
 J = TypeVar("J")
 R = TypeVar("R")

@@ -19,8 +19,7 @@ from airl_mav.rehearsal.observer import LiveObserver, Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RUN_FILE, locked, open_folder
 from airl_mav.rehearsal.signals import terminated_as_interrupted
-from airl_mav.scenario.resolve import plan_of
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario, plan_of
 from airl_mav.view.ends import ViewEnds, ViewRequest
 from firmware_sim.external.programs import check_program
 

@@ -22,8 +22,7 @@ from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario, resolve
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from airl_mav.scenario.model import free_fields
 from airl_mav.scenario.scenario_file import SCENARIO_FILE, save_scenario
 
 if TYPE_CHECKING:
-    from airl_mav.scenario.resolved import ResolvedScenario
+    from airl_mav.scenario.resolve import ResolvedScenario
 
 SCHEMA = 1
 """Version of the folder's layout and of `run.json`."""

@@ -33,12 +33,12 @@ from airl_mav.core.fields import Each, ProfileModel, quantity
 from airl_mav.core.files import replace_file
 from airl_mav.core.machine import describe_machine, package_versions
 from airl_mav.core.progress import RichProgress, new_console
-from airl_mav.latency.percentiles import MIN_SAMPLES, percentile
-from airl_mav.policy.action_sets import ActionSpec
+from airl_mav.latency.stages import MIN_SAMPLES, percentile
+from airl_mav.policy.actions import ActionSpec
+from airl_mav.policy.card_writing import NetworkSize, build_template, template_size
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import OnnxRuntime, outputs_of
-from airl_mav.policy.template import NetworkSize, build_template, template_size
 from airl_mav.profiles.loading import load_profile
 from airl_mav.report.heatmap import Field as Cell
 from airl_mav.report.heatmap import HeatMap, draw_heat_map

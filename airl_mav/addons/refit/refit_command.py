@@ -16,7 +16,7 @@ from airl_mav.core.progress import new_console
 from airl_mav.report.table import NONE, Column, TableView, columns_of, print_table
 
 if TYPE_CHECKING:
-    from airl_mav.addons.refit.quantity import FittedQuantity
+    from airl_mav.addons.refit.flown import FittedQuantity
     from airl_mav.addons.refit.refit import Refit
 
 
