@@ -27,9 +27,7 @@ from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.pacing import Pacing
-from firmware_sim.plant.camera_process import CameraProcess
-from firmware_sim.plant.camera_server import SimulatedCamera
-from firmware_sim.plant.onboard_camera import CameraMaker
+from firmware_sim.plant.camera import CameraMaker, CameraProcess, SimulatedCamera
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 AUTOSAVE_US = 300_000
@@ -40,7 +38,7 @@ IDLE_S = 0.02
 
 
 class FrameServer(Protocol):
-    """Receiver of the camera's frames, such as `plant.camera_server.CameraServer`."""
+    """Receiver of the camera's frames, such as `plant.camera.CameraServer`."""
 
     endpoint: str
     """Address for subscribers."""

@@ -25,7 +25,7 @@ from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.vehicle.airframe import Airframe, draw_airframe
-from airl_mav.vehicle.wind import wind_of_episode
+from airl_mav.vehicle.atmosphere import wind_of_episode
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import FlightPhase
@@ -47,8 +47,7 @@ from firmware_sim.faults.faulty_camera import FailingCamera
 from firmware_sim.faults.faulty_controller import FailingParts
 from firmware_sim.interfaces import ActuatorControls, FlightController, SensorSample, TrueState
 from firmware_sim.pacing import Arrivals
-from firmware_sim.plant.camera_server import SimulatedCamera
-from firmware_sim.plant.onboard_camera import CameraMaker, OnboardCamera
+from firmware_sim.plant.camera import CameraMaker, OnboardCamera, SimulatedCamera
 from firmware_sim.plant.plant import Plant
 from firmware_sim.recording import FlightRecorder, fault_arrays
 from firmware_sim.simulation_snapshot import SimulationSnapshot

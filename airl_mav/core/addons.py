@@ -7,6 +7,10 @@ The `__init__` of an add-on is light and may define tables, which the core reads
     EXECUTORS: {value of `--executor`: module with `connected`}
     LIGHT: the commands can be imported without the simulator
 
+In `firmware_sim.addons`:
+
+    FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
+
 Values are text (`module` or `module:name`); `load` imports what they name, on first use.
 `after_import` runs a module of this package once another package is imported.
 """

@@ -22,8 +22,8 @@ from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.faults.fault import Fault
 from airl_mav.latency.injection import Injection, LatencySampler, latency_generator
 from airl_mav.profiles.conditions import WindSettings
-from airl_mav.vehicle.wind import BLOCK as WIND_BLOCK
-from airl_mav.vehicle.wind import Wind, wind_of_episode
+from airl_mav.vehicle.atmosphere import BLOCK as WIND_BLOCK
+from airl_mav.vehicle.atmosphere import Wind, wind_of_episode
 
 BLOCK = 32
 """Number of decisions drawn at a time."""

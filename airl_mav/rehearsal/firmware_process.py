@@ -33,7 +33,7 @@ from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.mavlink.link import LinkConfig
 from firmware_sim.mavlink.udp_links import UdpLinks, bind_udp_links, udp_server
 from firmware_sim.pacing import Pacing, WallPacing
-from firmware_sim.plant.camera_server import CameraServer
+from firmware_sim.plant.camera import CameraServer
 from firmware_sim.simulation import Simulation
 from firmware_sim.warm_up import warm_up
 

@@ -31,7 +31,7 @@ from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import load_vehicle
 from companion.frame_source import MESSAGES_PER_LOOK, ReceivedFrame, ZmqFrameSource
-from firmware_sim.plant.camera_server import CameraServer, SimulatedCamera
+from firmware_sim.plant.camera import CameraServer, SimulatedCamera
 from tests.support.flight_rig import quad
 
 LENS = Intrinsics.from_fov(33, 25, math.pi / 2)

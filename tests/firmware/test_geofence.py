@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.inputs import PositionYaw, Reposition
 from firmware_sim.autopilot.navigation.fence import (
     PERIOD_US,
     Circle,
@@ -25,7 +26,6 @@ from firmware_sim.autopilot.navigation.fence import (
 from firmware_sim.autopilot.navigation.flown_item import ExecutorState
 from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand, PlanItem, Plans
 from firmware_sim.autopilot.navigation.way_home import destination
-from firmware_sim.autopilot.requests import PositionYaw, Reposition
 from tests.support.flight_rig import Rig, velocity_setpoint
 from tests.support.mission_kit import DEFAULTS, ORIGIN, at, place
 

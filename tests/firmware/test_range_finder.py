@@ -22,10 +22,10 @@ from airl_mav.scenario.resolve import resolve
 from firmware_sim.autopilot.autopilot_state import Clearance, Result
 from firmware_sim.autopilot.error_state import V
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.inputs import Source, Sticks
 from firmware_sim.autopilot.land_detector import LandDetector
-from firmware_sim.autopilot.manual_control import Source, Sticks
-from firmware_sim.autopilot.modes.land import landing_speed
-from firmware_sim.autopilot.modes.piloted import Piloting, TerrainHold
+from firmware_sim.autopilot.modes.automatic import landing_speed
+from firmware_sim.autopilot.modes.sticks import Piloting, TerrainHold
 from firmware_sim.autopilot.range_finder import RangeFinder
 from firmware_sim.crash_detector import TOUCHDOWN_M_S
 from firmware_sim.engine.record import LANDING, new_controller

@@ -37,7 +37,7 @@ from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.cameras.by_name import open_named_camera
 from companion.ground_check import CheckResult, check_on_ground
 from companion.program import prepare
-from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.command_line import airl
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.ports import LOOPBACK, free_ports

@@ -29,7 +29,7 @@ from companion.video import GIMBAL_PORT, RtpVideo, VideoReceiver, picture_of, pi
 from companion.video_program import ShownCamera, show_video
 from firmware_sim.mavlink.link import gimbal_link
 from firmware_sim.mavlink.udp_links import DEVICE_PORTS
-from firmware_sim.plant.camera_server import CameraServer
+from firmware_sim.plant.camera import CameraServer
 from tests.support.command_line import airl
 from tests.support.ports import TestPorts, choose_ports
 from tests.support.processes import SITL_WITHOUT_REPORT, Running, running, wait_until

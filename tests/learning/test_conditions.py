@@ -28,11 +28,11 @@ from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import StandAloneVehicle
 from airl_mav.vehicle.airframe import draw_airframe
+from airl_mav.vehicle.atmosphere import BLOCK, wind_of_episode
 from airl_mav.vehicle.rotation import rotate
-from airl_mav.vehicle.wind import BLOCK, wind_of_episode
 from firmware_sim.interfaces import BatterySample
 from firmware_sim.plant.bullet_body import BulletBody, pybullet
-from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.camera import SimulatedCamera
 from firmware_sim.plant.sensors import SensorSuite
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.learning.test_fleet import ENDLESS, OPEN, QUAD, VEHICLE, PlantPilot, command

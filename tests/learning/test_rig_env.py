@@ -19,7 +19,7 @@ from airl_mav.faults.fault import Fault
 from airl_mav.policy.images import NUMPY
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.profiles.conditions import SensorNoise
-from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.camera import SimulatedCamera
 
 RIG = """
 base = "quad-rig"

@@ -24,7 +24,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.replay.replayed_flight import ReplayedRun
-from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.run_demo import write_demo_run
 
 PROFILE = """

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.control.attitude import attitude_setpoint
+from airl_mav.control.loops import attitude_setpoint
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import GRAVITY_M_S2, CommandKind
 from airl_mav.core.errors import FieldError

@@ -25,7 +25,7 @@ from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.loading import list_profiles, load_profile
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from companion.limits import ground_in_view
-from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.camera import SimulatedCamera
 
 RIG = load_vehicle("quad-rig")
 

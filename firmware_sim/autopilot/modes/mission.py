@@ -7,14 +7,13 @@ import math
 from airl_mav.control.demand import AnyDemand
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
-from firmware_sim.autopilot.modes.land import landing_speed
-from firmware_sim.autopilot.modes.precision_land import PrecisionLand
-from firmware_sim.autopilot.modes.takeoff import gentle, leave_ground
+from firmware_sim.autopilot.inputs import ModeRequest, PrecisionRequest
+from firmware_sim.autopilot.modes.automatic import gentle, landing_speed, leave_ground
+from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, optional_mode, triple
 from firmware_sim.autopilot.navigation.plan import Triplet, TripletKind
-from firmware_sim.autopilot.requests import ModeRequest
 from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment
 
 _TAKEOFF, _LAND, _IDLE = TripletKind.TAKEOFF, TripletKind.LAND, TripletKind.IDLE
@@ -32,7 +31,7 @@ class Mission(FlightMode, modes=(Mode.MISSION,)):
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
         self._triplet: Triplet | None = None
-        self._precision = PrecisionLand(context)
+        self._precision = optional_mode(Mode.PRECISION_LAND, context)
         self._lands_precisely = False
 
     @property
@@ -60,8 +59,16 @@ class Mission(FlightMode, modes=(Mode.MISSION,)):
             if self._triplet is None or triplet.cruise_m_s != self._triplet.cruise_m_s:
                 travel.speed_m_s = triplet.cruise_m_s
             self._triplet = triplet
-        if triplet.precision:
-            return self._land_precisely(triplet, state, time_us)
+            if triplet.precision and self._precision is None:
+                text = "Precision landing is not available without the add-on extra_modes"
+                context.say(OperatorText(Severity.CRITICAL, text))
+        if triplet.precision and self._precision is not None:
+            if not self._lands_precisely:
+                self._lands_precisely = True
+                north, east, down = *triplet.target[:2], position[2]
+                required = triplet.precision == _REQUIRED
+                self._precision.enter(state, PrecisionRequest((north, east, down), required))
+            return self._precision.demand(state, time_us)
         self._lands_precisely = False
         yaw = triplet.yaw if math.isfinite(triplet.yaw) else self._heading(state)
         leg, limits = _leg(triplet, position), self._limits(state)
@@ -70,15 +77,6 @@ class Mission(FlightMode, modes=(Mode.MISSION,)):
             north, east, _ = triplet.target
             leg = PathSegment((north, east, math.nan), vertical_m_s=speed)
         return travel.fly(state, time_us, leg, yaw=yaw, limits=limits)
-
-    def _land_precisely(self, triplet: Triplet, state: Vector, time_us: int) -> AnyDemand:
-        """Land on a target near the item's position."""
-        if not self._lands_precisely:
-            self._lands_precisely = True
-            north, east, _ = triplet.target
-            height = triple(state, P)[2]
-            self._precision.begin((north, east, height), required=triplet.precision == _REQUIRED)
-        return self._precision.demand(state, time_us)
 
     def is_done(self, _state: Vector, /) -> bool:
         """Return whether the mission has ended."""

@@ -10,12 +10,17 @@ import numpy as np
 from airl_mav.core.frames import Geodetic, local_to_geodetic
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
+from firmware_sim.autopilot.error_state import P, V
+from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.failsafes.failsafe_conditions import FenceBreach
 from firmware_sim.autopilot.failsafes.watch import Reports
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.modes.interface import FlightContext
+from firmware_sim.autopilot.guidance import Home
+from firmware_sim.autopilot.inputs import ModeRequest, PositionYaw, Reposition
+from firmware_sim.autopilot.modes.interface import FlightContext, here, triple
+from firmware_sim.autopilot.modes.return_to_launch import return_height, return_time_s
 from firmware_sim.autopilot.navigation.executor import PERIOD_US, Crew, MissionExecutor
 from firmware_sim.autopilot.navigation.feasibility import FeasibilityResult, check
 from firmware_sim.autopilot.navigation.fence import FenceMonitor
@@ -28,7 +33,6 @@ from firmware_sim.autopilot.navigation.plan import (
     Triplet,
     distance_m,
 )
-from firmware_sim.autopilot.navigation.return_path import return_height, return_time_s
 from firmware_sim.autopilot.navigation.way_home import (
     Destination,
     ReturnType,
@@ -38,7 +42,7 @@ from firmware_sim.autopilot.navigation.way_home import (
     landing_start,
     onwards,
 )
-from firmware_sim.autopilot.requests import ModeRequest, PositionYaw, Reposition
+from firmware_sim.autopilot.sensor_monitor import NewestSensors
 
 IDLE_US = 100_000
 """Period in other modes [µs]; its reports are read at 10 Hz."""
@@ -230,3 +234,41 @@ class Navigator:
             landed=situation.landed,
             inside_fence=lambda place: self.fence.inside(place, situation.home),
         )
+
+
+class Whereabouts:
+    """Vehicle position from estimator, sensors and home."""
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        sensors: NewestSensors,
+        home: Home,
+        value: Callable[[str], float],
+    ) -> None:
+        """Store the sources and the look-up for PX4 parameters."""
+        self._estimator, self._sensors, self._home = estimator, sensors, home
+        self._value = value
+
+    def situation(self, *, landed: bool) -> ExecutorState | None:
+        """Return the flight state for missions; None before the first fix."""
+        sample, home, origin = self._sensors.sample, self._home.place, self._estimator.origin
+        if sample is None or home is None or origin is None:
+            return None
+        state = self._estimator.state
+        place, velocity = here(state), triple(state, V)
+        return ExecutorState(
+            sample.time_us, place.position, place.yaw, landed, home, origin, velocity
+        )
+
+    def fenced_place(self) -> Geodetic:
+        """Return the position selected by GF_SOURCE: the estimate, or GPS.
+
+        Raises RuntimeError before the first fix.
+        """
+        origin, gps = self._estimator.origin, self._sensors.gps
+        if gps is not None and (self._value("GF_SOURCE") > 0.0 or origin is None):
+            return gps.position
+        if origin is None:
+            raise RuntimeError("no fix yet: the vehicle is nowhere on the globe")
+        return local_to_geodetic(self._estimator.state[P:V], origin)

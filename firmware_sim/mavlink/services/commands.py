@@ -23,8 +23,8 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.inputs import OrbitRequest, PositionYaw, Reposition
 from firmware_sim.autopilot.navigation.plan import NavCommand
-from firmware_sim.autopilot.requests import OrbitRequest, PositionYaw, Reposition
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.px4_custom_mode import requested_mode
 from firmware_sim.mavlink.services import calibration, logs, message_requests, params

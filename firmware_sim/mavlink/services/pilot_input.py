@@ -9,8 +9,7 @@ from __future__ import annotations
 import math
 
 from airl_mav.core.frames import Geodetic, geodetic_to_local
-from firmware_sim.autopilot.manual_control import Source, Sticks
-from firmware_sim.autopilot.requests import FollowedTarget
+from firmware_sim.autopilot.inputs import FollowedTarget, Source, Sticks
 from firmware_sim.mavlink.codec import WireMessage
 from firmware_sim.mavlink.services.context import Context
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from airl_mav.core.frames import geodetic_to_local
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Landed
 from firmware_sim.autopilot.flight_modes import BY_CUSTOM_MODE, ModeSpec
-from firmware_sim.autopilot.navigation.return_path import return_time_s
+from firmware_sim.autopilot.modes.return_to_launch import return_time_s
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams.units import boot_ms
 

@@ -1,6 +1,10 @@
-"""Orbit: circle around a place with a radius and speed.
+"""Orbit, Follow and Acro.
 
-Source: PX4 1.16, FlightTaskOrbit.
+Orbit flies a circle around a place. Follow stays relative to a target that reports its position
+(FOLLOW_TARGET), by FLW_TGT_DST, FLW_TGT_FA and FLW_TGT_HT above home; terrain is not used. In Acro
+the sticks command body rates and thrust.
+
+Source: PX4 1.16, FlightTaskOrbit, FlightTaskAutoFollowTarget, MulticopterRateControl.
 """
 
 from __future__ import annotations
@@ -8,14 +12,16 @@ from __future__ import annotations
 import math
 from enum import IntEnum
 
-from airl_mav.control.demand import AnyDemand, TrajectoryDemand
-from airl_mav.core.constants import DEG
+from airl_mav.control.demand import AnyDemand, RateDemand, TrajectoryDemand
+from airl_mav.core.constants import DEG, US_PER_S
 from airl_mav.core.frames import Vector, quat_yaw, wrap_pi
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import OperatorText, OrbitStatus, Severity
 from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.inputs import ModeRequest, OrbitRequest
+from firmware_sim.autopilot.modes.automatic import Hold
 from firmware_sim.autopilot.modes.interface import (
     NAN,
     FlightContext,
@@ -23,7 +29,7 @@ from firmware_sim.autopilot.modes.interface import (
     since,
     triple,
 )
-from firmware_sim.autopilot.requests import ModeRequest, OrbitRequest
+from firmware_sim.autopilot.modes.sticks import IDLE_THROTTLE, RELEASED, superexpo
 from firmware_sim.autopilot.smooth_trajectory import PathSegment
 
 LEAST_RADIUS_M = 1.0
@@ -153,3 +159,76 @@ class Orbit(FlightMode, modes=(Mode.ORBIT,)):
     def _report(self) -> None:
         radius = math.copysign(self._radius, self._speed)
         self._context.orbit = OrbitStatus(radius, self._centre)
+
+
+LOST_US = 3 * US_PER_S
+"""Target timeout [µs], after which the vehicle waits at its position."""
+
+WALKS_M_S = 1.0
+"""Minimum speed at which a target has a course; below it, the last course applies [m/s]."""
+
+
+class Follow(FlightMode, modes=(Mode.FOLLOW,)):
+    """Follow mode: keeps a position relative to the target's course, nose towards the target."""
+
+    def __init__(self, context: FlightContext, /) -> None:
+        self._context = context
+        self._waiting = Hold(context)
+        self._course = 0.0
+        """Course of the target [rad]."""
+        self._following = False
+
+    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
+        """Start; until the target moves, its course is the vehicle's heading."""
+        self._course, self._following = quat_yaw(state[Q:RATES]), False
+        self._waiting.enter(state, None)
+
+    def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
+        """Return the demand to the place given by the target's position and course."""
+        target = self._context.target
+        if target is None or time_us - target.time_us > LOST_US:
+            if self._following:
+                self._following = False
+                self._waiting.enter(state, None)
+            return self._waiting.demand(state, time_us)
+        self._following = True
+        value, travel = self._context.value, self._context.travel
+        age_s = max(0, time_us - target.time_us) / US_PER_S
+        (north, east, _), (vn, ve, _) = target.position, target.velocity
+        north, east = north + vn * age_s, east + ve * age_s
+        if math.hypot(vn, ve) > WALKS_M_S:
+            self._course = math.atan2(ve, vn)
+        angle = self._course + value("FLW_TGT_FA") * DEG
+        distance = value("FLW_TGT_DST")
+        place = (
+            north + distance * math.cos(angle),
+            east + distance * math.sin(angle),
+            self._context.home[2] - value("FLW_TGT_HT"),
+        )
+        here = triple(state, P)
+        yaw = math.atan2(east - here[1], north - here[0])
+        travel.speed_m_s = value("FLW_TGT_MAX_VEL")
+        return travel.fly(state, time_us, PathSegment(place, velocity=(vn, ve, 0.0)), yaw=yaw)
+
+
+class Acro(FlightMode, modes=(Mode.ACRO,)):
+    """Body rates proportional to the sticks, and thrust linear in the throttle stick."""
+
+    def __init__(self, context: FlightContext, /) -> None:
+        self._context = context
+
+    @property
+    def lifts(self) -> bool:
+        """True if the throttle stick commands thrust."""
+        sticks = self._context.sticks
+        return sticks is not None and sticks.throttle > IDLE_THROTTLE
+
+    def demand(self, _state: Vector, _time_us: int, /) -> RateDemand:
+        """Return the demand of the sticks."""
+        value, sticks = self._context.value, self._context.sticks or RELEASED
+        gentle, steep = value("MC_ACRO_EXPO"), value("MC_ACRO_SUPEXPO")
+        roll = superexpo(sticks.roll, gentle, steep) * value("MC_ACRO_R_MAX") * DEG
+        pitch = -superexpo(sticks.pitch, gentle, steep) * value("MC_ACRO_P_MAX") * DEG
+        yaw = superexpo(sticks.yaw, value("MC_ACRO_EXPO_Y"), value("MC_ACRO_SUPEXPOY"))
+        rates = (roll, pitch, yaw * value("MC_ACRO_Y_MAX") * DEG)
+        return RateDemand(rates, 0.5 * (sticks.throttle + 1.0))

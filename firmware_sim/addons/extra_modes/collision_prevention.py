@@ -11,12 +11,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import Vector
-from firmware_sim.autopilot.requests import ObstacleBins
+from airl_mav.core.frames import Vector, quat_yaw
+from firmware_sim.autopilot.error_state import RATES, Q
+from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.inputs import ObstacleBins
+from firmware_sim.autopilot.modes.interface import FlightContext
+from firmware_sim.autopilot.modes.sticks import Pair, Position
 from firmware_sim.autopilot.smooth_trajectory import braking_speed
 
 BINS = 72
@@ -227,6 +232,36 @@ class CollisionPrevention:
                 hardest, away = brake, bins[i]
         braked: Vector = hardest * away if math.isfinite(hardest) else away
         return braked
+
+
+class GuardedPosition(Position, modes=(Mode.POSITION,)):
+    """Position mode with collision prevention."""
+
+    prevents_collisions = True
+
+    def __init__(self, context: FlightContext, /) -> None:
+        super().__init__(context)
+        self._prevention = CollisionPrevention(context.value)
+
+    def _restart(self, state: Vector) -> None:
+        super()._restart(state)
+        self._prevention.rest()
+
+    def _limiter(self, state: Vector, /) -> Callable[[Pair, Pair], Pair] | None:
+        prevention = self._prevention
+        if not prevention.is_on:
+            prevention.rest()
+            return None
+        return partial(
+            prevention.constrain,
+            obstacles=self._context.obstacles,
+            yaw=quat_yaw(state[Q:RATES]),
+            now_us=self._time_us or 0,
+        )
+
+    def is_done(self, _state: Vector, /) -> bool:
+        """Return whether obstacle data have been missing too long to permit steering."""
+        return self._prevention.gives_up
 
 
 def _edges(count: int, width_deg: float, offset_deg: float) -> Vector:

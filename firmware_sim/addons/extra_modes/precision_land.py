@@ -14,9 +14,9 @@ from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.inputs import LandingTarget, ModeRequest, PrecisionRequest
+from firmware_sim.autopilot.modes.automatic import landing_speed
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
-from firmware_sim.autopilot.modes.land import landing_speed
-from firmware_sim.autopilot.requests import LandingTarget, ModeRequest
 from firmware_sim.autopilot.smooth_trajectory import PathSegment
 
 PERIOD_US = 50_000
@@ -78,16 +78,11 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
         north, east, down = self._goal
         return north, east, self._context.home[2] if self._state in _DOWNWARDS else down
 
-    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
-        """Start at the current position; search for the target if not visible."""
-        self.begin(triple(state, P), required=True)
-
-    def begin(self, place: Vec, *, required: bool) -> None:
-        """Start above a place, local NED [m].
-
-        `required`: search for the target if not visible; otherwise land without it.
-        """
-        self._goal, self._required = place, required
+    def enter(self, state: Vector, request: ModeRequest | None, /) -> None:
+        """Start above the request's place, by default here, and search for the target."""
+        if not isinstance(request, PrecisionRequest):
+            request = PrecisionRequest(triple(state, P), required=True)
+        self._goal, self._required = request.place, request.required
         self._searches, self._next_us = 1, 0
         self._known_us, self._is_new = -1, False
         self._reached_us = self._found_us = None
