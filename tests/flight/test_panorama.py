@@ -25,7 +25,6 @@ from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import MOST_FRAMES, ObservationSpec
 from airl_mav.policy.registry import GreedyPolicy
-from firmware_sim.plant.camera_server import SimulatedCamera
 from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.poses import at_rest
