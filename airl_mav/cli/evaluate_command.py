@@ -72,9 +72,8 @@ def run(options: EvaluateOptions, console: Console | None = None) -> int:
         matrix,
         write_on_card,
     )
-    from airl_mav.experiments.experiment import known_seeds
+    from airl_mav.experiments.experiment import fly_scenario, known_seeds, run_name
     from airl_mav.experiments.live import fly_live
-    from airl_mav.experiments.run import fly_scenario, run_name
 
     voice = Voice(options, "airl evaluate", console)
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)

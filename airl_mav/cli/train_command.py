@@ -19,7 +19,7 @@ from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.first_start import compile_shown
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.training.request import Exported, TrainingBar, TrainRequest
+from airl_mav.training.training_folder import Exported, TrainingBar, TrainRequest
 
 if TYPE_CHECKING:
     from airl_mav.view.ends import ViewRequest

@@ -16,13 +16,13 @@ from airl_mav.envs.evaluation import (
     LearnedPilots,
     Pilots,
     SinglePilots,
+    Trace,
     fly_seeds,
 )
 from airl_mav.envs.faults import acted
 from airl_mav.envs.fleet import FlightArrays
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
-from airl_mav.envs.trace import Trace
 from airl_mav.experiments.executors import FlyEpisodes, Stop
 from airl_mav.faults.fault import check_twin
 from airl_mav.flight.episode_record import EpisodeRecord, FaultActed

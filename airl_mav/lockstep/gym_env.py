@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import FieldError
-from airl_mav.envs.decisions import (
+from airl_mav.envs.draws import source_of
+from airl_mav.envs.fleet import FlightArrays
+from airl_mav.envs.navigation_env import (
     action_space,
     checked_actions,
     draw_seeds,
@@ -21,11 +23,9 @@ from airl_mav.envs.decisions import (
     observation_space,
     zone_option,
 )
-from airl_mav.envs.draws import source_of
-from airl_mav.envs.fleet import FlightArrays
+from airl_mav.envs.observations import sight_of
 from airl_mav.envs.rendering import RENDER_MODES, Pictures
 from airl_mav.envs.rewards import Step, costs, reward_of
-from airl_mav.envs.sight import sight_of
 from airl_mav.envs.spec import EnvironmentSpec, gymnasium_spec
 from airl_mav.envs.stopping import bounded, injections_of
 from airl_mav.flight.judge import Outcome

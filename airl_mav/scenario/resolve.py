@@ -60,7 +60,7 @@ from airl_mav.scenario.model import PilotSettings, Scenario, WatchdogSettings
 from airl_mav.scenario.scenario_file import anchored
 
 _FLIGHT = "firmware_sim.warm_up"
-_VECTORIZED = "airl_mav.envs.compile_envs"
+_VECTORIZED = "airl_mav.envs.navigation"
 
 
 def plan_of(scenario: ResolvedScenario) -> CompilePlan:

@@ -32,7 +32,7 @@ from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import first_line
 from airl_mav.profiles.camera_kind import CHANNELS, KINDS
 from airl_mav.training import export_request, onnx_export
-from airl_mav.training.recurrent import RecurrentNetwork, RecurrentOfAny
+from airl_mav.training.onnx_export import RecurrentNetwork, RecurrentOfAny
 
 DEPTH = "depth"
 """Key of the image of a depth camera."""

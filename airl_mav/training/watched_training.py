@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MM_PER_M
 from airl_mav.core.constants import US_PER_S
+from airl_mav.envs.evaluation import Trace
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.envs.trace import Trace
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.actions import commands, discrete_actions
 from airl_mav.policy.layouts import newest_frame

@@ -29,7 +29,7 @@ from airl_mav.cli.report_command import run as report
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import quat_yaw
-from airl_mav.experiments.run import Run, load_run
+from airl_mav.experiments.experiment import Run, load_run
 from airl_mav.flight.episode_record import Setup
 from airl_mav.flight.judge import Outcome
 from airl_mav.latency.stamps import STAMPS

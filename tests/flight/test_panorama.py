@@ -13,10 +13,10 @@ from airl_mav.camera.render import Motion, Mount
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.colour_images import lens_of
-from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.evaluation import SinglePilots, fly_seeds
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
+from airl_mav.envs.observations import COMPILED
 from airl_mav.envs.spec import spec_of
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.actions import Action

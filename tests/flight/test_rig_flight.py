@@ -19,9 +19,9 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.colour_images import Looks
-from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.fleet import new_fleet
 from airl_mav.envs.mesh_batch import MeshesSeen
+from airl_mav.envs.observations import COMPILED
 from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.vector import NavigationVectorEnv

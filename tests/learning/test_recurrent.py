@@ -26,7 +26,7 @@ from airl_mav.scenario.aircraft import Ports
 from airl_mav.training.algorithms import policy_arguments
 from airl_mav.training.config import NetworkSpec
 from airl_mav.training.export import export_sb3
-from airl_mav.training.recurrent import GreedyDecisions
+from airl_mav.training.onnx_export import GreedyDecisions
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.policy_kit import facts, make_model
 from tests.support.ports import choose_ports

@@ -73,6 +73,6 @@ assert "numba" not in sys.modules
     done = run_alone(program, tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == [
-        "airl_mav.envs.single:NavigationEnv",
+        "airl_mav.envs.navigation_env:NavigationEnv",
         "airl_mav.envs.vector:NavigationVectorEnv",
     ]

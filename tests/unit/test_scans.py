@@ -20,6 +20,12 @@ from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.encoding import COMPILED
 from airl_mav.policy.images import (
+from airl_mav.envs.observations import COMPILED
+from airl_mav.policy.images import NUMPY
+from airl_mav.policy.layouts import boxes, encode_layout, newest_frame
+from airl_mav.policy.observation import Kinematics, observe
+from airl_mav.policy.observation_spec import ObservationSpec
+from airl_mav.policy.scans import (
     NEAREST_M,
     NUMPY,
     Moved,
