@@ -18,8 +18,6 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import optional, switch, validated
 from airl_mav.core.machine import package_versions
 from airl_mav.core.plugins import names_code
-from airl_mav.envs.sight import further_seen
-from airl_mav.core.provenance import package_versions
 from airl_mav.envs.observations import further_seen
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import GOAL_RADIUS_M
