@@ -21,13 +21,6 @@ from airl_mav.core.kernels import kernel
 from airl_mav.envs.fleet import Fleet
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.faults.fault import Fault
-from airl_mav.policy.layouts import DISTANCE_SCALE_M, LEAST_DISTANCE_M, SPEED_SCALE_M_S
-from airl_mav.policy.observation_spec import (
-    ObservationSpec,
-    SeenCamera,
-    camera_mismatch,
-    further_mismatch,
-)
 from airl_mav.policy.images import (
     BAND_M,
     NEAREST_M,
@@ -40,6 +33,13 @@ from airl_mav.policy.images import (
     Shrink,
     Tilt,
     goes_round,
+)
+from airl_mav.policy.layouts import DISTANCE_SCALE_M, LEAST_DISTANCE_M, SPEED_SCALE_M_S
+from airl_mav.policy.observation_spec import (
+    ObservationSpec,
+    SeenCamera,
+    camera_mismatch,
+    further_mismatch,
 )
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.vehicle import VehicleProfile
