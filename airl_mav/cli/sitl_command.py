@@ -24,7 +24,7 @@ from airl_mav.cli.shared_options import (
 from airl_mav.cli.video_command import video_shown, video_words, watcher_of
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
-from airl_mav.profiles.camera_kind import SLOW
+from airl_mav.profiles.projections import SLOW
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
 from firmware_sim.external.programs import how_to_start

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.gates import Openings, openings_of
 from airl_mav.arena.geometry import Arena
+from airl_mav.arena.walls import Openings, openings_of
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import ned_to_heading, quats_to_euler
 from airl_mav.envs.navigation import Navigation

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MM_PER_M
-from airl_mav.camera.imaging_checks import check_noise, check_twin_imaging
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.kernels import kernel
@@ -42,6 +41,18 @@ from airl_mav.policy.observation_spec import (
     further_mismatch,
 )
 from airl_mav.profiles.camera import Camera
+from airl_mav.policy.scans import (
+    BAND_M,
+    NEAREST_M,
+    WIDEST_RAD,
+    Floats,
+    Moved,
+    Scanning,
+    ScanRays,
+    Tilt,
+    goes_round,
+)
+from airl_mav.profiles.camera import Camera, check_noise, check_twin_imaging
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.rotation import Quat, Vec, multiply, yaw_of
 

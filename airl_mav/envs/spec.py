@@ -31,9 +31,14 @@ from airl_mav.policy.observation_spec import (
     Told,
 )
 from airl_mav.profiles.camera import Camera, check_matched, check_rows
-from airl_mav.profiles.camera_kind import CYLINDER_MOST_DEG, CameraKind, Projection, check_fov
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
-from airl_mav.profiles.distortion import check_distortion
+from airl_mav.profiles.projections import (
+    CYLINDER_MOST_DEG,
+    CameraKind,
+    Projection,
+    check_distortion,
+    check_fov,
+)
 from airl_mav.profiles.vehicle import load_vehicle
 
 SHIPPED_REWARDS = ("shaped", "timed", "progress", "paced", "paper-scaled", "paper")

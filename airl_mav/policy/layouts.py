@@ -46,6 +46,8 @@ from airl_mav.policy.observation_spec import (
     Told,
 )
 from airl_mav.profiles.camera_kind import CHANNELS, KINDS
+from airl_mav.policy.scans import scan_bytes, scans_of
+from airl_mav.profiles.projections import CHANNELS, KINDS
 
 VELOCITY, GOAL = "velocity", "goal"
 """Keys of the shipped layouts besides the image's key, which is the camera's kind."""

@@ -8,9 +8,9 @@ from contextlib import closing
 from dataclasses import dataclass, field
 
 from airl_mav.arena.generate import generate
-from airl_mav.camera.imaging_checks import check_noise, check_renderer
 from airl_mav.core.frames import Goal
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.camera import check_noise, check_renderer
 from airl_mav.profiles.conditions import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile

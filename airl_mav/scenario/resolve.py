@@ -37,6 +37,10 @@ from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.conditions import check_spread, equipped
 from airl_mav.profiles.loading import load_profile, profile_digest
 from airl_mav.profiles.parameters import flown_values
+from airl_mav.profiles.camera import check_noise, check_renderer
+from airl_mav.profiles.conditions import check_spread, equipped
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import CameraKind
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, FirmwareName, PlantName
 from airl_mav.scenario.checks import (

@@ -31,9 +31,8 @@ from airl_mav.policy.actions import (
 from airl_mav.policy.card import PolicyFacts, Training
 from airl_mav.policy.observation_spec import LayoutName, ObservationSpec
 from airl_mav.policy.runtime import first_line
-from airl_mav.profiles.camera_kind import CameraKind, Projection
-from airl_mav.profiles.distortion import UNDISTORTED
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import UNDISTORTED, CameraKind, Projection
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import PilotSettings
 

@@ -24,7 +24,7 @@ from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
 from airl_mav.policy.registry import near_points
 from airl_mav.prediction.compensator import CameraPose, PosedImage, Reprojector
 from airl_mav.profiles.appearance import DEFAULT
-from airl_mav.profiles.distortion import UNDISTORTED, Distortion
+from airl_mav.profiles.projections import UNDISTORTED, Distortion
 from airl_mav.profiles.vehicle import load_vehicle
 from tests.support.lenses import BARREL, OPENING, published, rays_of_fisheye
 from tests.unit.test_colour import arena, busy, poses, sun

@@ -15,10 +15,10 @@ from rich.console import Console
 from scipy import ndimage, stats
 
 from airl_mav.arena.draw import OPENING_COLOUR, draw_arena
-from airl_mav.arena.gates import openings_of, over_openings
 from airl_mav.arena.generate import free_area_fraction, generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.arena.placement import bounding_boxes
+from airl_mav.arena.walls import openings_of, over_openings
 from airl_mav.cli.arena_command import arena_table
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import goal_distance_m

@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 
 from airl_mav import camera, envs
 from airl_mav.camera.colour import Work
-from airl_mav.core import first_start, kernels
+from airl_mav.core import compiling, kernels
+from airl_mav.camera.picture import Work
+from airl_mav.core import compiling, kernels
 from tests.support.processes import run_alone
 
 FILES = {
