@@ -40,18 +40,6 @@ from airl_mav.policy.observation_spec import (
     camera_mismatch,
     further_mismatch,
 )
-from airl_mav.profiles.camera import Camera
-from airl_mav.policy.scans import (
-    BAND_M,
-    NEAREST_M,
-    WIDEST_RAD,
-    Floats,
-    Moved,
-    Scanning,
-    ScanRays,
-    Tilt,
-    goes_round,
-)
 from airl_mav.profiles.camera import Camera, check_noise, check_twin_imaging
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.rotation import Quat, Vec, multiply, yaw_of

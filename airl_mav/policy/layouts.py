@@ -45,8 +45,6 @@ from airl_mav.policy.observation_spec import (
     SeenCamera,
     Told,
 )
-from airl_mav.profiles.camera_kind import CHANNELS, KINDS
-from airl_mav.policy.scans import scan_bytes, scans_of
 from airl_mav.profiles.projections import CHANNELS, KINDS
 
 VELOCITY, GOAL = "velocity", "goal"

@@ -21,11 +21,9 @@ from airl_mav.faults.kinds import LINKS
 from airl_mav.latency.injection import Injection, select_injection
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.registry import PolicyInfo, load_policy
-from airl_mav.profiles.camera_kind import SLOW, Renderer
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.vehicle import Sensors, VehicleProfile
 from airl_mav.profiles.projections import SLOW, Renderer
-from airl_mav.profiles.vehicle import Sensors
+from airl_mav.profiles.vehicle import Sensors, VehicleProfile
 from airl_mav.scenario.aircraft import GREATEST_PORT, HAS_PYBULLET, NO_TWIN, Aircraft, Ports
 from airl_mav.scenario.model import (
     Decisions,

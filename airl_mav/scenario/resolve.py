@@ -11,7 +11,6 @@ from typing import Any
 from pydantic import BaseModel
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.imaging_checks import check_noise, check_renderer
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
 from airl_mav.core.errors import FieldError
@@ -32,14 +31,11 @@ from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import PolicyInfo, camera_refused, find_policy
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.camera import check_noise, check_renderer
 from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.conditions import check_spread, equipped
 from airl_mav.profiles.loading import load_profile, profile_digest
 from airl_mav.profiles.parameters import flown_values
-from airl_mav.profiles.camera import check_noise, check_renderer
-from airl_mav.profiles.conditions import check_spread, equipped
-from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projections import CameraKind
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, FirmwareName, PlantName

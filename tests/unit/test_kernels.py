@@ -17,10 +17,8 @@ from numba import TypingError
 from numpy.typing import NDArray
 
 from airl_mav import camera, envs
-from airl_mav.camera.colour import Work
-from airl_mav.core import compiling, kernels
 from airl_mav.camera.picture import Work
-from airl_mav.core import compiling, kernels
+from airl_mav.core import kernels
 from tests.support.processes import run_alone
 
 FILES = {
