@@ -65,7 +65,7 @@ def test_an_edit_compiles_again_what_depends_on_it_and_no_more(tmp_path: Path) -
         file = tmp_path / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text, encoding="utf-8")
-    for module in (first_start, kernels):
+    for module in (compiling, kernels):
         shutil.copy(str(module.__file__), tmp_path / "airl_mav/core")
 
     def run() -> list[str]:
