@@ -36,7 +36,7 @@ from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import LinkConfig, gcs_link
+from firmware_sim.mavlink.px4_links import LinkConfig, gcs_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.plant.plant import Plant
 from firmware_sim.plant.sensors import SensorSuite

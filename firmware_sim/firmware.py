@@ -25,7 +25,7 @@ from firmware_sim.flight_log.flight_log import ULOG_SUFFIX, FlightLog, LogFolder
 from firmware_sim.interfaces import FlightController, TrueState
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
-from firmware_sim.mavlink.tlog import TlogWriter
+from firmware_sim.mavlink.traffic import TlogWriter
 from firmware_sim.pacing import Pacing
 from firmware_sim.plant.camera import CameraMaker, CameraProcess, SimulatedCamera
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
