@@ -30,7 +30,7 @@ from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.checks import check_fitted
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.external.flight_stack import FirmwareRequest, real_firmware

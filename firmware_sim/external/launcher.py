@@ -16,7 +16,7 @@ import psutil
 
 from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.clock import Patience
-from airl_mav.core.log_file import PARTIAL_SUFFIX
+from airl_mav.core.files import PARTIAL_SUFFIX
 from firmware_sim.external.parameters import RequiredAirframe
 from firmware_sim.interfaces import (
     ActuatorControls,
