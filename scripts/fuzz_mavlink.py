@@ -32,7 +32,7 @@ from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.codec import Encoder, WireLayout, dialect, message_id
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.services import handlers
 from firmware_sim.mavlink.services.commands import ACTIONS

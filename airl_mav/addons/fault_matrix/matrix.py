@@ -30,8 +30,7 @@ from firmware_sim.autopilot.autopilot_state import Result, Setpoint
 from firmware_sim.autopilot.commander import FlightPhase as Commander
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem
-from firmware_sim.crash_detector import TOUCHDOWN_M_S
-from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
+from firmware_sim.simulation import TOUCHDOWN_M_S, EpisodeSetup, Simulation, builtin_autopilot
 
 AFTER_S = 0.5
 """Time from the start of the phase to the fault [s]."""

@@ -11,9 +11,7 @@ from airl_mav.core.signing import Signing
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
-from firmware_sim.mavlink.event_buffer import EventBuffer
 from firmware_sim.mavlink.link import Link
-from firmware_sim.mavlink.own_streams import Radio
 from firmware_sim.mavlink.services.transfers import (
     FtpClient,
     LogDownload,
@@ -22,6 +20,8 @@ from firmware_sim.mavlink.services.transfers import (
     RunningCalibration,
     Shell,
 )
+from firmware_sim.mavlink.streams.sensors import Radio
+from firmware_sim.mavlink.texts_and_events import EventBuffer
 from firmware_sim.storage import Storage
 
 S = TypeVar("S")

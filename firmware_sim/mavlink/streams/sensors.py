@@ -1,9 +1,10 @@
-"""Sensors and outputs: IMU, pressure, GPS, battery, motors, vibration."""
+"""Sensors and outputs: IMU, pressure, battery, motors, vibration, ranges, flow, RC channels."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,9 +13,13 @@ from airl_mav.core.kernels import kernel
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Vector
 from firmware_sim.autopilot.port import ParameterStore
 from firmware_sim.engine.record import Record
-from firmware_sim.mavlink.codec import Values, dialect
-from firmware_sim.mavlink.px4_custom_mode import base_mode
+from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.streams import units
+from firmware_sim.mavlink.streams.status import base_mode
+from firmware_sim.mavlink.streams.units import UINT16_MAX, boot_ms, percent
+
+if TYPE_CHECKING:
+    from firmware_sim.mavlink.streams import Builder
 
 _NO_AIRSPEED = 0.0
 """Differential pressure: the vehicle has no airspeed sensor."""
@@ -105,11 +110,6 @@ def _charge_state(remaining: float, parameters: ParameterStore) -> int:
         if remaining < threshold.value:
             state = warning
     return state
-
-
-def percent(share: float) -> int:
-    """Return a fraction 0..1 as percent for an int8 field; -1 if unknown."""
-    return units.saturate(share * 100.0, 0, 100, -1)
 
 
 # --- outputs
@@ -287,3 +287,58 @@ def optical_flow_rad(state: AutopilotState) -> Values | None:
         _NO_DISTANCE_US,
         _NO_DISTANCE_M,
     )
+
+
+# RC_CHANNELS echoes the newest RC_CHANNELS_OVERRIDE. Source: PX4 1.16, streams/RC_CHANNELS.hpp and
+# MavlinkReceiver::handle_message_rc_channels_override.
+
+CHANNELS = 18
+
+
+_ZERO_SAYS_NOTHING = 8
+"""First channel for which 0 means unused. UINT16_MAX means unused for all channels."""
+
+
+_FULL_SIGNAL = 100
+
+
+class Radio:
+    """Channel values of the newest RC_CHANNELS_OVERRIDE, common to all clients."""
+
+    def __init__(self) -> None:
+        self._said: tuple[int, ...] = ()
+        self._time_us = 0
+        self._count = 0
+        """Number of RC_CHANNELS_OVERRIDE messages received."""
+
+    def hear(self, message: WireMessage, now_us: int) -> None:
+        """Store an RC_CHANNELS_OVERRIDE received at simulated `now_us` [µs]."""
+        said = [getattr(message, f"chan{number}_raw") for number in range(1, CHANNELS + 1)]
+        # Trailing unused channels do not count: PX4 reports the number of channels up to the last
+        # used one.
+        while said and _says_nothing(said[-1], len(said) - 1):
+            said.pop()
+        self._said, self._time_us = tuple(said), now_us
+        self._count += 1
+
+    def updates(self) -> Builder:
+        """Return a builder of RC_CHANNELS for one link. Sends each update once."""
+        # Updates before the link opened are not sent.
+        sent = self._count
+
+        def build(_state: AutopilotState) -> Values | None:
+            nonlocal sent
+            if sent == self._count:
+                return None
+            sent = self._count
+            said = self._said
+            # RC_CHANNELS always has 18 values; UINT16_MAX marks the missing ones.
+            unused = (UINT16_MAX,) * (CHANNELS - len(said))
+            signal = _FULL_SIGNAL if said else 0
+            return boot_ms(self._time_us), len(said), *said, *unused, signal
+
+        return build
+
+
+def _says_nothing(width: int, place: int) -> bool:
+    return width == UINT16_MAX or (width == 0 and place >= _ZERO_SAYS_NOTHING)

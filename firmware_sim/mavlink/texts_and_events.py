@@ -1,5 +1,6 @@
-"""MAVLink events: sent in order to all clients, and again on request.
+"""Texts (STATUSTEXT) and events (EVENT) for operators.
 
+Events are sent in order to all clients, and again on request.
 Source: https://mavlink.io/en/services/events.html, and PX4 1.16, mavlink/mavlink_events.cpp.
 """
 
@@ -10,6 +11,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.events.definition import MavlinkEvent
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.streams.units import boot_ms
@@ -120,3 +122,50 @@ def message(sent: SentEvent) -> WireMessage:
         *(everybody, everybody, event.number, boot_ms(sent.time_us), sent.sequence),
         *(event.levels, list(arguments)),
     )
+
+
+CHUNK_BYTES = 50
+
+
+_LAST_ID = 65_535
+
+
+SAID_BY_EVENT = b"\t"
+"""Suffix of a text that is also sent as an event, as in PX4. Ground stations with event support
+skip such texts."""
+
+
+REPLY_IDS = 32_768
+"""First id of replies if they are numbered separately from the autopilot's texts. The ids of two
+consecutive long texts must differ."""
+
+
+class TextEncoder:
+    """Encoder of texts as STATUSTEXT messages, with the ids that link the chunks."""
+
+    def __init__(self, last_id: int = 0) -> None:
+        """Number long texts from the id after `last_id`."""
+        self._id = last_id
+
+    def encode(self, message: OperatorText) -> list[WireMessage]:
+        """Return the messages of one text, in order.
+
+        A text of up to 50 characters is one message with id 0. A longer text is split into chunks
+        with a common id. A chunk with a NUL is the last, so an empty chunk follows a full last
+        chunk.
+        """
+        # STATUSTEXT is ASCII in PX4; other characters become question marks.
+        text = message.text.encode("ascii", errors="replace")
+        if message.event is not None:
+            text += SAID_BY_EVENT
+        if len(text) <= CHUNK_BYTES:
+            return [dialect.MAVLink_statustext_message(message.severity, text)]
+        # Id 0 means a single chunk, so ids run from 1 to 65535.
+        self._id = self._id % _LAST_ID + 1
+        starts = range(0, len(text) + 1, CHUNK_BYTES)
+        return [
+            dialect.MAVLink_statustext_message(
+                message.severity, text[start : start + CHUNK_BYTES], self._id, chunk
+            )
+            for chunk, start in enumerate(starts)
+        ]

@@ -1,4 +1,4 @@
-"""Message requests and stream rates.
+"""Stream rates, message requests, HEARTBEAT, PING, TIMESYNC and SETUP_SIGNING.
 
 REQUEST_MESSAGE, SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL and older equivalents, with the replies
 of a running PX4 1.16. A request for a message without content is DENIED; setting the rate of a
@@ -10,16 +10,18 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import count
 
+from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Result
+from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect, message_name
-from firmware_sim.mavlink.event_buffer import KEPT, NUMBERS, message
-from firmware_sim.mavlink.scheduler import OFF
+from firmware_sim.mavlink.link import OFF
 from firmware_sim.mavlink.services import component_metadata
-from firmware_sim.mavlink.services.context import Action, Context, VehicleCommand
-from firmware_sim.mavlink.streams import information
+from firmware_sim.mavlink.services.context import ANY, Action, Context, VehicleCommand, sender
+from firmware_sim.mavlink.streams import Builder, status
 from firmware_sim.mavlink.streams.units import INT32_MAX, boot_ms
+from firmware_sim.mavlink.texts_and_events import KEPT, NUMBERS, message
 
 _INTERVAL_UNAVAILABLE = 0
 """Reported interval of a stream that is off. PX4 reports the same for an unknown stream."""
@@ -97,7 +99,7 @@ def _request_interval(command: VehicleCommand, context: Context) -> Result:
 def _request_modes(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 2: number of the mode, starting at 1; 0 = all."""
     asked = command.integer(2) or 0
-    modes = information.available_modes()
+    modes = status.available_modes()
     if not 0 <= asked <= len(modes):
         return Result.DENIED
     # Modes are numbered from 1.
@@ -225,3 +227,60 @@ ACTIONS: dict[int, Action] = {
         lambda command, context: _request_storage(_first_as_second(command), context)
     ),
 }
+
+
+def handle_heartbeat(message: WireMessage, context: Context) -> bool:
+    """Report a ground station's heartbeat to the autopilot (PX4's data link loss), and no other."""
+    if message.type == dialect.MAV_TYPE_GCS:
+        context.port.gcs_heartbeat(context.now_us)
+    return True
+
+
+def handle_ping(message: WireMessage, context: Context) -> bool:
+    """Return a request (target 0/0) to its sender. Replies to our requests need no action."""
+    # Other targets are replies, or requests to another system.
+    if (message.target_system, message.target_component) != (ANY, ANY):
+        return False
+    context.link.send(
+        dialect.MAVLink_ping_message(message.time_usec, message.seq, *sender(message))
+    )
+    return True
+
+
+def handle_timesync(message: WireMessage, context: Context) -> bool:
+    """Answer a request (tc1 = 0) with the vehicle's time [ns]. Replies need no action.
+
+    Peers can measure the offset to the vehicle's clock (simulated time since boot).
+    """
+    if message.tc1 != 0:
+        return False
+    context.link.send(dialect.MAVLink_timesync_message(context.now_us * NS_PER_US, message.ts1))
+    return True
+
+
+def ping_requests() -> Builder:
+    """Return the builder of one link's PING stream, with numbered requests."""
+    sequence = count()
+    return lambda state: (state.time_us, next(sequence) & 0xFFFF_FFFF, ANY, ANY)
+
+
+def handle_setup(message: WireMessage, context: Context) -> bool:
+    """Handle SETUP_SIGNING: replace the signing key; all zeros remove it.
+
+    As in PX4 (PR 25284), an unsigned message is accepted only without a key, and never while armed.
+    """
+    if context.port.state().status.arming is Arming.ARMED:
+        return False
+    key = bytes(message.secret_key)
+    try:
+        context.signing.change(key if any(key) else None, message.initial_timestamp)
+    except OSError as error:
+        text = f"Signing key not stored: {error.strerror}"
+        context.announce(OperatorText(Severity.CRITICAL, text))
+    else:
+        # Other operators must notice a change of the key.
+        what = "set" if any(key) else "removed"
+        system, component = sender(message)
+        text = f"Signing key {what} by system {system} component {component}"
+        context.announce(OperatorText(Severity.NOTICE, text))
+    return True
