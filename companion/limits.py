@@ -117,14 +117,13 @@ class Limits:
         settings: LimitSettings,
         goal: Goal,
         pilot: PilotSettings,
-        mount_pitch_up_rad: float = 0.0,
-        mount_yaw_rad: float = 0.0,
+        mount_rad: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        """Prepare a flight to a goal north, east and, if it has a height, down [m]."""
+        """Prepare a flight to a goal; `mount_rad` are the camera's angles up and right [rad]."""
         self.ending: Ending | None = None
         """Broken rule that has ended the flight; None = no rule broken."""
         self._vehicle = VehicleLimits(settings, goal, pilot)
-        self._camera = CameraLimits(settings, mount_pitch_up_rad, mount_yaw_rad)
+        self._camera = CameraLimits(settings, mount_rad)
 
     def begin(self, now_us: int) -> None:
         """Start navigation at `now_us` [µs]."""
@@ -269,11 +268,9 @@ class VehicleLimits:
 class CameraLimits:
     """Rules for images of the main camera; additional cameras are not checked."""
 
-    def __init__(
-        self, settings: LimitSettings, mount_pitch_up_rad: float, mount_yaw_rad: float
-    ) -> None:
+    def __init__(self, settings: LimitSettings, mount_rad: tuple[float, float]) -> None:
         """Set the limits and the camera's mounting angles, up and to the right of the nose."""
-        self._mount_rad = mount_pitch_up_rad, mount_yaw_rad
+        self._mount_rad = mount_rad
         self._silence_us = round(settings.silence_s * US_PER_S)
         self._same_us = round(settings.image_s * US_PER_S)
         self._first: Frame | None = None

@@ -8,7 +8,7 @@ import threading
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.errors import FieldError, UsageError
@@ -26,6 +26,10 @@ from companion.mavsdk_connection import ARDUPILOT
 from companion.mavsdk_link import MavsdkLink
 from companion.pilot import FRAME_WAIT_S, WAITING, Pilot, SentDecision
 from companion.watchdog import Guard, Watchdog
+
+if TYPE_CHECKING:
+    from airl_mav.profiles.vehicle import VehicleProfile
+    from airl_mav.scenario.resolve import ResolvedScenario
 
 PREPARE_TIMEOUT_S = 10.0
 """Maximum silence of the flight controller at the start of a mission [wall s]."""
@@ -60,52 +64,93 @@ class MissionResult:
     log: DecisionLog
 
 
+@dataclass(frozen=True)
+class Mission:
+    """Goal, policy and settings of a mission."""
+
+    goal: Goal
+    """North, east of the start [m], and down if it has a height."""
+    policy: Policy
+    pilot: PilotSettings
+    watchdog: WatchdogSettings
+    limits: LimitSettings
+    latency: LatencySampler | None = None
+    """Sampler of the inference time t2; None = no injection."""
+    compensator: Compensator | None = None
+    """Latency compensation of image and state; None = no compensation."""
+    mount_rad: tuple[float, float] = (0.0, 0.0)
+    """Mounting angles of the camera, up and to the right of the nose [rad]."""
+    start: Start = "arm"
+
+    @classmethod
+    def of(
+        cls,
+        scenario: ResolvedScenario,
+        goal: Goal,
+        policy: Policy,
+        latency: LatencySampler | None,
+        compensator: Compensator | None,
+    ) -> Mission:
+        """Return the mission of a scenario to a goal."""
+        return cls(
+            goal,
+            policy,
+            scenario.companion_pilot,
+            scenario.watchdog,
+            scenario.scenario.limits,
+            latency,
+            compensator,
+            mount_of(scenario.vehicle),
+            start="hover" if scenario.scenario.start == "hover" else "arm",
+        )
+
+
+def mount_of(vehicle: VehicleProfile) -> tuple[float, float]:
+    """Return the camera's mounting angles, up and to the right of the nose [rad]."""
+    return math.radians(vehicle.camera.pitch_up_deg), math.radians(vehicle.camera.yaw_deg)
+
+
 def fly_mission(
     link: MavsdkLink,
     frames: FrameSource,
-    policy: Policy,
-    goal: Goal,
+    mission: Mission,
     clock: Clock,
     stop: threading.Event,
     abandon: threading.Event,
     progress: Callable[[str], None],
-    *,
-    pilot_settings: PilotSettings,
-    watchdog_settings: WatchdogSettings,
-    limit_settings: LimitSettings,
     guard: Guard,
-    latency: LatencySampler | None = None,
-    compensator: Compensator | None = None,
-    mount_pitch_up_rad: float = 0.0,
-    mount_yaw_rad: float = 0.0,
-    start: Start = "arm",
     decided: Callable[[SentDecision], None] | None = None,
 ) -> MissionResult:
     """Fly one mission on a connected link; failures of a flight do not raise.
 
-    `goal` is north, east [m] from the start, and down if it has a height. `stop`, set externally,
-    lands early; `abandon`, the link's event, ends without landing after a crash. `progress`
-    receives the name of each phase at its start; `decided` must not block.
+    `stop`, set externally, lands early; `abandon`, the link's event, ends without landing after a
+    crash. `progress` receives the name of each phase at its start; `decided` must not block.
     """
-    watchdog = Watchdog(link, clock, watchdog_settings)
+    settings, start = mission.pilot, mission.start
+    watchdog = Watchdog(link, clock, mission.watchdog)
     navigating = False
-    limits = Limits(limit_settings, goal, pilot_settings, mount_pitch_up_rad, mount_yaw_rad)
+    limits = Limits(mission.limits, mission.goal, settings, mission.mount_rad)
     pilot = Pilot(
-        *(link, frames, policy, watchdog, clock, pilot_settings),
-        latency=latency,
-        compensator=compensator,
-        limits=limits,
-        decided=decided,
+        link,
+        frames,
+        mission.policy,
+        watchdog,
+        clock,
+        settings,
+        mission.latency,
+        mission.compensator,
+        limits,
+        decided,
     )
     # From here on the vehicle may fly: every way out passes through the landing below.
     try:
-        _begin(link, start, pilot_settings, stop, progress)
+        _begin(link, start, settings, stop, progress)
         progress("navigating")
         # The watchdog starts before its guard, so that the first deadline counts from here.
         watchdog.begin()
         guard.start(watchdog)
         navigating = True
-        reason = pilot.fly(goal, stop)
+        reason = pilot.fly(mission.goal, stop)
     except LinkError as error:
         reason = str(error)
     except Exception as error:

@@ -5,7 +5,6 @@ The ground check looks at camera, flight controller and policy for a few seconds
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
@@ -19,12 +18,10 @@ from airl_mav.core.addons import load_entry
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.frames import Goal
 from airl_mav.core.machine import describe_machine
 from airl_mav.core.scheduling import held_to
 from airl_mav.flight.episode_record import Part, Setup
-from airl_mav.latency.injection import LatencySampler, latency_generator
-from airl_mav.policy.actions import Policy
+from airl_mav.latency.injection import latency_generator
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import InFlight, Kinematics, observe, views_of
 from airl_mav.policy.registry import camera_refused, find_policy
@@ -32,7 +29,7 @@ from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario import checks
-from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
+from airl_mav.scenario.model import PilotSettings
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
 from companion.frame_source import (
     FrameSource,
@@ -44,7 +41,14 @@ from companion.frame_source import (
 from companion.link_interface import LinkError
 from companion.mavsdk_connection import RATE_HZ, signed
 from companion.mavsdk_link import MavsdkLink
-from companion.offboard_mission import FRAME_TIMEOUT_S, MissionResult, check_camera, fly_mission
+from companion.offboard_mission import (
+    FRAME_TIMEOUT_S,
+    Mission,
+    MissionResult,
+    check_camera,
+    fly_mission,
+    mount_of,
+)
 from companion.pilot import age_of
 from companion.status_reports import obstacles_told, present
 from companion.watchdog import ThreadGuard
@@ -56,33 +60,13 @@ FLIGHT_S = 600.0
 """Default time limit of navigation [s]."""
 
 
-@dataclass(frozen=True)
-class MissionSetup:
-    """Goal, policy and settings of a mission."""
+@dataclass(frozen=True, kw_only=True)
+class MissionSetup(Mission):
+    """Mission of a stand-alone companion."""
 
-    goal: Goal
-    """North, east of the start [m]."""
-    policy: Policy
-    pilot: PilotSettings
-    watchdog: WatchdogSettings
-    limits: LimitSettings
-    latency: LatencySampler | None
-    """Sampler of the inference time t2; None = no injection."""
-    compensator: Compensator | None
-    """Latency compensation of image and state; None = no compensation."""
     vehicle: VehicleProfile
     """Vehicle profile, with the camera and its mounting."""
     setup: Setup
-
-    @property
-    def mount_pitch_up_rad(self) -> float:
-        """Mounting angle of the camera above the nose [rad]."""
-        return math.radians(self.vehicle.camera.pitch_up_deg)
-
-    @property
-    def mount_yaw_rad(self) -> float:
-        """Mounting angle of the camera to the right of the nose [rad]."""
-        return math.radians(self.vehicle.camera.yaw_deg)
 
 
 def prepare(asked: StandAloneCompanion) -> MissionSetup:
@@ -142,15 +126,17 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
         firmware="not known",
     )
     return MissionSetup(
-        asked.goal,
-        loaded,
-        pilot,
-        watchdog,
-        limits,
-        sampler,
-        compensator,
-        vehicle,
-        setup,
+        goal=asked.goal,
+        policy=loaded,
+        pilot=pilot,
+        watchdog=watchdog,
+        limits=limits,
+        latency=sampler,
+        compensator=compensator,
+        mount_rad=mount_of(vehicle),
+        start=asked.start,
+        vehicle=vehicle,
+        setup=setup,
     )
 
 
@@ -162,9 +148,8 @@ def mission_camera(asked: StandAloneCompanion, mission: MissionSetup, clock: Clo
     if isinstance(policy, LearnedPolicy):
         cameras = {k: v for k, v in cameras.items() if k in policy.card.observation.cameras}
     further = {name: Intrinsics.of(each) for name, each in cameras.items()}
-    return open_named_camera(
-        *(asked.camera, clock, Intrinsics.of(vehicle.camera), f"vehicle {asked.vehicle}"), further
-    )
+    wanted, whose = Intrinsics.of(vehicle.camera), f"vehicle {asked.vehicle}"
+    return open_named_camera(asked.camera, clock, wanted, whose, further)
 
 
 @contextmanager
@@ -180,7 +165,7 @@ def obstacles_reported(
         yield camera
         return
     frames, range_m = SharedFrames(camera), mission.vehicle.camera.range_m
-    with obstacles_told(link, frames, range_m, mission.mount_pitch_up_rad, clock):
+    with obstacles_told(link, frames, range_m, mission.mount_rad[0], clock):
         yield frames
 
 
@@ -239,18 +224,9 @@ def fly_alone(
             obstacles_reported(asked, mission, link, camera, clock) as frames,
             recorded(asked, mission, link, clock) as box,
         ):
+            decided = None if box is None else box.decided
             result = fly_mission(
-                *(link, frames, mission.policy, mission.goal, clock, stop, abandon, begin),
-                pilot_settings=mission.pilot,
-                watchdog_settings=mission.watchdog,
-                limit_settings=mission.limits,
-                guard=ThreadGuard(clock),
-                latency=mission.latency,
-                compensator=mission.compensator,
-                mount_pitch_up_rad=mission.mount_pitch_up_rad,
-                mount_yaw_rad=mission.mount_yaw_rad,
-                start=asked.start,
-                decided=None if box is None else box.decided,
+                link, frames, mission, clock, stop, abandon, begin, ThreadGuard(clock), decided
             )
             link.tell(f"airl: {result.reason}")
             # Losses are notes of the result: they need not end the flight.

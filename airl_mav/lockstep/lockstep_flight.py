@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, closing
@@ -40,7 +39,7 @@ from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFold
 from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.view.ends import ViewEnds
-from companion.offboard_mission import MissionResult, Start, check_camera, fly_mission
+from companion.offboard_mission import Mission, MissionResult, Start, check_camera, fly_mission
 from companion.pilot import SentDecision
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.interfaces import FirmwareLostError
@@ -271,24 +270,17 @@ class LockstepFlight:
         if watched is not None:
             latency = watched.companion.latency(latency)
             compensator, decided = watched.companion.compensator(), watched.decided
+        policy = WitnessedPolicy(self._policy, self._digest)
+        mission = Mission.of(resolved, self._goal, policy, latency, compensator)
         self._result = fly_mission(
             stage.link,
             stage.camera,
-            WitnessedPolicy(self._policy, self._digest),
-            self._goal,
+            mission,
             stage.clock,
             self._stop,
             stage.abandon,
             self._announce,
-            pilot_settings=resolved.companion_pilot,
-            watchdog_settings=resolved.watchdog,
-            limit_settings=resolved.scenario.limits,
             guard=stage.clock,
-            latency=latency,
-            compensator=compensator,
-            mount_pitch_up_rad=math.radians(resolved.vehicle.camera.pitch_up_deg),
-            mount_yaw_rad=math.radians(resolved.vehicle.camera.yaw_deg),
-            start=self._start,
             decided=decided,
         )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 
 from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
@@ -73,24 +74,12 @@ def fly_in_lockstep(
         # Turns start before the camera check, which needs frames.
         with turns.taken(link):
             check_camera(mission.policy, camera, stop, mission.compensator)
-            result = fly_mission(
-                link,
-                camera,
-                WitnessedPolicy(mission.policy, digest),
-                mission.goal,
-                clock,
-                stop,
-                abandon,
-                announce,
-                pilot_settings=mission.pilot,
-                watchdog_settings=mission.watchdog,
-                limit_settings=mission.limits,
-                guard=clock,
-                # Without injection a fixed t2 is used: the measured one would differ in each
-                # flight.
+            flown = replace(
+                mission,
+                policy=WitnessedPolicy(mission.policy, digest),
+                # Without injection a fixed t2: the measured one would differ in each flight.
                 latency=mission.latency or FixedSampler(NATIVE_T2_US),
-                compensator=mission.compensator,
-                mount_pitch_up_rad=mission.mount_pitch_up_rad,
-                mount_yaw_rad=mission.mount_yaw_rad,
+                start="arm",
             )
+            result = fly_mission(link, camera, flown, clock, stop, abandon, announce, clock)
     return result, {SEEN: digest.lanes()[SEEN]}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import queue
 import sys
@@ -23,7 +22,7 @@ from companion.frame_source import open_camera
 from companion.link_interface import LinkError
 from companion.mavsdk_connection import signed
 from companion.mavsdk_link import MavsdkLink
-from companion.offboard_mission import check_camera, fly_mission
+from companion.offboard_mission import Mission, check_camera, fly_mission
 from companion.watchdog import ThreadGuard
 
 if TYPE_CHECKING:  # Loaded only for a view.
@@ -91,25 +90,10 @@ class Missions:
                     latency, carries = tap.latency(latency), tap.compensator()
                     decided = tap.decided
                 use.begin()
+                mission = Mission.of(self._scenario, request.goal, policy, latency, carries)
+                stop, abandon, guard = self._stop, self._abandon, ThreadGuard(clock)
                 result = fly_mission(
-                    link,
-                    frames,
-                    policy,
-                    request.goal,
-                    clock,
-                    self._stop,
-                    self._abandon,
-                    self._announce,
-                    pilot_settings=self._scenario.companion_pilot,
-                    watchdog_settings=self._scenario.watchdog,
-                    limit_settings=self._scenario.scenario.limits,
-                    guard=ThreadGuard(clock),
-                    latency=latency,
-                    compensator=carries,
-                    mount_pitch_up_rad=math.radians(self._scenario.vehicle.camera.pitch_up_deg),
-                    mount_yaw_rad=math.radians(self._scenario.vehicle.camera.yaw_deg),
-                    start="hover" if aircraft.start == "hover" else "arm",
-                    decided=decided,
+                    link, frames, mission, clock, stop, abandon, self._announce, guard, decided
                 )
                 used = use.end()
                 save_arrays(Path(request.record), result.log.columns())

@@ -29,7 +29,7 @@ from airl_mav.rehearsal.run_folder import load
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from companion.frame_source import ZmqFrameSource
 from companion.mavsdk_link import MavsdkLink
-from companion.offboard_mission import MissionResult, fly_mission
+from companion.offboard_mission import Mission, MissionResult, fly_mission
 from companion.watchdog import ThreadGuard
 from tests.support.ports import LOOPBACK, TestPorts, choose_ports, free_ports
 from tests.support.processes import (
@@ -312,13 +312,12 @@ def fly_in_thread(ports: TestPorts, policy: Any) -> tuple[threading.Thread, list
         frames = ZmqFrameSource(f"tcp://{LOOPBACK}:{ports.camera}", clock)
         try:
             link.connect(20.0)
+            watchdog = WatchdogSettings(decision_timeout_s=1.5, leave_after_s=1.0)
+            pilot = PilotSettings(altitude_m=1.5)
+            mission = Mission((FAR_M, 0.0), policy, pilot, watchdog, LimitSettings())
             results.append(
                 fly_mission(
-                    *(link, frames, policy, (FAR_M, 0.0), clock, stop, abandon, lambda _: None),
-                    pilot_settings=PilotSettings(altitude_m=1.5),
-                    watchdog_settings=WatchdogSettings(decision_timeout_s=1.5, leave_after_s=1.0),
-                    limit_settings=LimitSettings(),
-                    guard=ThreadGuard(clock),
+                    link, frames, mission, clock, stop, abandon, lambda _: None, ThreadGuard(clock)
                 )
             )
         finally:

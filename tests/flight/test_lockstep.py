@@ -39,7 +39,7 @@ from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettin
 from airl_mav.scenario.resolve import ResolvedScenario
 from companion.link_interface import BodyVelocity
 from companion.lockstep_turns import Poll
-from companion.offboard_mission import fly_mission
+from companion.offboard_mission import Mission, fly_mission
 from firmware_sim.autopilot.failsafes.supervisor import LOOK_US
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.simulation import EpisodeSetup
@@ -295,14 +295,18 @@ def companion_dies(stage: LockstepStage) -> None:
 
 
 def policy_hangs(stage: LockstepStage) -> None:
-    result = fly_mission(
-        *(stage.link, stage.camera, Still(), (500.0, 0.0), stage.clock),
-        *(stage.abandon, stage.abandon, lambda _: None),
-        pilot_settings=PilotSettings(),
-        watchdog_settings=WatchdogSettings(decision_timeout_s=1.0, leave_after_s=1.0),
-        limit_settings=LimitSettings(),
-        guard=stage.clock,
+    watchdog = WatchdogSettings(decision_timeout_s=1.0, leave_after_s=1.0)
+    mission = Mission(
+        (500.0, 0.0),
+        Still(),
+        PilotSettings(),
+        watchdog,
+        LimitSettings(),
         latency=FixedSampler(10 * US_PER_S),
+    )
+    stop, clock = stage.abandon, stage.clock
+    result = fly_mission(
+        stage.link, stage.camera, mission, clock, stop, stop, lambda _: None, clock
     )
     # Without an arena there is nothing to see: it hangs in waiting for a frame.
     assert result.reason == "camera silent"

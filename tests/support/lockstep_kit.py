@@ -16,7 +16,7 @@ from airl_mav.rehearsal.observer import Observer
 from airl_mav.scenario.checks import NATIVE_T2_US
 from airl_mav.scenario.model import LimitSettings, PilotSettings, Scenario, WatchdogSettings
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
-from companion.offboard_mission import MissionResult, Start, fly_mission
+from companion.offboard_mission import Mission, MissionResult, Start, fly_mission
 from companion.pilot import SentDecision
 
 SEED = 11
@@ -56,16 +56,18 @@ def fly_as_companion(
 
     `stop` ends it early; `phase` receives its phases, and `decided` its decisions.
     """
-    return fly_mission(
-        *(stage.link, stage.camera, policy, goal, stage.clock),
-        *(stage.abandon if stop is None else stop, stage.abandon, phase),
-        pilot_settings=PilotSettings(),
-        watchdog_settings=WatchdogSettings(),
-        limit_settings=LimitSettings(),
-        guard=stage.clock,
+    mission = Mission(
+        goal,
+        policy,
+        PilotSettings(),
+        WatchdogSettings(),
+        LimitSettings(),
         latency=FixedSampler(NATIVE_T2_US),
         start=start,
-        decided=decided,
+    )
+    clock, abandon = stage.clock, stage.abandon
+    return fly_mission(
+        stage.link, stage.camera, mission, clock, stop or abandon, abandon, phase, clock, decided
     )
 
 

@@ -25,7 +25,7 @@ from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.addons.black_box.recorder import SAMPLE_US, open_recorder, run_of
 from companion.link_interface import BatteryState, VehicleStatus
 from companion.mavsdk_link import MavsdkLink
-from companion.offboard_mission import fly_mission
+from companion.offboard_mission import Mission, fly_mission
 from companion.program import prepare
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
@@ -127,16 +127,17 @@ def fly_recorded(
             recorder.phase(name)
 
         def program() -> None:
-            result = fly_mission(
-                *(stage.link, stage.camera, scenario.fresh_policy(seed), goal, stage.clock),
-                *(stage.abandon, stage.abandon, phase),
-                pilot_settings=scenario.companion_pilot,
-                watchdog_settings=scenario.watchdog,
-                limit_settings=asked.limits,
-                guard=stage.clock,
-                latency=scenario.latency_sampler(seed, native=False),
-                decided=recorder.decided,
+            mission = Mission(
+                goal,
+                scenario.fresh_policy(seed),
+                scenario.companion_pilot,
+                scenario.watchdog,
+                asked.limits,
+                scenario.latency_sampler(seed, native=False),
             )
+            link, frames, clock, stop = stage.link, stage.camera, stage.clock, stage.abandon
+            decided = recorder.decided
+            result = fly_mission(link, frames, mission, clock, stop, stop, phase, clock, decided)
             reasons.append(result.reason)
 
         stage.firmware.on_tick = look_on

@@ -13,7 +13,7 @@ import json
 import signal
 import threading
 from contextlib import AbstractContextManager, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -148,22 +148,9 @@ def _fly(
         link.exchange(GROUND_EXCHANGES, GROUND_INTERVAL_S, stop)
         before = link.take_exchanges()
         with link.exchanging(FLIGHT_INTERVAL_S):
+            flown = replace(mission, policy=limited, latency=None, start="arm")
             result = fly_mission(
-                link,
-                frames,
-                limited,
-                mission.goal,
-                clock,
-                stop,
-                abandon,
-                lambda _: None,
-                pilot_settings=mission.pilot,
-                watchdog_settings=mission.watchdog,
-                limit_settings=mission.limits,
-                guard=ThreadGuard(clock),
-                compensator=mission.compensator,
-                mount_pitch_up_rad=mission.mount_pitch_up_rad,
-                mount_yaw_rad=mission.mount_yaw_rad,
+                link, frames, flown, clock, stop, abandon, lambda _: None, ThreadGuard(clock)
             )
         during = link.take_exchanges()
         # `stop` is set by now: it ends the flight.
