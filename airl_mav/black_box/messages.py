@@ -34,8 +34,12 @@ Vector3: TypeAlias = tuple[Number, Number, Number]
 Vector4: TypeAlias = tuple[Number, Number, Number, Number]
 
 
+class Message:
+    """Message of a black box."""
+
+
 @dataclass(frozen=True)
-class Decision:
+class Decision(Message):
     """Decision, written as soon as its command is sent."""
 
     capture_us: Microseconds
@@ -61,7 +65,7 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Telemetry:
+class Telemetry(Message):
     """State of the vehicle as reported by the flight controller."""
 
     time_us: Microseconds
@@ -82,7 +86,7 @@ class Truth(Telemetry):
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(Message):
     """Current velocity command, rotated by the vehicle's heading."""
 
     time_us: Microseconds
@@ -93,7 +97,7 @@ class Command:
 
 
 @dataclass(frozen=True)
-class Latency:
+class Latency(Message):
     """Duration of each stage of a decision [ms]; None = its start or end is unknown."""
 
     sent_us: Microseconds
@@ -110,7 +114,7 @@ class Latency:
 
 
 @dataclass(frozen=True)
-class Status:
+class Status(Message):
     """Flight mode, arming state and battery."""
 
     time_us: Microseconds
@@ -125,7 +129,7 @@ class Status:
 
 
 @dataclass(frozen=True)
-class Resources:
+class Resources(Message):
     """Load, memory and temperature of the companion computer."""
 
     time_us: Microseconds
@@ -140,7 +144,7 @@ class Resources:
 
 
 @dataclass(frozen=True)
-class Phase:
+class Phase(Message):
     """Start of a phase of the mission."""
 
     time_us: Microseconds
@@ -148,7 +152,7 @@ class Phase:
 
 
 @dataclass(frozen=True)
-class End:
+class End(Message):
     """End of the mission."""
 
     time_us: Microseconds
@@ -165,7 +169,7 @@ class Timestamp:
 
 
 @dataclass(frozen=True)
-class RawImage:
+class RawImage(Message):
     """foxglove.RawImage: input image of a decision before compensation."""
 
     timestamp: Timestamp
@@ -181,7 +185,7 @@ class RawImage:
 
 
 @dataclass(frozen=True)
-class Log:
+class Log(Message):
     """foxglove.Log: a text message."""
 
     timestamp: Timestamp
@@ -191,20 +195,6 @@ class Log:
     file: str = ""
     line: int = 0
 
-
-Message: TypeAlias = (
-    Decision
-    | Telemetry
-    | Truth
-    | Command
-    | Latency
-    | Status
-    | Resources
-    | Phase
-    | End
-    | RawImage
-    | Log
-)
 
 TOPICS: dict[type[Message], str] = {
     Decision: "/decision",
@@ -220,11 +210,8 @@ TOPICS: dict[type[Message], str] = {
     Log: "/log",
 }
 
-SCHEMAS: dict[type[Message], str] = {
-    **{kind: f"airl.{kind.__name__}" for kind in TOPICS},
-    RawImage: "foxglove.RawImage",
-    Log: "foxglove.Log",
-}
+FOXGLOVE: dict[type[Message], str] = {RawImage: "foxglove.RawImage", Log: "foxglove.Log"}
+"""Foxglove's schemas; the others are named after their class."""
 
 INFO, WARNING = 2, 3
 
@@ -313,7 +300,8 @@ class Channel(NamedTuple):
 
 def _channel(kind: type[Message]) -> Channel:
     schema = json.dumps(foxglove_schema(kind)).encode()
-    return Channel(TOPICS[kind], SCHEMAS[kind], "jsonschema", schema, JSON)
+    name = FOXGLOVE.get(kind, f"airl.{kind.__name__}")
+    return Channel(TOPICS[kind], name, "jsonschema", schema, JSON)
 
 
 CHANNELS = {kind: _channel(kind) for kind in TOPICS}

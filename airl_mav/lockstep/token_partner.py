@@ -176,11 +176,10 @@ class TokenPartner:
         # A sleep until the next frame ends at its arrival, which is known once the frame is in
         # transit.
         if rest.event == "frame":
-            under_way = self._camera.under_way
-            if under_way.next_us is not None:
-                wake_us = min(wake_us, under_way.next_us)
+            if self._camera.next_us is not None:
+                wake_us = min(wake_us, self._camera.next_us)
             else:
-                interrupt = under_way.published
+                interrupt = self._camera.published
                 interrupt.clear()
         elif rest.event == "stop" and not self._order:
             interrupt = self._ordered

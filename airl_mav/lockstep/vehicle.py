@@ -65,12 +65,7 @@ class ConductedVehicle:
 
 
 def builtin_vehicle(clock: Clock, faults: Sequence[Fault] = ()) -> ConductedVehicle:
-    """Return the built-in autopilot with an in-memory link.
-
-    Args:
-        clock: Clock of the conductor.
-        faults: Faults of the flight; link faults add a `FailingEndpoint`.
-    """
+    """Return the built-in autopilot with an in-memory link; link faults act on the clock."""
     endpoint = MemoryEndpoint()
     failing = None
     if link_fails(faults):
@@ -85,15 +80,8 @@ def real_vehicle(
 ) -> ConductedVehicle | None:
     """Return the aircraft's real firmware; None for the built-in autopilot.
 
-    Binds the ports, starts nothing.
-
-    Args:
-        aircraft: Options of the aircraft.
-        vehicle: Vehicle profile.
-        log: Path for the output of real firmware; None = a file in the firmware's folder.
-
-    Raises:
-        UsageError: No instance of real firmware is free, or its program is missing.
+    Binds the ports, starts nothing. The firmware's output goes to `log`; None = a file in its
+    folder. Raises UsageError if no instance is free, or the program is missing.
     """
     if aircraft.firmware == "builtin":
         return None
@@ -121,27 +109,20 @@ class VehicleEnd(Protocol):
     """True if the vehicle needs simulated time to answer commands."""
 
     def deliver(self, frame: bytes, carry_out: Callable[[], object], *, echo: bool) -> None:
-        """Deliver a frame of the companion to the vehicle.
+        """Deliver a MAVLink frame of the companion; `carry_out` lets an in-process vehicle read it.
 
-        Args:
-            frame: A MAVLink frame.
-            carry_out: Callback that lets an in-process vehicle process its input.
-            echo: True = return after the vehicle has read the frame. Must be False while a command
-                is pending, as the vehicle may need simulated time until it reads again.
+        With `echo`, return after the vehicle has read the frame. Must be False while a command is
+        pending, as the vehicle may need simulated time until it reads again.
         """
-        ...
 
     def take(self) -> list[bytes]:
         """Return all MAVLink frames sent since the last call, oldest first."""
-        ...
 
     def after_tick(self, *, expected: bool) -> list[bytes]:
         """Return new frames once per tick; they may be delayed unless an answer is `expected`."""
-        ...
 
     def settle(self) -> None:
         """Wait until the vehicle has finished all due work and sent its messages."""
-        ...
 
 
 class InMemory:
@@ -221,19 +202,19 @@ def acknowledged(frame: bytes) -> int | None:
     return int.from_bytes(payload[:2], "little")
 
 
-class UnderWay:
+class DelayedFrames:
     """Queue of frames in transit from exposure to the companion."""
 
     def __init__(self, transport_us: int) -> None:
         """Set the transport latency [µs]: from exposure to the decoded frame in the companion."""
+        self.transport_us = transport_us
         self.published = threading.Event()
         """Set by each sent frame; a waiting thread clears the event first."""
-        self._transport_us = transport_us
         self._frames: deque[Frame] = deque()
 
-    def send(self, frame: Frame) -> None:
-        """Queue a frame for delivery."""
-        frames, arrived_us = self._frames, frame.capture_time_us - self._transport_us
+    def publish(self, frame: Frame) -> None:
+        """Queue a frame for delivery, in simulated time."""
+        frames, arrived_us = self._frames, frame.capture_time_us - self.transport_us
         while len(frames) > 1 and frames[1].capture_time_us <= arrived_us:
             frames.popleft()  # A newer frame has arrived: this one can no longer be read.
         frames.append(frame)
@@ -250,46 +231,34 @@ class UnderWay:
     @property
     def next_us(self) -> int | None:
         """Arrival time of the next frame [µs]; None = no frame is in transit."""
-        return self._frames[0].capture_time_us + self._transport_us if self._frames else None
+        return self._frames[0].capture_time_us + self.transport_us if self._frames else None
 
     @property
     def awaited(self) -> bool:
         """True if the companion waits for the next exposure."""
         return not self.published.is_set()
 
-    def clear(self) -> None:
+    def close(self) -> None:
         """Discard all frames."""
         self._frames.clear()
 
 
-class MemoryCamera:
+class MemoryCamera(DelayedFrames):
     """In-process camera: `firmware.FrameServer` and, with `latest`, `frame_source.FrameSource`."""
 
     endpoint = "memory"
 
     def __init__(self, transport_us: int) -> None:
-        """Set the transport latency [µs]: from exposure to the decoded frame in the companion."""
+        """Set the transport latency from exposure to arrival [µs]."""
+        super().__init__(transport_us)
         self.clock: Clock | None = None
         """Clock of the companion; None = not connected yet."""
-        self.transport_us = transport_us
-        self._under_way = UnderWay(transport_us)
-        self.publish = self._under_way.send
         self._newest: ReceivedFrame | None = None
-
-    @property
-    def awaited(self) -> bool:
-        """True if the companion waits for the next exposure."""
-        return self._under_way.awaited
-
-    def close(self) -> None:
-        """Discard all frames."""
-        self._under_way.clear()
 
     def latest(self) -> ReceivedFrame | None:
         """Return the newest frame that has arrived, without blocking; None before the first."""
         now_us = 0 if self.clock is None else self.clock.time_us()
-        arrived = self._under_way.arrived(now_us)
-        if arrived is not None:
+        if (arrived := self.arrived(now_us)) is not None:
             self._newest = ReceivedFrame(arrived, now_us)
         return self._newest
 
@@ -298,7 +267,7 @@ class MemoryCamera:
 
         The timeout is in simulated time.
         """
-        clock, under_way = self.clock, self._under_way
+        clock = self.clock
         if clock is None:
             raise RuntimeError("nobody looks: the camera has no companion's clock")
         # The timeout counts in simulated time: wall time must not affect the flight.
@@ -310,39 +279,32 @@ class MemoryCamera:
             if clock.time_us() >= deadline_us:
                 return None
             # A frame in transit has a known arrival; otherwise its publication ends the sleep.
-            if under_way.next_us is not None:
-                clock.sleep_until(min(deadline_us, under_way.next_us))
+            if self.next_us is not None:
+                clock.sleep_until(min(deadline_us, self.next_us))
             else:
-                under_way.published.clear()
-                clock.sleep_until(deadline_us, under_way.published)
+                self.published.clear()
+                clock.sleep_until(deadline_us, self.published)
 
 
-class TokenCamera:
+class TokenCamera(DelayedFrames):
     """Camera of a companion in another process. Implements `firmware.FrameServer`.
 
     Each turn sends only the newest frame that has arrived, as the companion cannot read older ones.
     """
 
     def __init__(self, server: FrameServer, transport_us: int) -> None:
-        """Set the frame server and the transport latency from exposure to arrival [µs]."""
-        self.transport_us = transport_us
-        self.under_way = UnderWay(transport_us)
+        """Set the frame server and the transport latency from exposure to arrival [µs].
+
+        The caller owns and closes the server.
+        """
+        super().__init__(transport_us)
         self.endpoint = server.endpoint
         self._server = server
         self._newest: Frame | None = None
 
-    @property
-    def awaited(self) -> bool:
-        """True if the companion waits for the next exposure."""
-        return self.under_way.awaited
-
-    def publish(self, frame: Frame) -> None:
-        """Queue a frame for delivery, in simulated time."""
-        self.under_way.send(frame)
-
     def arrive(self, now_us: int) -> bool:
         """Receive all frames that arrived by `now_us` [µs]; return True if there was one."""
-        arrived = self.under_way.arrived(now_us)
+        arrived = self.arrived(now_us)
         self._newest = arrived or self._newest
         return arrived is not None
 
@@ -355,7 +317,3 @@ class TokenCamera:
         """Send the newest arrived frame immediately; a resend covers packet loss."""
         if self._newest is not None:
             self._server.publish(self._newest)
-
-    def close(self) -> None:
-        """Discard all frames; the caller owns and closes the server."""
-        self.under_way.clear()

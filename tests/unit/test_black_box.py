@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 
 from airl_mav.black_box.mcap_file import BlackBoxFile, read_black_box
 from airl_mav.black_box.messages import (
-    SCHEMAS,
+    CHANNELS,
     TOPICS,
     Command,
     Decision,
@@ -119,7 +119,7 @@ def test_any_reader_of_mcap_reads_it_and_finds_its_schemas(whole: Path) -> None:
         for kind, topic in TOPICS.items():
             schema, channel, message = found[topic]
             assert schema is not None
-            assert (schema.name, schema.encoding) == (SCHEMAS[kind], "jsonschema")
+            assert (schema.name, schema.encoding) == (CHANNELS[kind].schema_name, "jsonschema")
             assert channel.message_encoding == "json"
             properties = json.loads(schema.data)["properties"]
             assert properties.keys() == json.loads(message.data).keys()

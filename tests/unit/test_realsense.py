@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.clock import SimClock
+from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.errors import FieldError
 from companion.addons.cameras.fitting import Fitting, Lens
 from companion.frame_source import open_named_camera
@@ -133,7 +133,7 @@ def test_what_a_d435_sees_is_what_the_profile_of_it_sees() -> None:
 
 def test_no_camera_and_no_file_are_one_line() -> None:
     with pytest.raises(FieldError, match=r"realsense:none\.bag.: no such file"):
-        realsense.open_realsense("none.bag")
+        realsense.open_realsense("none.bag", WallClock())
     if not list(rs.context().query_devices()):
         for name in ("realsense", "realsense:0123"):
             with pytest.raises(FieldError, match=f"{name}.: librealsense finds no camera"):

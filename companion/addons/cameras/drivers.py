@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.addons import load
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
@@ -24,15 +25,13 @@ from airl_mav.core.plugins import CAMERAS, load_part, reference
 from companion.addons.cameras.fitting import Fitting, Lens, check_coverage
 from companion.frame_source import OpenCamera, ReceivedFrame
 
-REALSENSE, OAK_D, ROS2, ROSBAG = "realsense", "oak-d", "ros2", "rosbag"
-"""Names of built-in drivers, before a colon."""
-
-EXTRAS = {
-    REALSENSE: "librealsense (pip install pyrealsense2)",
-    OAK_D: "depthai (pip install 'airl-mav[oak]')",
-    ROS2: "Cyclone DDS and rosbags (pip install 'airl-mav[ros2]')",
-    ROSBAG: "rosbags (pip install 'airl-mav[ros2]')",
+DRIVERS = {
+    "realsense": ("realsense:open_realsense", "librealsense (pip install pyrealsense2)"),
+    "oak-d": ("oak_d:open_oak_d", "depthai (pip install 'airl-mav[oak]')"),
+    "ros2": ("ros2:open_ros2", "Cyclone DDS and rosbags (pip install 'airl-mav[ros2]')"),
+    "rosbag": ("rosbag:open_rosbag", "rosbags (pip install 'airl-mav[ros2]')"),
 }
+"""Built-in drivers by the name before a colon: function in this package, and its packages."""
 
 
 def open_driver(
@@ -82,11 +81,13 @@ def _check_fits(name: str, wanted: Intrinsics, whose: str) -> None:
 def _driver(name: str, clock: Clock) -> DepthCamera:
     brand, _, which = name.partition(":")
     # Missing optional packages become one line that names the extra to install.
-    if brand in EXTRAS:
+    if brand in DRIVERS:
+        place, packages = DRIVERS[brand]
         try:
-            return _shipped(brand, which, clock)
+            opened: DepthCamera = load(f"{__package__}.{place}")(which, clock)
         except ImportError as error:
-            raise FieldError("camera", name, problem=f"needs {EXTRAS[brand]}: {error}") from None
+            raise FieldError("camera", name, problem=f"needs {packages}: {error}") from None
+        return opened
     # Custom drivers resolve last: they cannot replace the built-in names.
     if reference(CAMERAS, name) is None:
         accepted = (
@@ -102,28 +103,6 @@ def _driver(name: str, clock: Clock) -> DepthCamera:
         told = " ".join(f"{type(error).__name__}: {error}".split())
         raise FieldError("camera", name, problem=told) from error
     return camera
-
-
-def _shipped(brand: str, which: str, clock: Clock) -> DepthCamera:
-    """Open a camera of a built-in driver, imported on demand, as its packages are optional."""
-    if brand == REALSENSE:
-        from companion.addons.cameras.realsense import open_realsense
-
-        return open_realsense(which)
-    if brand == OAK_D:
-        from companion.addons.cameras.oak_d import open_oak_d
-
-        return open_oak_d(which)
-    # A ROS 2 topic is absolute; a recording needs a path.
-    if not which.startswith("/") if brand == ROS2 else not which:
-        raise FieldError("camera", f"{brand}:{which}", "ros2:/TOPIC or rosbag:PATH")
-    if brand == ROS2:
-        from companion.addons.cameras.ros2 import Ros2Camera
-
-        return Ros2Camera(which)
-    from companion.addons.cameras.rosbag import RosBag
-
-    return RosBag(which, clock)
 
 
 READ_S = 0.1

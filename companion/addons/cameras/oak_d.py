@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from airl_mav.core.clock import Clock
 from airl_mav.core.errors import FieldError
 from companion.addons.cameras.drivers import FAILED_S, DepthImage, Silence, plausible_age_us
 from companion.addons.cameras.fitting import Lens
@@ -122,7 +123,7 @@ def _checked(frame: Any) -> Any:
     return np.array(frame.getFrame(), np.uint16)
 
 
-def open_oak_d(which: str) -> OakD:
+def open_oak_d(which: str, _clock: Clock) -> OakD:
     """Open a camera and start the stereo matching, or raise FieldError.
 
     `which` is "" for the first camera, a device id listed by `depthai`, or a network address (PoE),

@@ -10,7 +10,7 @@ import numpy as np
 import pyrealsense2 as rs
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
-from airl_mav.core.clock import utc_us
+from airl_mav.core.clock import Clock, utc_us
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from companion.addons.cameras.drivers import DepthImage, Silence, plausible_age_us
@@ -69,7 +69,7 @@ class RealSense:
         return plausible_age_us(self._utc_now_us() - int(frame.get_timestamp() * US_PER_MS))
 
 
-def open_realsense(which: str) -> RealSense:
+def open_realsense(which: str, _clock: Clock) -> RealSense:
     """Open the first camera, a serial number, or a .bag or .db3 file; FieldError if missing."""
     context = rs.context()
     if which.endswith(RECORDINGS):

@@ -5,23 +5,23 @@ the type p::msg::dds_::T_ (ROS 2 design, "Topic and Service name mapping to DDS"
 receives the sample, and rosbags decodes it.
 """
 
-# No `from __future__ import annotations`: Cyclone DDS reads field types at class creation.
+from __future__ import annotations
+
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from cyclonedds.core import DDSException, Policy, Qos
 from cyclonedds.domain import Domain, DomainParticipant
-from cyclonedds.idl import IdlStruct
 from cyclonedds.idl import annotations as annotate
+from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl.types import array, float64, int32, sequence, uint8, uint32
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 from rosbags.typesys import Stores, get_typestore
 
-from airl_mav.core.clock import utc_us
+from airl_mav.core.clock import Clock, utc_us
 from airl_mav.core.errors import FieldError, UsageError
 from companion.addons.cameras.drivers import DepthImage, Silence
 from companion.addons.cameras.rosbag import (
@@ -47,87 +47,64 @@ HERE_ALONE = """<CycloneDDS><Domain>
 </Domain></CycloneDDS>"""
 """Cyclone DDS configuration for ROS_LOCALHOST_ONLY=1."""
 
+_sequence: Any = sequence
+_array: Any = array
+"""Not generic to mypy."""
+
 _messages = get_typestore(Stores.ROS2_HUMBLE)
 
 NEWEST = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(1))
 """QoS compatible with every publisher: no retransmission, only the newest image."""
 
 
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
-    """builtin_interfaces/Time."""
+def _message(kind: str, fields: dict[str, Any]) -> Any:
+    """Return the DDS type of a ROS 2 message, decoded by rosbags.
 
-    sec: int32
-    nanosec: uint32
-
-
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
-    """std_msgs/Header."""
-
-    stamp: Time
-    frame_id: str
+    Cyclone DDS's decoder converts every byte to a Python number.
+    """
+    package, _, name = kind.rpartition("/")
+    made: Any = make_idl_struct(name, f"{package.replace('/', '::')}::dds_::{name}_", fields)
+    made.deserialize = lambda data, *_, **__: _messages.deserialize_cdr(data, kind)
+    return annotate.final(annotate.autoid("sequential")(made))
 
 
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
-    """sensor_msgs/Image."""
-
-    header: Header
-    height: uint32
-    width: uint32
-    encoding: str
-    is_bigendian: uint8
-    step: uint32
-    data: sequence[uint8]
-
-    @classmethod
-    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Any:
-        """Decode a sample. Cyclone DDS's decoder converts every byte to a Python number."""
-        return _messages.deserialize_cdr(data, IMAGE)
-
-
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class RegionOfInterest(IdlStruct, typename="sensor_msgs::msg::dds_::RegionOfInterest_"):
-    """sensor_msgs/RegionOfInterest."""
-
-    x_offset: uint32
-    y_offset: uint32
-    height: uint32
-    width: uint32
-    do_rectify: bool
-
-
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class CameraInfo(IdlStruct, typename="sensor_msgs::msg::dds_::CameraInfo_"):
-    """sensor_msgs/CameraInfo."""
-
-    header: Header
-    height: uint32
-    width: uint32
-    distortion_model: str
-    d: sequence[float64]
-    k: array[float64, 9]
-    r: array[float64, 9]
-    p: array[float64, 12]
-    binning_x: uint32
-    binning_y: uint32
-    roi: RegionOfInterest
-
-    @classmethod
-    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Any:
-        """Decode a sample, like `Image`."""
-        return _messages.deserialize_cdr(data, CAMERA_INFO)
+Time = _message("builtin_interfaces/msg/Time", {"sec": int32, "nanosec": uint32})
+Header = _message("std_msgs/msg/Header", {"stamp": Time, "frame_id": str})
+RegionOfInterest = _message(
+    "sensor_msgs/msg/RegionOfInterest",
+    {
+        **dict.fromkeys(("x_offset", "y_offset", "height", "width"), uint32),
+        "do_rectify": bool,
+    },
+)
+Image = _message(
+    IMAGE,
+    {
+        "header": Header,
+        "height": uint32,
+        "width": uint32,
+        "encoding": str,
+        "is_bigendian": uint8,
+        "step": uint32,
+        "data": _sequence[uint8],
+    },
+)
+CameraInfo = _message(
+    CAMERA_INFO,
+    {
+        "header": Header,
+        "height": uint32,
+        "width": uint32,
+        "distortion_model": str,
+        "d": _sequence[float64],
+        "k": _array[float64, 9],
+        "r": _array[float64, 9],
+        "p": _array[float64, 12],
+        "binning_x": uint32,
+        "binning_y": uint32,
+        "roi": RegionOfInterest,
+    },
+)
 
 
 class Ros2Camera:
@@ -207,3 +184,10 @@ def _participant() -> DomainParticipant:
     if alone and "CYCLONEDDS_URI" not in os.environ and number not in _restricted:
         _restricted[number] = Domain(number, HERE_ALONE)
     return DomainParticipant(number)
+
+
+def open_ros2(which: str, _clock: Clock) -> Ros2Camera:
+    """Open a topic, which is absolute. Raises FieldError."""
+    if not which.startswith("/"):
+        raise FieldError("camera", f"ros2:{which}", "ros2:/TOPIC or rosbag:PATH")
+    return Ros2Camera(which)

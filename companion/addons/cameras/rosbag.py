@@ -114,6 +114,13 @@ class RosBag:
         self._bag.close()
 
 
+def open_rosbag(which: str, clock: Clock) -> RosBag:
+    """Open a recording. Raises FieldError."""
+    if not which:
+        raise FieldError("camera", "rosbag:", "ros2:/TOPIC or rosbag:PATH")
+    return RosBag(which, clock)
+
+
 IMAGE, CAMERA_INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 """Message types of the two topics of a camera."""
 
