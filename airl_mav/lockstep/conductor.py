@@ -112,12 +112,7 @@ class Inbound:
         """Encoders of the flight controller, for answers on its behalf."""
 
     def take(self, frame: bytes, now_us: int) -> Passed:
-        """Filter one frame.
-
-        Args:
-            frame: A MAVLink frame of the companion.
-            now_us: Simulated time [µs].
-        """
+        """Filter one MAVLink frame of the companion, at simulated `now_us` [µs]."""
         # Filtered by the header alone, before decoding: these messages are frequent.
         if frame[:1] == _MAVLINK_2 and frame[_MESSAGE] in _IGNORED:
             return NOTHING
@@ -139,11 +134,8 @@ class Inbound:
     def renewed(self, setpoints_sent: int, now_us: int) -> bytes | None:
         """Return the setpoint again if the companion sent an identical one; otherwise None.
 
-        The frame on the wire does not differ from MAVSDK's repetition.
-
-        Args:
-            setpoints_sent: Number of setpoints that the companion has passed to MAVSDK so far.
-            now_us: Simulated time [µs].
+        The frame on the wire does not differ from MAVSDK's repetition. `setpoints_sent` counts the
+        setpoints that the companion has passed to MAVSDK so far.
         """
         again = setpoints_sent > self._counted and self._setpoint is not None
         self._counted = setpoints_sent
@@ -245,14 +237,10 @@ class Conductor:
         speed: float | None = None,
         clock: SimClock | None = None,
     ) -> None:
-        """Connect the vehicle and the companion.
+        """Connect the vehicle's end of the link and the companion; the clock is advanced here.
 
-        Args:
-            vehicle: Vehicle's end of the companion link.
-            partner: Companion.
-            digest: Digest of all traffic on the link; None = not needed.
-            speed: Maximum simulated seconds per wall second; None = unlimited.
-            clock: Simulated clock, advanced here; None = a new one.
+        `digest` receives all traffic on the link. `speed` is the maximum of simulated seconds per
+        wall second; None = unlimited.
         """
         self.clock = clock or SimClock()
         self.ended = False
@@ -348,14 +336,11 @@ class Conductor:
             self._wall.epoch_ns -= int(tick_us * 1_000 / self._speed)
 
     def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
-        """Process all events up to simulated `tick_us` [µs] and return that time.
+        """Process all events up to the next tick at simulated `tick_us` [µs]; return that time.
 
-        Args:
-            tick_us: Time of the next tick [µs].
-            sockets: Unused: the vehicle's messages are read after each tick.
-            readable: Callback that lets the vehicle process received messages at a given time.
+        `readable` lets the vehicle process received messages at a given time.
         """
-        del sockets
+        del sockets  # the vehicle's messages are read after each tick
         self._readable = readable
         if self._wall is not None:
             # With pacing, the tick waits for the wall clock here.
@@ -448,8 +433,7 @@ class Conductor:
     ) -> bool:
         """Let the vehicle process one frame now, and forward its answers.
 
-        Returns:
-            True if the frame is a command without an acknowledgement yet.
+        Returns True if the frame is a command without an acknowledgement yet.
         """
         now_us, vehicle = self.clock.time_us(), self._vehicle
         # The digest contains frames of the flight, not requests that depend on the wall clock.

@@ -26,13 +26,9 @@ class Judge:
         order: Callable[[Order], None],
         judged: Callable[[Verdict], None] = lambda _: None,
     ) -> None:
-        """Initialize before the flight.
+        """Set the supervisor, None = no verdict, and the digest of the true trajectory.
 
-        Args:
-            supervisor: Decides when the flight is over; None = no verdict.
-            digest: Digest to update with the true trajectory.
-            order: Callback for orders to the companion.
-            judged: Callback for the verdict.
+        `order` receives orders to the companion, `judged` the verdict.
         """
         self.battery: float | None = None
         """Remaining battery at the verdict; None = no verdict yet."""

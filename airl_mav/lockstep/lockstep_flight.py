@@ -160,20 +160,12 @@ class LockstepFlight:
         lands: bool = True,
         ticked: Callable[[Simulation, Referee, str | None], None] = lambda *_: None,
     ) -> None:
-        """Set the parameters of the flight; nothing is started.
+        """Set the parameters of the flight, see `fly`; nothing is started.
 
-        Args:
-            resolved: Scenario to fly.
-            policy: Policy, in its initial state.
-            index: Index of the episode in its run.
-            seed: Seed of arena, sensors, wind and latency.
-            observer: Receiver of progress reports.
-            notes: Additional notes for the episode's record.
-            view: Connection to the viewer; None = no viewer.
-            patience_s: Maximum duration of a decision of the policy [s of wall time].
-            lands: True = the companion lands at the time limit; False = it continues until the
-                flight is aborted.
-            ticked: Called after every tick, with the first object that was hit.
+        `notes` are added to the episode's record. `patience_s` is the maximum duration of a
+        decision [s of wall time]. Unless it `lands`, the companion continues after the time limit
+        until the flight is aborted. `ticked` is called after every tick, with the first object that
+        was hit.
         """
         self._view = view
         self._watched: Watched | None = None
@@ -206,13 +198,7 @@ class LockstepFlight:
             self._abandon.set()
 
     def fly(self, tlog: Path | None = None, log: Path | None = None) -> FlownEpisode:
-        """Fly the episode; see the function `fly`.
-
-        Raises:
-            UsageError: See `fly`.
-            LockstepError: The companion hangs or raised an error.
-            FirmwareLostError: Real firmware was lost.
-        """
+        """Fly the episode; see the function `fly`. Raises FirmwareLostError, too."""
         resolved = self._resolved
         setup = episode_setup(resolved, self.arena, self._seed)
         asked = resolved.scenario

@@ -46,13 +46,8 @@ class RemoteStage:
     ) -> None:
         """Connect all parts; nothing is started.
 
-        Args:
-            asked: Options: transport latency, turns, pace, goal.
-            endpoint: Endpoint of the companion, connected or not.
-            frames: Server of the camera's frames.
-            stored: Signing key of both sides; None = no signing.
-            broken_off: Polled while waiting for the companion; True ends the wait.
-            say: Callback for status lines.
+        `stored` is the signing key of both sides; None = no signing. `broken_off` is polled while
+        waiting for the companion; True ends the wait. `say` receives status lines.
         """
         self._asked = asked
         self._say = say
@@ -94,12 +89,7 @@ class RemoteStage:
         return self._conductor.clock.time_us()
 
     def load(self, setup: EpisodeSetup, tlog: Path | None) -> LoadedEpisode:
-        """Load the episode; the companion starts shortly afterwards.
-
-        Args:
-            setup: Episode to load.
-            tlog: Path of the MAVLink log; None = no log.
-        """
+        """Load the episode, with a MAVLink log if not None; the companion starts shortly after."""
         asked = self._asked
         loaded = self.firmware.load(setup, tlog, BOOT_UNIX_US)
         # Without a goal radius the flight has no verdict.
@@ -115,11 +105,7 @@ class RemoteStage:
         return loaded
 
     def step(self) -> None:
-        """Fly one tick, after the companion's turns that are due before.
-
-        Raises:
-            LockstepError: The companion is lost or violates the protocol.
-        """
+        """Fly one tick, after the companion's due turns. Raises LockstepError if it is lost."""
         self.firmware.step()
 
     def lanes(self) -> dict[str, str]:
@@ -149,12 +135,7 @@ class RemoteStage:
 def fly_vehicle_in_lockstep(
     asked: StandAloneVehicle, stop: threading.Event, listener: Listener | None = None
 ) -> None:
-    """Fly with one companion that passes turns, until the companion ends.
-
-    Args:
-        asked: Options of the vehicle and its network.
-        stop: Set by the caller to end the flight.
-        listener: Receiver of events.
+    """Fly with one companion that passes turns, until the companion ends or `stop` is set.
 
     Raises:
         UsageError: The input is invalid, or a port is in use.
@@ -198,10 +179,7 @@ def fly_vehicle_in_lockstep(
 def _fly(
     stage: RemoteStage, stop: threading.Event, end_us: int | None, say: Callable[[str], None]
 ) -> None:
-    """Fly a loaded stage until the companion has ended, or simulated `end_us` [µs].
-
-    Prints a summary of the flight and the digests.
-    """
+    """Fly a loaded stage until the companion has ended, or simulated `end_us`; print a summary."""
     start_us, stopwatch = stage.time_us, WallClock()
     stage.end_us = math.inf if end_us is None else end_us
     while not stage.ended and not stop.is_set() and stage.time_us < stage.end_us:

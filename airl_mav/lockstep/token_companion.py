@@ -33,14 +33,9 @@ def fly_in_lockstep(
 ) -> tuple[MissionResult, dict[str, str]]:
     """Fly one mission; equal simulator and mission give a bit-identical flight.
 
-    Args:
-        asked: Connection and camera of the simulator, with the timeouts for the simulator and for
-            each turn.
-        mission: Mission to fly.
-        stop: Event that ends the flight early; the simulator sets it, too.
-        abandon: Event that ends the flight without landing; the simulator sets it, too.
-        waiting: Called when the wait for the simulator begins.
-        progress: Called at the start of each phase with its name and the simulated time [µs].
+    `stop` ends the flight early, `abandon` without landing; the simulator sets them, too. `waiting`
+    is called when the wait for the simulator begins, `progress` at the start of each phase with its
+    name and the simulated time [µs].
 
     Returns:
         The mission's result, and the digest of the policy's observations.

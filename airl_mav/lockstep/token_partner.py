@@ -62,14 +62,10 @@ class TokenPartner:
     ) -> None:
         """Initialize without waiting for the companion.
 
-        Args:
-            wire: Socket of the companion, connected or not.
-            camera: Camera of the companion.
-            turn_us: Time until the next turn if the companion does not request one [µs].
-            patience_s: Maximum duration of a turn [s of wall time, while this process runs].
-            broken_off: Polled while waiting for the companion; True ends the wait and, for this
-                flight, the companion.
-            phase: Called with each phase that the companion reports, and the simulated time [µs].
+        `turn_us` is the time until the next turn if the companion does not request one [µs],
+        `patience_s` the maximum duration of a turn [s of wall time, while this process runs].
+        `broken_off` is polled while waiting; True ends the wait and, for this flight, the
+        companion. `phase` receives each phase that the companion reports, with its time [µs].
         """
         self._wire = wire
         self._camera = camera
@@ -406,11 +402,8 @@ class Wire:
     ) -> None:
         """Discard pending input of an earlier flight.
 
-        Args:
-            endpoint: Endpoint of the companion, connected or not.
-            stored: Signing key shared with the companion; None = no signing.
-            say: Callback for messages about rejected frames.
-            clock: Wall clock for the interval of these messages.
+        `stored` is the signing key shared with the companion; None = no signing. `say` receives
+        messages about rejected frames, at intervals by the wall clock.
         """
         socket = endpoint.fileno()
         if socket is None:

@@ -43,16 +43,10 @@ class Partner(Protocol):
 
     def send(self, frames: Sequence[bytes]) -> None:
         """Forward telemetry (MAVLink frames); delivered before the companion's next turn begins."""
-        ...
 
     def turn(self, now_us: int, handle: Handle) -> Turn:
         """Let the companion run until it sleeps; simulated time is constant at `now_us` [µs].
 
-        Args:
-            now_us: Simulated time [µs].
-            handle: Called with every MAVLink frame that the companion sends.
-
-        Raises:
-            LockstepError: The companion does not return the turn.
+        `handle` is called with every MAVLink frame that the companion sends. Raises LockstepError
+        if the companion does not return the turn.
         """
-        ...

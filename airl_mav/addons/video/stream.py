@@ -119,30 +119,22 @@ class RtpVideo:
 STREAM_ID: Final = 1
 """Id of the only stream; a request for 0 means all streams."""
 
-CAMERA_INFORMATION: Final = 259
-CAMERA_SETTINGS: Final = 260
-STORAGE_INFORMATION: Final = 261
-CAMERA_CAPTURE_STATUS: Final = 262
-VIDEO_STREAM_INFORMATION: Final = 269
-VIDEO_STREAM_STATUS: Final = 270
-"""Numbers of the messages sent on request (common.xml)."""
+MESSAGES: Final = {
+    259: "CAMERA_INFORMATION",
+    260: "CAMERA_SETTINGS",
+    261: "STORAGE_INFORMATION",
+    262: "CAMERA_CAPTURE_STATUS",
+    269: "VIDEO_STREAM_INFORMATION",
+    270: "VIDEO_STREAM_STATUS",
+}
+"""Messages sent on request (common.xml)."""
 
-STAMPED: Final = (CAMERA_INFORMATION, CAMERA_SETTINGS, STORAGE_INFORMATION, CAMERA_CAPTURE_STATUS)
-"""Messages with a time stamp."""
+CAMERA_INFORMATION, STREAM_INFORMATION, STREAM_STATUS = 259, 269, 270
 
-REQUEST_MESSAGE: Final = 512
-VIDEO_START_STREAMING: Final = 2502
-VIDEO_STOP_STREAMING: Final = 2503
+REQUEST_MESSAGE, VIDEO_START_STREAMING, VIDEO_STOP_STREAMING = 512, 2502, 2503
 """Supported commands."""
 
-OLD_REQUESTS: Final = {
-    521: CAMERA_INFORMATION,
-    522: CAMERA_SETTINGS,
-    525: STORAGE_INFORMATION,
-    527: CAMERA_CAPTURE_STATUS,
-    2504: VIDEO_STREAM_INFORMATION,
-    2505: VIDEO_STREAM_STATUS,
-}
+OLD_REQUESTS: Final = {521: 259, 522: 260, 525: 261, 527: 262, 2504: 269, 2505: 270}
 """Commands that request one message each, older than REQUEST_MESSAGE; clients still send them."""
 
 WITHOUT_EFFECT: Final = (
@@ -153,24 +145,6 @@ WITHOUT_EFFECT: Final = (
 
 ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
 """MAV_RESULT."""
-
-HAS_VIDEO_STREAM: Final = 256
-"""CAMERA_CAP_FLAGS."""
-
-MODE_VIDEO: Final = 1
-"""CAMERA_MODE."""
-
-NO_STORAGE: Final = 3
-"""STORAGE_STATUS_NOT_SUPPORTED."""
-
-RTP_UDP: Final = 1
-"""VIDEO_STREAM_TYPE: RTP over UDP, with the port of the receiver as URI."""
-
-H264: Final = 1
-"""VIDEO_STREAM_ENCODING."""
-
-RUNNING: Final = 1
-"""VIDEO_STREAM_STATUS_FLAGS."""
 
 NAME_BYTES: Final = 32
 
@@ -189,66 +163,55 @@ class VideoStream:
     port: int
 
 
-def camera_information(stream: VideoStream) -> Fields:
-    """Return the fields of CAMERA_INFORMATION except the time; 0 = unknown lens sizes."""
-    return {
-        "vendor_name": _bytes("airl-mav"),
-        "model_name": _bytes(stream.model),
-        "firmware_version": 0,
-        "focal_length": 0.0,
-        "sensor_size_h": 0.0,
-        "sensor_size_v": 0.0,
-        "resolution_h": stream.size_px[0],
-        "resolution_v": stream.size_px[1],
-        "lens_id": 0,
-        "flags": HAS_VIDEO_STREAM,
-        "cam_definition_version": 0,
-        "cam_definition_uri": "",
-        "gimbal_device_id": 0,
-    }
-
-
-def stream_status(stream: VideoStream, *, running: bool) -> Fields:
-    """Return the fields of VIDEO_STREAM_STATUS."""
-    return {
+def camera_messages(stream: VideoStream, *, running: bool) -> dict[str, Fields]:
+    """Return the fields of `MESSAGES` by name, without the time; 0 = unknown lens sizes."""
+    width_px, height_px = stream.size_px
+    size = {"resolution_h": width_px, "resolution_v": height_px}
+    status = {
         "stream_id": STREAM_ID,
-        "flags": RUNNING if running else 0,
+        "flags": int(running),  # VIDEO_STREAM_STATUS_FLAGS_RUNNING
         "framerate": stream.rate_hz,
-        "resolution_h": stream.size_px[0],
-        "resolution_v": stream.size_px[1],
+        **size,
         "bitrate": 0,  # determined by the quality
         "rotation": 0,
         "hfov": round(stream.horizontal_fov_deg),
     }
-
-
-def stream_information(stream: VideoStream, *, running: bool) -> Fields:
-    """Return the fields of VIDEO_STREAM_INFORMATION."""
     return {
-        **stream_status(stream, running=running),
-        "count": 1,
-        "type": RTP_UDP,
-        "name": stream.model[: NAME_BYTES - 1],
-        "uri": f"{stream.port}",
-        "encoding": H264,
+        "CAMERA_INFORMATION": {
+            "vendor_name": _bytes("airl-mav"),
+            "model_name": _bytes(stream.model),
+            "firmware_version": 0,
+            **dict.fromkeys(("focal_length", "sensor_size_h", "sensor_size_v"), 0.0),
+            **size,
+            "lens_id": 0,
+            "flags": 256,  # CAMERA_CAP_FLAGS_HAS_VIDEO_STREAM
+            "cam_definition_version": 0,
+            "cam_definition_uri": "",
+            "gimbal_device_id": 0,
+        },
+        "CAMERA_SETTINGS": {"mode_id": 1},  # CAMERA_MODE_VIDEO
+        "STORAGE_INFORMATION": {
+            "storage_id": 0,
+            "storage_count": 0,
+            "status": 3,  # STORAGE_STATUS_NOT_SUPPORTED
+            **dict.fromkeys(("total_capacity", "used_capacity", "available_capacity"), 0.0),
+            **dict.fromkeys(("read_speed", "write_speed"), 0.0),
+        },
+        "CAMERA_CAPTURE_STATUS": {
+            **dict.fromkeys(("image_status", "video_status", "image_count"), 0),
+            **dict.fromkeys(("image_interval", "available_capacity"), 0.0),
+            "recording_time_ms": 0,
+        },
+        "VIDEO_STREAM_STATUS": status,
+        "VIDEO_STREAM_INFORMATION": {
+            **status,
+            "count": 1,
+            "type": 1,  # VIDEO_STREAM_TYPE_RTPUDP, with the port of the receiver as URI
+            "name": stream.model[: NAME_BYTES - 1],
+            "uri": f"{stream.port}",
+            "encoding": 1,  # VIDEO_STREAM_ENCODING_H264
+        },
     }
-
-
-_NOT_STORING: Final[Fields] = {
-    "storage_id": 0,
-    "storage_count": 0,
-    "status": NO_STORAGE,
-    **dict.fromkeys(("total_capacity", "used_capacity", "available_capacity"), 0.0),
-    **dict.fromkeys(("read_speed", "write_speed"), 0.0),
-}
-_NOT_CAPTURING: Final[Fields] = {
-    "image_status": 0,
-    "video_status": 0,
-    "image_interval": 0.0,
-    "recording_time_ms": 0,
-    "available_capacity": 0.0,
-    "image_count": 0,
-}
 
 
 def _bytes(text: str) -> list[int]:
@@ -264,21 +227,7 @@ class CameraComponent:
         """Announce a stream by a MAVSDK connected as a camera component (`open_connection`)."""
         self.running = True
         """True while the video is enabled; clients may stop and restart it."""
-        self._clock = clock
-        self._messages: dict[int, tuple[str, Callable[[], Fields]]] = {
-            CAMERA_INFORMATION: ("CAMERA_INFORMATION", lambda: camera_information(stream)),
-            CAMERA_SETTINGS: ("CAMERA_SETTINGS", lambda: {"mode_id": MODE_VIDEO}),
-            STORAGE_INFORMATION: ("STORAGE_INFORMATION", lambda: _NOT_STORING),
-            CAMERA_CAPTURE_STATUS: ("CAMERA_CAPTURE_STATUS", lambda: _NOT_CAPTURING),
-            VIDEO_STREAM_INFORMATION: (
-                "VIDEO_STREAM_INFORMATION",
-                lambda: stream_information(stream, running=self.running),
-            ),
-            VIDEO_STREAM_STATUS: (
-                "VIDEO_STREAM_STATUS",
-                lambda: stream_status(stream, running=self.running),
-            ),
-        }
+        self._clock, self._stream = clock, stream
         self._server = MavlinkDirectServer(mavsdk.server_component(0))
         streaming = (VIDEO_START_STREAMING, VIDEO_STOP_STREAMING)
         # MAVSDK answers only commands with a subscription.
@@ -301,12 +250,11 @@ class CameraComponent:
             "target_component": sender[1],
         }
         self._send("COMMAND_ACK", acknowledged, sender)
-        for number in wanted:
-            name, made = self._messages[number]
-            stamp = (
-                {"time_boot_ms": self._clock.time_us() // US_PER_MS} if number in STAMPED else {}
-            )
-            self._send(name, {**stamp, **made()}, sender)
+        made = camera_messages(self._stream, running=self.running)
+        for name in (MESSAGES[number] for number in wanted):
+            if not name.startswith("VIDEO"):
+                made[name]["time_boot_ms"] = self._clock.time_us() // US_PER_MS
+            self._send(name, made[name], sender)
 
     def _carried_out(self, command: int, one: int, two: int) -> tuple[int, tuple[int, ...]]:
         """Return the result of a command with its parameters, and the requested messages."""
@@ -317,12 +265,12 @@ class CameraComponent:
             self.running = command == VIDEO_START_STREAMING
             return ACCEPTED, ()
         asked = one if command == REQUEST_MESSAGE else OLD_REQUESTS.get(command)
-        if asked not in self._messages:
+        if asked not in MESSAGES:
             return UNSUPPORTED, ()
         if asked == CAMERA_INFORMATION:
             # MAVSDK requests the stream only 20 s later.
-            return ACCEPTED, (CAMERA_INFORMATION, VIDEO_STREAM_INFORMATION)
-        if asked in (VIDEO_STREAM_INFORMATION, VIDEO_STREAM_STATUS):
+            return ACCEPTED, (CAMERA_INFORMATION, STREAM_INFORMATION)
+        if asked in (STREAM_INFORMATION, STREAM_STATUS):
             # REQUEST_MESSAGE has the stream id in parameter 2, the older commands in parameter 1.
             which = two if command == REQUEST_MESSAGE else one
             if which not in (0, STREAM_ID):

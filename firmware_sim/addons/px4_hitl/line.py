@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import serial
 from serial.tools import list_ports
@@ -100,22 +100,6 @@ class TokenBucket:
         return True
 
 
-class BoardLine(Protocol):
-    """Line to the board, such as `serial_port.SerialPort`. All may raise SerialLostError."""
-
-    def read(self) -> bytes:
-        """Return received data."""
-
-    def write(self, data: bytes) -> bool:
-        """Queue data to be sent; return False if dropped."""
-
-    def drain(self) -> None:
-        """Send queued data."""
-
-    def fileno(self) -> int:
-        """Return the descriptor to wait on."""
-
-
 class _Client:
     """Client over UDP."""
 
@@ -148,7 +132,7 @@ class Router:
         sent before: a boot loader at the other end would interpret bytes as commands."""
         self._clients = {name: _Client(endpoint) for name, endpoint in clients.items()}
         self._clock = clock
-        self._line: BoardLine | None = None
+        self._line: SerialPort | None = None
         self._line_fd = -1
         self._decoder = FrameDecoder(datagrams=False)
         self._budget = TokenBucket(0, clock)
@@ -162,7 +146,7 @@ class Router:
 
     # --- the line
 
-    def attach(self, line: BoardLine, budget_bytes_s: int) -> None:
+    def attach(self, line: SerialPort, budget_bytes_s: int) -> None:
         """Replace the line to the board, with a client budget [bytes/s]. The caller closes it."""
         self.detach()
         self._line, self._line_fd = line, line.fileno()
