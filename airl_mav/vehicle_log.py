@@ -1,4 +1,16 @@
-"""Reader of PX4 flight logs, versions 1.14 to 1.16; times since boot [µs], NED and FRD."""
+"""PX4 flight logs, versions 1.14 to 1.16, and their alignment with a companion's recording.
+
+Times of a log count from boot [µs], frames are NED and FRD. Alignment of the clocks:
+
+Downlink: telemetry repeats the log's velocity and attitude with a delay. The best matching shift is
+the clock offset plus the age of telemetry: the link delay plus the age of the newest message.
+Uplink: a setpoint appears in the log between two samples. Each setpoint thus bounds the clock
+offset plus its delay. Marzullo's algorithm finds the shift within most of these bounds
+(K. Marzullo, Maintaining the time in a distributed system, 1984).
+
+Neither shift alone separates the offset from the link delay. The offset cancels in their sum, which
+is the round trip from sending a setpoint to the first telemetry that can reflect it.
+"""
 
 from __future__ import annotations
 
@@ -24,21 +36,6 @@ Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 MOTORS = 4
-
-_TOPICS = (
-    "actuator_motors",
-    "battery_status",
-    "sensor_combined",
-    "trajectory_setpoint",
-    "vehicle_acceleration",
-    "vehicle_attitude",
-    "vehicle_attitude_setpoint",
-    "vehicle_local_position",
-    "vehicle_local_position_setpoint",
-    "vehicle_rates_setpoint",
-    "vehicle_status",
-    "wind",
-)
 
 _THRUST = "thrust_body[2]"
 """Thrust field of multicopters, along the body's down axis, so negative."""
@@ -129,64 +126,61 @@ class VehicleLog:
     """Parameters at the start of the log."""
 
 
+def _numbered(name: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{name}[{i}]" for i in range(count))
+
+
+_SERIES: Mapping[str, tuple[str, Sequence[str]]] = {
+    "attitude": ("vehicle_attitude", _numbered("q", 4)),
+    "motion": ("vehicle_local_position", ("x", "y", "z", "vx", "vy", "vz")),
+    "motors": ("actuator_motors", _numbered("control", MOTORS)),
+    "specific_force": ("vehicle_acceleration", _numbered("xyz", 3)),
+    "raw_specific_force": ("sensor_combined", _numbered("accelerometer_m_s2", 3)),
+    "raw_rates": ("sensor_combined", _numbered("gyro_rad", 3)),
+    "setpoint": ("vehicle_local_position_setpoint", ("vx", "vy", "vz", "yawspeed")),
+    "yaw_rate_setpoint": ("vehicle_attitude_setpoint", ("yaw_sp_move_rate",)),
+    "attitude_setpoint": ("vehicle_attitude_setpoint", (*_numbered("q_d", 4), _THRUST)),
+    "rates_setpoint": ("vehicle_rates_setpoint", ("roll", "pitch", "yaw", _THRUST)),
+    "more_than_velocity": (
+        "trajectory_setpoint",
+        (*_numbered("position", 3), *_numbered("acceleration", 3)),
+    ),
+    "nav_state": ("vehicle_status", ("nav_state",)),
+    "battery": ("battery_status", ("voltage_v", "current_a", "remaining")),
+    "wind": ("wind", ("windspeed_north", "windspeed_east")),
+}
+"""Topic and columns of each series of a `VehicleLog`."""
+
+_PARTLY_NAN = ("setpoint", "more_than_velocity", "nav_state", "battery")
+"""Series in which NaN has a meaning; samples with NaN are removed from all others."""
+
+
 def read_vehicle_log(path: Path) -> VehicleLog:
     """Read a .ulg file; raise UsageError without attitude or velocity."""
     accepted = "a ULog (.ulg) with vehicle_attitude and vehicle_local_position"
     try:
         with path.open("rb") as file:
-            read = ULog(file, list(_TOPICS))
+            read = ULog(file, sorted({topic for topic, _ in _SERIES.values()}))
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
     except _BROKEN:
         raise UsageError(f"{path}: accepted: {accepted}") from None
     topics = {each.name: each.data for each in reversed(read.data_list) if each.multi_id == 0}
-    attitude = _series(topics, "vehicle_attitude", _numbered("q", 4))
-    motion = _series(topics, "vehicle_local_position", ("x", "y", "z", "vx", "vy", "vz"))
-    if len(attitude) < 2 or len(motion) < 2:
+    series = {name: _series(topics, *columns) for name, columns in _SERIES.items()}
+    if len(series["attitude"]) < 2 or len(series["motion"]) < 2:
         raise UsageError(f"{path}: accepted: {accepted}")
+    # Either topic may have more samples.
+    velocity = (*_numbered("velocity", 3), "yawspeed")
+    trajectory = _series(topics, "trajectory_setpoint", velocity)
+    series["setpoint"] = max(series["setpoint"], trajectory, key=len)
+    battery = series["battery"].values
+    battery[battery[:, 1] == UNMEASURED_A, 1] = np.nan
+    known = {name: each if name in _PARTLY_NAN else _known(each) for name, each in series.items()}
     return VehicleLog(
         path=path,
-        attitude=_known(attitude),
-        motion=_known(motion),
-        motors=_known(_series(topics, "actuator_motors", _numbered("control", MOTORS))),
-        specific_force=_known(_series(topics, "vehicle_acceleration", _numbered("xyz", 3))),
-        raw_specific_force=_known(
-            _series(topics, "sensor_combined", _numbered("accelerometer_m_s2", 3))
-        ),
-        raw_rates=_known(_series(topics, "sensor_combined", _numbered("gyro_rad", 3))),
-        setpoint=_setpoint(topics),
-        yaw_rate_setpoint=_known(
-            _series(topics, "vehicle_attitude_setpoint", ("yaw_sp_move_rate",))
-        ),
-        attitude_setpoint=_upward(
-            _series(topics, "vehicle_attitude_setpoint", (*_numbered("q_d", 4), _THRUST))
-        ),
-        rates_setpoint=_upward(
-            _series(topics, "vehicle_rates_setpoint", ("roll", "pitch", "yaw", _THRUST))
-        ),
-        more_than_velocity=_series(
-            topics,
-            "trajectory_setpoint",
-            (*_numbered("position", 3), *_numbered("acceleration", 3)),
-        ),
-        nav_state=_series(topics, "vehicle_status", ("nav_state",)),
-        battery=_battery(topics),
-        wind=_known(_series(topics, "wind", ("windspeed_north", "windspeed_east"))),
         parameters={name: float(value) for name, value in read.initial_parameters.items()},
+        **known | {name: _upward(known[name]) for name in ("attitude_setpoint", "rates_setpoint")},
     )
-
-
-def _battery(topics: Mapping[str, Any]) -> Series:
-    """Return the battery measurements; an unmeasured current is NaN."""
-    told = _series(topics, "battery_status", ("voltage_v", "current_a", "remaining"))
-    told.values[told.values[:, 1] == UNMEASURED_A, 1] = np.nan
-    return told
-
-
-def _setpoint(topics: Mapping[str, Any]) -> Series:
-    local = _series(topics, "vehicle_local_position_setpoint", ("vx", "vy", "vz", "yawspeed"))
-    trajectory = _series(topics, "trajectory_setpoint", (*_numbered("velocity", 3), "yawspeed"))
-    return max(local, trajectory, key=len)
 
 
 def _series(topics: Mapping[str, Any], topic: str, fields: Sequence[str]) -> Series:
@@ -207,13 +201,8 @@ def _known(series: Series) -> Series:
 
 
 def _upward(series: Series) -> Series:
-    """Return the finite samples with the thrust, their last column, made positive."""
-    known = _known(series)
-    return Series(known.time_us, np.column_stack([known.values[:, :-1], -known.values[:, -1]]))
-
-
-def _numbered(name: str, count: int) -> tuple[str, ...]:
-    return tuple(f"{name}[{i}]" for i in range(count))
+    """Return the samples with the thrust, their last column, made positive."""
+    return Series(series.time_us, np.column_stack([series.values[:, :-1], -series.values[:, -1]]))
 
 
 GRID_US = 40_000

@@ -131,7 +131,7 @@ class MavsdkLink:
         """Wait for a flight controller; LinkError after a timeout [wall s] or on `stop`."""
         system = first_autopilot(self._mavsdk, timeout_s, stop)
         if system is None:
-            raise LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
+            raise self._unheard(timeout_s)
         # A second `connect` replaces the plugins of an earlier system.
         self._release_plugins()
         self._system = system
@@ -155,7 +155,7 @@ class MavsdkLink:
         stopwatch = WallClock()
         while not self.connected:
             if stopwatch.time_us() > timeout_s * US_PER_S:
-                raise LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
+                raise self._unheard(timeout_s)
             self._pause_wall(stop)
         # `release` has destroyed the offboard plugin.
         if self._offboard is None:
@@ -178,6 +178,9 @@ class MavsdkLink:
                     if stopwatch.time_us() > STREAM_TIMEOUT_S * US_PER_S:
                         raise LinkError(f"no telemetry: {_refusal(error)}") from None
                 self._pause_wall(stop)
+
+    def _unheard(self, timeout_s: float) -> LinkError:
+        return LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
 
     def _pause_wall(self, stop: threading.Event | None) -> None:
         if self._abandon.is_set() or (stop is not None and stop.is_set()):
@@ -225,11 +228,6 @@ class MavsdkLink:
             return False
         return bool(self._system.is_connected()) if self._heard is None else self._heard()
 
-    @property
-    def healthy(self) -> bool:
-        """True if the flight controller reports healthy sensors and ready to arm."""
-        return not self.missing_health()
-
     def missing_health(self, *, by_gps: bool = True) -> list[str]:
         """Return the names of the health flags not reported as good.
 
@@ -240,11 +238,6 @@ class MavsdkLink:
         needed = [flag for flag in self.dialect.health if by_gps or flag not in POSITION]
         flags = [flag for flag in needed if not getattr(health, flag)]
         return [flag.removeprefix("is_").removesuffix("_ok").replace("_", " ") for flag in flags]
-
-    @property
-    def has_local_position(self) -> bool:
-        """True if MAVSDK's newest report of the local position is good."""
-        return bool(self._telemetry.health().is_local_position_ok)
 
     @property
     def armed(self) -> bool:
@@ -311,7 +304,8 @@ class MavsdkLink:
             self._pause()
             missing = self.missing_health(by_gps=origin is None)
             # An origin sent before PX4 has a local position would shift that position.
-            if origin is not None and "armable" in missing and self.has_local_position:
+            local = self._telemetry.health().is_local_position_ok
+            if origin is not None and "armable" in missing and local:
                 tell_us = self._tell_origin(origin, tell_us)
             if missing:
                 good_since_us = self._clock.time_us()
@@ -345,7 +339,9 @@ class MavsdkLink:
             position = _newest(frames, _LOCAL_POSITION_NED)
             if position is None:
                 return math.nan, math.nan
-            down_m, down_m_s = _down(position)
+            # MAVLink 2 truncates trailing zeros of a payload.
+            payload = position[_HEADER : _HEADER + position[1]].ljust(_DOWN.size, b"\0")
+            down_m, down_m_s = _DOWN.unpack(payload)
             return least_m - (start_down - down_m), max(0.0, -down_m_s)
 
         def high(frames: Sequence[bytes]) -> bool:
@@ -396,14 +392,12 @@ class MavsdkLink:
 
     def tell(self, text: str) -> None:
         """Send a text of up to 50 characters, which may be forwarded to the ground station."""
-        if self._texts is None:
-            self._texts = ServerUtility(self._system)
+        self._texts = self._texts or ServerUtility(self._system)
         self._texts.send_status_text(StatusTextType.INFO, text[:TEXT_CHARACTERS])
 
     def send_message(self, name: str, fields: Mapping[str, Any]) -> bool:
         """Send a MAVLink message by name and fields; return True if sent."""
-        if self._direct is None:
-            self._direct = MavlinkDirect(self._system)
+        self._direct = self._direct or MavlinkDirect(self._system)
         try:
             self._direct.send_message(MavlinkMessage(name, fields_json=json.dumps(dict(fields))))
         except MavlinkDirectError:
@@ -412,8 +406,7 @@ class MavsdkLink:
 
     def _hear_messages(self, name: str, heard: Callable[[Any, Any], None]) -> None:
         """Call a function with every message of a name, in an MAVSDK thread."""
-        if self._direct is None:
-            self._direct = MavlinkDirect(self._system)
+        self._direct = self._direct or MavlinkDirect(self._system)
         self._direct.subscribe_message(name, heard)
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
@@ -508,23 +501,12 @@ class MavsdkLink:
 
 def _newest(frames: Sequence[bytes], number: bytes) -> bytes | None:
     """Return the newest frame of a message; None without one."""
-    for frame in reversed(frames):
-        if frame[7:10] == number:
-            return frame
-    return None
+    return next((frame for frame in reversed(frames) if frame[7:10] == number), None)
 
 
 def _disarmed(frames: Sequence[bytes]) -> bool:
     heartbeat = _newest(frames, _HEARTBEAT)
     return heartbeat is not None and not heartbeat[_HEADER + _BASE_MODE] & _ARMED
-
-
-def _down(position: bytes) -> tuple[float, float]:
-    """Return z [m] and vz [m/s] of a LOCAL_POSITION_NED."""
-    # MAVLink 2 truncates trailing zeros of a payload.
-    payload = position[_HEADER : _HEADER + position[1]].ljust(_DOWN.size, b"\0")
-    down_m, down_m_s = _DOWN.unpack(payload)
-    return down_m, down_m_s
 
 
 def _known(value: float) -> float | None:

@@ -33,7 +33,7 @@ from airl_mav.rehearsal.episode import (
     judged_record,
     part_of,
 )
-from airl_mav.rehearsal.episode_setup import episode_setup, state_of
+from airl_mav.rehearsal.firmware_process import episode_setup, state_of
 from airl_mav.rehearsal.observer import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.checks import TRANSPORT_US

@@ -160,11 +160,8 @@ class TokenPartner:
 
     def _wakes(self, rest: _Rest, now_us: int, arrived: bool) -> bool:
         """Return True if a wake-up condition is met."""
-        if now_us >= rest.wake_us:
-            return True
-        if rest.event == "frame":
-            return arrived
-        return rest.event == "stop" and self._ordered.is_set()
+        met = {"": False, "frame": arrived, "stop": self._ordered.is_set()}
+        return now_us >= rest.wake_us or met[rest.event]
 
     def _asleep(self, rest: _Rest) -> Turn:
         """Return the time or event until which the conductor can continue alone."""
@@ -348,13 +345,9 @@ def split(frames: bytes) -> Iterator[bytes]:
         start = end
 
 
-def newest_heartbeat(frames: Iterable[bytes]) -> bytes | None:
+def newest_heartbeat(frames: Sequence[bytes]) -> bytes | None:
     """Return the last HEARTBEAT of some frames, or None."""
-    found = None
-    for frame in frames:
-        if frame[_MESSAGE] == b"\0\0\0":
-            found = frame
-    return found
+    return next((frame for frame in reversed(frames) if frame[_MESSAGE] == b"\0\0\0"), None)
 
 
 def datagrams(frames: Iterable[bytes], longest: int) -> Iterator[bytes]:
@@ -431,8 +424,12 @@ class Wire:
 
     def send(self, frames: bytes) -> None:
         """Send unsigned frames to the preset remote and the last sender; sign if there is a key."""
+        signing = None if self._stored is None else self._stored.signing
+        signed = (
+            each if signing is None else signing.sign(each, LINK_ID) for each in split(frames)
+        )
         ends = [self._preset, None if self._learned is None else self._learned[1]]
-        for datagram in datagrams(self._signed(frames), LONGEST_DATAGRAM):
+        for datagram in datagrams(signed, LONGEST_DATAGRAM):
             for end in ends:
                 if end is not None:
                     end.send(datagram)
@@ -472,15 +469,6 @@ class Wire:
         self._tell()
         if self._stored is not None:
             self._stored.save()
-
-    def _signed(self, frames: bytes) -> Iterable[bytes]:
-        if self._stored is None:
-            return split(frames)
-        return self._with_signatures(frames, self._stored)
-
-    def _with_signatures(self, frames: bytes, stored: StoredSigning) -> Iterator[bytes]:
-        for frame in split(frames):
-            yield stored.signing.sign(frame, LINK_ID)
 
     def _accepted(self, messages: list[WireMessage]) -> list[WireMessage]:
         if self._stored is None:

@@ -12,12 +12,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from airl_mav.arena.generate import generate
+from airl_mav.arena.geometry import Arena
 from airl_mav.core.clock import utc_now
 from airl_mav.core.compiling import heard_compiling
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.frames import Goal
+from airl_mav.core.frames import Geodetic, Goal, quat_yaw
 from airl_mav.core.signing import StoredSigning
 from airl_mav.faults.fault import Fault, link_fails
 from airl_mav.faults.kinds import PROCESSES
@@ -27,12 +30,13 @@ from airl_mav.profiles.conditions import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal import channel
-from airl_mav.rehearsal.episode_setup import episode_setup, state_of
+from airl_mav.rehearsal.channel import State
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.checks import check_fitted
 from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.autopilot.autopilot_state import OperatorText
+from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.external.flight_stack import FirmwareRequest, real_firmware
 from firmware_sim.external.parameters import KeptParameters
 from firmware_sim.external.programs import how_to_start
@@ -44,7 +48,7 @@ from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, bind_device_lin
 from firmware_sim.mavlink.server import udp_server
 from firmware_sim.pacing import Pacing, Unpaced, WallPacing
 from firmware_sim.plant.camera import CameraServer
-from firmware_sim.simulation import CrashDetector, EpisodeSetup, Simulation
+from firmware_sim.simulation import CrashDetector, EpisodeSetup, HoverStart, Simulation
 from firmware_sim.warm_up import warm_up
 
 if TYPE_CHECKING:
@@ -326,6 +330,41 @@ def episode_of(
     width_m = vehicle.body.width_m
     arena = generate(spec, asked.seed, name=asked.arena, vehicle_width_m=width_m)
     return EpisodeSetup(vehicle, arena, asked.seed, asked, computer_w), arena.goal_point
+
+
+def episode_setup(resolved: ResolvedScenario, arena: Arena, seed: int) -> EpisodeSetup:
+    """Return the setup of an episode in the arena of a seed."""
+    hover = None
+    if resolved.scenario.start == "hover":
+        place = None if resolved.vehicle.uses_gps else resolved.companion_pilot.origin
+        origin = None if place is None else Geodetic(*place)
+        hover = HoverStart(resolved.pilot.altitude_m, origin)
+    return EpisodeSetup(
+        resolved.vehicle,
+        arena,
+        seed,
+        resolved.scenario,
+        resolved.computer.onboard_watts,
+        hover,
+    )
+
+
+def state_of(simulation: Simulation, collision: str | None, slipped_us: int = 0) -> State:
+    """Return the state after the newest tick, with collision and skipped time [µs]."""
+    truth, flight = simulation.truth, simulation.autopilot.flight
+    x, y, z = (float(c) for c in truth.position)
+    return State(
+        time_us=truth.time_us,
+        position=(x, y, z),
+        speed_m_s=float(np.linalg.norm(truth.velocity)),
+        yaw=quat_yaw(truth.quaternion),
+        battery=truth.battery_remaining,
+        collision=collision,
+        mode=flight.mode.name.lower(),
+        armed=flight.phase >= FlightPhase.GROUND,
+        landed=flight.phase < FlightPhase.AIR,
+        slipped_us=slipped_us,
+    )
 
 
 if __name__ == "__main__":

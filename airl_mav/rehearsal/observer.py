@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Goal, goal_distance_m
 from airl_mav.core.progress import Event, Progress
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.quality import Quality
 from airl_mav.flight.statistics import reached_goals, wilson
 from airl_mav.rehearsal.channel import State, Text
 
@@ -184,12 +183,8 @@ class FlightEnded(Event):
             reason=record.reason,
             invalid=record.invalid,
             sha256=None if record.sha256 is None else record.sha256["flight"],
-            **{name: _figure(record.quality, name) for name in FIGURES},
+            **{name: getattr(record.quality, name, None) for name in FIGURES},
         )
-
-
-def _figure(quality: Quality | None, name: str) -> Any:
-    return None if quality is None else getattr(quality, name)
 
 
 class Tally:
@@ -223,8 +218,7 @@ class Tally:
         rate = wilson(sum(self._reached), len(self._reached))
         text = ""
         if rate.value is not None and rate.low is not None and rate.high is not None:
-            interval = f"{100 * rate.low:.0f}, {100 * rate.high:.0f}"
-            text = f"{100 * rate.value:.0f} % [{interval}] reached"
+            text = f"{100 * rate.value:.0f} % [{100 * rate.low:.0f}, {100 * rate.high:.0f}] reached"
         self._bar.update(postfix=text, figures={"success": asdict(rate)})
 
     def close(self) -> None:

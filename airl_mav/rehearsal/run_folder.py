@@ -126,16 +126,9 @@ class RunFolder:
     ) -> RunFolder:
         """Create the folder, by default `runs/<UTC time>-<name>`, and write `run.json`."""
         now = utc_now()
-        if out is None:
-            path = _fresh_folder(Path("runs"), f"{now:%Y%m%dT%H%M%SZ}-{name}")
-        else:
-            path = out
-            if (path / RUN_FILE).exists():
-                raise UsageError(f"--out {path}: already holds a run; accepted: a new folder")
-            try:
-                path.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise UsageError(f"--out {path}: {error.strerror}") from None
+        if out is not None and (out / RUN_FILE).exists():
+            raise UsageError(f"--out {out}: already holds a run; accepted: a new folder")
+        path = out or _fresh_folder(Path("runs"), f"{now:%Y%m%dT%H%M%SZ}-{name}")
         info = RunInfo(
             name=name,
             created_utc=now.isoformat(timespec="seconds"),
@@ -146,16 +139,15 @@ class RunFolder:
             machine=describe_machine(),
             git=git_state(),
         )
-        _write_info(path / RUN_FILE, info)
-        return cls(path)
+        return cls.adopt(path, info, "--out ")
 
     @classmethod
-    def adopt(cls, path: Path, info: RunInfo) -> RunFolder:
-        """Create the folder of a run from elsewhere. Raises UsageError."""
+    def adopt(cls, path: Path, info: RunInfo, option: str = "") -> RunFolder:
+        """Create the folder of a run from elsewhere. Raises UsageError, after the option's name."""
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise UsageError(f"{path}: {error.strerror}") from None
+            raise UsageError(f"{option}{path}: {error.strerror}") from None
         _write_info(path / RUN_FILE, info)
         return cls(path)
 
@@ -345,10 +337,8 @@ def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return the settings by their dotted names."""
     flat: dict[str, Any] = {}
     for key, value in config.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
+        name = f"{prefix}{key}"
+        flat |= _flat(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
     return flat
 
 

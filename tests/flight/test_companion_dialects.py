@@ -99,15 +99,15 @@ def test_what_was_heard_of_the_last_ardupilot_does_not_count() -> None:
         with ardupilot(port, position_s=1.0):
             link.connect(20.0)
             link.prepare(10.0)
-            wait_for(lambda: link.healthy)
+            wait_for(lambda: not link.missing_health())
         with ardupilot(port, position_s=1e6) as stage:
             wait_for(lambda: stage.simulation.time_us > 3e6)
             link.prepare(10.0)
-            assert not link.healthy
+            assert link.missing_health()
             assert math.isnan(link.kinematics().position[0])
             # Messages of the second vehicle arrive: attitudes are requested again.
             wait_for(lambda: not math.isnan(link.kinematics().quaternion[0]))
-            assert not link.healthy
+            assert link.missing_health()
             with pytest.raises(LinkError, match="refuses to arm"):
                 link.arm(2.0, NEVER)
         with ardupilot(port, position_s=1.0):
@@ -160,10 +160,10 @@ def test_px4_is_asked_for_two_streams_and_for_nothing_right_after_connecting(
             before = Counter(asked)
             link.prepare(10.0)
             assert Counter(asked) == before
-            wait_for(lambda: link.healthy)
+            wait_for(lambda: not link.missing_health())
             link.prepare(10.0)
             assert [number for number in asked if number in kinematics] == kinematics * 2
-            wait_for(lambda: link.healthy)
+            wait_for(lambda: not link.missing_health())
         finally:
             pacer.stop()
     bench.server.close()

@@ -15,7 +15,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.gym_env import RehearsalEnv
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.stage import LockstepStage
-from airl_mav.rehearsal.episode_setup import episode_setup
+from airl_mav.rehearsal.firmware_process import episode_setup
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
