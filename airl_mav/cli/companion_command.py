@@ -8,12 +8,13 @@ import threading
 from rich.console import Console
 
 from airl_mav.cli.options import run_command
+from airl_mav.core.addons import load_entry
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED
 from airl_mav.core.files import save_arrays
 from airl_mav.core.progress import new_console
 from airl_mav.scenario.stand_alone import StandAloneCompanion
+from companion.conducted import Abandoned
 from companion.link_interface import LinkError
-from companion.lockstep_turns import Abandoned
 from companion.program import MissionSetup, check_on_ground, fly_alone, prepare
 from companion.status_reports import service
 
@@ -63,10 +64,9 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
     try:
         with service() as manager:
             if options.lockstep:
-                # Imported here: not needed on a drone.
-                from airl_mav.lockstep.token_companion import fly_in_lockstep
-
-                result, sha256 = fly_in_lockstep(options, mission, stop, abandon, waiting, progress)
+                option = "lockstep", True
+                fly = load_entry("airl_mav", "LOCKSTEP", "companion", option, "remote_lockstep")
+                result, sha256 = fly(options, mission, stop, abandon, waiting, progress)
             else:
                 result = fly_alone(options, mission, stop, abandon, waiting, progress)
             manager.tell(STATUS=result.reason)

@@ -8,11 +8,11 @@ import threading
 from rich.console import Console
 
 from airl_mav.cli.options import run_command
+from airl_mav.core.addons import load_entry
 from airl_mav.core.errors import EXIT_BROKEN
 from airl_mav.core.first_start import compile_shown
 from airl_mav.core.frames import Goal
 from airl_mav.core.progress import new_console
-from airl_mav.lockstep.remote import fly_vehicle_in_lockstep
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
@@ -46,7 +46,9 @@ def run(options: FirmwareOptions, console: Console | None = None) -> int:
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    fly = fly_vehicle_in_lockstep if options.lockstep else fly_vehicle
+    fly = fly_vehicle
+    if options.lockstep:
+        fly = load_entry("airl_mav", "LOCKSTEP", "firmware", ("lockstep", True), "remote_lockstep")
     try:
         fly(options, stop, _listener(options, console))
     except (FirmwareLostError, LockstepError) as error:

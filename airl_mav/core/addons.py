@@ -6,6 +6,8 @@ The `__init__` of an add-on is light and may define tables, which the core reads
     COMMANDS: {command of `airl`: (purpose, module with OPTIONS and run)}
     EXECUTORS: {value of `--executor`: module with `connected`}
     LIGHT: the commands can be imported without the simulator
+    ENVIRONMENTS: {id of a Gymnasium environment: class}
+    LOCKSTEP: {"firmware" or "companion": function that flies one side of two processes}
     SITL_OPTIONS: {option of `airl sitl`: function to a context manager around the flights}
 
 In `companion.addons`:
@@ -16,9 +18,6 @@ In `companion.addons`:
 In `firmware_sim.addons`:
 
     FIRMWARE: {value of `--firmware`: `firmware_sim.external.programs.FirmwareKind`}
-
-In `firmware_sim.addons`:
-
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
     MISSIONS: {name: subclass of `navigation.plan.Missions`}
     SERVICES: {name: MAVLink service, a module with HANDLERS and `send_pending`}

@@ -1,4 +1,4 @@
-"""Registers `airl/Navigation-v0` with Gymnasium.
+"""Registers `airl/Navigation-v0`, and environments of add-ons, with Gymnasium.
 
 `import airl_mav` imports this module as soon as Gymnasium is imported, so
 `gymnasium.make("airl_mav:airl/Navigation-v0", arena="dense-obstacles")` needs no other import.
@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import gymnasium as gym
 
+from airl_mav.core.addons import entries
+
 NAVIGATION = "airl/Navigation-v0"
-REHEARSAL = "airl/Rehearsal-v0"
 
 if NAVIGATION not in gym.registry:
     gym.register(
@@ -21,5 +22,6 @@ if NAVIGATION not in gym.registry:
         vector_entry_point="airl_mav.envs.vector:NavigationVectorEnv",
     )
 
-if REHEARSAL not in gym.registry:
-    gym.register(id=REHEARSAL, entry_point="airl_mav.lockstep.gym_env:RehearsalEnv")
+for name, place in entries("airl_mav", "ENVIRONMENTS").items():
+    if name not in gym.registry:
+        gym.register(id=name, entry_point=place)

@@ -22,17 +22,22 @@ from airl_mav.faults.fault import Fault
 from airl_mav.faults.kinds import LINKS
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.digest import FlightDigest
-from airl_mav.lockstep.token_partner import newest, newest_heartbeat
 from airl_mav.lockstep.turns import COMPANION_STARTS_US, Handle, LockstepError, Turn
-from airl_mav.lockstep.vehicle import BOOT_UNIX_US, ConductedVehicle, MemoryCamera, builtin_vehicle
+from airl_mav.lockstep.vehicle import (
+    BOOT_UNIX_US,
+    ConductedVehicle,
+    MemoryCamera,
+    builtin_vehicle,
+)
+from companion.conducted import Abandoned, ConductedClock, Poll
 from companion.link_interface import LinkError
-from companion.lockstep_turns import Abandoned, ConductedClock, Poll
 from companion.mavsdk_connection import RAW_TIMEOUT_S, RAW_URL
 from companion.mavsdk_link import MavsdkLink
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.faults.fault_timeline import FaultTimeline
 from firmware_sim.firmware import Firmware
 from firmware_sim.mavlink.codec import Encoder, dialect, layout
+from firmware_sim.mavlink.px4_links import ONBOARD_HZ
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 FIRST_BARRIER = 0x8000_0000
@@ -401,3 +406,58 @@ class LockstepStage:
             raise error
         if error is not None:
             raise LockstepError(f"the companion broke: {type(error).__name__}: {error}") from error
+
+
+_MESSAGE = slice(7, 10)
+"""Position of the message id in a frame."""
+
+
+_SENT_BY = slice(5, 10)
+"""Position of system id, component id and message id in a frame."""
+
+
+_PER_INSTANCE = ("DISTANCE_SENSOR",)
+"""Streams of several devices, distinguished by a field."""
+
+
+STATES = frozenset(
+    layout(name).id_bytes
+    for name, rate_hz in ONBOARD_HZ.items()
+    if rate_hz > 1.0 and name not in _PER_INSTANCE
+)
+"""Messages that replace older ones: state streams, and TIMESYNC, whose answer is not sent to the
+vehicle (`conductor`). Answers, events, texts and slow streams such as HEARTBEAT are excluded."""
+
+
+UNREAD = frozenset(
+    layout(name).id_bytes
+    for name in (
+        *("HIGHRES_IMU", "ODOMETRY", "ALTITUDE", "ATTITUDE_TARGET", "SERVO_OUTPUT_RAW", "VFR_HUD"),
+        *("POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT", "ESC_INFO", "ESC_STATUS"),
+    )
+)
+"""Messages that the companion never reads from MAVSDK."""
+
+
+def newest(frames: Sequence[bytes]) -> list[bytes]:
+    """Return frames without `UNREAD` messages, and only the newest of each of the `STATES`."""
+    kept: list[bytes] = []
+    replaced: set[bytes] = set()
+    # From the newest to the oldest: the first frame of each state is the one to keep.
+    for frame in reversed(frames):
+        if frame[_MESSAGE] in UNREAD:
+            continue
+        if frame[_MESSAGE] in STATES:
+            # States of several systems are kept separately.
+            sent_by = frame[_SENT_BY]
+            if sent_by in replaced:
+                continue
+            replaced.add(sent_by)
+        kept.append(frame)
+    kept.reverse()
+    return kept
+
+
+def newest_heartbeat(frames: Sequence[bytes]) -> bytes | None:
+    """Return the last HEARTBEAT of some frames, or None."""
+    return next((frame for frame in reversed(frames) if frame[_MESSAGE] == b"\0\0\0"), None)

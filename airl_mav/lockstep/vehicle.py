@@ -16,10 +16,9 @@ from airl_mav.faults.fault import Fault, link_fails
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from companion.frame_source import ReceivedFrame
-from companion.lockstep_turns import NO_FRAME
 from firmware_sim.external.px4_lockstep import OnboardLink, conducted_px4
 from firmware_sim.faults.faulty_link import FailingEndpoint
-from firmware_sim.firmware import BuiltinFlightStack, FlightStack, FrameServer
+from firmware_sim.firmware import BuiltinFlightStack, FlightStack
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, SharedEndpoint
 from firmware_sim.mavlink.px4_links import LinkConfig, onboard_link
@@ -103,7 +102,7 @@ _COMMANDS = {
 
 
 class VehicleEnd(Protocol):
-    """Interface between the conductor and a vehicle."""
+    """Interface between the conductor and a vehicle; by default for one in this process."""
 
     answers_later: bool
     """True if the vehicle needs simulated time to answer commands."""
@@ -120,12 +119,14 @@ class VehicleEnd(Protocol):
 
     def after_tick(self, *, expected: bool) -> list[bytes]:
         """Return new frames once per tick; they may be delayed unless an answer is `expected`."""
+        del expected
+        return self.take()
 
     def settle(self) -> None:
         """Wait until the vehicle has finished all due work and sent its messages."""
 
 
-class InMemory:
+class InMemory(VehicleEnd):
     """Vehicle in this process, which answers within the tick. Implements `VehicleEnd`."""
 
     answers_later = False
@@ -133,21 +134,19 @@ class InMemory:
     def __init__(self, endpoint: MemoryEndpoint) -> None:
         """Set the vehicle's endpoint."""
         self._endpoint = endpoint
-        self.take = endpoint.take
+
+    def take(self) -> list[bytes]:
+        """Return all MAVLink frames sent since the last call, oldest first."""
+        return self._endpoint.take()
+
+    def settle(self) -> None:
+        """Do nothing: the vehicle has no threads."""
 
     def deliver(self, frame: bytes, carry_out: Callable[[], object], *, echo: bool) -> None:
         """Let the vehicle process a frame immediately."""
         del echo
         self._endpoint.inbox.append(frame)
         carry_out()
-
-    def after_tick(self, *, expected: bool) -> list[bytes]:
-        """Return all frames sent since the last call."""
-        del expected
-        return self.take()
-
-    def settle(self) -> None:
-        """Do nothing: the vehicle has no threads."""
 
 
 class RealFirmwareEnd:
@@ -284,36 +283,3 @@ class MemoryCamera(DelayedFrames):
             else:
                 self.published.clear()
                 clock.sleep_until(deadline_us, self.published)
-
-
-class TokenCamera(DelayedFrames):
-    """Camera of a companion in another process. Implements `firmware.FrameServer`.
-
-    Each turn sends only the newest frame that has arrived, as the companion cannot read older ones.
-    """
-
-    def __init__(self, server: FrameServer, transport_us: int) -> None:
-        """Set the frame server and the transport latency from exposure to arrival [µs].
-
-        The caller owns and closes the server.
-        """
-        super().__init__(transport_us)
-        self.endpoint = server.endpoint
-        self._server = server
-        self._newest: Frame | None = None
-
-    def arrive(self, now_us: int) -> bool:
-        """Receive all frames that arrived by `now_us` [µs]; return True if there was one."""
-        arrived = self.arrived(now_us)
-        self._newest = arrived or self._newest
-        return arrived is not None
-
-    @property
-    def sequence(self) -> int:
-        """Sequence number of the newest arrived frame."""
-        return NO_FRAME if self._newest is None else self._newest.sequence
-
-    def send(self) -> None:
-        """Send the newest arrived frame immediately; a resend covers packet loss."""
-        if self._newest is not None:
-            self._server.publish(self._newest)

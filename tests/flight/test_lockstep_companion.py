@@ -8,10 +8,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from airl_mav.addons.remote_lockstep.turns import TokenFrameSource, TokenTurns
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
+from companion.conducted import Abandoned, ConductedClock
 from companion.frame_source import ReceivedFrame
-from companion.lockstep_turns import Abandoned, ConductedClock, TokenFrameSource, TokenTurns
 
 
 class ScriptedLink:

@@ -26,11 +26,11 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
+from airl_mav.addons.remote_lockstep.vehicle_side import RemoteStage
 from airl_mav.core.frames import Goal
 from airl_mav.core.signing import StoredSigning, write_key
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.lockstep_flight import fly
-from airl_mav.lockstep.remote import RemoteStage
 from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneVehicle
 from firmware_sim.mavlink.endpoint import UdpEndpoint

@@ -21,11 +21,11 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 from stable_baselines3.common.env_util import make_vec_env
 
+from airl_mav.addons.rehearsal_env.gym_env import AskedFlight, RehearsalEnv
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.navigation_env import FIRST_TRAINING_SEED, NavigationEnv
-from airl_mav.envs.registration import NAVIGATION, REHEARSAL
+from airl_mav.envs.registration import NAVIGATION
 from airl_mav.experiments.gym_flier import environment_of
-from airl_mav.lockstep.gym_env import AskedFlight, RehearsalEnv
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.scenario.model import Scenario
@@ -35,6 +35,7 @@ from tests.flight.test_lockstep_px4 import REAL
 from tests.support.processes import write_arena
 from tests.support.px4_peer import write_build
 
+REHEARSAL = "airl/Rehearsal-v0"
 AHEAD = 22
 """An action of arc-25 that flies straight on."""
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+from airl_mav.addons.remote_lockstep.token_partner import TokenCamera, TokenPartner, Wire
 from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.signing import StoredSigning
@@ -18,9 +19,8 @@ from airl_mav.flight.judge import Referee, Task, Verdict
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.digest import SEEN, FlightDigest
 from airl_mav.lockstep.judging import Judge
-from airl_mav.lockstep.token_partner import TokenPartner, Wire
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
-from airl_mav.lockstep.vehicle import BOOT_UNIX_US, TokenCamera, builtin_vehicle
+from airl_mav.lockstep.vehicle import BOOT_UNIX_US, builtin_vehicle
 from airl_mav.rehearsal.episode import EpisodeSupervisor
 from airl_mav.rehearsal.firmware_process import Listener, aircraft_of, episode_of
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle

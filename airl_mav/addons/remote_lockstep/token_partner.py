@@ -13,18 +13,20 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+from airl_mav.addons.remote_lockstep.turns import NO_FRAME, PhaseToken, TurnBack, TurnGiven
+from airl_mav.addons.remote_lockstep.turns import Order as Word
+from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.signing import StoredSigning
+from airl_mav.lockstep.stage import newest_heartbeat
 from airl_mav.lockstep.turns import Handle, LockstepError, Turn
-from airl_mav.lockstep.vehicle import TokenCamera
+from airl_mav.lockstep.vehicle import DelayedFrames
 from airl_mav.rehearsal.episode import Order
 from airl_mav.scenario.stand_alone import COMPANION_TIMEOUT_S, LONGEST_REST_US, TURN_US
-from companion.lockstep_turns import Order as Word
-from companion.lockstep_turns import PhaseToken, TurnBack, TurnGiven
-from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect, is_signed, layout
+from firmware_sim.firmware import FrameServer
+from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect, is_signed
 from firmware_sim.mavlink.endpoint import Peer, Sender, UdpEndpoint
-from firmware_sim.mavlink.px4_links import ONBOARD_HZ
 
 KNOCK_S = 0.1
 """Heartbeat interval before the companion is connected [wall s]."""
@@ -289,52 +291,6 @@ def _repeats(total_s: float) -> Iterator[float]:
 _OVERHEAD = 12
 """Header and checksum of an unsigned frame [bytes]."""
 
-_MESSAGE = slice(7, 10)
-"""Position of the message id in a frame."""
-
-_SENT_BY = slice(5, 10)
-"""Position of system id, component id and message id in a frame."""
-
-_PER_INSTANCE = ("DISTANCE_SENSOR",)
-"""Streams of several devices, distinguished by a field."""
-
-STATES = frozenset(
-    layout(name).id_bytes
-    for name, rate_hz in ONBOARD_HZ.items()
-    if rate_hz > 1.0 and name not in _PER_INSTANCE
-)
-"""Messages that replace older ones: state streams, and TIMESYNC, whose answer is not sent to the
-vehicle (`conductor`). Answers, events, texts and slow streams such as HEARTBEAT are excluded."""
-
-
-UNREAD = frozenset(
-    layout(name).id_bytes
-    for name in (
-        *("HIGHRES_IMU", "ODOMETRY", "ALTITUDE", "ATTITUDE_TARGET", "SERVO_OUTPUT_RAW", "VFR_HUD"),
-        *("POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT", "ESC_INFO", "ESC_STATUS"),
-    )
-)
-"""Messages that the companion never reads from MAVSDK."""
-
-
-def newest(frames: Sequence[bytes]) -> list[bytes]:
-    """Return frames without `UNREAD` messages, and only the newest of each of the `STATES`."""
-    kept: list[bytes] = []
-    replaced: set[bytes] = set()
-    # From the newest to the oldest: the first frame of each state is the one to keep.
-    for frame in reversed(frames):
-        if frame[_MESSAGE] in UNREAD:
-            continue
-        if frame[_MESSAGE] in STATES:
-            # States of several systems are kept separately.
-            sent_by = frame[_SENT_BY]
-            if sent_by in replaced:
-                continue
-            replaced.add(sent_by)
-        kept.append(frame)
-    kept.reverse()
-    return kept
-
 
 def split(frames: bytes) -> Iterator[bytes]:
     """Yield the frames of concatenated unsigned frames."""
@@ -343,11 +299,6 @@ def split(frames: bytes) -> Iterator[bytes]:
         end = start + _OVERHEAD + frames[start + 1]
         yield frames[start:end]
         start = end
-
-
-def newest_heartbeat(frames: Sequence[bytes]) -> bytes | None:
-    """Return the last HEARTBEAT of some frames, or None."""
-    return next((frame for frame in reversed(frames) if frame[_MESSAGE] == b"\0\0\0"), None)
 
 
 def datagrams(frames: Iterable[bytes], longest: int) -> Iterator[bytes]:
@@ -492,3 +443,36 @@ class Wire:
             self._say(f"onboard: {self.refused} frames refused so far: bad signature")
         if self.foreign:
             self._say(f"onboard: {self.foreign} datagrams dropped so far: not the companion's")
+
+
+class TokenCamera(DelayedFrames):
+    """Camera of a companion in another process. Implements `firmware.FrameServer`.
+
+    Each turn sends only the newest frame that has arrived, as the companion cannot read older ones.
+    """
+
+    def __init__(self, server: FrameServer, transport_us: int) -> None:
+        """Set the frame server and the transport latency from exposure to arrival [µs].
+
+        The caller owns and closes the server.
+        """
+        super().__init__(transport_us)
+        self.endpoint = server.endpoint
+        self._server = server
+        self._newest: Frame | None = None
+
+    def arrive(self, now_us: int) -> bool:
+        """Receive all frames that arrived by `now_us` [µs]; return True if there was one."""
+        arrived = self.arrived(now_us)
+        self._newest = arrived or self._newest
+        return arrived is not None
+
+    @property
+    def sequence(self) -> int:
+        """Sequence number of the newest arrived frame."""
+        return NO_FRAME if self._newest is None else self._newest.sequence
+
+    def send(self) -> None:
+        """Send the newest arrived frame immediately; a resend covers packet loss."""
+        if self._newest is not None:
+            self._server.publish(self._newest)

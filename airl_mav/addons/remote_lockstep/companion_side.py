@@ -7,12 +7,13 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 
+from airl_mav.addons.remote_lockstep.turns import TokenFrameSource, TokenTurns
 from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
 from airl_mav.scenario.checks import NATIVE_T2_US
 from airl_mav.scenario.stand_alone import StandAloneCompanion
+from companion.conducted import ConductedClock
 from companion.frame_source import open_camera
-from companion.lockstep_turns import ConductedClock, TokenFrameSource, TokenTurns
 from companion.mavsdk_connection import signed
 from companion.mavsdk_link import MavsdkLink
 from companion.offboard_mission import MissionResult, check_camera, fly_mission
