@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.addons import load_entry
+from airl_mav.core.addons import entries, load, load_entry
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
@@ -35,7 +35,6 @@ from companion.frame_source import (
     FrameSource,
     OpenCamera,
     ReceivedFrame,
-    SharedFrames,
     open_named_camera,
 )
 from companion.link_interface import LinkError
@@ -50,7 +49,6 @@ from companion.offboard_mission import (
     mount_of,
 )
 from companion.pilot import age_of
-from companion.status_reports import obstacles_told, present
 from companion.watchdog import ThreadGuard
 
 if TYPE_CHECKING:
@@ -74,6 +72,9 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
     check_companion(asked)
     if asked.black_box is not None:
         _recording(asked)
+    if asked.tell_obstacles:
+        option = "tell_obstacles", True
+        load_entry("companion", "REPORTS", "vehicle", option, "vehicle_reports")
     policy = find_policy(asked.policy, trust=asked.trust)
     pilot, watchdog = checks.decide_piloting(asked, policy, PilotSettings.goal_radius_m)
     # Computing time of this computer counts, except in lockstep.
@@ -152,21 +153,19 @@ def mission_camera(asked: StandAloneCompanion, mission: MissionSetup, clock: Clo
     return open_named_camera(asked.camera, clock, wanted, whose, further)
 
 
-@contextmanager
-def obstacles_reported(
+def reporting(
     asked: StandAloneCompanion,
     mission: MissionSetup,
     link: MavsdkLink,
-    camera: FrameSource,
+    camera: OpenCamera,
     clock: Clock,
-) -> Iterator[FrameSource]:
-    """Send obstacle distances if requested; yield the frames for the policy."""
-    if not asked.tell_obstacles:
-        yield camera
-        return
-    frames, range_m = SharedFrames(camera), mission.vehicle.camera.range_m
-    with obstacles_told(link, frames, range_m, mission.mount_rad[0], clock):
-        yield frames
+) -> AbstractContextManager[FrameSource]:
+    """Send reports to the vehicle's network, if their add-on is there; return the frames to use."""
+    place = entries("companion", "REPORTS").get("vehicle")
+    if place is None:
+        return nullcontext(camera)
+    reports: AbstractContextManager[FrameSource] = load(place)(asked, mission, link, camera, clock)
+    return reports
 
 
 def recorded(
@@ -220,8 +219,7 @@ def fly_alone(
         # The camera is checked before the status messages start, and before take-off.
         check_camera(mission.policy, camera, stop, mission.compensator)
         with (
-            present(link, clock),
-            obstacles_reported(asked, mission, link, camera, clock) as frames,
+            reporting(asked, mission, link, camera, clock) as frames,
             recorded(asked, mission, link, clock) as box,
         ):
             decided = None if box is None else box.decided

@@ -16,7 +16,7 @@ from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.conducted import Abandoned
 from companion.link_interface import LinkError
 from companion.program import MissionSetup, check_on_ground, fly_alone, prepare
-from companion.status_reports import service
+from companion.systemd import service
 
 
 class CompanionOptions(StandAloneCompanion):

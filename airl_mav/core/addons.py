@@ -14,6 +14,7 @@ In `companion.addons`:
 
     CAMERAS: {"driver": function that opens a camera by the name of a driver}
     RECORDERS: {"black_box": context manager that records a mission}
+    REPORTS: {"vehicle": context manager that sends messages in a mission}
 
 In `firmware_sim.addons`:
 

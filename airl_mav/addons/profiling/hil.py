@@ -39,7 +39,7 @@ from companion.link_interface import LinkError
 from companion.mavsdk_link import MavsdkLink
 from companion.offboard_mission import MissionResult, check_camera, fly_mission
 from companion.program import mission_camera, prepare
-from companion.status_reports import every
+from companion.systemd import every
 from companion.watchdog import ThreadGuard
 
 GOAL = 9_000.0, 0.0

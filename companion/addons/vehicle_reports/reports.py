@@ -7,48 +7,27 @@ Directions without a return within range are free, directions outside the field 
 from __future__ import annotations
 
 import math
-import os
-import socket
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
-from typing import Any, Protocol
+from contextlib import AbstractContextManager, contextmanager
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import psutil
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.clock import Clock, WallClock
+from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.frames import Vector, quats_to_euler
 from airl_mav.core.machine import temperature_c
 from airl_mav.policy.images import NEAREST_M, level_scan, rays_of, tilt_of
 from airl_mav.policy.observation import Kinematics
-from companion.frame_source import FrameSource
+from companion.frame_source import FrameSource, SharedFrames
+from companion.systemd import every
 
-
-@contextmanager
-def every(period_us: int, act: Callable[[], object], clock: Clock, name: str) -> Iterator[None]:
-    """Call `act` immediately and once per period [µs] in a named thread, skipping missed calls."""
-    ended = threading.Event()
-
-    def go_on() -> None:
-        due_us = clock.time_us()
-        while not ended.is_set():
-            act()
-            # A late call moves the schedule instead of causing a burst.
-            due_us = max(due_us + period_us, clock.time_us())
-            clock.sleep_until(due_us, ended)
-
-    thread = threading.Thread(target=go_on, name=name, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-
+if TYPE_CHECKING:
+    from airl_mav.scenario.stand_alone import StandAloneCompanion
+    from companion.program import MissionSetup
 
 MESSAGE = "ONBOARD_COMPUTER_STATUS"
 
@@ -205,69 +184,19 @@ def obstacles_told(
     return every(OBSTACLES_US, tell, clock, "obstacles")
 
 
-ALIVE_SHARE = 0.5
-"""Interval of watchdog notifications as a share of systemd's timeout, as recommended by
-sd_watchdog_enabled(3)."""
-
-
-class ServiceManager:
-    """Service manager that started this process, if any. Thread-safe."""
-
-    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
-        """Read the socket and the watchdog timeout from an environment."""
-        self._socket: socket.socket | None = None
-        address = environment.get("NOTIFY_SOCKET", "")
-        if address[:1] in ("/", "@"):
-            # CLOEXEC: child processes must not notify the manager.
-            found = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
-            try:
-                # "@" marks a name in Linux's abstract namespace.
-                found.connect(address.replace("@", "\0", 1))
-                found.setblocking(False)
-                self._socket = found
-            except OSError:
-                found.close()
-        self.watchdog_us = _watchdog_us(environment)
-        """Watchdog timeout [µs]; None = no watchdog."""
-
-    def tell(self, **facts: str) -> None:
-        """Send facts by names of sd_notify(3), such as STATUS; lost facts are not an error."""
-        if self._socket is not None:
-            # One fact per line: a newline within a value would start another.
-            lines = (f"{name}={value}".replace("\n", " ") for name, value in facts.items())
-            try:
-                self._socket.send("\n".join(lines).encode())
-            except BlockingIOError:
-                # The manager's queue is full; the flight must not wait.
-                return
-            except OSError:
-                self.close()
-
-    def close(self) -> None:
-        """Stop sending notifications."""
-        found, self._socket = self._socket, None
-        if found is not None:
-            found.close()
-
-
-def _watchdog_us(environment: Mapping[str, str]) -> int | None:
-    """Return WATCHDOG_USEC if it applies to this process; None otherwise."""
-    told, pid = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID")
-    if not told.isdecimal() or int(told) == 0 or pid not in (None, f"{os.getpid()}"):
-        return None
-    return int(told)
-
-
 @contextmanager
-def service(environment: Mapping[str, str] = os.environ) -> Iterator[ServiceManager]:
-    """Yield the service manager, with watchdog pings from a thread while the context is active."""
-    with closing(ServiceManager(environment)) as manager, ExitStack() as alive:
-        if manager.watchdog_us is not None:
-            # Half the timeout leaves room for one missed ping.
-            period_us = int(ALIVE_SHARE * manager.watchdog_us)
-            sign = every(period_us, lambda: manager.tell(WATCHDOG="1"), WallClock(), "systemd")
-            alive.enter_context(sign)
-        try:
-            yield manager
-        finally:
-            manager.tell(STOPPING="1")
+def reporting(
+    asked: StandAloneCompanion,
+    mission: MissionSetup,
+    link: VehicleLink,
+    camera: FrameSource,
+    clock: Clock,
+) -> Iterator[FrameSource]:
+    """Send the computer's status and, if requested, obstacles; yield the frames for the policy."""
+    with present(link, clock):
+        if not asked.tell_obstacles:
+            yield camera
+            return
+        frames, range_m = SharedFrames(camera), mission.vehicle.camera.range_m
+        with obstacles_told(link, frames, range_m, mission.mount_rad[0], clock):
+            yield frames
