@@ -13,8 +13,8 @@ from firmware_sim.autopilot.commander import CommanderState
 from firmware_sim.external.airframe_check import GROUND_LOSS, differences
 from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import FirmwareObserver
-from firmware_sim.flight_log.flight_log import ULOG_SUFFIX
 from firmware_sim.interfaces import (
+    ULOG_SUFFIX,
     ActuatorControls,
     FirmwareLostError,
     FirmwareMissingError,

@@ -19,6 +19,7 @@ from airl_mav.faults.kinds import FITTED_CASES, STANDS, Case
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
+from firmware_sim.addons.flight_log import topics
 from firmware_sim.autopilot.autopilot_state import Clearance, Result
 from firmware_sim.autopilot.error_state import V
 from firmware_sim.autopilot.flight_modes import Mode
@@ -30,7 +31,6 @@ from firmware_sim.autopilot.range_finder import RangeFinder
 from firmware_sim.engine.record import LANDING, new_controller
 from firmware_sim.engine.ticks import detect_record
 from firmware_sim.external.px4 import hil_messages as hil
-from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import DOWNWARD, DistanceReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.mavlink.streams import sensors, status

@@ -23,8 +23,8 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.vehicle_log.clock_alignment import marzullo
 from airl_mav.vehicle_log.ulog_reader import Series, VehicleLog, empty, read_vehicle_log
-from firmware_sim.flight_log.topics import TOPICS
-from firmware_sim.flight_log.ulog_writer import UlogWriter
+from firmware_sim.addons.flight_log.topics import TOPICS
+from firmware_sim.addons.flight_log.ulog_writer import UlogWriter
 
 QUAD = load_vehicle("quad")
 STILL = np.zeros(0, np.int64)

@@ -10,7 +10,7 @@ from airl_mav.addons.export_log.recorded import RecordedFlight
 from airl_mav.addons.export_log.ulog_log import write_ulog
 from airl_mav.core.files import replacing
 from airl_mav.report.replay.replayed_flight import ReplayedRun
-from firmware_sim.flight_log.flight_log import ULOG_SUFFIX
+from firmware_sim.interfaces import ULOG_SUFFIX
 
 Format = Literal["mcap", "ulog"]
 

@@ -14,13 +14,13 @@ from typing import NamedTuple, TypeVar
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic, quat_yaw
 from airl_mav.vehicle import atmosphere
+from firmware_sim.addons.flight_log.ulog_writer import Topic, Values
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
 from firmware_sim.autopilot.optical_flow import (
     GREATEST_HEIGHT_M,
     GREATEST_RAD_S,
     LEAST_HEIGHT_M,
 )
-from firmware_sim.flight_log.ulog_writer import Topic, Values
 from firmware_sim.interfaces import PoseFrame, TrueState, VelocityFrame
 
 ON_CHANGE_US = 500 * US_PER_MS
