@@ -37,8 +37,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from airl_mav.core.constants import LOOPBACK
-from airl_mav.core.provenance import provenance, usable_cores
-from airl_mav.latency.percentiles import summarize
+from airl_mav.core.machine import provenance, usable_cores
+from airl_mav.latency.stages import summarize
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.table import (
     DURATION_COLUMNS,

@@ -30,8 +30,7 @@ from airl_mav.lockstep.threaded import ThreadPartner
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario, resolve
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.estimator import Estimator

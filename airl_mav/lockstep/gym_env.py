@@ -30,7 +30,7 @@ from airl_mav.envs.spec import EnvironmentSpec, gymnasium_spec
 from airl_mav.envs.stopping import bounded, injections_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.asked_flight import AskedFlight
-from airl_mav.policy.action_sets import command, commands
+from airl_mav.policy.actions import command, commands
 from airl_mav.policy.layouts import encode_layout, newest_frame
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import Encoded
@@ -38,8 +38,7 @@ from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.conditions import SensorNoise, Spread
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.model import Scenario, WatchdogSettings
-from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario, resolve
 from firmware_sim.warm_up import warm_up
 
 BESIDE = (

@@ -21,7 +21,7 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
 from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.external.compose import Wanted, real_firmware
 from firmware_sim.external.parameter_file import KeptParameters

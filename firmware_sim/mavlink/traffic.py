@@ -11,7 +11,7 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from airl_mav.core.log_file import LogFile
+from airl_mav.core.files import LogFile
 from firmware_sim.mavlink.clients import Client
 from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
 from firmware_sim.mavlink.services.context import ANY, sender

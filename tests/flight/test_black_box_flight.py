@@ -37,8 +37,8 @@ from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.report.comparison.runs import compare_folders
 from airl_mav.report.recorded_flight import episode_of
 from airl_mav.report.recording_folder import take_in
+from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.model import PilotSettings
-from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.black_box import SAMPLE_US, open_recorder
 from companion.offboard_mission import MissionResult

@@ -32,7 +32,7 @@ from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation import Observation
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.cameras.by_name import open_named_camera
 from companion.ground_check import CheckResult, check_on_ground

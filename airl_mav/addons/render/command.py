@@ -20,12 +20,11 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.shared_options import folder_of
-from airl_mav.core.console import new_console
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.frames import quat_from_euler
-from airl_mav.core.progress import RichProgress
+from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import Coefficients
 from airl_mav.profiles.loading import load_profile
