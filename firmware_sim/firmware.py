@@ -21,7 +21,7 @@ from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import AutopilotState, OperatorText, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
 from firmware_sim.engine.record import Record
-from firmware_sim.faults.faulty_link import FailingEndpoint
+from firmware_sim.fault_timeline import FailingLink
 from firmware_sim.interfaces import ULOG_SUFFIX, FlightController, TrueState
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
@@ -223,7 +223,7 @@ class Firmware:
         pacing: Pacing,
         *,
         recording: bool = True,
-        failing: FailingEndpoint | None = None,
+        failing: FailingLink | None = None,
     ) -> None:
         """Create the firmware without an episode.
 

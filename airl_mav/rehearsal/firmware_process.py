@@ -25,8 +25,7 @@ from airl_mav.scenario.resolve import ResolvedScenario
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.external.compose import Wanted, real_firmware
 from firmware_sim.external.parameter_file import KeptParameters
-from firmware_sim.faults.fault_timeline import FaultTimeline
-from firmware_sim.faults.faulty_link import FailingEndpoint
+from firmware_sim.fault_timeline import FailingLink, FaultTimeline, failing_link
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, bind_udp_links
@@ -81,11 +80,11 @@ def build_firmware(
     signing = None if aircraft.signing_key is None else StoredSigning(aircraft.signing_key)
     insecure = insecure or signing is not None
     flight_stack: FlightStack
-    failing: FailingEndpoint | None = None
+    failing: FailingLink | None = None
     if aircraft.firmware == "builtin":
         links = ends()
         if link_fails(aircraft.faults):
-            failing = FailingEndpoint(links.api, pacing.clock)
+            failing = failing_link(links.api, pacing.clock)
         try:
             devices = bind_devices()
         except UsageError:

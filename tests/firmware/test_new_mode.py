@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from airl_mav.faults.kinds import PHASES
+from airl_mav.faults.fault import PHASES
 from firmware_sim.autopilot.flight_modes import BY_CUSTOM_MODE, Mode
 from firmware_sim.autopilot.modes import implementations
 from tests.support.processes import ROOT

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from airl_mav.addons.fault_matrix.matrix import fly_fault
+from airl_mav.addons.fault_matrix.matrix import FITTED_CASES, STANDS, Case, fly_fault
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import HOME
-from airl_mav.faults.kinds import FITTED_CASES, STANDS, Case
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
