@@ -10,6 +10,9 @@ The `__init__` of an add-on is light and may define tables, which the core reads
 In `firmware_sim.addons`:
 
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
+    MISSIONS: {name: subclass of `navigation.plan.Missions`}
+    SERVICES: {name: MAVLink service, a module with HANDLERS and `send_pending`}
+    EVENTS: {name: module with event `Definition`s}
 
 Values are text (`module` or `module:name`); `load` imports what they name, on first use.
 `after_import` runs a module of this package once another package is imported.

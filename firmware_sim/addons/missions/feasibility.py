@@ -10,10 +10,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from airl_mav.core.frames import Geodetic
+from firmware_sim.addons.missions.items import NOT_IN_MISSIONS, NavCommand
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
-from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import Definition
-from firmware_sim.autopilot.navigation.plan import NOT_IN_MISSIONS, NavCommand, PlanItem, distance_m
+from firmware_sim.autopilot.events.definition import Definition, Level, define, error, warning
+from firmware_sim.autopilot.navigation.plan import PlanItem, distance_m
 
 _N = NavCommand
 
@@ -32,6 +32,47 @@ _NEVER_FIRST = frozenset(
     | {_N.DO_SET_ACTUATOR}
 )
 """Commands after which PX4 no longer counts a take-off as the first waypoint."""
+
+
+def _rejected(name: str, words: str, listed: str = "", internal: Level = Level.INFO) -> Definition:
+    return define(name, f"Mission rejected: {words}", listed, level=Level.ERROR, internal=internal)
+
+
+NO_POSITION = define("navigator_mis_no_pos_lock", "Not yet ready for mission, no position lock")
+UNSUPPORTED_COMMAND = _rejected(
+    "navigator_mis_unsup_cmd",
+    "item {1}: unsupported command: {2}",
+    "uint16_t item, uint16_t nav_cmd",
+    internal=Level.WARNING,
+)
+STARTS_WITH_LANDING = _rejected("navigator_mis_starts_w_landing", "starts with landing")
+TAKEOFF_TOO_LOW = _rejected(
+    "navigator_mis_takeoff_too_low", "takeoff altitude too low! Minimum: {1:.1m_v}", "float minimum"
+)
+TAKEOFF_NOT_FIRST = _rejected(
+    "navigator_mis_takeoff_not_first", "takeoff is not the first waypoint item"
+)
+VTOL_ITEMS = _rejected(
+    "navigator_mis_vtol_items", "Mission contains VTOL items but vehicle is not a VTOL"
+)
+TAKEOFF_MISSING = _rejected("navigator_mis_takeoff_missing", "Takeoff waypoint required")
+LAND_MISSING = _rejected("navigator_mis_land_missing", "Landing waypoint/pattern required")
+LAND_MISSING_IN_AIR = _rejected(
+    "feasibility_mis_in_air_landing_req", "Landing waypoint/pattern required"
+)
+TAKEOFF_OR_LAND_MISSING = _rejected(
+    "navigator_mis_takeoff_or_land_missing", "Takeoff or Landing item missing"
+)
+ADD_LANDING = _rejected("navigator_mis_add_land_or_rm_to", "Add Landing item or remove Takeoff")
+ADD_TAKEOFF = _rejected("navigator_mis_add_to_or_rm_land", "Add Takeoff item or remove Landing")
+OUTSIDE_FENCE = error(
+    "navigator_mis_geofence_violation", "Geofence violation for waypoint {1}", "int16_t waypoint"
+)
+FIRST_FAR_AWAY = warning(
+    "navigator_mis_first_wp_far",
+    "First waypoint far away from Home: {1m} Correct mission loaded?",
+    "uint32_t distance",
+)
 
 
 class FeasibilityResult(NamedTuple):
@@ -62,9 +103,7 @@ def check(
         return FeasibilityResult(valid=False)
     if home is None:
         text = "Not yet ready for mission, no position lock."
-        return FeasibilityResult(
-            False, (OperatorText.of(Severity.INFO, events.NO_POSITION, text=text),)
-        )
+        return FeasibilityResult(False, (OperatorText.of(Severity.INFO, NO_POSITION, text=text),))
     found = _first_invalid(items, landed=landed)
     if found is None:
         found = [
@@ -85,9 +124,9 @@ def _first_invalid(items: tuple[PlanItem, ...], *, landed: bool) -> list[Operato
     for number, item in enumerate(items, start=1):
         if item.command not in FLYABLE:
             text = f"Mission rejected: item {number}: unsupported cmd: {item.command}"
-            return [_critical(events.UNSUPPORTED_COMMAND, number, item.command, text=text)]
+            return [_critical(UNSUPPORTED_COMMAND, number, item.command, text=text)]
         if number == 1 and item.command == _N.LAND and landed:
-            return [_critical(events.STARTS_WITH_LANDING)]
+            return [_critical(STARTS_WITH_LANDING)]
     return None
 
 
@@ -98,17 +137,17 @@ def _takeoffs(items: tuple[PlanItem, ...], home: Geodetic) -> list[OperatorText]
             if item.place(home.altitude_m).altitude_m <= home.altitude_m:
                 text = "Mission rejected: Takeoff altitude below home altitude!"
                 least = 0.0 if item.altitude_is_relative else home.altitude_m
-                return [_critical(events.TAKEOFF_TOO_LOW, least, text=text)]
+                return [_critical(TAKEOFF_TOO_LOW, least, text=text)]
             if passed:
                 text = "Mission rejected: takeoff not first waypoint item"
-                return [_critical(events.TAKEOFF_NOT_FIRST, text=text)]
+                return [_critical(TAKEOFF_NOT_FIRST, text=text)]
         passed = passed or item.command in _NEVER_FIRST
     return []
 
 
 def _vehicle_type(items: tuple[PlanItem, ...]) -> list[OperatorText]:
     if any(item.command in _VTOL for item in items):
-        return [_critical(events.VTOL_ITEMS)]
+        return [_critical(VTOL_ITEMS)]
     return []
 
 
@@ -117,13 +156,13 @@ def _required(items: tuple[PlanItem, ...], required: int, *, landed: bool) -> li
     commands = {item.command for item in items}
     takeoff, land = not commands.isdisjoint(_TAKEOFFS), _N.LAND in commands
     missing = {
-        1: None if takeoff else events.TAKEOFF_MISSING,
-        2: None if land else events.LAND_MISSING,
-        3: None if takeoff and land else events.TAKEOFF_OR_LAND_MISSING,
+        1: None if takeoff else TAKEOFF_MISSING,
+        2: None if land else LAND_MISSING,
+        3: None if takeoff and land else TAKEOFF_OR_LAND_MISSING,
         4: _not_both(takeoff=takeoff, land=land),
         5: _not_both(takeoff=takeoff, land=land)
         if landed
-        else (None if land else events.LAND_MISSING_IN_AIR),
+        else (None if land else LAND_MISSING_IN_AIR),
     }.get(required)
     return [] if missing is None else [_critical(missing, text=f"{missing.message}.")]
 
@@ -131,7 +170,7 @@ def _required(items: tuple[PlanItem, ...], required: int, *, landed: bool) -> li
 def _not_both(*, takeoff: bool, land: bool) -> Definition | None:
     if takeoff == land:
         return None
-    return events.ADD_LANDING if takeoff else events.ADD_TAKEOFF
+    return ADD_LANDING if takeoff else ADD_TAKEOFF
 
 
 def _fence(
@@ -140,7 +179,7 @@ def _fence(
     for number, item in enumerate(items, start=1):
         if item.has_position and not inside_fence(item.place(home.altitude_m)):
             text = f"Geofence violation for waypoint {number}"
-            return [_critical(events.OUTSIDE_FENCE, number, text=text)]
+            return [_critical(OUTSIDE_FENCE, number, text=text)]
     return []
 
 
@@ -155,4 +194,4 @@ def _first_far_away(
     if not away >= most_m:
         return []
     text = f"First waypoint far away from home: {int(away)}m. Correct mission loaded?"
-    return [_critical(events.FIRST_FAR_AWAY, int(away), text=text)]
+    return [_critical(FIRST_FAR_AWAY, int(away), text=text)]

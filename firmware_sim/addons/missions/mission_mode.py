@@ -7,13 +7,14 @@ import math
 from airl_mav.control.demand import AnyDemand
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
+from firmware_sim.addons.missions.items import STANDING, Triplet, TripletKind
+from firmware_sim.addons.missions.manager import MissionManager
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import ModeRequest, PrecisionRequest
 from firmware_sim.autopilot.modes.automatic import gentle, landing_speed, leave_ground
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, optional_mode, triple
-from firmware_sim.autopilot.navigation.plan import Triplet, TripletKind
 from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment
 
 _TAKEOFF, _LAND, _IDLE = TripletKind.TAKEOFF, TripletKind.LAND, TripletKind.IDLE
@@ -26,7 +27,7 @@ _MOVES_M_S = 0.5
 
 
 class Mission(FlightMode, modes=(Mode.MISSION,)):
-    """Mission mode: follows `FlightContext.triplet` with PX4's speeds at and between waypoints."""
+    """Mission mode: follows the triplets of missions with PX4's speeds at and between waypoints."""
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
@@ -35,14 +36,19 @@ class Mission(FlightMode, modes=(Mode.MISSION,)):
         self._lands_precisely = False
 
     @property
+    def _path(self) -> Triplet:
+        missions = self._context.missions
+        return missions.triplet if isinstance(missions, MissionManager) else STANDING
+
+    @property
     def lifts(self) -> bool:
         """True if the mission leaves the ground."""
-        return self._context.triplet.kind not in (_IDLE, _LAND)
+        return self._path.kind not in (_IDLE, _LAND)
 
     @property
     def destination(self) -> Vec | None:
         """Position of the active item."""
-        return self._context.triplet.target
+        return self._path.target
 
     def enter(self, _state: Vector, _request: ModeRequest | None, /) -> None:
         """Start; the executor supplies the waypoints."""
@@ -51,7 +57,7 @@ class Mission(FlightMode, modes=(Mode.MISSION,)):
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Return the demand for the active waypoints."""
         context = self._context
-        triplet, position, travel = context.triplet, triple(state, P), context.travel
+        triplet, position, travel = self._path, triple(state, P), context.travel
         if context.standing:
             # The trajectory starts at the vehicle's position at lift-off.
             return leave_ground(context, state, time_us)
@@ -80,10 +86,10 @@ class Mission(FlightMode, modes=(Mode.MISSION,)):
 
     def is_done(self, _state: Vector, /) -> bool:
         """Return whether the mission has ended."""
-        return self._context.mission_over
+        return self._context.missions.over
 
     def _limits(self, state: Vector) -> PathLimits:
-        triplet = self._context.triplet
+        triplet = self._path
         limits = self._context.travel.limits()._replace(acceptance_m=triplet.acceptance_m)
         return gentle(limits, self._context, state) if triplet.kind is _TAKEOFF else limits
 
@@ -97,7 +103,7 @@ class Mission(FlightMode, modes=(Mode.MISSION,)):
             return math.nan
         position = triple(state, P)
         north, east = home[0] - position[0], home[1] - position[1]
-        if math.hypot(north, east) < self._context.triplet.acceptance_m:
+        if math.hypot(north, east) < self._path.acceptance_m:
             return math.nan
         return math.atan2(east, north) if mode == 1 else math.atan2(-east, -north)
 

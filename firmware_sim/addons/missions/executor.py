@@ -2,7 +2,7 @@
 
 Source of the sequence, conditions and texts: PX4 1.16, MissionBase, Mission and MissionBlock, for a
 multicopter. Source of the region of interest: Navigator (vehicle_roi) and
-MissionBase::heading_sp_update. It runs at `PERIOD_US`, like PX4's navigator.
+MissionBase::heading_sp_update. It runs at 20 Hz, like PX4's navigator.
 """
 
 from __future__ import annotations
@@ -10,31 +10,30 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from enum import Enum, auto
-from typing import Protocol
 
 from airl_mav.core.frames import Geodetic, wrap_pi
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
-from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import MavlinkEvent
-from firmware_sim.autopilot.navigation.feasibility import FeasibilityResult
-from firmware_sim.autopilot.navigation.flown_item import (
-    Arrival,
-    ExecutorState,
-    FlownItem,
-    as_flown,
-)
-from firmware_sim.autopilot.navigation.plan import (
+from firmware_sim.addons.missions.feasibility import FeasibilityResult
+from firmware_sim.addons.missions.items import (
     STANDING,
-    MissionType,
+    Arrival,
+    FlownItem,
     NavCommand,
     PlanFrame,
-    PlanItem,
-    Plans,
     Triplet,
     TripletKind,
+    as_flown,
     go_to,
     next_places,
+)
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
+from firmware_sim.autopilot.events.definition import Level, MavlinkEvent, define
+from firmware_sim.autopilot.navigation.plan import (
+    Crew,
+    MissionType,
+    NavigationState,
+    PlanItem,
+    Plans,
 )
 
 _MODE_LOCATION = 3
@@ -100,23 +99,27 @@ class VehicleRoi:
 _N = NavCommand
 NAN = math.nan
 
-PERIOD_US = 50_000
-"""Period of PX4's navigator, 20 Hz [µs]."""
-
 _LOITERS = (_N.LOITER_UNLIM, _N.LOITER_TIME, _N.LOITER_TO_ALT)
 
 
-class Crew(Protocol):
-    """Callbacks for mission commands other than flight."""
-
-    def say(self, message: OperatorText, /) -> None:
-        """Send a text to the operator."""
-
-    def set_home(self, place: Geodetic | None, /) -> object:
-        """Move home; None = the current position."""
-
-    def return_to_launch(self) -> None:
-        """Abort the mission and return."""
+MISSION_EXECUTE = define("mission_execute", "Executing Mission")
+MISSION_FINISHED = define("mission_finished", "Mission finished, landed")
+MISSION_FINISHED_LOITER = define("mission_finished_loiter", "Mission finished, loitering")
+MISSION_REFUSED = define(
+    "mission_not_valid_refuse",
+    "No valid mission available, refusing takeoff",
+    level=Level.ERROR,
+    internal=Level.DISABLED,
+)
+MISSION_LOITER = define(
+    "mission_not_valid_loiter",
+    "No valid mission available, loitering",
+    level=Level.ERROR,
+    internal=Level.DISABLED,
+)
+MISSION_CLIMB = define(
+    "mission_climb_before_start", "Climb to {1:.1m_v} above home", "float mission_init_climb_alt"
+)
 
 
 class _Work(Enum):
@@ -137,7 +140,7 @@ class MissionExecutor:
         plans: Plans,
         value: Callable[[str], float],
         crew: Crew,
-        check: Callable[[ExecutorState], FeasibilityResult],
+        check: Callable[[NavigationState], FeasibilityResult],
         *,
         climbs_first: bool = True,
     ) -> None:
@@ -174,14 +177,14 @@ class MissionExecutor:
 
     # --- interface to the autopilot
 
-    def idle(self, situation: ExecutorState, *, armed: bool) -> None:
+    def idle(self, situation: NavigationState, *, armed: bool) -> None:
         """Track changes of the plans while another mode flies."""
         if not armed:
             self._disarmed_meanwhile = True
         self._look()
         self.review(situation)
 
-    def activate(self, situation: ExecutorState) -> None:
+    def activate(self, situation: NavigationState) -> None:
         """Start Mission mode."""
         plans = self._plans
         self._look()
@@ -206,8 +209,8 @@ class MissionExecutor:
         self._work = _Work.ITEM
         self._plans.reached = -1
 
-    def update(self, situation: ExecutorState) -> None:
-        """Advance the mission; call every PERIOD_US in Mission mode."""
+    def update(self, situation: NavigationState) -> None:
+        """Advance the mission; call at 20 Hz in Mission mode."""
         if self._look():
             self.review(situation)
             self.triplet = STANDING
@@ -238,7 +241,7 @@ class MissionExecutor:
         self._seen = seen
         return True
 
-    def review(self, situation: ExecutorState) -> None:
+    def review(self, situation: NavigationState) -> None:
         """Check the mission after a change of mission, fence or home."""
         revisions = tuple(
             self._plans.stored(kind).revision for kind in (MissionType.MISSION, MissionType.FENCE)
@@ -246,7 +249,7 @@ class MissionExecutor:
         if (revisions, situation.home) != self._checked_for:
             self._validate(situation)
 
-    def _validate(self, situation: ExecutorState) -> None:
+    def _validate(self, situation: NavigationState) -> None:
         revisions = tuple(
             self._plans.stored(kind).revision for kind in (MissionType.MISSION, MissionType.FENCE)
         )
@@ -262,16 +265,16 @@ class MissionExecutor:
         self.finished = False
         if not self.valid:
             self._running = False
-            refused = events.MISSION_REFUSED if landed else events.MISSION_LOITER
+            refused = MISSION_REFUSED if landed else MISSION_LOITER
             self._say(Severity.CRITICAL, refused.message, refused.event())
             return
         if not self._running:
-            self._say(Severity.INFO, "Executing Mission", events.MISSION_EXECUTE.event())
+            self._say(Severity.INFO, "Executing Mission", MISSION_EXECUTE.event())
         self._running = True
         self._work = _Work.ITEM
         self._plans.reached = -1
 
-    def _climb_first(self, situation: ExecutorState) -> None:
+    def _climb_first(self, situation: NavigationState) -> None:
         """Determine whether the vehicle must climb before departure."""
         self._climb_down = NAN
         following = next_places(self._plans, self._plans.current, 1)
@@ -289,13 +292,13 @@ class MissionExecutor:
         ]
         return speeds[-1] if speeds and speeds[-1] > 0.0 else NAN
 
-    def _advance(self, situation: ExecutorState) -> None:
+    def _advance(self, situation: NavigationState) -> None:
         """Advance to the next item, or end the mission."""
         if self._work is _Work.ITEM:
             following = go_to(self._plans, self._plans.current + 1)
             if following is None:
                 landed = situation.landed
-                end = events.MISSION_FINISHED if landed else events.MISSION_FINISHED_LOITER
+                end = MISSION_FINISHED if landed else MISSION_FINISHED_LOITER
                 self._say(Severity.INFO, end.message, end.event())
                 if self._plans.current + 1 == len(self._plans.mission):
                     self._plans.jumps_done.clear()
@@ -304,7 +307,7 @@ class MissionExecutor:
             self._plans.current = following
         self._take_item(situation)
 
-    def _end(self, situation: ExecutorState) -> None:
+    def _end(self, situation: NavigationState) -> None:
         """Hold position at the end of the mission."""
         self._running = False
         self.finished = True
@@ -319,7 +322,7 @@ class MissionExecutor:
 
     # --- one item
 
-    def _take_item(self, situation: ExecutorState) -> None:
+    def _take_item(self, situation: NavigationState) -> None:
         """Set the path for the current item."""
         if not self._running:
             self._end(situation)
@@ -352,7 +355,7 @@ class MissionExecutor:
         self._arrival.restart()
         self._home_altitude_m = situation.home.altitude_m
 
-    def _prepare(self, item: PlanItem, situation: ExecutorState) -> tuple[_Work, Vec | None]:
+    def _prepare(self, item: PlanItem, situation: NavigationState) -> tuple[_Work, Vec | None]:
         """Replace the item by a preparatory step if needed; return the item's place after it."""
         flown = self._flown
         north, east, down = situation.position
@@ -361,7 +364,7 @@ class MissionExecutor:
         if not math.isnan(self._climb_down) and self._work is _Work.ITEM:
             above_m = -(self._climb_down - situation.local(situation.home)[2])
             text = f"Climb to {above_m:.1f} meters above home"
-            self._say(Severity.INFO, text, events.MISSION_CLIMB.event(above_m))
+            self._say(Severity.INFO, text, MISSION_CLIMB.event(above_m))
             then = flown.place
             flown.command = _N.TAKEOFF if situation.landed else _N.LOITER_TO_ALT
             flown.place = north, east, self._climb_down
@@ -381,7 +384,7 @@ class MissionExecutor:
             return _Work.MOVE_TO_LAND, then
         return _Work.ITEM, None
 
-    def _set_triplet(self, flown: FlownItem, situation: ExecutorState, places: list[Vec]) -> None:
+    def _set_triplet(self, flown: FlownItem, situation: NavigationState, places: list[Vec]) -> None:
         if flown.command in _LOITERS:
             kind = TripletKind.LOITER
         elif flown.command == _N.LAND:
@@ -403,14 +406,14 @@ class MissionExecutor:
             cruise_m_s=self.cruise_m_s,
         )
 
-    def _place(self, item: PlanItem, situation: ExecutorState) -> Vec:
+    def _place(self, item: PlanItem, situation: NavigationState) -> Vec:
         if not (item.has_position or item.command == _N.CONDITION_GATE):
             return situation.position
         north, east, down = situation.local(item.place(situation.home.altitude_m))
         # An omitted altitude is the current one.
         return north, east, down if math.isfinite(down) else situation.position[2]
 
-    def _follow_home(self, situation: ExecutorState) -> None:
+    def _follow_home(self, situation: NavigationState) -> None:
         """Shift relative altitudes when home has moved."""
         rise = situation.home.altitude_m - self._home_altitude_m
         self._home_altitude_m = situation.home.altitude_m
@@ -428,7 +431,7 @@ class MissionExecutor:
 
     # --- commands
 
-    def _issue(self, item: PlanItem, situation: ExecutorState) -> None:
+    def _issue(self, item: PlanItem, situation: NavigationState) -> None:
         """Execute an item without a place."""
         command, params = item.command, item.params
         self._arrival.issued(situation.time_us)
@@ -444,7 +447,7 @@ class MissionExecutor:
         else:
             self.roi.command(item)
 
-    def _look_at_roi(self, situation: ExecutorState) -> None:
+    def _look_at_roi(self, situation: NavigationState) -> None:
         """Point the nose to the region of interest, unless the mount does (MIS_MNT_YAW_CTL)."""
         turns = self.triplet.kind in (TripletKind.POSITION, TripletKind.LOITER)
         if not turns or self._value("MIS_MNT_YAW_CTL") > 0.0:

@@ -11,13 +11,8 @@ import struct
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
-from firmware_sim.autopilot.navigation.plan import (
-    NOT_IN_MISSIONS,
-    MissionType,
-    NavCommand,
-    PlanFrame,
-    PlanItem,
-)
+from firmware_sim.addons.missions.items import NOT_IN_MISSIONS, NavCommand, PlanFrame
+from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.transfers import crc32part
 
