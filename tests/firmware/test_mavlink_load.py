@@ -13,10 +13,10 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from firmware_sim.addons.flight_log.flight_log import FlightLog
+from firmware_sim.addons.ground_station_services.logs import PACKETS_PER_TICK
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import LEAST_PIECES_PER_TICK, PIECES_PER_TICK, MavlinkServer
-from firmware_sim.mavlink.services.logs import PACKETS_PER_TICK
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.memory_hub import MemoryHub
 

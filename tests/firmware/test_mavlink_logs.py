@@ -15,9 +15,9 @@ from mavsdk.plugins.log_streaming import LogStreaming
 from pyulog import ULog
 
 from firmware_sim.addons.flight_log.flight_log import FlightLog
+from firmware_sim.addons.ground_station_services.logs import NO_MESSAGE
 from firmware_sim.engine.record import TRUE_TICK
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.transfers import NO_MESSAGE
 from firmware_sim.mavlink.telemetry import flown_of
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import (

@@ -9,6 +9,7 @@ Guide: docs/how-to/faults.md.
 
 _HERE = "firmware_sim.addons.fault_injection"
 
+SERVICES = {"inject_failure": f"{_HERE}.inject_failure"}
 FAULT_EFFECTS = {
     "parts": f"{_HERE}.failing_parts:FailingParts",
     "camera": f"{_HERE}.failing_parts:FailingCamera",

@@ -7,9 +7,6 @@ message that is not a stream is FAILED.
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable, Mapping
-from dataclasses import replace
 from itertools import count
 
 from airl_mav.core.clock import NS_PER_US
@@ -17,15 +14,24 @@ from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect, message_name
 from firmware_sim.mavlink.link import OFF
-from firmware_sim.mavlink.services import component_metadata
-from firmware_sim.mavlink.services.context import ANY, Action, Context, VehicleCommand, sender
+from firmware_sim.mavlink.services import table
+from firmware_sim.mavlink.services.context import (
+    ANY,
+    Action,
+    Context,
+    Handlers,
+    VehicleCommand,
+    for_anyone,
+    for_vehicle,
+    for_vehicle_or_all,
+    sender,
+)
 from firmware_sim.mavlink.streams import Builder, status
-from firmware_sim.mavlink.streams.units import INT32_MAX, boot_ms
+from firmware_sim.mavlink.streams.units import INT32_MAX
 from firmware_sim.mavlink.texts_and_events import KEPT, NUMBERS, message
 
 _INTERVAL_UNAVAILABLE = 0
 """Reported interval of a stream that is off. PX4 reports the same for an unknown stream."""
-_MIB = 1024.0 * 1024.0
 
 FIXED_RATE = frozenset(("HEARTBEAT", "MISSION_CURRENT"))
 """Messages with fixed rates in PX4, which clients cannot change."""
@@ -84,9 +90,10 @@ def _request_message(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 1: message id; 2: parameter of the message."""
     number = command.integer(1) or 0
     # Some messages take a parameter or are not streams.
-    special = _SPECIAL.get(number)
+    special = table("REQUESTS").get(number)
     if special is not None:
-        return special(command, context)
+        result: Result = special(command, context)
+        return result
     name = _stream_name(number, context)
     return Result.DENIED if name is None else send_stream(name, context)
 
@@ -108,35 +115,9 @@ def _request_modes(command: VehicleCommand, context: Context) -> Result:
     return Result.ACCEPTED
 
 
-def _request_storage(command: VehicleCommand, context: Context) -> Result:
-    """Handle parameter 2: storage number; 0 = all. The only storage has number 1."""
-    number, count, empty = 1, 1, b""
-    if command.integer(2) not in (None, 0, number):
-        return Result.DENIED
-    disk = shutil.disk_usage(context.storage.folder)
-    # STORAGE_INFORMATION has mebibytes.
-    sizes = (size / _MIB for size in (disk.total, disk.used, disk.free))
-    no_speed = 0.0
-    context.link.send(
-        dialect.MAVLink_storage_information_message(
-            *(boot_ms(context.now_us), number, count, dialect.STORAGE_STATUS_READY),
-            *(*sizes, no_speed, no_speed, dialect.STORAGE_TYPE_UNKNOWN, empty),
-        )
-    )
-    return Result.ACCEPTED
-
-
-def _first_as_second(command: VehicleCommand) -> VehicleCommand:
-    first = command.params[0]
-    return replace(command, params=(first, first, *command.params[2:]))
-
-
-_SPECIAL: Mapping[int, Callable[[VehicleCommand, Context], Result]] = {
+REQUESTS: dict[int, Action] = {
     dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL: _request_interval,
     dialect.MAVLINK_MSG_ID_AVAILABLE_MODES: _request_modes,
-    dialect.MAVLINK_MSG_ID_COMPONENT_METADATA: component_metadata.request_metadata,
-    dialect.MAVLINK_MSG_ID_COMPONENT_INFORMATION: component_metadata.request_information,
-    dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION: _request_storage,
 }
 """Messages that are not streams, or whose request has parameters."""
 
@@ -223,9 +204,6 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: _sends("AUTOPILOT_VERSION"),
     dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION: _sends("PROTOCOL_VERSION"),
     dialect.MAV_CMD_REQUEST_FLIGHT_INFORMATION: _sends("FLIGHT_INFORMATION"),
-    dialect.MAV_CMD_REQUEST_STORAGE_INFORMATION: (
-        lambda command, context: _request_storage(_first_as_second(command), context)
-    ),
 }
 
 
@@ -284,3 +262,13 @@ def handle_setup(message: WireMessage, context: Context) -> bool:
         text = f"Signing key {what} by system {system} component {component}"
         context.announce(OperatorText(Severity.NOTICE, text))
     return True
+
+
+HANDLERS: Handlers = {
+    "REQUEST_DATA_STREAM": (for_vehicle_or_all, handle_data_stream),
+    "REQUEST_EVENT": (for_vehicle, handle_event),
+    "HEARTBEAT": (for_anyone, handle_heartbeat),
+    "SETUP_SIGNING": (for_vehicle_or_all, handle_setup),
+    "PING": (for_anyone, handle_ping),
+    "TIMESYNC": (for_anyone, handle_timesync),
+}

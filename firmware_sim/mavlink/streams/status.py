@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from airl_mav.core.addons import entries
 from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local, local_to_geodetic, quat_yaw
 from firmware_sim.autopilot.autopilot_state import (
     Arming,
@@ -45,9 +46,9 @@ CAPABILITIES: int = (
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
-    | dialect.MAV_PROTOCOL_CAPABILITY_FTP
+    | sum(entries("firmware_sim", "CAPABILITIES").values())
 )
-"""Capabilities, equal to a real PX4's 0xE8FF."""
+"""Capabilities, with all add-ons equal to a real PX4's 0xE8FF."""
 
 _FIRMWARE_VERSION = 1 << 24 | 16 << 16 | 0 << 8 | 255
 """Emulated PX4 release: 1.16.0, FIRMWARE_VERSION_TYPE_OFFICIAL."""
