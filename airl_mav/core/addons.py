@@ -12,6 +12,7 @@ In `firmware_sim.addons`:
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
     MISSIONS: {name: subclass of `navigation.plan.Missions`}
     SERVICES: {name: MAVLink service, a module as described in `firmware_sim.mavlink.services`}
+    STREAMS: {name: module with BUILDERS of streamed messages, as `firmware_sim.mavlink.streams`}
     CAPABILITIES: {name: bit of MAV_PROTOCOL_CAPABILITY}
     EVENTS: {name: module with event `Definition`s}
     FLIGHT_LOGS: {name: function that opens a `firmware_sim.firmware.FlightLog`}

@@ -28,7 +28,13 @@ from firmware_sim.mavlink.link import Link, LinkCounters, Payloads
 from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, gcs_link, onboard_link
 from firmware_sim.mavlink.services import connection, handle, send_pending, table
 from firmware_sim.mavlink.services.context import Context, sender
-from firmware_sim.mavlink.streams import BUILDERS, VEHICLE_BUILDERS, Builder, Vehicle
+from firmware_sim.mavlink.streams import (
+    BUILDERS,
+    VEHICLE_BUILDERS,
+    Builder,
+    Vehicle,
+    addon_builders,
+)
 from firmware_sim.mavlink.streams.sensors import Radio
 from firmware_sim.mavlink.telemetry import TickContext, flown_of
 from firmware_sim.mavlink.texts_and_events import REPLY_IDS, EventBuffer, EventSender, TextEncoder
@@ -117,6 +123,7 @@ class MavlinkServer:
         # All links share these builders, so each message is built once per tick.
         self._builders: dict[str, Builder | None] = {
             **BUILDERS,
+            **addon_builders(),
             **{name: partial(build, self._vehicle) for name, build in VEHICLE_BUILDERS.items()},
             "TIMESYNC": None,
         }

@@ -27,7 +27,6 @@ SERVICES = {
     "params": "firmware_sim.mavlink.services.params",
     "commands": "firmware_sim.mavlink.services.commands",
     "connection": "firmware_sim.mavlink.services.connection",
-    "measurements": "firmware_sim.mavlink.services.measurements",
     "setpoints": "firmware_sim.mavlink.services.setpoints",
 }
 """Services of the core, as those of add-ons: loaded by the first server."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 from itertools import count
 
 from airl_mav.core.clock import NS_PER_US
-from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect, message_name
 from firmware_sim.mavlink.link import OFF
@@ -26,7 +25,7 @@ from firmware_sim.mavlink.services.context import (
     for_vehicle_or_all,
     sender,
 )
-from firmware_sim.mavlink.streams import Builder, status
+from firmware_sim.mavlink.streams import Builder
 from firmware_sim.mavlink.streams.units import INT32_MAX
 from firmware_sim.mavlink.texts_and_events import KEPT, NUMBERS, message
 
@@ -39,24 +38,6 @@ FIXED_RATE = frozenset(("HEARTBEAT", "MISSION_CURRENT"))
 OF_MISSING_DEVICES = frozenset((370, 371))
 """Ids of BATTERY_INFO and FUEL_STATUS, which the definitions here lack. PX4 accepts a rate but
 sends nothing, because it lacks the devices. PX4 also accepts a NaN id."""
-
-
-GROUPS: dict[int, tuple[str, ...]] = {
-    dialect.MAV_DATA_STREAM_RAW_SENSORS: ("HIGHRES_IMU", "SCALED_PRESSURE", "GPS_RAW_INT"),
-    dialect.MAV_DATA_STREAM_EXTENDED_STATUS: (
-        "SYS_STATUS",
-        "EXTENDED_SYS_STATE",
-        "MISSION_CURRENT",
-        "BATTERY_STATUS",
-    ),
-    dialect.MAV_DATA_STREAM_RC_CHANNELS: ("SERVO_OUTPUT_RAW",),
-    dialect.MAV_DATA_STREAM_RAW_CONTROLLER: ("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED"),
-    dialect.MAV_DATA_STREAM_POSITION: ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT"),
-    dialect.MAV_DATA_STREAM_EXTRA1: ("ATTITUDE",),
-    dialect.MAV_DATA_STREAM_EXTRA2: ("VFR_HUD",),
-    dialect.MAV_DATA_STREAM_EXTRA3: ("SYSTEM_TIME", "ESTIMATOR_STATUS", "VIBRATION"),
-}
-"""Streams of the groups of REQUEST_DATA_STREAM."""
 
 
 def _set_message_interval(command: VehicleCommand, context: Context) -> Result:
@@ -103,21 +84,8 @@ def _request_interval(command: VehicleCommand, context: Context) -> Result:
     return Result.DENIED if asked is None else _send_interval(asked & 0xFFFF, context)
 
 
-def _request_modes(command: VehicleCommand, context: Context) -> Result:
-    """Handle parameter 2: number of the mode, starting at 1; 0 = all."""
-    asked = command.integer(2) or 0
-    modes = status.available_modes()
-    if not 0 <= asked <= len(modes):
-        return Result.DENIED
-    # Modes are numbered from 1.
-    for fields in modes if asked == 0 else modes[asked - 1 : asked]:
-        context.link.send(dialect.MAVLink_available_modes_message(*fields))
-    return Result.ACCEPTED
-
-
 REQUESTS: dict[int, Action] = {
     dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL: _request_interval,
-    dialect.MAVLINK_MSG_ID_AVAILABLE_MODES: _request_modes,
 }
 """Messages that are not streams, or whose request has parameters."""
 
@@ -143,31 +111,6 @@ def _send_interval(number: int, context: Context) -> Result:
         interval = _INTERVAL_UNAVAILABLE if interval == OFF else interval
     context.link.send(dialect.MAVLink_message_interval_message(number, interval))
     return Result.ACCEPTED
-
-
-def handle_data_stream(message: WireMessage, context: Context) -> bool:
-    """Handle REQUEST_DATA_STREAM: raise the rates of a stream group, or restore the defaults.
-
-    A real PX4 ignores this deprecated message. Here it can only raise rates: MAVProxy requests all
-    streams at 4 Hz when it connects, and another client on the same link must keep its 100 Hz
-    attitude.
-    """
-    if message.req_stream_id == dialect.MAV_DATA_STREAM_ALL:
-        names = tuple(name for group in GROUPS.values() for name in group)
-    else:
-        names = GROUPS.get(message.req_stream_id, ())
-    scheduler = context.link.scheduler
-    start = message.start_stop == 1 and message.req_message_rate > 0
-    for name in names:
-        if not start:
-            scheduler.set_interval(name, scheduler.default_us(name), context.now_us)
-            continue
-        asked_us = US_PER_S // message.req_message_rate
-        present_us = scheduler.interval_us(name)
-        # Only a shorter interval is set: a request must not slow another client's stream.
-        if present_us == OFF or max(asked_us, 1) < present_us:
-            scheduler.set_interval(name, max(asked_us, 1), context.now_us)
-    return bool(names)
 
 
 def handle_event(request: WireMessage, context: Context) -> bool:
@@ -265,7 +208,6 @@ def handle_setup(message: WireMessage, context: Context) -> bool:
 
 
 HANDLERS: Handlers = {
-    "REQUEST_DATA_STREAM": (for_vehicle_or_all, handle_data_stream),
     "REQUEST_EVENT": (for_vehicle, handle_event),
     "HEARTBEAT": (for_anyone, handle_heartbeat),
     "SETUP_SIGNING": (for_vehicle_or_all, handle_setup),
