@@ -19,7 +19,6 @@ from airl_mav.core.clock import Patience
 from airl_mav.core.files import PARTIAL_SUFFIX
 from firmware_sim.external.parameters import RequiredAirframe
 from firmware_sim.interfaces import (
-    ULOG_SUFFIX,
     ActuatorControls,
     FirmwareLostError,
     FirmwareMissingError,
