@@ -9,7 +9,9 @@ The `__init__` of an add-on is light and may define tables, which the core reads
 
 In `firmware_sim.addons`:
 
+    AIDING: {any name: class of the `estimator.Aiding` that fuses further sensors}
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
+    SENSORS: {name in `profiles.vehicle.Sensors`: its `sensor_table.Sensor`}
 
 Values are text (`module` or `module:name`); `load` imports what they name, on first use.
 """

@@ -11,6 +11,7 @@ from itertools import chain
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.signing import Signing, StoredSigning
+from firmware_sim import sensor_table
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.engine.record import Record
@@ -117,6 +118,7 @@ class MavlinkServer:
             **BUILDERS,
             "SYSTEM_TIME": system_time(boot_unix_us),
             **self._streams.builders,
+            **{name: each.build for name, each in sensor_table.streams().items()},
             "TIMESYNC": None,
         }
         self._forwarder = Forwarder(self._all)

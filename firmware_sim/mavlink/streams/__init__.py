@@ -75,9 +75,8 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "PROTOCOL_VERSION": information.protocol_version,
         "HIGH_LATENCY2": status.high_latency2,
         # Last, because start times of streams depend on their order.
-        "DISTANCE_SENSOR": sensor_streams.distance_sensor,
-        "OPTICAL_FLOW_RAD": sensor_streams.optical_flow_rad,
+        **dict.fromkeys(("DISTANCE_SENSOR", "OPTICAL_FLOW_RAD"), _nothing),
     }
 )
-"""Streams that need only the snapshot; the server adds the others. None = packed by compiled code
-(`telemetry`)."""
+"""Streams that need only the snapshot; the server adds the others, of sensors (`sensor_table`) too.
+None = packed by compiled code (`telemetry`)."""
