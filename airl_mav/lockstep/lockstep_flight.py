@@ -37,8 +37,8 @@ from airl_mav.rehearsal.episode import (
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
 from airl_mav.rehearsal.observer import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
-from airl_mav.scenario.piloting import TRANSPORT_US
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.checks import TRANSPORT_US
+from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.view.ends import ViewEnds
 from companion.offboard_mission import MissionResult, Start, check_camera, fly_mission
 from firmware_sim.autopilot.autopilot_state import OperatorText

@@ -6,7 +6,7 @@ from contextlib import ExitStack, closing
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.view.ends import ViewEnds
 from airl_mav.view.taps import CompanionTap, SimulationTap
 from airl_mav.view.viewer import REAL_TIME, Pace

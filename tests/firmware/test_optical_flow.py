@@ -34,13 +34,13 @@ from firmware_sim.addons.auxiliary_estimation.simulated_sensors import (
 )
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.crash_detector import TOUCHDOWN_M_S
 from firmware_sim.engine.dynamics import WIDTH
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.interfaces import FlowReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder, layout
 from firmware_sim.mavlink.telemetry import payload
 from firmware_sim.plant.sensors import Site
+from firmware_sim.simulation import TOUCHDOWN_M_S
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig, aids_of, velocity_setpoint
 

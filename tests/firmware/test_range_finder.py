@@ -28,14 +28,14 @@ from firmware_sim.autopilot.inputs import Source, Sticks
 from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.modes.automatic import landing_speed
 from firmware_sim.autopilot.modes.sticks import Piloting, TerrainHold
-from firmware_sim.crash_detector import TOUCHDOWN_M_S
 from firmware_sim.engine.record import LANDING, new_controller
 from firmware_sim.engine.ticks import detect_record
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import DOWNWARD, DistanceReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder
-from firmware_sim.mavlink.streams import sensor_streams, status
+from firmware_sim.mavlink.streams import sensors, status
+from firmware_sim.simulation import TOUCHDOWN_M_S
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig, aids_of, velocity_setpoint
 
@@ -138,7 +138,7 @@ def test_a_flight_over_a_box() -> None:
         float(state.estimate.position[2]),
     )
     assert ground is not None and told is not None and ground.by_range
-    terrain, bottom = sensor_streams.clearance(state, float(state.estimate.position[2]))
+    terrain, bottom = sensors.clearance(state, float(state.estimate.position[2]))
     assert bottom == ground.dist_bottom_m and terrain == -down - ground.dist_bottom_m
     sent = distance_sensor(state)
     assert sent is not None
@@ -169,7 +169,7 @@ def test_ranges_that_are_not_fused_tell_no_ground() -> None:
     rig.take_off(2.0)
     assert not clearance(rig).valid and not finder(rig).tells_ground
     state = rig.ap.state()
-    terrain, bottom = sensor_streams.clearance(state, float(state.estimate.position[2]))
+    terrain, bottom = sensors.clearance(state, float(state.estimate.position[2]))
     assert math.isnan(terrain) and math.isnan(bottom)
     assert distance_sensor(rig.ap.state()) is not None
 

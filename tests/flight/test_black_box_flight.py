@@ -29,7 +29,7 @@ from airl_mav.cli.report_command import run as report
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import quat_yaw
-from airl_mav.experiments.run import Run, load_run
+from airl_mav.experiments.experiment import Run, load_run
 from airl_mav.flight.episode_record import Setup
 from airl_mav.flight.judge import Outcome
 from airl_mav.latency.stamps import STAMPS
@@ -37,8 +37,8 @@ from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.report.comparison.runs import compare_folders
 from airl_mav.report.recorded_flight import episode_of
 from airl_mav.report.recording_folder import take_in
+from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.model import PilotSettings
-from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.black_box import SAMPLE_US, open_recorder
 from companion.offboard_mission import MissionResult

@@ -15,11 +15,11 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.draws import Winds
+from airl_mav.envs.evaluation import Trace
 from airl_mav.envs.fleet import Fleet, hover, new_fleet
 from airl_mav.envs.fleet_step import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
-from airl_mav.envs.trace import Trace
 from airl_mav.experiments.gym_flier import environment_of
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 from airl_mav.rehearsal.stand_alone_vehicle import aircraft_of
