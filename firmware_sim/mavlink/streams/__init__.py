@@ -73,11 +73,11 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "CURRENT_MODE": status.current_mode,
         "ESC_INFO": None,
         "ESC_STATUS": None,
-        "DISTANCE_SENSOR": sensors.distance_sensor,
-        "OPTICAL_FLOW_RAD": sensors.optical_flow_rad,
+        **dict.fromkeys(("DISTANCE_SENSOR", "OPTICAL_FLOW_RAD"), _nothing),
     }
 )
-"""Streams that need only the snapshot. None = packed by compiled code (`telemetry`)."""
+"""Streams that need only the snapshot. None = packed by compiled code (`telemetry`). The server
+adds the streams of further sensors (`sensor_table`)."""
 
 
 @cache
