@@ -14,7 +14,7 @@ from airl_mav.cli.shared_options import Gate, leave, requirements_of
 from airl_mav.cli.telling import Voice
 from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.experiments.verdict import seek_verdict
-from airl_mav.flight.sequential import LOOKS
+from airl_mav.flight.requirements import LOOKS
 from airl_mav.scenario import model
 
 DEFAULT_REQUIREMENT = "success >= 95 %"

@@ -9,6 +9,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from airl_mav.core import addons
 from airl_mav.core.clock import utc_now
 from airl_mav.core.progress import Progress
 from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cells, shared_flights
@@ -24,7 +25,7 @@ from airl_mav.experiments.run import Run, raise_unless_complete, shown
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.comparison_model import Comparison, Kind, RunEntry
-from airl_mav.report.table import count_outcomes
+from airl_mav.report.document import count_outcomes
 from airl_mav.scenario.model import Scenario, free_fields
 from airl_mav.scenario.resolve import resolve
 
@@ -105,13 +106,13 @@ class ExperimentResult:
     """Statistics of every run, and paired differences between runs."""
     page: Path
 
-    def _repr_html_(self) -> str:
+    def _repr_html_(self) -> str | None:
         """Return the notebook view: results, statistics and the first figure."""
-        # Imported here: matplotlib takes half a second, which flights do not need.
-        from airl_mav.report.notebook import comparison_html
-
+        html = addons.entries("airl_mav", "NOTEBOOK").get("comparison")
+        if html is None:
+            return None
         loaded = {name: load(run.path) for name, run in self.runs.items()}
-        return comparison_html(self.comparison, loaded, self.path, self.page)
+        return str(addons.load(html)(self.comparison, loaded, self.path, self.page))
 
 
 def file_name(text: str) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from airl_mav.core import addons
 from airl_mav.core.console import new_console
 from airl_mav.core.files import Arrays
 from airl_mav.core.progress import Progress, RichProgress
@@ -77,11 +78,10 @@ class Run:
         """True if all planned episodes have been flown."""
         return len(self.episodes) == len(self.info.seeds)
 
-    def _repr_html_(self) -> str:
+    def _repr_html_(self) -> str | None:
         """Return the notebook view: the verdict, the statistics and a map of the flights."""
-        from airl_mav.report.notebook import run_html
-
-        return run_html(self._loaded)
+        html = addons.entries("airl_mav", "NOTEBOOK").get("run")
+        return None if html is None else str(addons.load(html)(self._loaded))
 
     def report(self) -> Path:
         """Write the page and pictures of the run and return the page, or raise UsageError."""

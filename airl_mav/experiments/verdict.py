@@ -17,8 +17,7 @@ from airl_mav.experiments.experiment import entry_of, file_name, known_seeds
 from airl_mav.experiments.gap import NOT_MITIGATED, declare_gap
 from airl_mav.experiments.live import Ended, FlownRun
 from airl_mav.experiments.run import fly_scenario, workers_of
-from airl_mav.flight.requirements import Requirement
-from airl_mav.flight.sequential import LOOKS, RequirementDecision
+from airl_mav.flight.requirements import LOOKS, Requirement, RequirementDecision
 from airl_mav.flight.statistics import reached_goals
 from airl_mav.rehearsal.run_folder import RUN_FILE, check_folder, load_info
 from airl_mav.report.comparison.comparison_model import Comparison, comparison_file

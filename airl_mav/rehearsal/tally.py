@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 from airl_mav.core.progress import Event, Progress
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.quality import Quality
 from airl_mav.flight.statistics import reached_goals, wilson
+from airl_mav.flight.trajectory import Quality
 
 FIGURES = ("flight_time_s", "distance_m", "energy_j")
 """Quality figures sent to programs at once; the record contains all of them."""

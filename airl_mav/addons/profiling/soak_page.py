@@ -12,8 +12,16 @@ from airl_mav.addons.profiling.soak import Soak
 from airl_mav.core.provenance import package_versions
 from airl_mav.latency.percentiles import summarize
 from airl_mav.report import theme
-from airl_mav.report.document import Document, Section, provenance_facts, write_document
-from airl_mav.report.table import DURATION_COLUMNS, Column, TableView, duration_cells
+from airl_mav.report.document import (
+    DURATION_COLUMNS,
+    Column,
+    Document,
+    Section,
+    TableView,
+    duration_cells,
+    provenance_facts,
+    write_document,
+)
 
 AXES = (
     ("frequency_mhz", "frequency", "MHz"),

@@ -14,6 +14,7 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 from PIL import Image
 
+from airl_mav.addons.view.replayed_flight import ReplayedFlight
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera import primitives
 from airl_mav.camera.frame import depth_to_z16
@@ -25,7 +26,6 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.flight.trajectory import pose_at
 from airl_mav.report.forensics.camera_view import PolicyCamera
-from airl_mav.report.replay.replayed_flight import ReplayedFlight
 from airl_mav.report.theme import coloured
 
 ROOM = {

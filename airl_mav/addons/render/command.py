@@ -13,6 +13,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.addons.render import camera_pictures, ground_truth
+from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.arena.generate import generate
 from airl_mav.black_box.messages import SUFFIX
 from airl_mav.camera.flow import CameraMotion
@@ -33,7 +34,6 @@ from airl_mav.profiles.distortion import UNDISTORTED, check_distortion
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.replay.replayed_flight import ReplayedRun
 from airl_mav.report.run_arenas import trust_arenas
 from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.addons.render.camera_pictures import Pixels, Shown
+from airl_mav.addons.view.replayed_flight import ReplayedFlight
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.exposure import expose
 from airl_mav.camera.flow import CameraMotion, motion_of_camera, optical_flow, velocities_of
@@ -25,7 +26,6 @@ from airl_mav.core.frames import quat_to_matrix
 from airl_mav.flight.trajectory import pose_at
 from airl_mav.profiles.camera import Camera
 from airl_mav.report.forensics.camera_view import PolicyCamera
-from airl_mav.report.replay.replayed_flight import ReplayedFlight
 from airl_mav.report.theme import coloured
 
 TURNED_OVER_US = 20_000
