@@ -23,7 +23,7 @@ pytest.importorskip("viser")
 TOLD = """
 import sys
 from airl_mav.core.console import new_console
-from airl_mav.cli import view_command
+from airl_mav.addons.view import command
 
 class Told:
     encoding = "utf-8"
@@ -38,7 +38,7 @@ class Told:
 
 console = new_console()
 console.file = Told()
-sys.exit(view_command.run(view_command.ViewOptions(run=sys.argv[1]), console))
+sys.exit(command.run(command.ViewOptions(run=sys.argv[1]), console))
 """
 
 
