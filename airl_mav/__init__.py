@@ -13,30 +13,27 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from airl_mav.core.after_import import after_import as _after_import
+from airl_mav.core.addons import after_import as _after_import
 
 __version__ = "0.2.0"
 
 _EXPORTS = {
     "ExperimentResult": "airl_mav.experiments.experiment",
-    "Run": "airl_mav.experiments.run",
+    "Run": "airl_mav.experiments.experiment",
     "Scenario": "airl_mav.scenario.model",
-    "degrade": "airl_mav.experiments.degrade",
+    "degrade": "airl_mav.experiments.evaluate",
     "evaluate": "airl_mav.experiments.evaluate",
     "gap": "airl_mav.experiments.gap",
-    "ladder": "airl_mav.experiments.ladder",
-    "load_run": "airl_mav.experiments.run",
-    "rehearse": "airl_mav.experiments.run",
+    "ladder": "airl_mav.experiments.evaluate",
+    "load_run": "airl_mav.experiments.experiment",
+    "rehearse": "airl_mav.experiments.experiment",
 }
 """Public names, and the modules that define them."""
 
 if TYPE_CHECKING:
-    from airl_mav.experiments.degrade import degrade
-    from airl_mav.experiments.evaluate import evaluate
-    from airl_mav.experiments.experiment import ExperimentResult
+    from airl_mav.experiments.evaluate import degrade, evaluate, ladder
+    from airl_mav.experiments.experiment import ExperimentResult, Run, load_run, rehearse
     from airl_mav.experiments.gap import gap
-    from airl_mav.experiments.ladder import ladder
-    from airl_mav.experiments.run import Run, load_run, rehearse
     from airl_mav.scenario.model import Scenario
 
 __all__ = [

@@ -23,8 +23,7 @@ from airl_mav.core.clock import Clock, processor_time_us, utc_now, utc_us
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Goal, goal_distance_m
-from airl_mav.core.machine import temperature_c
-from airl_mav.core.provenance import describe_machine, git_state, package_versions
+from airl_mav.core.machine import describe_machine, git_state, package_versions, temperature_c
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.observation import Kinematics
 from companion.link_interface import BatteryState, VehicleStatus

@@ -11,8 +11,8 @@ import numpy as np
 
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import UsageError
+from airl_mav.core.scheduling import held_to
 from airl_mav.policy.observation import InFlight, Kinematics, observe, views_of
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.dialects import RATE_HZ

@@ -21,8 +21,8 @@ from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.frames import Vector, quats_to_euler
 from airl_mav.core.machine import temperature_c
+from airl_mav.policy.images import NEAREST_M, level_scan, rays_of, tilt_of
 from airl_mav.policy.observation import Kinematics
-from airl_mav.policy.scans import NEAREST_M, level_scan, rays_of, tilt_of
 from companion.frame_source import FrameSource
 
 

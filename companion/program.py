@@ -13,10 +13,10 @@ from pydantic import TypeAdapter
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock, WallClock
-from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Goal
-from airl_mav.core.provenance import describe_machine
+from airl_mav.core.machine import describe_machine
+from airl_mav.core.scheduling import held_to
 from airl_mav.flight.episode_record import Part, Setup
 from airl_mav.latency.injection import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
@@ -25,7 +25,7 @@ from airl_mav.policy.registry import camera_refused, find_policy
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from airl_mav.scenario import piloting
+from airl_mav.scenario import checks
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
 from companion.cameras.by_name import OpenCamera, open_named_camera
@@ -78,11 +78,11 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
     """Check the input and load the policy before any connection, or raise UsageError."""
     check_companion(asked)
     policy = find_policy(asked.policy, trust=asked.trust)
-    pilot, watchdog = piloting.decide_piloting(asked, policy, PilotSettings.goal_radius_m)
+    pilot, watchdog = checks.decide_piloting(asked, policy, PilotSettings.goal_radius_m)
     # Computing time of this computer counts, except in lockstep.
-    injection = piloting.select_latency(asked, policy, on_this_computer=not asked.lockstep)
-    piloting.check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
-    loaded = piloting.load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
+    injection = checks.select_latency(asked, policy, on_this_computer=not asked.lockstep)
+    checks.check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
+    loaded = checks.load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
     sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
     # Obstacle messages need depth along the heading; other cameras are rejected before the flight.
     vehicle, compensator = load_vehicle(asked.vehicle), None
@@ -100,11 +100,11 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
         raise FieldError(
             "policy", asked.policy, problem=f"does not fit vehicle {asked.vehicle}: {reason}"
         )
-    piloting.check_goal_height(
+    checks.check_goal_height(
         policy, asked.goal, "goal", " ".join(f"{metres:g}" for metres in asked.goal)
     )
     # Checked before the compensator is created.
-    piloting.check_compensated(pilot, policy, vehicle)
+    checks.check_compensated(pilot, policy, vehicle)
     if pilot.compensate:
         compensator = Compensator(1, vehicle, Intrinsics.of(vehicle.camera))
     limits = asked.limits
@@ -125,7 +125,7 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
         computer_watts=0.0,
         injection=injection,
         speed=asked.speed,
-        between_commands=piloting.between_commands(pilot, watchdog.hover_after_s),
+        between_commands=checks.between_commands(pilot, watchdog.hover_after_s),
         firmware="not known",
     )
     return MissionSetup(

@@ -15,7 +15,7 @@ from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
-from airl_mav.profiles.camera_kind import SLOW, Renderer
+from airl_mav.profiles.projections import SLOW, Renderer
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
@@ -25,11 +25,9 @@ from firmware_sim.flight_log.flight_log import ULOG_SUFFIX, FlightLog, LogFolder
 from firmware_sim.interfaces import FlightController, TrueState
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
-from firmware_sim.mavlink.tlog import TlogWriter
+from firmware_sim.mavlink.traffic import TlogWriter
 from firmware_sim.pacing import Pacing
-from firmware_sim.plant.camera_process import CameraProcess
-from firmware_sim.plant.camera_server import SimulatedCamera
-from firmware_sim.plant.onboard_camera import CameraMaker
+from firmware_sim.plant.camera import CameraMaker, CameraProcess, SimulatedCamera
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 AUTOSAVE_US = 300_000
@@ -40,7 +38,7 @@ IDLE_S = 0.02
 
 
 class FrameServer(Protocol):
-    """Receiver of the camera's frames, such as `plant.camera_server.CameraServer`."""
+    """Receiver of the camera's frames, such as `plant.camera.CameraServer`."""
 
     endpoint: str
     """Address for subscribers."""

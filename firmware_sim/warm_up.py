@@ -12,8 +12,7 @@ import numpy as np
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
-from airl_mav.control.demand import AttitudeDemand, RateDemand, TrajectoryDemand
-from airl_mav.control.gains import Gains
+from airl_mav.control.demand import AttitudeDemand, Gains, RateDemand, TrajectoryDemand
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.profiles.arena import ArenaSpec
@@ -21,9 +20,8 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import DEFAULT_PLANT, Aircraft, PlantName
 from firmware_sim.autopilot.climb import Climb
-from firmware_sim.autopilot.error_state import INITIAL_SIGMA, new_state
+from firmware_sim.autopilot.error_state import INITIAL_SIGMA, KernelFilter, new_state
 from firmware_sim.autopilot.failsafes.watch import is_calm
-from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.range_finder import Aids, RangeFinder
 from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
@@ -32,10 +30,10 @@ from firmware_sim.engine.record import FLOWN_TICK, RISING
 from firmware_sim.engine.ticks import detect_record
 from firmware_sim.interfaces import DistanceReading
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.telemetry import Packer, TickContext
-from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.camera import SimulatedCamera
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 LONGEST_TICKS = 1300

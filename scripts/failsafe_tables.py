@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from airl_mav.profiles.parameters import SPEC_BY_NAME
 from firmware_sim.autopilot import prearm
-from firmware_sim.autopilot.failsafes.failsafe_actions import (
+from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     Clear,
     FailsafeAction,
     Options,

@@ -29,13 +29,11 @@ from typing import Any
 import tyro
 from rich.console import Console
 
+from airl_mav.addons.sweep.command import run_sweep
 from airl_mav.addons.sweep.config import load_sweep
-from airl_mav.addons.sweep.run import run_sweep
-from airl_mav.core.console import new_console
-from airl_mav.core.progress import RichProgress
+from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.experiments.campaign import Cell, run_cell
-from airl_mav.experiments.executors import ExecutorSettings
-from airl_mav.experiments.process_executor import open_executor
+from airl_mav.experiments.executors import ExecutorSettings, open_executor
 from airl_mav.policy.card import read_card
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve

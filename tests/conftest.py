@@ -105,15 +105,15 @@ def _one_worker_unless_asked() -> Iterator[None]:
     keep the cores busy without workers. test_evaluate_lockstep.py tests that workers do not change
     flights.
     """
-    from airl_mav.experiments import experiment, run
-    from airl_mav.experiments.process_executor import open_executor
+    from airl_mav.experiments import experiment
+    from airl_mav.experiments.executors import open_executor
 
     def here(settings: Workers, *, in_process: bool = False) -> AbstractContextManager[Executor]:
         return open_executor(settings, in_process=in_process or settings.workers is None)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("airl_mav.experiments.process_executor.usable_cores", lambda: 1)
-        for module in (experiment, run):
+        patch.setattr("airl_mav.experiments.executors.usable_cores", lambda: 1)
+        for module in (experiment, experiment):
             patch.setattr(module, "open_executor", here)
         yield
 

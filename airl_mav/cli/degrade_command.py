@@ -11,7 +11,7 @@ from rich.console import Console
 from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.options import POSITIONAL, scenario_of
 from airl_mav.cli.shared_options import Gate
-from airl_mav.experiments.degrade import LATENCIES, declare_degradation
+from airl_mav.experiments.evaluate import LATENCIES, declare_degradation
 from airl_mav.scenario.model import DEFAULT_ARENA, DEFAULT_POLICY, ArenaName
 
 

@@ -11,8 +11,7 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.options import POSITIONAL, scenario_of
-from airl_mav.cli.shared_options import Gate, Viewing, leave, requirements_of, view_of
-from airl_mav.cli.telling import Voice
+from airl_mav.cli.shared_options import Gate, Viewing, Voice, leave, requirements_of, view_of
 from airl_mav.core.errors import FieldError
 
 if TYPE_CHECKING:
@@ -73,9 +72,8 @@ def run(options: EvaluateOptions, console: Console | None = None) -> int:
         matrix,
         write_on_card,
     )
-    from airl_mav.experiments.experiment import known_seeds
+    from airl_mav.experiments.experiment import fly_scenario, known_seeds, run_name
     from airl_mav.experiments.live import fly_live
-    from airl_mav.experiments.run import fly_scenario, run_name
 
     voice = Voice(options, "airl evaluate", console)
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)

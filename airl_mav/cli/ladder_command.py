@@ -11,8 +11,7 @@ from rich.console import Console
 from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.options import POSITIONAL, scenario_of
 from airl_mav.core.fields import quantity
-from airl_mav.experiments.evaluate import training_arena
-from airl_mav.experiments.ladder import LEVELS, declare_ladder
+from airl_mav.experiments.evaluate import LEVELS, declare_ladder, training_arena
 from airl_mav.policy.registry import find_policy
 from airl_mav.scenario.model import LevelName
 

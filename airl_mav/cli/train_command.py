@@ -14,14 +14,13 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.cli.shared_options import Viewing, view_of
-from airl_mav.cli.telling import Telling, Voice
+from airl_mav.cli.shared_options import Telling, Viewing, Voice, view_of
 from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.first_start import compile_shown
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.live_view import ViewError, view_part
-from airl_mav.training.request import Exported, TrainingBar, TrainRequest
+from airl_mav.training.training_folder import Exported, TrainingBar, TrainRequest
 
 if TYPE_CHECKING:
     from airl_mav.rehearsal.live_view import ViewRequest

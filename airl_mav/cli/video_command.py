@@ -17,10 +17,10 @@ from rich.console import Console
 from airl_mav.cli.options import run_command
 from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.clock import WallClock
-from airl_mav.core.console import new_console
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
+from airl_mav.core.progress import new_console
 from airl_mav.core.scheduling import give_way
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, GREATEST_PORT, VehicleName

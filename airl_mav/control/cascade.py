@@ -13,9 +13,18 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from airl_mav.control.attitude import attitude_setpoint, heading_of, rate_control, rate_setpoint
-from airl_mav.control.demand import AttitudeDemand, Demand, RateDemand, TrajectoryDemand
-from airl_mav.control.gains import Gains
+from airl_mav.control.demand import AttitudeDemand, Demand, Gains, RateDemand, TrajectoryDemand
+from airl_mav.control.loops import (
+    Motors,
+    acceleration_control,
+    attitude_setpoint,
+    heading_of,
+    mix,
+    rate_control,
+    rate_setpoint,
+    velocity_control,
+    velocity_setpoint,
+)
 from airl_mav.control.memory import (
     ATTITUDE_SP,
     DGYRO,
@@ -43,8 +52,6 @@ from airl_mav.control.memory import (
     three,
     weight,
 )
-from airl_mav.control.mixer import Motors, mix
-from airl_mav.control.velocity import acceleration_control, velocity_control, velocity_setpoint
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 

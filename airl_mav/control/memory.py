@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.gains import Gains
-from airl_mav.control.mixer import PITCH, ROLL, Motors
+from airl_mav.control.demand import Gains
+from airl_mav.control.loops import PITCH, ROLL, Motors
 from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec

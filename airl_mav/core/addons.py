@@ -10,14 +10,25 @@ The `__init__` of an add-on is light and may define tables, which the core reads
     NOTEBOOK: {`run` or `comparison`: function that returns its HTML}
     LIGHT: the commands can be imported without the simulator
 
+In `firmware_sim.addons`:
+
+    FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
+    MISSIONS: {name: subclass of `navigation.plan.Missions`}
+    SERVICES: {name: MAVLink service, a module with HANDLERS and `send_pending`}
+    EVENTS: {name: module with event `Definition`s}
+
 Values are text (`module` or `module:name`); `load` imports what they name, on first use.
+`after_import` runs a module of this package once another package is imported.
 """
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+import sys
 from functools import cache
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 from typing import Any
 
 PACKAGES = ("airl_mav", "companion", "firmware_sim")
@@ -53,3 +64,47 @@ def addon_commands() -> dict[str, tuple[str, str]]:
 def addon_executors() -> dict[str, str]:
     """Return the executors of add-ons: modules by name."""
     return entries("airl_mav", "EXECUTORS")
+
+
+def after_import(package: str, ours: str) -> None:
+    """Import module `ours` after `package` is fully imported; `package` may be missing."""
+    if package in sys.modules:
+        importlib.import_module(ours)
+    else:
+        sys.meta_path.insert(0, _Watcher(package, ours))
+
+
+class _Watcher:
+    """Import finder that detects the import of a package and delegates it to other finders."""
+
+    def __init__(self, package: str, ours: str) -> None:
+        self._package = package
+        self._ours = ours
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        """Return the spec of the next finders, extended by the import of our module."""
+        if name != self._package:
+            return None
+        for finder in sys.meta_path:
+            if isinstance(finder, _Watcher) or not hasattr(finder, "find_spec"):
+                continue
+            if (spec := finder.find_spec(name, path, target)) is not None:
+                self._watch(spec)
+                return spec
+        return None
+
+    def _watch(self, spec: ModuleSpec) -> None:
+        """Let the package's loader import our module at its end."""
+        loader: Any = spec.loader
+        execute = getattr(loader, "exec_module", None)
+        if execute is None:
+            return
+
+        def then(module: ModuleType) -> None:
+            execute(module)
+            if self in sys.meta_path:
+                sys.meta_path.remove(self)
+            importlib.import_module(self._ours)
+
+        # Patch only this loader object: the package's spec and loader interface are unchanged.
+        loader.exec_module = then

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.attitude import attitude_setpoint
-from airl_mav.control.gains import Gains
+from airl_mav.control.demand import Gains
+from airl_mav.control.loops import attitude_setpoint
 from airl_mav.control.memory import MEMORY_SIZE, new_memory, trim_against_torque, trim_for_hover
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
 from airl_mav.core.kernels import borrowing_kernel, kernel

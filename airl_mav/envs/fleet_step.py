@@ -16,7 +16,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.attitude import heading_of, rates_towards, reduced_attitude, weighted_turn
 from airl_mav.control.cascade import (
     POSITION_TICKS,
     Filters,
@@ -28,8 +27,15 @@ from airl_mav.control.cascade import (
     start,
     torque_setpoint,
 )
-from airl_mav.control.demand import Demand
-from airl_mav.control.gains import Gains
+from airl_mav.control.demand import Demand, Gains
+from airl_mav.control.loops import (
+    allocate,
+    desaturate,
+    heading_of,
+    rates_towards,
+    reduced_attitude,
+    weighted_turn,
+)
 from airl_mav.control.memory import (
     ATTITUDE_SP,
     MEMORY_SIZE,
@@ -41,7 +47,6 @@ from airl_mav.control.memory import (
     WAIT,
     YAW_RATE_SP,
 )
-from airl_mav.control.mixer import allocate, desaturate
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_kernel
 from airl_mav.envs.arena_batch import (

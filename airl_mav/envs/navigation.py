@@ -9,7 +9,7 @@ simulated time, so results are independent of the machine.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +22,8 @@ from airl_mav.envs.arena_batch import ArenaBatch, move_all_obstacles
 from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.companions import Companions
 from airl_mav.envs.decision import Timing, begin_decision, new_decision
-from airl_mav.envs.draws import BLOCK, DelayDraws, Winds
-from airl_mav.envs.encoding import COMPILED, EncodedBody
+from airl_mav.envs.draws import BLOCK, DelayDraws, TelemetryErrors, Winds
 from airl_mav.envs.episode_arenas import EpisodeArenas
-from airl_mav.envs.estimation import TelemetryErrors
 from airl_mav.envs.faults import delays_of, later_us, twin_faults
 from airl_mav.envs.fleet import (
     STILL,
@@ -41,11 +39,10 @@ from airl_mav.envs.fleet import (
     vehicle_of,
 )
 from airl_mav.envs.fleet_step import fly
+from airl_mav.envs.observations import COMPILED, EncodedBody, check_conditions, sight_of
 from airl_mav.envs.saved_state import State, Stateful
-from airl_mav.envs.sight import check_conditions, sight_of
 from airl_mav.envs.spec import SHIPPED_REWARDS, EnvironmentSpec
 from airl_mav.envs.stopping import injections_of
-from airl_mav.envs.trace import Trace
 from airl_mav.envs.world import World, decide, status
 from airl_mav.faults.fault import Fault, check_twin
 from airl_mav.latency.injection import Injection
@@ -60,8 +57,12 @@ from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.conditions import Payload, check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import flown_values
+from airl_mav.profiles.projections import CameraKind
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import draw_airframe, spreads
+
+if TYPE_CHECKING:
+    from airl_mav.envs.evaluation import Trace
 
 EVERYONE = slice(None)
 """Rows of all n vehicles."""
@@ -544,3 +545,27 @@ class Navigation(Stateful):
         if self.cameras.may_freeze and (seen.time_us[who] == 0).any():
             self.cameras.freeze(self.fleet, arenas, self.seeds)
         self.cameras.capture(seen, arenas, who, self.seeds)
+
+
+def compile_vectorized(kind: CameraKind) -> None:
+    """Compile all kernels by a flight of a few decisions."""
+    flying = _navigation(kind)
+    flying.begin([0], [1])
+    # A few decisions reach every kernel of a flight.
+    for _ in range(3):
+        flying.observe()
+        flying.fly(np.zeros((1, 3)))
+
+
+def compile_dynamics() -> None:
+    """Compile flight dynamics and contacts."""
+    _navigation("depth").compile_dynamics()
+
+
+def compile_images(kind: CameraKind) -> None:
+    """Compile arenas and images."""
+    _navigation(kind).begin([0], [1])
+
+
+def _navigation(kind: CameraKind) -> Navigation:
+    return Navigation(EnvironmentSpec.model_validate({"camera": {"kind": kind}}), 1)

@@ -17,7 +17,7 @@ REHEARSAL = "airl/Rehearsal-v0"
 if NAVIGATION not in gym.registry:
     gym.register(
         id=NAVIGATION,
-        entry_point="airl_mav.envs.single:NavigationEnv",
+        entry_point="airl_mav.envs.navigation_env:NavigationEnv",
         vector_entry_point="airl_mav.envs.vector:NavigationVectorEnv",
     )
 

@@ -13,7 +13,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.decisions import (
+from airl_mav.envs.fleet import FlightArrays, FlightStatus
+from airl_mav.envs.navigation_env import (
     FLYING,
     FleetDecisions,
     action_space,
@@ -23,7 +24,6 @@ from airl_mav.envs.decisions import (
     outcome,
     zone_option,
 )
-from airl_mav.envs.fleet import FlightArrays, FlightStatus
 from airl_mav.envs.saved_state import (
     State,
     Stateful,

@@ -19,11 +19,10 @@ from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.envs.arena_batch import ArenaBatch
 from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.decision import DecisionBatch, plan
-from airl_mav.envs.draws import BLOCK
-from airl_mav.envs.encoding import EncodedBody, encode_body
-from airl_mav.envs.estimation import Drift, step_error
+from airl_mav.envs.draws import BLOCK, Drift, step_error
 from airl_mav.envs.fleet import Fleet, FleetConstants, FlightStatus, Rules
 from airl_mav.envs.fleet_step import fly
+from airl_mav.envs.observations import EncodedBody, encode_body
 from airl_mav.envs.rewards import pay
 from airl_mav.policy.images import Bytes
 

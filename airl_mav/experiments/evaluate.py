@@ -1,9 +1,11 @@
-"""Evaluations: policies in arenas, one run of seeded episodes per pair."""
+"""Evaluations (policies by arenas), latency curves, and the fidelity ladder."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
@@ -15,7 +17,7 @@ from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.card import MeasuredResult
 from airl_mav.policy.card_writing import add_result
 from airl_mav.policy.registry import PolicyInfo, find_policy
-from airl_mav.scenario.model import DEFAULT_ARENA, Scenario
+from airl_mav.scenario.model import DEFAULT_ARENA, LevelName, Scenario
 
 SHARED = (
     *("level", "vehicle", "computer", "workload", "latency", "ablate", "zone", "episodes", "seed"),
@@ -154,3 +156,139 @@ def _check_names(field: str, names: Sequence[str]) -> None:
     for name in names:
         if names.count(name) > 1:
             raise FieldError(field, name, "each name once")
+
+
+NATIVE = "native"
+"""Name for no injected latency."""
+
+LATENCIES = (NATIVE, "150ms", "300ms", "400ms", "950ms")
+
+DEGRADATION_FACTS = ("arena", "level", "vehicle", "episodes", "seed")
+
+
+def degrade(
+    scenario: Scenario,
+    latencies: Sequence[str] = LATENCIES,
+    policies: Sequence[str] = (),
+    *,
+    compensated: bool = False,
+    out: Path | str | None = None,
+    progress: bool = False,
+) -> experiment.ExperimentResult:
+    """Fly policies at increasing latencies and compare the results. Raises as `evaluate`.
+
+    Args:
+        scenario: Flight settings; latency and workload are ignored.
+        latencies: Sources of t2, increasing, the reference first; `native` = none injected.
+        policies: Names or folders; empty = the scenario's policy.
+        compensated: Also fly each policy with latency compensation.
+        out: Folder to create or resume; None = `runs/<UTC time>-degradation-...`.
+        progress: Draw progress bars on standard error.
+    """
+    declared = declare_degradation(scenario, latencies, policies, compensated=compensated)
+    return experiment.run_and_compare(declared, out, progress=progress)
+
+
+def declare_degradation(
+    scenario: Scenario,
+    latencies: Sequence[str] = LATENCIES,
+    policies: Sequence[str] = (),
+    *,
+    compensated: bool = False,
+) -> experiment.Experiment:
+    """Declare a latency curve; see `degrade`. Raises UsageError."""
+    if len(latencies) < 2 or len(set(latencies)) < len(latencies):
+        raise FieldError("latencies", " ".join(latencies), "two or more, each once, growing")
+    names = list(policies) or [scenario.policy]
+    cells = []
+    found = [find_policy(name, trust=scenario.trust).name for name in names]
+    flown_as: list[dict[str, Any]] = [{}, {"compensate": True}] if compensated else [{}]
+    for (path, name), way in product(zip(names, found, strict=True), flown_as):
+        policy = f"{name}, compensated" if way else name
+        for latency in latencies:
+            given = None if latency == NATIVE else latency
+            label = latency if given is None or not Path(given).is_file() else Path(given).stem
+            flown = {"policy": path, "latency": given, "workload": None, **way}
+            cells.append(
+                experiment.make_cell(
+                    experiment.file_name(f"{policy}-{label}"),
+                    f"{policy} at {label}",
+                    scenario.model_copy(update=flown),
+                    label=label,
+                    role=label,
+                    group=policy,
+                )
+            )
+    facts = {field: getattr(scenario, field) for field in DEGRADATION_FACTS}
+    return experiment.Experiment(
+        kind="degradation",
+        name="-".join(found),
+        facts={"policies": found, **facts},
+        cells=tuple(cells),
+    )
+
+
+LEVELS: tuple[LevelName, ...] = ("gym", "lockstep", "sitl")
+
+SITL_EPISODES = 10
+"""Default number of episodes at level sitl, which runs in real time."""
+
+LADDER_FACTS = ("arena", "vehicle", "computer", "workload", "latency", "seed")
+"""Fields in the header of a ladder, besides the policy."""
+
+
+def ladder(
+    scenario: Scenario,
+    levels: Sequence[LevelName] = LEVELS,
+    *,
+    sitl_episodes: int | None = None,
+    out: Path | str | None = None,
+    progress: bool = False,
+) -> experiment.ExperimentResult:
+    """Fly the same scenario at several levels and compare the results. Raises as `evaluate`.
+
+    Args:
+        scenario: The scenario; its level is ignored.
+        levels: Two or more levels, the reference first.
+        sitl_episodes: Episodes at level sitl; None = 10, or all if fewer.
+        out: Folder to create or resume; None = `runs/<UTC time>-ladder-...`.
+        progress: Draw progress bars on standard error.
+    """
+    declared = declare_ladder(scenario, levels, sitl_episodes=sitl_episodes)
+    return experiment.run_and_compare(declared, out, progress=progress)
+
+
+def declare_ladder(
+    scenario: Scenario,
+    levels: Sequence[LevelName] = LEVELS,
+    *,
+    sitl_episodes: int | None = None,
+) -> experiment.Experiment:
+    """Declare a ladder; see `ladder`. Raises UsageError."""
+    if len(set(levels)) < len(levels) or len(levels) < 2:
+        raise FieldError(
+            "levels", " ".join(levels) or "none", "two or more of gym lockstep sitl, each once"
+        )
+    if sitl_episodes is not None and not 1 <= sitl_episodes <= scenario.episodes:
+        raise FieldError("sitl_episodes", sitl_episodes, f"1 <= value <= {scenario.episodes}")
+    fewer = min(sitl_episodes or SITL_EPISODES, scenario.episodes)
+    cells = tuple(
+        experiment.make_cell(level, level, scenario.model_copy(update=_at(level, fewer)))
+        for level in levels
+    )
+    policy, arena = cells[0].scenario.policy, cells[0].scenario.arena_name
+    facts = {"policy": policy.name, **{field: getattr(scenario, field) for field in LADDER_FACTS}}
+    facts["rules"] = "; ".join(dict.fromkeys(cell.scenario.rules for cell in cells))
+    return experiment.Experiment(
+        kind="ladder",
+        name=f"{policy.name}-{arena}",
+        facts=facts,
+        cells=cells,
+    )
+
+
+def _at(level: LevelName, sitl_episodes: int) -> dict[str, object]:
+    """Return the changed fields at a level; fields without support there get their defaults."""
+    if level == "sitl":
+        return {"level": level, "episodes": sitl_episodes, "workers": None, "tlogs": False}
+    return {"level": level, "speed": None}

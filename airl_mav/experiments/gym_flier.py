@@ -16,13 +16,13 @@ from airl_mav.envs.evaluation import (
     LearnedPilots,
     Pilots,
     SinglePilots,
+    Trace,
     fly_seeds,
 )
 from airl_mav.envs.faults import acted
 from airl_mav.envs.fleet import FlightArrays
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
-from airl_mav.envs.trace import Trace
 from airl_mav.experiments.executors import FlyEpisodes, Stop
 from airl_mav.faults.fault import check_twin
 from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
@@ -31,8 +31,8 @@ from airl_mav.flight.trajectory import measure_quality
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
-from airl_mav.scenario.piloting import action_generator
-from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
+from airl_mav.scenario.checks import action_generator
+from airl_mav.scenario.resolve import PlannedEpisode, ResolvedScenario
 
 BLOCK_SLOTS = 4
 """Episodes per job and slot: in shorter jobs most slots would wait for the longest flights."""

@@ -21,7 +21,7 @@ from airl_mav.lockstep.lockstep_flight import LockstepFlight
 from airl_mav.policy.actions import Action, AnyAction, BodyRates
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import FlownEpisode
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from firmware_sim.engine.record import TRUE_TICK
 from firmware_sim.simulation import Simulation
 

@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import FieldError
-from airl_mav.envs.decisions import (
+from airl_mav.envs.draws import source_of
+from airl_mav.envs.fleet import FlightArrays
+from airl_mav.envs.navigation_env import (
     action_space,
     checked_actions,
     draw_seeds,
@@ -21,16 +23,14 @@ from airl_mav.envs.decisions import (
     observation_space,
     zone_option,
 )
-from airl_mav.envs.draws import source_of
-from airl_mav.envs.fleet import FlightArrays
+from airl_mav.envs.observations import sight_of
 from airl_mav.envs.rendering import RENDER_MODES, Pictures
 from airl_mav.envs.rewards import Step, costs, reward_of
-from airl_mav.envs.sight import sight_of
 from airl_mav.envs.spec import EnvironmentSpec, gymnasium_spec
 from airl_mav.envs.stopping import bounded, injections_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.asked_flight import AskedFlight
-from airl_mav.policy.action_sets import command, commands
+from airl_mav.policy.actions import command, commands
 from airl_mav.policy.layouts import encode_layout, newest_frame
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import Encoded
@@ -38,8 +38,7 @@ from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.conditions import SensorNoise, Spread
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.model import Scenario, WatchdogSettings
-from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario, resolve
 from firmware_sim.warm_up import warm_up
 
 BESIDE = (

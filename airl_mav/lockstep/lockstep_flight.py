@@ -36,8 +36,8 @@ from airl_mav.rehearsal.episode_setup import episode_setup, state_of
 from airl_mav.rehearsal.live_view import FlightTap, ViewEnds, view_part
 from airl_mav.rehearsal.observer import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
-from airl_mav.scenario.piloting import TRANSPORT_US
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.checks import TRANSPORT_US
+from airl_mav.scenario.resolve import ResolvedScenario
 from companion.offboard_mission import MissionResult, Start, check_camera, fly_mission
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.interfaces import FirmwareLostError
@@ -216,7 +216,6 @@ class LockstepFlight:
         asked = resolved.scenario
         vehicle = real_vehicle(asked, resolved.vehicle, log)
         with ExitStack() as held:
-            # Imported on demand: a flight without viewer needs no web server.
             if self._view is not None:
                 tap = view_part("flight")(self._view, resolved)
                 self._watched = held.enter_context(closing(tap))

@@ -16,7 +16,7 @@ from firmware_sim.external.compose import conducted_px4
 from firmware_sim.faults.faulty_link import FailingEndpoint
 from firmware_sim.firmware import BuiltinFlightStack, FlightStack
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, SharedEndpoint
-from firmware_sim.mavlink.link import LinkConfig, onboard_link
+from firmware_sim.mavlink.px4_links import LinkConfig, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 
 BOOT_UNIX_US = 1_767_225_600 * US_PER_S

@@ -28,7 +28,7 @@ from airl_mav.rehearsal.stand_alone_vehicle import Listener, aircraft_of, episod
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.firmware import Firmware, FrameServer, LoadedEpisode
 from firmware_sim.mavlink.endpoint import UdpEndpoint
-from firmware_sim.plant.camera_server import CameraServer
+from firmware_sim.plant.camera import CameraServer
 from firmware_sim.simulation import EpisodeSetup
 from firmware_sim.warm_up import warm_up
 

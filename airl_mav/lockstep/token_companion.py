@@ -8,7 +8,7 @@ from contextlib import closing
 
 from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
-from airl_mav.scenario.piloting import NATIVE_T2_US
+from airl_mav.scenario.checks import NATIVE_T2_US
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.conducted import ConductedClock
 from companion.frame_source import open_camera

@@ -13,7 +13,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.signing import StoredSigning
 from firmware_sim.mavlink.codec import Decoder, WireMessage, is_signed, layout
 from firmware_sim.mavlink.endpoint import Peer, Sender, UdpEndpoint
-from firmware_sim.mavlink.scheduler import ONBOARD_HZ
+from firmware_sim.mavlink.px4_links import ONBOARD_HZ
 
 _OVERHEAD = 12
 """Header and checksum of an unsigned frame [bytes]."""

@@ -13,13 +13,13 @@ from typing import Any
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK
-from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import EXIT_BROKEN
 from airl_mav.core.files import save_arrays
-from airl_mav.core.process_use import UseMeter
+from airl_mav.core.resource_use import UseMeter
+from airl_mav.core.scheduling import held_to
 from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.live_view import CompanionTap, view_part
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from companion.frame_source import open_camera
 from companion.link_interface import LinkError
 from companion.mavsdk_link import MavsdkLink

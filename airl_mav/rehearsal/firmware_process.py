@@ -22,20 +22,19 @@ from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
 from airl_mav.rehearsal.live_view import SimulationTap, view_part
 from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from firmware_sim.autopilot.autopilot_state import OperatorText
-from firmware_sim.crash_detector import CrashDetector
 from firmware_sim.external.compose import Wanted, real_firmware
 from firmware_sim.external.parameter_file import KeptParameters
 from firmware_sim.faults.fault_timeline import FaultTimeline
 from firmware_sim.faults.faulty_link import FailingEndpoint
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack
 from firmware_sim.interfaces import FirmwareLostError
-from firmware_sim.mavlink.link import LinkConfig
-from firmware_sim.mavlink.udp_links import UdpLinks, bind_udp_links, udp_server
+from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, bind_udp_links
+from firmware_sim.mavlink.server import udp_server
 from firmware_sim.pacing import Pacing, WallPacing
-from firmware_sim.plant.camera_server import CameraServer
-from firmware_sim.simulation import Simulation
+from firmware_sim.plant.camera import CameraServer
+from firmware_sim.simulation import CrashDetector, Simulation
 from firmware_sim.warm_up import warm_up
 
 STATE_EVERY_US = 40_000

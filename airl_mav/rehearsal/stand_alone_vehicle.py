@@ -8,9 +8,9 @@ from contextlib import closing
 from dataclasses import dataclass, field
 
 from airl_mav.arena.generate import generate
-from airl_mav.camera.imaging_checks import check_noise, check_renderer
 from airl_mav.core.frames import Goal
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.camera import check_noise, check_renderer
 from airl_mav.profiles.conditions import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -20,8 +20,7 @@ from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.external.programs import how_to_start
 from firmware_sim.firmware import fly
-from firmware_sim.mavlink.link import LinkConfig
-from firmware_sim.mavlink.udp_links import bind_device_links
+from firmware_sim.mavlink.px4_links import LinkConfig, bind_device_links
 from firmware_sim.pacing import Unpaced, WallPacing
 from firmware_sim.simulation import EpisodeSetup
 from firmware_sim.warm_up import warm_up

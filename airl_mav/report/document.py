@@ -23,7 +23,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import (
     Estimate,
 )
-from airl_mav.latency.percentiles import MIN_SAMPLES, Summary
+from airl_mav.latency.stages import MIN_SAMPLES, Summary
 
 if TYPE_CHECKING:
     from jinja2 import Environment

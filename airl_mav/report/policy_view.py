@@ -25,13 +25,12 @@ from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, setpoint_column
 from airl_mav.policy import observation
-from airl_mav.policy.action_sets import commands, discrete_actions
+from airl_mav.policy.actions import commands, discrete_actions
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.policy.registry import find_policy
-from airl_mav.prediction.compensator import Compensator
-from airl_mav.prediction.decision_memory import DecisionMemory
+from airl_mav.prediction.compensator import Compensator, DecisionMemory
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
 from airl_mav.report.forensics.camera_view import PolicyCamera

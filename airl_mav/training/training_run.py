@@ -21,11 +21,11 @@ from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.files import replace_file
-from airl_mav.core.provenance import package_versions
-from airl_mav.envs.decisions import FIRST_TRAINING_SEED, LAST_TRAINING_SEED
+from airl_mav.core.machine import package_versions
 from airl_mav.envs.evaluation import EpisodeResult, fly_episodes, mean_of_successes, success_rate
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
+from airl_mav.envs.navigation_env import FIRST_TRAINING_SEED, LAST_TRAINING_SEED
 from airl_mav.envs.sb3 import NavigationVecEnv, Watcher
 from airl_mav.envs.spec import EnvironmentSpec, Randomisation
 from airl_mav.envs.stopping import bounded
@@ -44,7 +44,7 @@ from airl_mav.training.config import (
     kind_of,
 )
 from airl_mav.training.export import export_sb3
-from airl_mav.training.recurrent import GreedyDecisions
+from airl_mav.training.onnx_export import GreedyDecisions
 from airl_mav.training.training_folder import (
     BEST_MODEL,
     Evaluation,

@@ -18,7 +18,7 @@ from airl_mav.camera.frame import MAX_MM
 from airl_mav.camera.intrinsics import Intrinsics, finer, rays_of
 from airl_mav.core.errors import FieldError
 from airl_mav.policy.images import nearest_returns
-from airl_mav.profiles.distortion import Distortion, distorted, sees_to, undistorted
+from airl_mav.profiles.projections import Distortion, distorted, sees_to, undistorted
 
 MOST_POINTS = 16
 """Maximum number of sample points along each side of a pixel."""

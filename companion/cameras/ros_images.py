@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S
-from airl_mav.profiles.distortion import MOST_COEFFICIENT, Distortion
+from airl_mav.profiles.projections import MOST_COEFFICIENT, Distortion
 from companion.cameras.driver import plausible_age_us
 from companion.cameras.fitting import Lens
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
-from airl_mav.control.gains import Gains
+from airl_mav.control.demand import AnyDemand, AttitudeDemand, Gains, RateDemand
+from airl_mav.control.loops import Motors
 from airl_mav.control.memory import ticks_to_motors
-from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import TICK_HZ
 from airl_mav.core.frames import Geodetic, Vector
 from firmware_sim.autopilot.autopilot_state import (
@@ -27,33 +26,32 @@ from firmware_sim.autopilot.commander import (
     CommanderEvent,
     CommanderState,
     FlightPhase,
+    unavailable,
 )
-from firmware_sim.autopilot.error_state import RATES, Q
+from firmware_sim.autopilot.error_state import RATES, KernelFilter, NewFilter, Q
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import MavlinkEvent as Told
 from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
-from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.flight_commander import AutoDisarm, Commanded, FlightCommander
 from firmware_sim.autopilot.flight_modes import WITH_STICKS, Mode
-from firmware_sim.autopilot.fusion_horizon import NewFilter
 from firmware_sim.autopilot.guidance import Guidance, Home
-from firmware_sim.autopilot.land_detector import LandDetector
-from firmware_sim.autopilot.manual_control import ManualControl, Source, Sticks
-from firmware_sim.autopilot.navigation.flown_item import ExecutorState
-from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator
-from firmware_sim.autopilot.navigation.plan import Plans
-from firmware_sim.autopilot.navigation.whereabouts import Whereabouts
-from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
-from firmware_sim.autopilot.requests import (
+from firmware_sim.autopilot.inputs import (
     FollowedTarget,
     LandingTarget,
+    ManualControl,
     ModeRequest,
     ObstacleBins,
     PositionYaw,
+    Source,
+    Sticks,
 )
+from firmware_sim.autopilot.land_detector import LandDetector
+from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator, Whereabouts
+from firmware_sim.autopilot.navigation.plan import NavigationState, Plans
+from firmware_sim.autopilot.parameter_store import Parameters
+from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
 from firmware_sim.autopilot.snapshot import Parts, Snapshot
 from firmware_sim.engine.controller import Controller
@@ -95,6 +93,7 @@ class BuiltinAutopilot:
         self._guidance = Guidance(value, self._say, record)
         self._navigator = Navigator(self.plans, value, self)
         self._guidance.context.return_place = self._return_place
+        self._guidance.context.missions = self._navigator.missions
         self._manual_control = ManualControl(value)
         self._events: list[Told] = []
         self.supervisor = Supervisor(value, self.estimator, self._events.append)
@@ -390,7 +389,7 @@ class BuiltinAutopilot:
         home = PositionYaw(context.home, context.home_yaw)
         return home if now is None else self._navigator.return_place(now, home)
 
-    def _situation(self) -> ExecutorState | None:
+    def _situation(self) -> NavigationState | None:
         return self._whereabouts.situation(landed=self._commander.flight.phase is not _AIR)
 
     def _handle_detected(self) -> None:
@@ -525,6 +524,9 @@ class BuiltinAutopilot:
     def _ask(
         self, mode: Mode, request: ModeRequest | None = None, granted: OperatorText | None = None
     ) -> Result:
+        if not self._guidance.flies(mode):
+            self._say(unavailable(mode))
+            return Result.TEMPORARILY_REJECTED
         self._look_anew(mode)
         # The geofence may forbid the place of the request.
         if self.flight.phase >= _GROUND:
@@ -553,7 +555,7 @@ class BuiltinAutopilot:
             self.plans.set_current(index)
         return Result.ACCEPTED
 
-    # --- towards the mission (navigation.executor.Crew)
+    # --- towards the mission (navigation.plan.Crew)
 
     def say(self, message: OperatorText) -> None:
         """Send a text to the operator."""
@@ -581,11 +583,7 @@ class BuiltinAutopilot:
 
     def look_at(self, place: Geodetic | None) -> None:
         """Turn the nose to a place during a mission; None = cancel."""
-        roi = self._navigator.mission.roi
-        if place is None:
-            roi.reset()
-        else:
-            roi.look_at(place)
+        self._navigator.missions.look_at(place)
 
     def return_to_launch(self) -> None:
         """Abort the mission and return."""

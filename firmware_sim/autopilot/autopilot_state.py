@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.events.definition import Definition, MavlinkEvent
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.manual_control import Sticks
+from firmware_sim.autopilot.inputs import Sticks
 from firmware_sim.interfaces import (
     BatterySample,
     DistanceReading,

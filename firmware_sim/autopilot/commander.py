@@ -138,10 +138,11 @@ def _ask(mode: Mode) -> TransitionCell:
     return TransitionCell(choice=Choice.ASK, mode=mode)
 
 
-def _unavailable(mode: Mode) -> TransitionCell:
+def unavailable(mode: Mode) -> OperatorText:
+    """Return the text for the rejection of a mode."""
     text = f"Switching to {mode.spec.title} is currently not available"
     event = events.MODE_NOT_AVAILABLE.event(mode.spec.custom_mode, mode.spec.event)
-    return TransitionCell(result=_TEMP, text=_critical(text, event))
+    return _critical(text, event)
 
 
 def _asked(mode: Mode) -> tuple[TransitionCell, TransitionCell, TransitionCell, TransitionCell]:
@@ -153,7 +154,8 @@ def _asked_in_vain(
     mode: Mode,
 ) -> tuple[TransitionCell, TransitionCell, TransitionCell, TransitionCell]:
     # Disarmed, PX4 accepts any mode and rejects arming if its requirements are unmet.
-    return (_ask(mode), _ask(mode), _unavailable(mode), _unavailable(mode))
+    rejected = TransitionCell(result=_TEMP, text=unavailable(mode))
+    return (_ask(mode), _ask(mode), rejected, rejected)
 
 
 def _disarm(reason: ArmingReason) -> TransitionCell:
@@ -230,8 +232,7 @@ def transition(flight: CommanderState, event: Ask | CommanderEvent) -> EventOutc
     # Terminated vehicles accept no mode, and their mode does not end.
     if flight.mode is Mode.TERMINATION:
         if isinstance(event, Ask):
-            refused = _unavailable(event.mode)
-            return EventOutcome(flight, refused.result, refused.text)
+            return EventOutcome(flight, _TEMP, unavailable(event.mode))
         if event is CommanderEvent.MODE_DONE:
             return EventOutcome(flight, Result.ACCEPTED, None)
     row = TABLE[event][flight.phase]

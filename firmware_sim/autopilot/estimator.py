@@ -1,7 +1,7 @@
 """Estimator: an error-state extended Kalman filter.
 
 `error_state` defines the states and sensor models. A filter carries the error's covariance:
-`filter_kernel` is the default, `filter_filterpy` its reference. This module is the sequence: wait
+`KernelFilter` is the default, `filter_filterpy` its reference. This module is the sequence: wait
 at rest, align, then predict and fuse the available measurements.
 """
 
@@ -25,9 +25,14 @@ from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.alignment import Alignment, FieldCheck
 from firmware_sim.autopilot.autopilot_state import StateEstimate
+from firmware_sim.autopilot.error_state import (
+    FusionHorizon,
+    KernelFilter,
+    Measurement,
+    NewFilter,
+    selecting,
+)
 from firmware_sim.autopilot.external_vision import Control, ExternalVision
-from firmware_sim.autopilot.filter_kernel import KernelFilter
-from firmware_sim.autopilot.fusion_horizon import FusionHorizon, Measurement, NewFilter, selecting
 from firmware_sim.autopilot.optical_flow import OpticalFlowFusion
 from firmware_sim.autopilot.range_finder import Aids, RangeFinder
 from firmware_sim.autopilot.recovery import Recovery, RecoveryState
@@ -56,7 +61,7 @@ GPS_GONE_US = 1_000_000
 """Time without GPS fusion after which GPS counts as lost (EKF2: its data are delayed) [µs]."""
 
 _JUDGED_EVERY_US = US_PER_S // 10
-"""Interval of velocity checks by `consistency`, the sample period of a typical GPS [µs]."""
+"""Interval of velocity checks by `Consistency`, the sample period of a typical GPS [µs]."""
 
 BIAS_STEP_S = 0.01
 """Time step of PX4's filter, 100 Hz [s]; its bias process noises (EKF2_*_B_NOISE) are per step."""

@@ -18,7 +18,7 @@ import numpy as np
 from airl_mav.core.frames import Vector, quat_to_matrix
 from airl_mav.vehicle.rotation import conjugate, multiply, normalize, yaw_of
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.fusion_horizon import ErrorFilter, FusionHorizon, Measurement, selecting
+from firmware_sim.autopilot.error_state import ErrorFilter, FusionHorizon, Measurement, selecting
 from firmware_sim.autopilot.recovery import turn_to
 from firmware_sim.autopilot.sensor_monitor import LEARN_US
 from firmware_sim.interfaces import Odometry

@@ -1,4 +1,4 @@
-"""Error filter based on filterpy: the reference of `filter_kernel`.
+"""Error filter based on filterpy: the reference of `KernelFilter`.
 
 It follows the textbook and is many times slower.
 """
@@ -14,7 +14,7 @@ from firmware_sim.autopilot.error_state import N_STATES, gate_ratio, inject, pro
 
 
 class FilterpyFilter:
-    """Implementation of `fusion_horizon.ErrorFilter` with filterpy."""
+    """Implementation of `error_state.ErrorFilter` with filterpy."""
 
     def __init__(self, covariance: Vector, noise: Vector) -> None:
         """Start with a covariance (16, 16); variances `noise` (16,) are added in every tick."""

@@ -21,8 +21,8 @@ from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Interven
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.guidance import Guidance, Home
+from firmware_sim.autopilot.inputs import ModeRequest
 from firmware_sim.autopilot.navigation.navigator import Navigator
-from firmware_sim.autopilot.requests import ModeRequest
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
 
 _GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR

@@ -17,9 +17,9 @@ from firmware_sim.autopilot.error_state import SIGMA, P, V
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.modes import MODES
+from firmware_sim.autopilot.inputs import ModeRequest
+from firmware_sim.autopilot.modes import implementations
 from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, here
-from firmware_sim.autopilot.requests import ModeRequest
 from firmware_sim.engine.record import Record
 
 # Bound once: looking up an enum member in every tick is slow.
@@ -44,11 +44,15 @@ class Guidance:
         """
         self.context = FlightContext(value, Climb(record), say=say)
         """Context shared by the modes."""
-        self._modes = {mode: new(self.context) for mode, new in MODES.items()}
+        self._modes = {mode: new(self.context) for mode, new in implementations().items()}
         self._flown: FlightMode = self._modes[Mode.HOLD]
         self._stopped = False
         """True if the motors are stopped permanently."""
         self._spool_since_us: int | None = None
+
+    def flies(self, mode: Mode) -> bool:
+        """Return whether a mode is implemented: some are add-ons."""
+        return mode in self._modes
 
     def enter(self, mode: Mode, state: Vector, request: ModeRequest | None = None) -> None:
         """Start a mode at the current state, with the optional arguments of a user request."""

@@ -17,7 +17,7 @@ import numpy as np
 from airl_mav.core.constants import MS_PER_S, TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, quat_to_matrix
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.fusion_horizon import FusionHorizon, Measurement, selecting
+from firmware_sim.autopilot.error_state import FusionHorizon, Measurement, selecting
 from firmware_sim.autopilot.range_finder import RangeFinder
 from firmware_sim.autopilot.terrain_filter import GROUND
 from firmware_sim.interfaces import FlowReading

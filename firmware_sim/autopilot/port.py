@@ -20,9 +20,15 @@ from firmware_sim.autopilot.autopilot_state import (
 )
 from firmware_sim.autopilot.events.definition import MavlinkEvent
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.manual_control import Source, Sticks
+from firmware_sim.autopilot.inputs import (
+    FollowedTarget,
+    LandingTarget,
+    ModeRequest,
+    ObstacleBins,
+    Source,
+    Sticks,
+)
 from firmware_sim.autopilot.navigation.plan import Plans
-from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, ModeRequest, ObstacleBins
 from firmware_sim.interfaces import DistanceReading, FlowReading, Odometry, SensorSample
 
 

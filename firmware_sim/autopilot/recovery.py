@@ -1,7 +1,17 @@
 """Recovery of the estimator from inertial sensor and heading faults.
 
-`consistency` distinguishes faults from noise, and `EmergencyYaw` identifies a heading fault. This
-module restarts the filter's variances, or resets the heading to the yaw estimator's.
+`Consistency` distinguishes faults from noise, and `EmergencyYaw` identifies a heading fault.
+`Recovery` increases the filter's variances, or resets the heading to the yaw estimator's.
+
+Noise of any strength changes its sign from sample to sample. An unmodelled accelerometer or gyro
+error keeps the innovations of velocity and heading on one side. The filter then needs larger
+variances, above all for the biases. A receiver with more velocity noise than stated shows in the
+differences between innovations, which slow errors do not affect.
+
+Sources: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, ch.
+5.4 (consistency) and 11.2 (adjusting the noise upon a test of the innovations). PX4's EKF2 has the
+same responses with other tests: it raises the accelerometer noise (`BADACC_BIAS_PNOISE`), resets
+the gyro bias variance, and stops using a compass (`mag_fault`).
 """
 
 from __future__ import annotations
@@ -11,12 +21,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import Vector, quat_to_matrix
+from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import multiply, yaw_of
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.consistency import Compass, Consistency, Restart
-from firmware_sim.autopilot.fusion_horizon import ErrorFilter
+from firmware_sim.autopilot.error_state import ErrorFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 
 CONVERGED_RAD = 0.262
@@ -248,3 +258,263 @@ class Recovery:
             # Only increase: a restart must not claim more certainty.
             np.maximum(block, sigma**2, out=block)
         self._filter.restart(np.diag(variances))
+
+
+FAR = 3.0
+"""Threshold in standard deviations beyond which an innovation counts towards a run."""
+
+VELOCITY_RUN = 6
+"""Consecutive GPS velocities beyond `FAR` on the same side: 0.6 s at 10 Hz. False alarm rate: once
+in 10^16 samples."""
+
+HEADING_RUN = 25
+"""Consecutive headings beyond `FAR`: 0.5 s at 50 Hz."""
+
+LATE_S = 0.5
+"""Tolerated additional receiver delay [s]. Velocity innovations within the vehicle's velocity
+change over this time do not count as an inertial sensor fault."""
+
+LOOK_BACK = 6
+"""Number of samples searched for the maximum acceleration."""
+
+COMPASS_REFUSED_US = US_PER_S
+"""Time of continuous rejection after which a compass is disabled [µs]."""
+
+NOISY = 4.0
+"""Ratio of measured to expected velocity variance beyond which a receiver counts as noisy."""
+
+_NOISE_SHARE = 0.1
+"""Weight of the newest sample in the mean: 1 s at 10 Hz."""
+
+_OUTLIER = 12.0
+"""Upper limit of a sample's contribution: one outlier, which differs twice, is not yet noise."""
+
+
+class SigmaLimits(NamedTuple):
+    """Minimum and maximum standard deviation after a restart."""
+
+    least: float
+    greatest: float
+
+    def bound(self, sigma: float) -> float:
+        """Return a standard deviation clipped to the limits."""
+        return min(max(sigma, self.least), self.greatest)
+
+
+VELOCITY = SigmaLimits(0.3, 10.0)
+"""[m/s]"""
+ATTITUDE = SigmaLimits(0.1, 0.3)
+"""[rad]"""
+ACCEL_BIAS = SigmaLimits(0.5, 5.0)
+"""[m/s²]"""
+GYRO_BIAS = SigmaLimits(0.04, 0.2)
+"""2.3 to 11 °/s [rad/s]"""
+
+
+class Restart(NamedTuple):
+    """Standard deviations of the filter's errors after a restart."""
+
+    velocity_m_s: float
+    attitude_rad: float
+    accel_bias_m_s2: float
+    gyro_bias_rad_s: float
+
+
+def restart_for(velocity_m_s: float, seconds: float) -> Restart:
+    """Return the sensor errors that explain a velocity error accumulated in a time [s].
+
+    Candidates are an accelerometer error of `velocity / time`, a tilt with that share of gravity,
+    and a gyro error that causes this tilt in that time.
+    """
+    acceleration = abs(velocity_m_s) / seconds
+    tilt = acceleration / GRAVITY_M_S2
+    return Restart(
+        VELOCITY.bound(abs(velocity_m_s)),
+        ATTITUDE.bound(tilt),
+        ACCEL_BIAS.bound(acceleration),
+        GYRO_BIAS.bound(tilt / seconds),
+    )
+
+
+class InnovationCounter:
+    """Counter for consecutive large innovations on the same side."""
+
+    def __init__(self, needed: int) -> None:
+        """Start at zero; `needed` innovations in a row are not noise."""
+        self._needed = needed
+        self._side = 0
+        self.length = 0
+        """Current length of the run."""
+        self._since_us = 0
+
+    def take(self, deviations: float, time_us: int) -> float:
+        """Add an innovation in standard deviations.
+
+        Returns:
+            Duration of the run [s] if it is too long to be noise, else 0.
+        """
+        side = (deviations > FAR) - (deviations < -FAR)
+        # A change of side ends a run: noise changes its sign.
+        if side == 0 or side != self._side:
+            self._side, self.length, self._since_us = side, 0, time_us
+        if side == 0:
+            return 0.0
+        self.length += 1
+        return (time_us - self._since_us) / US_PER_S if self.length >= self._needed else 0.0
+
+    def restart(self) -> None:
+        """Reset the run."""
+        self._side = self.length = 0
+
+
+class Compass:
+    """Compass monitor that disables a compass after continuous rejection.
+
+    Without a compass the heading variance grows until the gate accepts any heading. To enable the
+    compass again, a heading must lie within the gate of the first rejection.
+    """
+
+    def __init__(self) -> None:
+        self.given_up = False
+        self._failed = False
+        self._refused_us: int | None = None
+        self._gate_rad = 0.0
+
+    @property
+    def is_suspect(self) -> bool:
+        """True if headings are rejected, or were recently."""
+        return self.given_up or self._failed or self._refused_us is not None
+
+    def admits(self, innovation_rad: float) -> bool:
+        """Return whether a heading may be fused if it also passes the gate."""
+        near = not self.given_up or abs(innovation_rad) <= self._gate_rad
+        return near and not self._failed
+
+    def fail(self) -> None:
+        """Disable the compass permanently: the heading has been proven wrong."""
+        self.given_up = self._failed = True
+
+    def tested(self, innovation_rad: float, ratio: float, time_us: int) -> None:
+        """Record the test ratio of a heading: above 1 it was rejected."""
+        if ratio <= 1.0:
+            self.given_up, self._refused_us = False, None
+        elif self._refused_us is None:
+            # The gate's width follows from the innovation and its ratio.
+            self._refused_us, self._gate_rad = time_us, abs(innovation_rad) / ratio
+        elif time_us - self._refused_us >= COMPASS_REFUSED_US:
+            self.given_up = True
+
+
+@kernel
+def note_velocity(record: Any, deviations: Vector, acceleration: Vector) -> None:
+    """Record a velocity's noise and the vehicle's acceleration in a flight controller's record.
+
+    Args:
+        record: Updated.
+        deviations: Innovation in standard deviations (3,).
+        acceleration: Estimate (3,) NED [m/s²].
+    """
+    square, slot = 0.0, record.fixes % LOOK_BACK
+    for i in range(3):
+        square += (deviations[i] - record.velocity_before[i]) ** 2
+        record.velocity_before[i] = deviations[i]
+        record.accelerations[slot, i] = abs(acceleration[i])
+    record.fixes += 1
+    if not math.isnan(square):
+        # The difference of two independent samples has twice the variance.
+        variance = min(square / 6.0, _OUTLIER)
+        record.velocity_noise += _NOISE_SHARE * (variance - record.velocity_noise)
+
+
+@kernel
+def _note_velocity(records: Any, deviations: Vector, acceleration: Vector) -> None:
+    note_velocity(records[0], deviations, acceleration)
+
+
+class Consistency:
+    """Monitor for the innovations of velocity and heading."""
+
+    def __init__(self, record: Any = None) -> None:
+        """Use the record of a flight controller; None = a new record."""
+        if record is None:
+            from firmware_sim.engine.record import new_controller
+
+            record = new_controller()
+        self._record = record
+        self.restarts = 0
+        """Number of filter restarts."""
+        self.restarted_us: int | None = None
+        """Time of the last restart."""
+        self._runs = [InnovationCounter(VELOCITY_RUN) for _ in range(3)]
+        self._heading = InnovationCounter(HEADING_RUN)
+
+    @property
+    def velocity_deviates(self) -> bool:
+        """True if the newest velocities were far off on one side, or noisy."""
+        return any(run.length for run in self._runs) or self.velocity_excess > 1.0
+
+    @property
+    def heading_deviates(self) -> bool:
+        """True if the newest headings were far off on one side."""
+        return self._heading.length > 0
+
+    @property
+    def velocity_excess(self) -> float:
+        """Ratio of measured to expected velocity variance if above `NOISY`, else 1."""
+        noise: float = self._record["velocity_noise"].item(0)
+        return noise if noise > NOISY else 1.0
+
+    def velocity(
+        self, innovation: Vector, sigma: Vector, acceleration: Vector, time_us: int
+    ) -> Restart | None:
+        """Check a GPS velocity.
+
+        Args:
+            innovation: Measured minus expected (3,) NED [m/s].
+            sigma: Expected standard deviation of the innovation (3,) [m/s].
+            acceleration: Estimate (3,) NED [m/s²].
+            time_us: Current time [µs].
+
+        Returns:
+            Standard deviations for a filter restart; None: no restart needed.
+        """
+        deviations = innovation / sigma
+        if not np.isfinite(deviations).all():
+            return None
+        # Read the excess before this sample changes it.
+        excess, record = self.velocity_excess, self._record
+        _note_velocity(record, deviations, acceleration)
+        seen = min(record["fixes"].item(0), LOOK_BACK)
+        # A receiver that is later than stated is off by the speed change in that time.
+        late = LATE_S * np.max(record["accelerations"][0, :seen], axis=0)
+        unexplained = np.sign(innovation) * np.maximum(np.abs(innovation) - late, 0.0)
+        deviations = unexplained / (sigma * math.sqrt(excess))
+        lasted = [
+            run.take(z, time_us) for run, z in zip(self._runs, deviations.tolist(), strict=True)
+        ]
+        if not any(lasted):
+            return None
+        # The longest run gives the smallest error that explains the deviation.
+        return self._anew(restart_for(float(np.abs(innovation).max()), max(lasted)))
+
+    def heading(self, deviations: float, time_us: int, *, within: bool) -> Restart | None:
+        """Check a heading innovation in standard deviations; `within` = inside the gate.
+
+        A compass fault leaves the gate at once. Only a gyro error grows through it and counts.
+        """
+        if not within and self._heading.length == 0:
+            return None
+        lasted = self._heading.take(deviations, time_us)
+        return self._anew(restart_for(0.0, lasted)) if lasted else None
+
+    def restarted(self, time_us: int) -> None:
+        """Record that the filter was restarted with the returned values."""
+        self.restarts += 1
+        self.restarted_us = time_us
+
+    def _anew(self, restart: Restart) -> Restart:
+        for run in (*self._runs, self._heading):
+            run.restart()
+        # NaN skips the next difference: the restart moves the innovations.
+        self._record["velocity_before"] = np.nan
+        return restart

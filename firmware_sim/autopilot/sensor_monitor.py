@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.mixer import Motors
+from airl_mav.control.loops import Motors
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import HOME, Vector, local_to_geodetic
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity

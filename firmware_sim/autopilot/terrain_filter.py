@@ -15,7 +15,7 @@ import numpy as np
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.fusion_horizon import ErrorFilter, FusionHorizon
+from firmware_sim.autopilot.error_state import ErrorFilter, FusionHorizon
 
 STEP_S = 0.01
 """Time step of PX4's filter, 100 Hz [s]; its terrain noises are per step."""
@@ -34,7 +34,7 @@ _OF_RANGE.setflags(write=False)
 
 
 class TerrainFilter:
-    """Implementation of `fusion_horizon.ErrorFilter` with a terrain estimate."""
+    """Implementation of `error_state.ErrorFilter` with a terrain estimate."""
 
     def __init__(self, inner: ErrorFilter) -> None:
         """Start with the terrain at z = 0; see `put`."""

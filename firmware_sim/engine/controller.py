@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from airl_mav.control.cascade import filters
-from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, TrajectoryDemand
-from airl_mav.control.gains import Gains
+from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, Gains, TrajectoryDemand
+from airl_mav.control.loops import Motors
 from airl_mav.control.memory import reset_integrals, settle_gyro_filter
-from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.frames import Vector
 from firmware_sim.engine.record import (

@@ -12,12 +12,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.gains import Gains
+from airl_mav.control.demand import Gains
 from airl_mav.control.memory import MEMORY_SIZE
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import PowerModel
-from firmware_sim.autopilot.consistency import LOOK_BACK
 from firmware_sim.autopilot.error_state import N_STATES, ROW_SIZE
+from firmware_sim.autopilot.recovery import LOOK_BACK
 from firmware_sim.autopilot.yaw_estimator import LONGEST, MODEL_SIZE, N_MODELS, SHARED_SIZE, WINDOW
 from firmware_sim.engine.dynamics import WIDTH
 

@@ -40,10 +40,9 @@ from airl_mav.vehicle.rotation import Vec, conjugate, rotate
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.alignment import ALIGN_US, FIXES, add
 from firmware_sim.autopilot.climb import climb_if_due
-from firmware_sim.autopilot.consistency import FAR, note_velocity
-from firmware_sim.autopilot.filter_kernel import fuse, predict, spread
+from firmware_sim.autopilot.error_state import fuse, predict, spread
 from firmware_sim.autopilot.land_detector import lifts_off, rests
-from firmware_sim.autopilot.recovery import REFUSED_US
+from firmware_sim.autopilot.recovery import FAR, REFUSED_US, note_velocity
 from firmware_sim.autopilot.yaw_estimator import feel, observe
 from firmware_sim.engine.dynamics import (
     WIDTH,
@@ -105,7 +104,7 @@ LIGHT_SHARE = 0.1
 
 CALM_RATIO = 0.6
 """Maximum test ratio (3 standard deviations) of headings that are fused without further checks; see
-`consistency.FAR`."""
+`recovery.FAR`."""
 
 PA_PER_HPA = 100.0
 

@@ -22,7 +22,7 @@ from firmware_sim.interfaces import (
     TrueState,
 )
 from firmware_sim.mavlink.link import LinkCounters
-from firmware_sim.mavlink.tlog import TlogWriter
+from firmware_sim.mavlink.traffic import TlogWriter
 from firmware_sim.simulation import EpisodeSetup
 
 ASK_EVERY_S = 0.25

@@ -29,7 +29,7 @@ from firmware_sim.external.px4.px4_program import check_free, find_px4
 from firmware_sim.external.px4.px4_sitl import Px4Bridge
 from firmware_sim.external.transport.router import Router
 from firmware_sim.mavlink.endpoint import Endpoint, UdpEndpoint
-from firmware_sim.mavlink.udp_links import UdpLinks
+from firmware_sim.mavlink.px4_links import UdpLinks
 
 
 @dataclass(frozen=True)

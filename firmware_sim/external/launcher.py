@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from airl_mav.core.log_file import PARTIAL_SUFFIX
+from airl_mav.core.files import PARTIAL_SUFFIX
 from firmware_sim.external.airframe_check import RequiredAirframe
 from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
 from firmware_sim.flight_log.flight_log import ULOG_SUFFIX

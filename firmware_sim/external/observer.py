@@ -17,7 +17,7 @@ from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect, m
 from firmware_sim.mavlink.endpoint import Endpoint
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.streams import units
-from firmware_sim.mavlink.tlog import TlogWriter
+from firmware_sim.mavlink.traffic import TlogWriter
 
 # ArduCopter's mode numbers: ArduCopter/mode.h, enum class Number.
 GUIDED = 4

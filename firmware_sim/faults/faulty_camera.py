@@ -15,7 +15,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.faults.kinds import NOISE_SEED
 from airl_mav.profiles.conditions import SensorNoise
 from firmware_sim.faults.fault_timeline import Acting, FaultTimeline
-from firmware_sim.plant.onboard_camera import OnboardCamera
+from firmware_sim.plant.camera import OnboardCamera
 
 
 class FailingCamera:

@@ -1,13 +1,23 @@
-"""Interface of the vehicle's body in an arena: motion and contacts."""
+"""Vehicle's body in an arena: its interface, and walls, obstacles, ground and tours as arrays."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
-from airl_mav.arena.geometry import Arena
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena, Shape
+from airl_mav.arena.ground import TOP, Relief, no_relief
+from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
+from airl_mav.profiles.vehicle import BodyProfile
 from airl_mav.vehicle.rotation import Quat, Vec
+from firmware_sim.engine.dynamics import quaternion
+from firmware_sim.plant.contacts.convex import reach_along
 
 WALL_THICKNESS_M = 0.2
 
@@ -105,3 +115,168 @@ def walls_of(arena: Arena) -> list[tuple[str, Vec, Vec]]:
         over = (half_n + 2 * t, half_e + 2 * t, t)
         walls.append((CEILING, (north, east, -b.height - t), over))
     return walls
+
+
+def tour_arrays(arena: Arena) -> tuple[Vector, Vector]:
+    """Return the tours of an arena's n moving obstacles, with up to k waypoints.
+
+    Returns:
+        times: (n, 1 + k) period of the tour, then the times of its waypoints [s], then inf.
+        points: (n, k, 2) waypoints north, east [m].
+    """
+    n, k = len(arena.tours), max((len(tour.times_s) for tour in arena.tours), default=1)
+    times, points = np.full((n, 1 + k), np.inf), np.zeros((n, k, 2))
+    for i, tour in enumerate(arena.tours):
+        times[i, 0] = tour.times_s[-1]
+        times[i, 1 : 1 + len(tour.times_s)] = tour.times_s
+        points[i, : len(tour.points)] = tour.points
+    return times, points
+
+
+@kernel
+def place_at(
+    time_us: int, times_s: Vector, points: Vector, leg: NDArray[np.int64], i: int
+) -> tuple[float, float]:
+    """Return north, east [m] of moving obstacle i.
+
+    Args:
+        time_us: Time since the start of the episode [µs].
+        times_s: (n, 1 + k) from `tour_arrays`.
+        points: (n, k, 2) from `tour_arrays`.
+        leg: (n,) index of the last waypoint passed; updated.
+        i: Index of the obstacle.
+    """
+    # Tours repeat with their period.
+    t = (time_us / US_PER_S) % times_s[i, 0]
+    passed = times_s[i, 1:]
+    # Start at the last waypoint passed; a new tour starts at the first.
+    k = leg[i] if passed[leg[i]] <= t else 0
+    while passed[k + 1] <= t:
+        k += 1
+    leg[i] = k
+    # Same order of operations as numpy.interp: body and image are bit-identical.
+    a, b, step = points[i, k], points[i, k + 1], passed[k + 1] - passed[k]
+    north = (b[0] - a[0]) / step * (t - passed[k]) + a[0]
+    east = (b[1] - a[1]) / step * (t - passed[k]) + a[1]
+    return north, east
+
+
+class Solids(NamedTuple):
+    """Walls and obstacles of an arena: n solids, of which the last m move; and its ground."""
+
+    shape: NDArray[np.int8]  # (n,)
+    center: Vector  # (n, 3) NED [m]; updated for moving ones
+    size: Vector  # (n, 3) half extents [m]
+    yaw: Vector  # (n,) [rad]
+    times_s: Vector  # (m, 1 + k) from `tour_arrays`
+    points: Vector  # (m, k, 2)
+    leg: NDArray[np.int64]  # (m,)
+    relief: Relief
+
+
+def solids_of(arena: Arena | None) -> tuple[Solids, list[str]]:
+    """Return walls, obstacles and ground of an arena, and their names; None = no solids."""
+    if arena is None:
+        return (
+            Solids(
+                np.zeros(0, np.int8),
+                np.zeros((0, 3)),
+                np.zeros((0, 3)),
+                np.zeros(0),
+                np.full((0, 2), np.inf),
+                np.zeros((0, 1, 2)),
+                np.zeros(0, np.int64),
+                no_relief(),
+            ),
+            [],
+        )
+    walls, o = walls_of(arena), arena.obstacles
+    times, points = tour_arrays(arena)
+    solids = Solids(
+        np.concatenate([np.full(len(walls), Shape.BOX, np.int8), o.shape]),
+        np.concatenate([np.array([center for _, center, _ in walls]), o.center]),
+        np.concatenate([np.array([half for _, _, half in walls]), o.half_size]),
+        np.concatenate([np.zeros(len(walls)), o.yaw]),
+        times,
+        points,
+        np.zeros(len(arena.tours), np.int64),
+        no_relief() if arena.ground is None else arena.ground.relief,
+    )
+    return solids, [name for name, _, _ in walls] + [arena.name_of(i) for i in range(len(o))]
+
+
+def greatest_speed(solids: Solids) -> float:
+    """Return the maximum speed of a moving obstacle [m/s]."""
+    fastest = 0.0
+    for times, points in zip(solids.times_s, solids.points, strict=True):
+        # Unused entries are inf.
+        passed = times[1:][np.isfinite(times[1:])]
+        ways = np.hypot(*np.diff(points[: len(passed)], axis=0).T)
+        took = np.diff(passed)
+        if len(took):
+            fastest = max(fastest, float(np.max(ways / took)))
+    return fastest
+
+
+@kernel
+def room_among(solids: Solids, p: Vec, radius: float) -> float:
+    """Return a lower bound [m] of the distance of a sphere around the vehicle to solids."""
+    room: float = math.inf
+    for i in range(len(solids.shape)):
+        c, s = math.cos(solids.yaw[i]), math.sin(solids.yaw[i])
+        dx, dy = p[0] - solids.center[i, 0], p[1] - solids.center[i, 1]
+        # Distance per axis in the solid's own axes; 0 inside.
+        x = max(0.0, abs(c * dx + s * dy) - solids.size[i, 0])
+        y = max(0.0, abs(c * dy - s * dx) - solids.size[i, 1])
+        z = max(0.0, abs(p[2] - solids.center[i, 2]) - solids.size[i, 2])
+        room = min(room, math.sqrt(x * x + y * y + z * z))
+    # A lower bound: a sphere contains the vehicle's box.
+    return room - radius
+
+
+class Room:
+    """Distances from a vehicle's collision box to the bodies of an arena."""
+
+    def __init__(self, arena: Arena | None, body: BodyProfile) -> None:
+        """Store the solids of an arena (None = an endless floor) and the collision box."""
+        self._solids, _ = solids_of(arena)
+        relief = self._solids.relief
+        self._top_m = float(relief.grid[TOP]) if len(relief.heights) else 0.0
+        """Height of the highest hill [m]."""
+        self._half = 0.5 * np.array([body.width_m, body.width_m, body.height_m])
+        self.reach_m = math.hypot(*self._half.tolist())
+        """Distance from the centre of the box to its corners [m]."""
+        self.closing_m_s = greatest_speed(self._solids)
+        """Maximum speed of an obstacle [m/s]."""
+
+    def above_floor_m(self, motion: Vector) -> float:
+        """Return the height of the box's lowest corner above floor and hills [m]; motion (16,)."""
+        lowest_m: float = _lowest(motion, self._half)
+        # Conservative: height above the highest hill, wherever it is.
+        return lowest_m - self._top_m
+
+    def among_solids_m(self, motion: Vector, moving_us: int) -> float:
+        """Return a lower bound of the distance to walls and obstacles [m].
+
+        Args:
+            motion: (16,) motion of the vehicle.
+            moving_us: Time since the moving obstacles started [µs].
+        """
+        room: float = _among_solids(self._solids, motion, self.reach_m, moving_us)
+        return room
+
+
+@kernel
+def _lowest(motion: Vector, half: Vector) -> float:
+    lowest_m: float = -motion[2] - reach_along(quaternion(motion), half, (0.0, 0.0, 1.0))
+    return lowest_m
+
+
+@kernel
+def _among_solids(solids: Solids, motion: Vector, radius: float, moving_us: int) -> float:
+    n, moving = len(solids.shape), len(solids.leg)
+    for i in range(moving):
+        north, east = place_at(moving_us, solids.times_s, solids.points, solids.leg, i)
+        solids.center[n - moving + i, 0] = north
+        solids.center[n - moving + i, 1] = east
+    return room_among(solids, (motion[0], motion[1], motion[2]), radius)

@@ -42,8 +42,7 @@ from firmware_sim.engine.dynamics import (
     WIDTH,
     from_bullet,
 )
-from firmware_sim.plant.body import FLOOR, NOTHING, Touch, walls_of
-from firmware_sim.plant.solids import place_at, tour_arrays
+from firmware_sim.plant.body import FLOOR, NOTHING, Touch, place_at, tour_arrays, walls_of
 
 
 @contextlib.contextmanager

@@ -15,9 +15,9 @@ from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, PlantName
 from airl_mav.vehicle.airframe import Airframe, lag
+from airl_mav.vehicle.atmosphere import Wind
 from airl_mav.vehicle.power import PowerModel, standing_power_w
 from airl_mav.vehicle.rotation import Quat, Vec
-from airl_mav.vehicle.wind import Wind
 from firmware_sim.autopilot.climb import climb_record
 from firmware_sim.engine.dynamics import (
     POSITION,
@@ -48,11 +48,10 @@ from firmware_sim.engine.ticks import (
     stretch,
 )
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, TrueState
-from firmware_sim.plant.body import FLOOR, PlantBody, Touch
+from firmware_sim.plant.body import FLOOR, PlantBody, Room, Touch
 from firmware_sim.plant.contacts.convex import BREAKING_SHARE
 from firmware_sim.plant.downward_sensors import PlantOpticalFlow, PlantRangefinder
 from firmware_sim.plant.sensors import SensorSuite
-from firmware_sim.plant.solids import Room
 
 
 def new_body(
@@ -69,7 +68,7 @@ def new_body(
     """
     # Local imports: pybullet is not available everywhere, and numba compiles on import.
     if name == "kernel":
-        from firmware_sim.plant.kernel_body import KernelBody
+        from firmware_sim.plant.contacts.solver import KernelBody
 
         return KernelBody(arena, body, airframe, tick_s)
     from firmware_sim.plant.bullet_body import BulletBody
@@ -94,7 +93,7 @@ STOPPED: Speeds = (0.0, 0.0, 0.0, 0.0)
 
 
 class Blowing(Protocol):
-    """Source of wind; see `vehicle.wind.Wind`."""
+    """Source of wind; see `vehicle.atmosphere.Wind`."""
 
     def step(self) -> Vector:
         """Advance one tick and return the wind (3,) NED [m/s]; read-only."""

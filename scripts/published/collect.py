@@ -17,7 +17,7 @@ from airl_mav.addons.sweep.summary import SWEEP_FILE
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json
-from airl_mav.experiments.run import load_run
+from airl_mav.experiments.experiment import load_run
 from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate
 from airl_mav.rehearsal.run_folder import RunInfo, load_info
 from airl_mav.report.comparison.comparison_model import Comparison, load_comparison

@@ -25,16 +25,15 @@ from rich.progress import track
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.options import run_command, scenario_of
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.files import replace_file
-from airl_mav.core.provenance import provenance
+from airl_mav.core.machine import provenance
+from airl_mav.core.progress import new_console
 from airl_mav.envs.evaluation import EpisodeResult, fly_seeds
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.experiments.gym_flier import navigation_of, pilots_of
 from airl_mav.flight.statistics import relative_difference, wilson
-from airl_mav.prediction.compensator import Compensator
-from airl_mav.prediction.decision_memory import REMEMBERED, ExpectedLatency
+from airl_mav.prediction.compensator import RECENT, Compensator, ExpectedLatency
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.report.document import (
     NONE,
@@ -88,7 +87,7 @@ class Quantile(ExpectedLatency):
 
     def expected_us(self) -> NDArray[np.int64]:
         newest = np.ma.masked_array(
-            self.measured_us, np.arange(REMEMBERED) >= np.minimum(self.count, REMEMBERED)[:, None]
+            self.measured_us, np.arange(RECENT) >= np.minimum(self.count, RECENT)[:, None]
         )
         return np.array(
             [np.quantile(row.compressed(), QUANTILE) if row.count() else 0 for row in newest],

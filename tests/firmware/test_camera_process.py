@@ -22,12 +22,11 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import Renderer
 from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.interfaces import FirmwareLostError
-from firmware_sim.plant.camera_process import CameraProcess, SlowCamera
-from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.camera import CameraProcess, SimulatedCamera, SlowCamera
 from tests.support.lenses import BARREL
 
 RATE_HZ = 20.0
@@ -65,7 +64,7 @@ def moving(time_us: int) -> Motion:
 def child() -> psutil.Process:
     """Return the newest process that takes images."""
     found = [
-        each for each in psutil.Process().children() if "camera_process" in " ".join(each.cmdline())
+        each for each in psutil.Process().children() if "plant.camera" in " ".join(each.cmdline())
     ]
     return max(found, key=psutil.Process.create_time)
 

@@ -10,17 +10,16 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.manual_control import Source, Sticks
-from firmware_sim.autopilot.modes.collision_prevention import (
+from firmware_sim.addons.extra_modes.collision_prevention import (
     BINS,
     UNKNOWN_CM,
     CollisionPrevention,
     ObstacleMap,
 )
+from firmware_sim.autopilot.autopilot_state import Result
+from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.inputs import ObstacleBins, Source, Sticks
 from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.autopilot.requests import ObstacleBins
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig
 

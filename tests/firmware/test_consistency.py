@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.consistency import (
+from firmware_sim.autopilot.recovery import (
     ACCEL_BIAS,
     ATTITUDE,
     GYRO_BIAS,

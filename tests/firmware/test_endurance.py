@@ -9,7 +9,7 @@ import pytest
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.failsafes.detectors import AVERAGE_S, Endurance
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.navigation.return_path import return_time_s
+from firmware_sim.autopilot.modes.return_to_launch import return_time_s
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import BatterySample
 from tests.support.flight_rig import flight

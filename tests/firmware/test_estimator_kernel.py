@@ -20,11 +20,10 @@ from airl_mav.profiles.conditions import WindSettings
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Result
+from firmware_sim.autopilot.error_state import KernelFilter, NewFilter
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.filter_filterpy import FilterpyFilter
-from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.fusion_horizon import NewFilter
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from tests.support.flight_rig import flight, quad, velocity_setpoint

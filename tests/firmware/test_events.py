@@ -31,18 +31,20 @@ from firmware_sim.autopilot.events.definition import (
     sub_id,
 )
 from firmware_sim.autopilot.events.health_report import ALL_MODES, HealthReport, health_report
-from firmware_sim.autopilot.failsafes.failsafe_actions import FailsafeAction as FailsafeAction
-from firmware_sim.autopilot.failsafes.failsafe_actions import FailsafeReason
-from firmware_sim.autopilot.failsafes.failsafe_conditions import Conditions
+from firmware_sim.autopilot.failsafes.failsafe_conditions import (
+    Conditions,
+    FailsafeAction,
+    FailsafeReason,
+)
 from firmware_sim.autopilot.failsafes.framework import announcement
 from firmware_sim.autopilot.flight_modes import Mode, Need
-from firmware_sim.autopilot.manual_control import Source, Sticks
+from firmware_sim.autopilot.inputs import Source, Sticks
 from firmware_sim.autopilot.prearm import ArmingSettings, Readiness, can_arm
 from firmware_sim.autopilot.sensor_monitor import ACCEL, BARO, GPS, GYRO, MAG, SensorWatch
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.event_buffer import FIRST_SEQUENCE, KEPT
 from firmware_sim.mavlink.services import component_metadata
 from firmware_sim.mavlink.services.component_metadata import definitions
+from firmware_sim.mavlink.texts_and_events import FIRST_SEQUENCE, KEPT
 from tests.support import flight_rig
 from tests.support.flown_by_mavsdk import Flown, flown
 from tests.support.mavlink_clients import RawClient, Rig, wait_for

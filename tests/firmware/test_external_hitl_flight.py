@@ -27,7 +27,7 @@ from firmware_sim.external.px4.board_link import BoardLink
 from firmware_sim.external.px4.hitl import HitlBridge
 from firmware_sim.external.transport.router import Router
 from firmware_sim.interfaces import FirmwareMissingError
-from firmware_sim.mavlink.udp_links import bind_udp_links
+from firmware_sim.mavlink.px4_links import bind_udp_links
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.flight_rig import quad
 from tests.support.hitl_peer import HitlPeer

@@ -21,7 +21,7 @@ from firmware_sim.external.transport.router import (
 )
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.udp_links import bind_udp_links
+from firmware_sim.mavlink.px4_links import bind_udp_links
 from tests.support.ports import LOOPBACK, free_ports
 
 PATIENCE_S = 60.0

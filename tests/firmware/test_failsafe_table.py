@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_sim.autopilot.failsafes.failsafe_actions import FailsafeAction
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
     Conditions,
+    FailsafeAction,
     FailsafeSettings,
     FenceBreach,
     can_run,

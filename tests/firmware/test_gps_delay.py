@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import TICK_S
 from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot.error_state import SIMULATED_MS, FusionHorizon
 from firmware_sim.autopilot.estimator import Estimator
-from firmware_sim.autopilot.fusion_horizon import SIMULATED_MS, FusionHorizon
 from firmware_sim.interfaces import SensorSample
 from tests.firmware.test_estimator import VALUE, Flight
 

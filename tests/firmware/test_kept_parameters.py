@@ -16,7 +16,7 @@ from firmware_sim.external.parameter_file import KeptParameters
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.pacing import Unpaced
 from firmware_sim.simulation import EpisodeSetup

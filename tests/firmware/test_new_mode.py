@@ -10,7 +10,7 @@ from pathlib import Path
 
 from airl_mav.faults.kinds import PHASES
 from firmware_sim.autopilot.flight_modes import BY_CUSTOM_MODE, Mode
-from firmware_sim.autopilot.modes import MODES
+from firmware_sim.autopilot.modes import implementations
 from tests.support.processes import ROOT
 
 AUTOPILOT = ROOT / "firmware_sim" / "autopilot"
@@ -122,7 +122,7 @@ def test_a_mode_is_added_with_two_files_and_flown(tmp_path: Path) -> None:
 
 
 def test_the_table_is_complete() -> None:
-    assert set(Mode) - set(MODES) == {Mode.TERMINATION}
+    assert set(Mode) - set(implementations()) == {Mode.TERMINATION}
     assert len({mode.spec.state for mode in Mode}) == len(Mode)
     assert set(Mode) - set(BY_CUSTOM_MODE.values()) == {Mode.DESCEND}
     assert {mode.spec.phase for mode in Mode} <= {*PHASES, None}

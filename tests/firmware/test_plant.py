@@ -19,8 +19,8 @@ from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import Sensors, VehicleProfile
 from airl_mav.scenario.aircraft import HAS_PYBULLET, Aircraft, PlantName
-from airl_mav.vehicle import wind as wind_module
-from airl_mav.vehicle.wind import Wind
+from airl_mav.vehicle import atmosphere as wind_module
+from airl_mav.vehicle.atmosphere import Wind
 from firmware_sim.engine.dynamics import FORCE, POSITION, QUATERNION, VELOCITY
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample
 from firmware_sim.plant import sensors as sensors_module

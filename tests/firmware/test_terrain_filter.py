@@ -8,9 +8,8 @@ import pytest
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot.error_state import KernelFilter, selecting
 from firmware_sim.autopilot.filter_filterpy import FilterpyFilter
-from firmware_sim.autopilot.filter_kernel import KernelFilter
-from firmware_sim.autopilot.fusion_horizon import selecting
 from firmware_sim.autopilot.terrain_filter import STEP_S, TerrainFilter
 
 N = es.N_STATES + 1

@@ -30,14 +30,14 @@ from airl_mav.cli.report_command import run as report
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import quat_yaw
-from airl_mav.experiments.run import Run, load_run
+from airl_mav.experiments.experiment import Run, load_run
 from airl_mav.flight.episode_record import Setup
 from airl_mav.flight.judge import Outcome
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.report.comparison.show import compare_folders
+from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.model import PilotSettings
-from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.black_box import SAMPLE_US, open_recorder
 from companion.offboard_mission import MissionResult

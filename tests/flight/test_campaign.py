@@ -30,10 +30,8 @@ from airl_mav.experiments.campaign_store import (
     load_campaign,
     open_campaign,
 )
-from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor
-from airl_mav.experiments.experiment import Experiment, run_experiment
-from airl_mav.experiments.process_executor import open_executor
-from airl_mav.experiments.run import fly_scenario
+from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor, open_executor
+from airl_mav.experiments.experiment import Experiment, fly_scenario, run_experiment
 from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE, FlownEpisode, load
 from tests.support.campaign_kit import cells, declared, gym_cell, same_runs

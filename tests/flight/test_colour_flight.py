@@ -14,15 +14,15 @@ from airl_mav.camera.render import Motion, Mount
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.colour_images import ColourImages, Looks
-from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.mesh_batch import MeshesSeen
+from airl_mav.envs.observations import COMPILED
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
-from airl_mav.scenario.resolved import ResolvedScenario
-from firmware_sim.plant.camera_server import SimulatedCamera
+from airl_mav.scenario.resolve import ResolvedScenario
+from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.command_line import airl
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.poses import at_rest

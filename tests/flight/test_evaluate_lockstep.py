@@ -259,7 +259,7 @@ def test_what_is_finished_is_shown_again_and_not_flown(
     reference: tuple[LoadedRun, str], tmp_path: Path
 ) -> None:
     one, text = reference
-    with patch("airl_mav.experiments.process_executor._spawn", side_effect=AssertionError):
+    with patch("airl_mav.experiments.executors._spawn", side_effect=AssertionError):
         code, again = evaluate("greedy", workers=7, speed=100.0, out=one.path)
     assert code == 0
     assert again.splitlines()[-1] == text.splitlines()[-1]

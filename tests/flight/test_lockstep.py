@@ -35,9 +35,9 @@ from airl_mav.policy.observation import Observation
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import FlownEpisode
+from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
-from airl_mav.scenario.piloting import TRANSPORT_US
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from companion.conducted import Poll
 from companion.link_interface import BodyVelocity
 from companion.offboard_mission import fly_mission

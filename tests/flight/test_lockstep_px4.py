@@ -17,7 +17,7 @@ import pytest
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
-from airl_mav.experiments.run import rehearse
+from airl_mav.experiments.experiment import rehearse
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.lockstep_link import ConductedVehicle, builtin_vehicle

@@ -13,19 +13,19 @@ from airl_mav.camera.render import Motion, Mount
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.colour_images import lens_of
-from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.evaluation import SinglePilots, fly_seeds
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
+from airl_mav.envs.observations import COMPILED
 from airl_mav.envs.spec import spec_of
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.actions import Action
-from airl_mav.policy.greedy import GreedyPolicy
 from airl_mav.policy.images import NUMPY
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import MOST_FRAMES, ObservationSpec
-from firmware_sim.plant.camera_server import SimulatedCamera
+from airl_mav.policy.registry import GreedyPolicy
+from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.poses import at_rest
 

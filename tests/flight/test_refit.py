@@ -31,7 +31,7 @@ from airl_mav.cli.main import main
 from airl_mav.cli.report_command import ReportOptions
 from airl_mav.cli.report_command import run as report
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.experiments.run import load_run
+from airl_mav.experiments.experiment import load_run
 from airl_mav.latency.injection import parse_latency
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.conditions import WindSettings

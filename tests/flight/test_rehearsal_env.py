@@ -22,9 +22,8 @@ from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 from stable_baselines3.common.env_util import make_vec_env
 
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.decisions import FIRST_TRAINING_SEED
+from airl_mav.envs.navigation_env import FIRST_TRAINING_SEED, NavigationEnv
 from airl_mav.envs.registration import NAVIGATION, REHEARSAL
-from airl_mav.envs.single import NavigationEnv
 from airl_mav.experiments.gym_flier import environment_of
 from airl_mav.lockstep.asked_flight import AskedFlight
 from airl_mav.lockstep.gym_env import RehearsalEnv

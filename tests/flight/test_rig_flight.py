@@ -19,9 +19,9 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.colour_images import Looks
-from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.fleet import new_fleet
 from airl_mav.envs.mesh_batch import MeshesSeen
+from airl_mav.envs.observations import COMPILED
 from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
@@ -32,12 +32,12 @@ from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation import Observation
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.cameras.by_name import open_named_camera
 from companion.ground_check import CheckResult, check_on_ground
 from companion.program import prepare
-from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.command_line import airl
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.ports import LOOPBACK, free_ports

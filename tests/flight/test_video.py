@@ -27,9 +27,8 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from companion.video import GIMBAL_PORT, RtpVideo, VideoReceiver, picture_of, picture_size
 from companion.video_program import ShownCamera, show_video
-from firmware_sim.mavlink.link import gimbal_link
-from firmware_sim.mavlink.udp_links import DEVICE_PORTS
-from firmware_sim.plant.camera_server import CameraServer
+from firmware_sim.mavlink.px4_links import DEVICE_PORTS, gimbal_link
+from firmware_sim.plant.camera import CameraServer
 from tests.support.command_line import airl
 from tests.support.ports import TestPorts, choose_ports
 from tests.support.processes import SITL_WITHOUT_REPORT, Running, running, wait_until

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from airl_mav.envs.single import NavigationEnv
+from airl_mav.envs.navigation_env import NavigationEnv
 from airl_mav.envs.vector import NavigationVectorEnv
 
 MOST_CALLS = {1: 60, 16: 68}

@@ -14,8 +14,8 @@ from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.experts import Expert
 from airl_mav.envs.navigation import Navigation
+from airl_mav.envs.navigation_env import NavigationEnv
 from airl_mav.envs.sb3 import NavigationVecEnv
-from airl_mav.envs.single import NavigationEnv
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.faults.fault import Fault
@@ -23,7 +23,7 @@ from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.learned import load_learned
 from airl_mav.policy.observation_spec import ObservationSpec, Told
-from airl_mav.profiles.camera_kind import CHANNELS, CameraKind, Projection
+from airl_mav.profiles.projections import CHANNELS, CameraKind, Projection
 from airl_mav.scenario.model import Scenario
 from tests.support.policy_kit import export_tiny
 

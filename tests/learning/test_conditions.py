@@ -15,11 +15,11 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.draws import Winds
+from airl_mav.envs.evaluation import Trace
 from airl_mav.envs.fleet import Fleet, hover, new_fleet
 from airl_mav.envs.fleet_step import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
-from airl_mav.envs.trace import Trace
 from airl_mav.experiments.gym_flier import environment_of
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 from airl_mav.rehearsal.stand_alone_vehicle import aircraft_of
@@ -28,11 +28,11 @@ from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import StandAloneVehicle
 from airl_mav.vehicle.airframe import draw_airframe
+from airl_mav.vehicle.atmosphere import BLOCK, wind_of_episode
 from airl_mav.vehicle.rotation import rotate
-from airl_mav.vehicle.wind import BLOCK, wind_of_episode
 from firmware_sim.interfaces import BatterySample
 from firmware_sim.plant.bullet_body import BulletBody, pybullet
-from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.camera import SimulatedCamera
 from firmware_sim.plant.sensors import SensorSuite
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.learning.test_fleet import ENDLESS, OPEN, QUAD, VEHICLE, PlantPilot, command

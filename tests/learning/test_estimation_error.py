@@ -11,12 +11,7 @@ from scipy.spatial.transform import Rotation
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_wxyz_to_xyzw
-from airl_mav.envs.estimation import (
-    GROUPS,
-    N_ERRORS,
-    EstimationError,
-    perturbed,
-)
+from airl_mav.envs.draws import GROUPS, N_ERRORS, EstimationError, perturbed
 from airl_mav.profiles.loading import load_profile, profiles_dir
 from airl_mav.profiles.vehicle import Estimation, VehicleProfile
 from tests.support.estimation_fit import autocorrelation, errors_between, fit

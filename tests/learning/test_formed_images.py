@@ -11,10 +11,10 @@ import pytest
 from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.render import Motion
 from airl_mav.core.errors import FieldError
+from airl_mav.envs.evaluation import Trace
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
-from airl_mav.envs.trace import Trace
-from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.camera import SimulatedCamera
 
 QUIET = """
 exposure_ms = 20.0

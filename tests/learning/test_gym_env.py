@@ -23,10 +23,9 @@ from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 import airl_mav.envs.rendering
 from airl_mav.arena.generate import generate
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.decisions import FIRST_TRAINING_SEED
+from airl_mav.envs.navigation_env import FIRST_TRAINING_SEED, NavigationEnv
 from airl_mav.envs.registration import NAVIGATION
 from airl_mav.envs.sb3 import NavigationVecEnv
-from airl_mav.envs.single import NavigationEnv
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.profiles.arena import ArenaSpec

@@ -9,10 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from airl_mav.arena.generate import generate
-from airl_mav.control.attitude import heading_of
 from airl_mav.control.cascade import Filters, cascade_tick, filters, rate_tick
-from airl_mav.control.demand import Demand, RateDemand
-from airl_mav.control.gains import Gains
+from airl_mav.control.demand import Demand, Gains, RateDemand
+from airl_mav.control.loops import heading_of
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arena_batch import ArenaBatch, batch_of

@@ -17,7 +17,7 @@ from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.experiments.gym_flier import environment_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.lockstep_flight import fly
-from airl_mav.policy.action_sets import ActionSpec, command, commands
+from airl_mav.policy.actions import ActionSpec, command, commands
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation import Observation
@@ -26,7 +26,7 @@ from airl_mav.scenario.aircraft import Ports
 from airl_mav.training.algorithms import policy_arguments
 from airl_mav.training.config import NetworkSpec
 from airl_mav.training.export import export_sb3
-from airl_mav.training.recurrent import GreedyDecisions
+from airl_mav.training.onnx_export import GreedyDecisions
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.policy_kit import facts, make_model
 from tests.support.ports import choose_ports

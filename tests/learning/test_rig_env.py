@@ -12,14 +12,14 @@ import pytest
 
 from airl_mav.camera.render import Motion
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.navigation import Navigation
+from airl_mav.envs.observations import COMPILED
 from airl_mav.envs.spec import spec_of
 from airl_mav.faults.fault import Fault
 from airl_mav.policy.images import NUMPY
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.profiles.conditions import SensorNoise
-from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.camera import SimulatedCamera
 
 RIG = """
 base = "quad-rig"

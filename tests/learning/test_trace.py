@@ -13,17 +13,16 @@ from airl_mav.arena.generate import generate
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.constants import TICK_US, US_PER_S
-from airl_mav.envs.evaluation import EpisodeResult, SinglePilots, fly_seeds
+from airl_mav.envs.evaluation import EpisodeResult, SinglePilots, Trace, fly_seeds
 from airl_mav.envs.fleet import Fleet, FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import Delay, EnvironmentSpec, EpisodeRules
-from airl_mav.envs.trace import Trace
 from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
 from airl_mav.latency.stages import stage_samples
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.actions import Action
-from airl_mav.policy.greedy import GreedyPolicy
 from airl_mav.policy.observation import Observation
+from airl_mav.policy.registry import GreedyPolicy
 from tests.support.recording import TestRecorder, record_tick
 
 SEEDS = range(1, 13)

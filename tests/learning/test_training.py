@@ -26,8 +26,7 @@ from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.training import training_run
 from airl_mav.training.config import TrainingConfig, check_fields
-from airl_mav.training.request import TrainingBar, TrainRequest
-from airl_mav.training.training_folder import Evaluation, TrainingFolder
+from airl_mav.training.training_folder import Evaluation, TrainingBar, TrainingFolder, TrainRequest
 from airl_mav.training.training_run import nominal
 from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here

@@ -12,12 +12,12 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.decision import frame_age_us
 from airl_mav.envs.draws import Winds
+from airl_mav.envs.evaluation import Trace
 from airl_mav.envs.faults import gusts, twin_faults
 from airl_mav.envs.fleet import hover, new_fleet
 from airl_mav.envs.fleet_step import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
-from airl_mav.envs.trace import Trace
 from airl_mav.experiments.gym_flier import GymFlier
 from airl_mav.faults.fault import Fault, check_twin
 from airl_mav.profiles.conditions import WindSettings

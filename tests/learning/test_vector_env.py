@@ -18,13 +18,12 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecCheckNan, VecMonitor
 
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.decisions import FIRST_TRAINING_SEED
 from airl_mav.envs.navigation import Navigation
+from airl_mav.envs.navigation_env import FIRST_TRAINING_SEED, NavigationEnv
 from airl_mav.envs.sb3 import QUALITY, NavigationVecEnv
-from airl_mav.envs.single import NavigationEnv
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.vector import NavigationVectorEnv
-from airl_mav.policy.action_sets import commands
+from airl_mav.policy.actions import commands
 
 BUSY: dict[str, Any] = {
     "arena": "dynamic-obstacles",

@@ -23,10 +23,10 @@ from PIL import Image
 from airl_mav.cli import main
 from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
-from airl_mav.experiments import ladder as ladder_experiment
+from airl_mav.experiments import evaluate as ladder_experiment
 from airl_mav.experiments.campaign import Cell, EpisodeSaver
+from airl_mav.experiments.evaluate import declare_ladder
 from airl_mav.experiments.experiment import make_cell
-from airl_mav.experiments.ladder import declare_ladder
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import tango
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load

@@ -10,10 +10,9 @@ import pytest
 from PIL import Image, ImageSequence
 from rich.console import Console
 
-from airl_mav.addons.render.ground_truth import _rates
+from airl_mav.addons.render.camera_pictures import CameraMotion, _rates, optical_flow, velocities_of
 from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.arena.generate import generate
-from airl_mav.camera.flow import CameraMotion, optical_flow, velocities_of
 from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
@@ -24,7 +23,7 @@ from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
-from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.run_demo import write_demo_run
 
 PROFILE = """

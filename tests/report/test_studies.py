@@ -22,7 +22,7 @@ from rich.console import Console
 from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments.evaluate import evaluate
-from airl_mav.experiments.run import load_run
+from airl_mav.experiments.experiment import load_run
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.report.comparison import show

@@ -12,9 +12,8 @@ import numpy as np
 from airl_mav.core.files import Arrays
 from airl_mav.experiments.campaign import Cell, run_cells
 from airl_mav.experiments.campaign_store import Declaration, DeclaredCell, open_campaign
-from airl_mav.experiments.executors import ExecutorSettings
+from airl_mav.experiments.executors import ExecutorSettings, open_executor
 from airl_mav.experiments.experiment import make_cell
-from airl_mav.experiments.process_executor import open_executor
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.scenario.model import Scenario
 

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from airl_mav.core.frames import quat_multiply
-from airl_mav.envs.estimation import GROUPS, Array
+from airl_mav.envs.draws import GROUPS, Array
 from airl_mav.profiles.vehicle import Estimation
 
 _LAGS = 40  # of the autocorrelation, evenly spaced on a logarithmic scale

@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from unittest.mock import patch
 
-from airl_mav.experiments import experiment, run
-from airl_mav.experiments.executors import Executor
-from airl_mav.experiments.process_executor import open_executor
+from airl_mav.experiments import experiment
+from airl_mav.experiments.executors import Executor, open_executor
 from airl_mav.scenario.model import Workers
 
 
@@ -24,6 +23,6 @@ def flown_here() -> Iterator[None]:
         return open_executor(settings, in_process=in_process or settings.workers == 1)
 
     with ExitStack() as stack:
-        for module in (run, experiment):
+        for module in (experiment, experiment):
             stack.enter_context(patch.object(module, "open_executor", here))
         yield

@@ -19,8 +19,8 @@ from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.policy.observation import Kinematics
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.episode import part_of
-from airl_mav.scenario.piloting import TRANSPORT_US
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.checks import TRANSPORT_US
+from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.black_box import SAMPLE_US, open_recorder
 from companion.link_interface import BatteryState, VehicleStatus

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from airl_mav.core.after_import import after_import
+from airl_mav.core.addons import after_import
 from tests.support.processes import run_alone
 
 
@@ -73,6 +73,6 @@ assert "numba" not in sys.modules
     done = run_alone(program, tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == [
-        "airl_mav.envs.single:NavigationEnv",
+        "airl_mav.envs.navigation_env:NavigationEnv",
         "airl_mav.envs.vector:NavigationVectorEnv",
     ]

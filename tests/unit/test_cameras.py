@@ -22,8 +22,8 @@ from airl_mav.camera.render import render
 from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.errors import FieldError
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.distortion import UNDISTORTED
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import UNDISTORTED
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
 from companion.cameras.by_name import open_named_camera

@@ -12,10 +12,17 @@ from hypothesis import strategies as st
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
-from airl_mav.control.attitude import attitude_setpoint, rate_control, rate_setpoint
 from airl_mav.control.cascade import Output, cascade_tick, filters
-from airl_mav.control.demand import Demand
-from airl_mav.control.gains import Gains
+from airl_mav.control.demand import Demand, Gains
+from airl_mav.control.loops import (
+    attitude_setpoint,
+    mix,
+    rate_control,
+    rate_setpoint,
+    thrust_from_acceleration,
+    velocity_control,
+    velocity_setpoint,
+)
 from airl_mav.control.memory import (
     Biquad,
     butterworth,
@@ -24,12 +31,6 @@ from airl_mav.control.memory import (
     reset_integrals,
     settled,
     weight,
-)
-from airl_mav.control.mixer import mix
-from airl_mav.control.velocity import (
-    thrust_from_acceleration,
-    velocity_control,
-    velocity_setpoint,
 )
 from airl_mav.core.constants import DEG, GRAVITY_M_S2, TICK_S
 from airl_mav.core.frames import quat_wxyz_to_xyzw, wrap_pi

@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from airl_mav.control.demand import AttitudeDemand, Demand, RateDemand, TrajectoryDemand
-from airl_mav.control.gains import Gains
+from airl_mav.control.demand import AttitudeDemand, Demand, Gains, RateDemand, TrajectoryDemand
 from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.profiles.parameters import flown_values
 from firmware_sim.engine.controller import Controller

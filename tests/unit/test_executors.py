@@ -15,15 +15,16 @@ from typing import Any
 import pytest
 
 from airl_mav.core.errors import UsageError
-from airl_mav.experiments import process_executor
+from airl_mav.experiments import executors
 from airl_mav.experiments.executors import (
     ONE_THREAD,
     Executor,
     ExecutorSettings,
     InProcessExecutor,
+    ProcessExecutor,
     WorkerError,
+    open_executor,
 )
-from airl_mav.experiments.process_executor import ProcessExecutor, open_executor
 from tests.support import worker_jobs
 from tests.support.processes import ROOT, has_ended, is_running, running, wait_until
 
@@ -247,7 +248,7 @@ def test_a_broken_job_is_told_in_one_line() -> None:
 def test_whoever_stops_does_not_wait_for_what_is_under_way(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(process_executor, "END_S", 3600.0)
+    monkeypatch.setattr(executors, "END_S", 3600.0)
 
     def both_sleep() -> bool:
         return len(list(tmp_path.glob("pid-*"))) == 2

@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.envs import encoding
+from airl_mav.envs import observations
 from airl_mav.policy.images import NUMPY, Bytes, shrink_depth
 from airl_mav.policy.layouts import ablated, boxes, encode_layout, newest_frame
 from airl_mav.policy.observation import Kinematics, Observation, observe
 from airl_mav.policy.observation_spec import STRIP_ROWS, Encoded, ObservationSpec, camera_mismatch
-from airl_mav.profiles.camera_kind import CHANNELS, KINDS, CameraKind
+from airl_mav.profiles.projections import CHANNELS, KINDS, CameraKind
 
 FAR_MM = 65_535
 
@@ -429,7 +429,7 @@ def test_the_compiled_images_are_those_of_numpy(rows: int, columns: int) -> None
     depth[0, :4] = (1 << 16) - 1
     bytes_of = Bytes(rng.integers(0, 256, 1 << 16).astype(np.uint8))
     wanted = shrink_depth(depth, rows, columns, bytes_of)
-    np.testing.assert_array_equal(encoding.shrink_depth(depth, rows, columns, bytes_of), wanted)
+    np.testing.assert_array_equal(observations.shrink_depth(depth, rows, columns, bytes_of), wanted)
 
 
 @pytest.mark.parametrize("range_m", [3.0, 5.0, 10.0, 12.5, 18.0, 20.0, 30.0, 65.0])
@@ -437,7 +437,7 @@ def test_the_compiled_images_in_proportion_are_those_of_the_table(range_m: float
     """Every depth value, at ranges supported by single precision and at 18 m, which is not."""
     depth = np.arange(1 << 16, dtype=np.uint16).reshape(1, 256, 256)
     layout = spec(height=256, width=256, range_m=range_m)
-    found = encode_layout(layout, seen(depth), encoding.COMPILED)["depth"]
+    found = encode_layout(layout, seen(depth), observations.COMPILED)["depth"]
     np.testing.assert_array_equal(found, encode_layout(layout, seen(depth), NUMPY)["depth"])
 
 
@@ -467,7 +467,7 @@ def test_a_colour_is_the_mean_of_its_block(kind: CameraKind, rows: int, columns:
     np.testing.assert_array_equal(found, wanted)
     assert found.dtype == np.uint8
     assert found.shape[1:] == boxes(layout)[kind].shape == (CHANNELS[kind], rows, columns)
-    compiled = encode_layout(layout, coloured(image, kind), encoding.COMPILED)[kind]
+    compiled = encode_layout(layout, coloured(image, kind), observations.COMPILED)[kind]
     np.testing.assert_array_equal(compiled, found)
 
 

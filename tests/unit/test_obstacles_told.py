@@ -23,7 +23,7 @@ from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.frame_source import ReceivedFrame, SharedFrames
 from companion.presence import UNKNOWN_CM, obstacle_distance, obstacles_told
 from companion.program import prepare
-from firmware_sim.autopilot.modes.collision_prevention import ObstacleMap
+from firmware_sim.addons.extra_modes.collision_prevention import ObstacleMap
 from tests.support import mavlink_clients
 from tests.unit.test_scans import posts
 

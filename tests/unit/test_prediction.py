@@ -19,15 +19,16 @@ from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.policy.observation import Kinematics
 from airl_mav.prediction.compensator import (
     LINK_US,
+    RECENT,
     CameraPose,
     Compensator,
+    ExpectedLatency,
     MotionBatch,
     PosedImage,
     Reprojector,
     flown_on,
     leaning,
 )
-from airl_mav.prediction.decision_memory import REMEMBERED, ExpectedLatency
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import Response, load_vehicle
@@ -295,10 +296,10 @@ def test_the_mean_of_the_newest_latencies_is_expected() -> None:
     rng = np.random.default_rng(5)
     latency = ExpectedLatency(3)
     assert latency.expected_us().tolist() == [0, 0, 0]
-    measured = rng.integers(1000, 900_000, (REMEMBERED + 9, 2))
+    measured = rng.integers(1000, 900_000, (RECENT + 9, 2))
     for k, each in enumerate(measured, start=1):
         latency.measure(np.array([0, 2]), each)
-        mean = measured[max(0, k - REMEMBERED) : k].mean(axis=0)
+        mean = measured[max(0, k - RECENT) : k].mean(axis=0)
         assert latency.expected_us()[[0, 2]] == pytest.approx(mean, abs=1.0)
         assert latency.expected_us()[1] == 0
     latency.begin(0)

@@ -54,7 +54,7 @@ from airl_mav.core.frames import frd_to_flu, quat_flu_from_optical
 from airl_mav.flight.trajectory import Trajectory, commanded_velocity
 from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT
-from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.projections import CameraKind
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.scene import FIRST, OTHER
 

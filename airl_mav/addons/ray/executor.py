@@ -141,7 +141,7 @@ def connected(settings: Workers, cores: int, gpus: float) -> Iterator[RayExecuto
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "1")
     if local:
         # Lets Ray's workers import this package, installed or not.
-        here = f"{Path(__file__).resolve().parents[2]}"
+        here = f"{Path(__file__).resolve().parents[3]}"
         known = os.environ.get("PYTHONPATH")
         os.environ["PYTHONPATH"] = here if known is None else f"{here}{os.pathsep}{known}"
     import ray

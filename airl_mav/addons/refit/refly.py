@@ -23,7 +23,7 @@ from airl_mav.core.fields import validated
 from airl_mav.core.files import read_typed, replace_file, write_json
 from airl_mav.core.frames import Goal, goal_height_m, quat_yaw
 from airl_mav.core.plugins import names_code
-from airl_mav.experiments.run import rehearse
+from airl_mav.experiments.experiment import rehearse
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import successful
 from airl_mav.flight.trajectory import Trajectory

@@ -4,20 +4,268 @@ from __future__ import annotations
 
 import shlex
 import sys
-from typing import Annotated
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
 
 from pydantic import Field
 from rich.console import Console
 
+from airl_mav.addons.sweep.config import (
+    SweepConfig,
+    Trial,
+    TrialResult,
+    load_sweep,
+    size_of,
+    trials,
+)
 from airl_mav.addons.sweep.document import document_of, print_plan
-from airl_mav.addons.sweep.run import SweepRequest, run_sweep
+from airl_mav.addons.sweep.summary import (
+    Computer,
+    Sweep,
+    SweepFolder,
+    declaration,
+    estimated_ms,
+    summarize,
+    write_sweep,
+)
 from airl_mav.cli.options import POSITIONAL, check_installed
-from airl_mav.core.console import new_console
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
-from airl_mav.core.progress import RichProgress
-from airl_mav.experiments.process_executor import open_executor
+from airl_mav.core.fields import optional, quantity, switch, validated
+from airl_mav.core.progress import Bar, Progress, RichProgress, new_console
+from airl_mav.experiments.campaign_store import open_campaign
+from airl_mav.experiments.executors import (
+    Executor,
+    ExecutorSettings,
+    Stop,
+    WorkerError,
+    never,
+    open_executor,
+)
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.document import print_document, print_place, write_document
+from airl_mav.scenario.model import Workers
+from airl_mav.training.training_folder import TrainingFolder
+
+
+class SweepRequest(Workers):
+    """Request of an architecture search and its execution. The methods raise UsageError."""
+
+    sweep: str = Field(
+        default="quick",
+        description="quick (two cores, an hour), full (the paper's grid), paper (the same on the"
+        " paper's image, for GPUs), tiny (seconds, shows nothing), or a path to a .toml",
+    )
+    out: Path | None = optional("folder of the sweep; by default runs/sweep-<name>")
+    seeds: int | None = quantity(
+        "training seeds of each cell, 1 to N; by default the sweep's",
+        "1",
+        ge=1,
+        le=1000,
+        default=None,
+    )
+    steps: int | None = optional("decisions of each training; by default the sweep's")
+    episodes: int | None = optional(
+        "flights that judge each trained network; by default the sweep's"
+    )
+    seed: int | None = optional(
+        "seed of the first of these flights; flight i has seed + i, in every cell; by"
+        " default the sweep's"
+    )
+    computer: str | None = optional(
+        "computer profile: each cell then shows its decision latency t2 there,"
+        " estimated from multiply-accumulates; may change when a sweep goes on"
+    )
+    device: Literal["cpu", "cuda"] = Field(
+        default="cpu", description="device for training: cpu, one core per trial, or cuda"
+    )
+    ray_gpus: float | None = quantity(
+        "share of a GPU that Ray keeps for each trial; by default 1 with device cuda, else 0",
+        "1",
+        ge=0,
+        le=8,
+        default=None,
+    )
+    dry_run: bool = switch(
+        "say what would be done: trials, parameters, multiply-accumulates, decisions;"
+        " nothing is trained or written"
+    )
+
+    @property
+    def name(self) -> str:
+        """Name of the sweep."""
+        return Path(self.sweep).stem
+
+    @property
+    def path(self) -> Path:
+        """Folder of the sweep, absolute."""
+        return (self.out or Path("runs") / f"sweep-{self.name}").absolute()
+
+    def config(self) -> SweepConfig:
+        """Load the sweep, apply the given values, and validate the result."""
+        data = load_sweep(self.sweep).model_dump(exclude_unset=True)
+        if self.seeds is not None:
+            data["seeds"] = range(1, self.seeds + 1)
+        for table, field, value in (
+            ("training", "steps", self.steps),
+            ("evaluation", "episodes", self.episodes),
+            ("evaluation", "seed", self.seed),
+        ):
+            if value is not None:
+                data.setdefault(table, {})[field] = value
+        for grid in data["grids"]:
+            load_profile("arenas", grid["arena"], ArenaSpec)
+            if grid["arena"].endswith(".toml"):
+                # Workers, and other machines, may have another working directory.
+                grid["arena"] = f"{Path(grid['arena']).absolute()}"
+        return validated(SweepConfig, data)
+
+    def executor_settings(self) -> ExecutorSettings:
+        """Return the executor settings of the trials, with their GPU share."""
+        gpus = self.ray_gpus
+        if gpus is not None and self.executor != "ray":
+            raise FieldError("ray_gpus", gpus, "with executor ray")
+        data = {name: getattr(self, name) for name in Workers.model_fields}
+        default = 1.0 if self.device == "cuda" else 0.0
+        return validated(ExecutorSettings, data | {"ray_gpus": default if gpus is None else gpus})
+
+    def for_computer(self) -> Computer | None:
+        """Return the computer for each cell's decision latency, or None."""
+        if self.computer is None:
+            return None
+        computer = Computer(self.computer, load_computer(self.computer))
+        estimated_ms(computer.profile, 1)  # Raises for a computer without a workload.
+        return computer
+
+
+LOOK_US = US_PER_S
+"""Interval at which the evaluations of the trainings are read [wall µs]."""
+
+MOST_BARS = 12
+"""Maximum number of running trials with a progress bar."""
+
+
+def _worker(
+    folder: SweepFolder,
+    command: str,
+    device: str,
+    stop: Stop,  # noqa: ARG001 (a worker is killed, and loses no checkpoint)
+) -> Callable[[Trial], list[TrialResult]]:
+    """Return the function that runs a trial."""
+    # Imported late: the learner takes two seconds to load, and only a worker needs it.
+    from airl_mav.addons.sweep.trial_run import run_trial
+
+    return lambda trial: [run_trial(folder, trial, command, device)]
+
+
+def run_sweep(
+    path: Path,
+    config: SweepConfig,
+    executor: Executor,
+    *,
+    command: str,
+    progress: Progress,
+    device: str = "cpu",
+    computer: Computer | None = None,
+    stop: Stop = never,
+) -> tuple[Sweep, str | None]:
+    """Run the remaining trials; `sweep.json` is written after each.
+
+    All workers see the folder, new or resumed, under this path. `stop` is polled several times a
+    second. True stops the sweep and keeps finished trials. Returns the sweep so far, and the reason
+    of an early end or None. Raises UsageError for invalid input, or if the folder contains
+    something else.
+    """
+    say = partial(progress.note, style="yellow")
+    with open_campaign(path, declaration(config), command=command, say=say) as store:
+        folder = SweepFolder(store.path, config)
+
+        def summary() -> Sweep:
+            sweep = summarize(folder, store.campaign.made, computer)
+            write_sweep(sweep)
+            return sweep
+
+        sweep, wanted = summary(), trials(config)
+        waiting = [trial for trial in wanted if folder.result(trial) is None]
+        bars = _TrialBars(progress, folder, len(wanted), waiting)
+
+        def stopped() -> bool:
+            bars.look()
+            return stop()
+
+        results = executor.run(
+            waiting,
+            partial(_worker, folder, command, device),
+            name=lambda trial: trial.name,
+            stop=stopped,
+            lost=say,
+        )
+        try:
+            with closing(results):
+                for _, result in results:
+                    bars.finished(result)
+                    sweep = summary()
+        except WorkerError as error:
+            return sweep, str(error)
+        return sweep, None
+
+
+class _TrialBars:
+    """Progress bar of the sweep, a bar for each running trial, and a line for each finished one."""
+
+    def __init__(
+        self, progress: Progress, folder: SweepFolder, total: int, waiting: Sequence[Trial]
+    ) -> None:
+        self._progress, self._folder = progress, folder
+        self._total, self._steps = total, folder.config.training.steps
+        # Measured on one core: a decision's cost grows more slowly than its multiply-accumulates.
+        self._left = {trial: size_of(folder.config, trial).macs ** 0.75 for trial in waiting}
+        self._bar = progress.bar("sweep", sum(self._left.values()) or 1.0)
+        self._bars: dict[Trial, Bar] = {}
+        self._done = 0.0
+        self._clock, self._due_us = WallClock(), 0
+
+    def finished(self, result: TrialResult) -> None:
+        """Count a finished trial."""
+        trial, trained = result.trial, result.trained
+        self._done += self._left.pop(trial)
+        if trial in self._bars:
+            self._bars.pop(trial).close()
+        self._progress.note(
+            f"{self._total - len(self._left):>{len(str(self._total))}}/{self._total}  "
+            f"{trial.arena_name}  {trial.network:>6}  seed {trial.seed}  success "
+            f"{result.success_rate:6.1%} of {result.episodes}, best after "
+            f"{trained.best_steps:,} of {trained.steps:,} decisions, {trained.seconds:,.0f} s"
+        )
+        self._due_us = 0
+        self.look()
+
+    def look(self) -> None:
+        """Update the progress of the trainings; cheap, call it often."""
+        if self._clock.time_us() < self._due_us:
+            return
+        self._due_us = self._clock.time_us() + LOOK_US
+        done = self._done
+        for trial, work in self._left.items():
+            evaluations = TrainingFolder(self._folder.trial_path(trial)).evaluations()
+            if not evaluations:
+                continue
+            last = evaluations[-1]
+            done += work * min(last.steps / self._steps, 1.0)
+            if trial not in self._bars and len(self._bars) < MOST_BARS:
+                self._bars[trial] = self._progress.bar(trial.name, self._steps, unit="decisions")
+            if trial in self._bars:
+                success = f"success {last.success_rate:.0%}"
+                self._bars[trial].update(completed=last.steps, postfix=success)
+        ended = self._total - len(self._left)
+        self._bar.update(completed=done, postfix=f"{ended}/{self._total} trials")
 
 
 class SweepOptions(SweepRequest):

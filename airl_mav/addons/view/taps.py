@@ -23,7 +23,7 @@ from airl_mav.prediction.compensator import Compensator
 from airl_mav.rehearsal.channel import State, Text
 from airl_mav.rehearsal.live_view import ViewEnds
 from airl_mav.rehearsal.observer import WARNING, Observer
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from companion.pilot import SentDecision
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.engine.dynamics import POSITION, QUATERNION, VELOCITY

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_MS, US_PER_S, CommandKind
 from airl_mav.core.frames import Goal, goal_distance_m
-from airl_mav.profiles.camera_kind import Projection
+from airl_mav.profiles.projections import Projection
 from airl_mav.profiles.vehicle import Momentum, VehicleProfile
 from airl_mav.rehearsal.live_view import ViewEnds
 

@@ -27,7 +27,7 @@ from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.rehearsal.live_view import ViewEnds, ViewError
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 
 REAL_TIME = 1.0
 """Default speed of a lockstep flight in a view, in simulated seconds per wall second."""

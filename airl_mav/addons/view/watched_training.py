@@ -20,11 +20,11 @@ from airl_mav.addons.view.view_messages import OFFBOARD, ViewSettings
 from airl_mav.addons.view.viewer import Feed, Pace
 from airl_mav.camera.frame import MM_PER_M
 from airl_mav.core.constants import US_PER_S
+from airl_mav.envs.evaluation import Trace
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.envs.trace import Trace
 from airl_mav.latency.stamps import NO_STAMP
-from airl_mav.policy.action_sets import commands, discrete_actions
+from airl_mav.policy.actions import commands, discrete_actions
 from airl_mav.policy.layouts import newest_frame
 from airl_mav.policy.observation_spec import Encoded
 from airl_mav.rehearsal.live_view import ViewEnds

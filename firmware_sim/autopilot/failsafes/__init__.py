@@ -1,5 +1,5 @@
 """Failsafes: automatic responses to failures, as in PX4.
 
-`failsafe_conditions` lists the failures, `failsafe_table` their actions, `framework` selects and
-times the active action, and `watch` detects the conditions.
+`failsafe_conditions` lists failures and actions, `failsafe_table` relates them, `framework` selects
+and times the active action, and `watch` detects the conditions.
 """

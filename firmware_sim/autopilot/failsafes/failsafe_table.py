@@ -12,18 +12,16 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.failsafes.failsafe_actions import (
-    Clear,
-    FailsafeAction,
-    FailsafeReason,
-    Options,
-    Takeover,
-)
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     FLIGHT_TERMINATION_OFF,
     BatteryWarning,
+    Clear,
     Conditions,
+    FailsafeAction,
+    FailsafeReason,
     FailsafeSettings,
+    Options,
+    Takeover,
     can_run,
 )
 from firmware_sim.autopilot.flight_modes import Mode, Need

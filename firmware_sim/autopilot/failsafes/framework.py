@@ -13,17 +13,15 @@ from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import FailsafeCause, MavlinkEvent
-from firmware_sim.autopilot.failsafes.failsafe_actions import (
-    Clear,
-    FailsafeAction,
-    FailsafeReason,
-    Options,
-    Takeover,
-)
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
+    Clear,
     Conditions,
+    FailsafeAction,
+    FailsafeReason,
     FailsafeSettings,
+    Options,
+    Takeover,
     can_run,
 )
 from firmware_sim.autopilot.failsafes.failsafe_table import (

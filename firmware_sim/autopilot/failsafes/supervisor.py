@@ -18,10 +18,10 @@ from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import MavlinkEvent
 from firmware_sim.autopilot.events.health_report import REPORT_US, HealthReporter
-from firmware_sim.autopilot.failsafes.failsafe_actions import FailsafeAction
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
     Conditions,
+    FailsafeAction,
     FailsafeSettings,
     lacking,
 )

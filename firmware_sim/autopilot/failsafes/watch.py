@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from airl_mav.control.mixer import Motors
+from airl_mav.control.loops import Motors
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel

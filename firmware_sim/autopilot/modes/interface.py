@@ -15,15 +15,15 @@ from firmware_sim.autopilot.autopilot_state import Clearance, OperatorText, Orbi
 from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.manual_control import Sticks
-from firmware_sim.autopilot.navigation.plan import STANDING, Triplet
-from firmware_sim.autopilot.requests import (
+from firmware_sim.autopilot.inputs import (
     FollowedTarget,
     LandingTarget,
     ModeRequest,
     ObstacleBins,
     PositionYaw,
+    Sticks,
 )
+from firmware_sim.autopilot.navigation.plan import Missions
 from firmware_sim.autopilot.smooth_trajectory import Travel
 
 NAN: float = math.nan
@@ -62,10 +62,8 @@ class FlightContext:
     """Newest offboard setpoint by type."""
     return_place: Callable[[], PositionYaw | None] | None = None
     """Returns Return's destination, or None if it flies mission items. None = home."""
-    triplet: Triplet = STANDING
-    """Waypoints of Mission mode, and of Return if it flies mission items."""
-    mission_over: bool = False
-    """True if the mission has ended."""
+    missions: Missions = field(default_factory=Missions)
+    """Missions of Mission mode, and of Return if it flies mission items."""
     armed: bool = False
     """True if armed: a mode selected earlier is only entered."""
     standing: bool = True
@@ -158,6 +156,12 @@ class FlightMode(Protocol):
     def is_done(self, _state: Vector, /) -> bool:
         """Return whether the mode has reached its goal, so that another one should follow."""
         return False
+
+
+def optional_mode(mode: Mode, context: FlightContext) -> FlightMode | None:
+    """Return a new mode that may be an add-on; None = not installed."""
+    new = IMPLEMENTATIONS.get(mode)
+    return None if new is None else new(context)
 
 
 FALLBACK_DESCENT_M_S = 0.75

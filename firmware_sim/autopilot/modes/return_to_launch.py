@@ -1,27 +1,32 @@
 """Return: climb, fly home or to a rally point, optionally wait, land; or fly the mission.
 
-Source: PX4 1.16, RtlDirect. The navigator provides the path along the mission.
+Source: PX4 1.16, RtlDirect, RtlTimeEstimator and RTL::calculate_return_alt_from_cone_half_angle.
+The navigator provides the path along the mission.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from enum import Enum, auto
 
 from airl_mav.control.demand import AnyDemand
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import DEG, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, triple
-from firmware_sim.autopilot.modes.land import landing_speed
-from firmware_sim.autopilot.modes.mission import Mission
-from firmware_sim.autopilot.modes.precision_land import PrecisionLand
-from firmware_sim.autopilot.navigation.return_path import return_height
-from firmware_sim.autopilot.requests import ModeRequest, PositionYaw
+from firmware_sim.autopilot.inputs import ModeRequest, PositionYaw, PrecisionRequest
+from firmware_sim.autopilot.modes.automatic import landing_speed
+from firmware_sim.autopilot.modes.interface import (
+    FlightContext,
+    FlightMode,
+    here,
+    optional_mode,
+    triple,
+)
 from firmware_sim.autopilot.smooth_trajectory import PathSegment
 
 _REQUIRED = 2
@@ -48,15 +53,15 @@ class ReturnToLaunch(FlightMode, modes=(Mode.RETURN,)):
         self._down = 0.0
         """Height of the flight home, NED [m]."""
         self._home = PositionYaw((0.0, 0.0, 0.0), 0.0)
-        self._mission = Mission(context)
-        self._precision = PrecisionLand(context)
-        self._precise = False
-        self._by_mission = False
+        self._mission = optional_mode(Mode.MISSION, context)
+        self._precision = optional_mode(Mode.PRECISION_LAND, context)
+        self._instead: FlightMode | None = None
+        """Mode that flies: Mission along mission items, Precision Landing at the end."""
 
     @property
     def destination(self) -> Vec | None:
         """End of the current stage."""
-        if self._by_mission:
+        if self._instead is not None and self._instead is self._mission:
             return self._mission.destination
         north, east, ground = self._home.position
         if self._stage is _Stage.CLIMB:
@@ -70,11 +75,11 @@ class ReturnToLaunch(FlightMode, modes=(Mode.RETURN,)):
         context = self._context
         home = PositionYaw(context.home, context.home_yaw)
         chosen = home if context.return_place is None else context.return_place()
-        self._by_mission = chosen is None
-        if chosen is None:
-            self._mission.enter(state, None)
+        self._instead = self._mission if chosen is None else None
+        if self._instead is not None:
+            self._instead.enter(state, None)
             return
-        self._home = chosen
+        self._home = chosen or home
         self._start = here(state)
         self._waiting_since_us = None
         height = self._height(state)
@@ -90,9 +95,10 @@ class ReturnToLaunch(FlightMode, modes=(Mode.RETURN,)):
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Return the demand of the current stage, and advance stages."""
-        if self._by_mission:
-            return self._mission.demand(state, time_us)
-        self._go_on(state, time_us)
+        if self._instead is None:
+            self._go_on(state, time_us)
+        if self._instead is not None:
+            return self._instead.demand(state, time_us)
         (north, east, _), travel = self._home.position, self._context.travel
         if self._stage is _Stage.CLIMB:
             start = self._start
@@ -102,8 +108,6 @@ class ReturnToLaunch(FlightMode, modes=(Mode.RETURN,)):
             near = self._away(state) < self._context.value("RTL_MIN_DIST")
             yaw = self._home.yaw if near else math.nan
             return travel.fly(state, time_us, PathSegment((north, east, self._down)), yaw=yaw)
-        if self._stage is _Stage.LAND and self._precise:
-            return self._precision.demand(state, time_us)
         if self._stage is _Stage.LAND:
             context = self._context
             speed = landing_speed(context.value, self._height(state), context.ground_m)
@@ -129,7 +133,7 @@ class ReturnToLaunch(FlightMode, modes=(Mode.RETURN,)):
             if delay:
                 self._stage = _Stage.DESCEND
             else:
-                self._land(down)
+                self._land(state)
         elif self._stage is _Stage.DESCEND and abs(down - self._waiting_down) < radius:
             self._stage, self._waiting_since_us = _Stage.WAIT, time_us
             if delay < 0.0:
@@ -137,16 +141,20 @@ class ReturnToLaunch(FlightMode, modes=(Mode.RETURN,)):
         elif self._stage is _Stage.WAIT and self._waiting_since_us is not None:
             waited_s = (time_us - self._waiting_since_us) / US_PER_S
             if 0.0 <= delay <= waited_s:
-                self._land(down)
+                self._land(state)
 
-    def _land(self, down: float) -> None:
-        """Land from a height NED [m], on a landing target if RTL_PLD_MD requires it."""
+    def _land(self, state: Vector) -> None:
+        """Land, on a landing target if RTL_PLD_MD requires it."""
         self._stage = _Stage.LAND
         asked = round(self._context.value("RTL_PLD_MD"))
-        self._precise = asked > 0
-        if self._precise:
-            north, east, _ = self._home.position
-            self._precision.begin((north, east, down), required=asked == _REQUIRED)
+        if asked > 0 and self._precision is not None:
+            north, east, down = *self._home.position[:2], state.item(P + 2)
+            request = PrecisionRequest((north, east, down), required=asked == _REQUIRED)
+            self._precision.enter(state, request)
+            self._instead = self._precision
+        elif asked > 0:
+            text = "RTL_PLD_MD has no effect without the add-on extra_modes"
+            self._context.say(OperatorText(Severity.CRITICAL, text))
         self._context.say(OperatorText.of(Severity.INFO, events.RTL_LAND))
 
     def _height(self, state: Vector) -> float:
@@ -157,3 +165,42 @@ class ReturnToLaunch(FlightMode, modes=(Mode.RETURN,)):
         """Return the horizontal distance from home [m]."""
         (north, east, _), home = triple(state, P), self._home.position
         return math.hypot(north - home[0], east - home[1])
+
+
+_SLOWEST_M_S = 0.1
+"""Minimum of every speed, as a parameter may be zero."""
+
+
+def return_height(value: Callable[[str], float], height_m: float, away_m: float) -> float:
+    """Return the height of the return flight above the destination [m].
+
+    Args:
+        value: Look-up for PX4 parameters by name.
+        height_m: Height of the vehicle above the destination.
+        away_m: Horizontal distance of the vehicle from the destination.
+    """
+    highest, angle, radius = value("RTL_RETURN_ALT"), value("RTL_CONE_ANG"), value("NAV_ACC_RAD")
+    if angle <= 0.0:
+        return max(height_m, highest)
+    if away_m <= radius:
+        wanted = 2.0 * away_m
+    else:
+        wanted = highest
+        if away_m <= value("RTL_MIN_DIST"):
+            wanted = min(highest, away_m / math.tan(min(89.0, max(1.0, angle)) * DEG))
+        wanted = max(wanted, 2.0 * radius)
+    return max(height_m, min(wanted, highest))
+
+
+def return_time_s(value: Callable[[str], float], height_m: float, away_m: float) -> float:
+    """Return the duration of Return, with RTL_TIME_FACTOR and RTL_TIME_MARGIN [s].
+
+    As in PX4, the whole descent is at MPC_Z_V_AUTO_DN. For the arguments see `return_height`.
+    """
+    at = return_height(value, height_m, away_m)
+    climb = (at - height_m) / max(value("MPC_Z_V_AUTO_UP"), _SLOWEST_M_S)
+    way = away_m / max(value("MPC_XY_CRUISE"), _SLOWEST_M_S)
+    wait = max(0.0, value("RTL_LAND_DELAY"))
+    descent = max(0.0, at) / max(value("MPC_Z_V_AUTO_DN"), _SLOWEST_M_S)
+    took = climb + way + wait + descent
+    return value("RTL_TIME_FACTOR") * took + value("RTL_TIME_MARGIN")

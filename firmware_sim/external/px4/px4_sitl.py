@@ -28,7 +28,7 @@ from firmware_sim.interfaces import (
     TrueState,
 )
 from firmware_sim.mavlink.codec import Decoder, Encoder, Values, WireLayout, WireMessage, dialect
-from firmware_sim.mavlink.streams.pose import hil_state_quaternion
+from firmware_sim.mavlink.streams.status import hil_state_quaternion
 
 WATCH_S = 0.1
 """Maximum wait between checks that the other program is alive [wall s]."""

@@ -1,0 +1,511 @@
+"""Cameras of the vehicle: schedule, images, and publication.
+
+In real time, images may take longer than a tick: `CameraProcess` renders them in a separate process
+while the vehicle keeps flying. A frame is published when it is complete, with its exposure time, as
+with a slow camera; exposures due during rendering are skipped. Otherwise the simulation waits for
+each image.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, Protocol
+
+import numpy as np
+import zmq
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.camera.exposure import exposure_by
+from airl_mav.camera.frame import Frame, FurtherImage
+from airl_mav.camera.imaging import ImageFormation
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.noise import noise_of, noisy_frame
+from airl_mav.camera.render import Motion, Mount, camera_pose
+from airl_mav.core.constants import TICK_US
+from airl_mav.core.errors import UsageError
+from airl_mav.core.scheduling import give_way
+from airl_mav.profiles.camera import Camera
+from airl_mav.profiles.conditions import SensorNoise
+from airl_mav.profiles.projections import Renderer
+from firmware_sim.interfaces import FirmwareLostError
+from firmware_sim.plant.sensors import Rate
+
+
+class _Eye:
+    """Single camera of a vehicle, for images on a trigger."""
+
+    def __init__(
+        self, camera: Camera, arena: Arena, noise: SensorNoise, renderer: Renderer, name: str = ""
+    ) -> None:
+        """Store camera, arena, conditions and renderer; `name` is an additional camera's."""
+        self._expose = exposure_by(renderer, name)
+        self._noise = noise_of(camera, noise, name)
+        self._forming = ImageFormation(camera, name) if camera.imaging is not None else None
+        self.intrinsics = Intrinsics.of(camera)
+        self._mount, self._max_range = Mount.of(camera), camera.range_m
+        self._arena = arena
+        self.follows = self._forming is not None and self._forming.follows
+        """True if an image depends on the previous one."""
+
+    def restart(self) -> None:
+        """Start an episode."""
+        if self._forming is not None:
+            self._forming.restart()
+
+    def take(self, elapsed_us: int, motion: Motion, seed: int, number: int) -> FurtherImage:
+        """Return an image of an episode.
+
+        Args:
+            elapsed_us: Time since the episode's start [µs].
+            motion: Motion of the vehicle at this time.
+            seed: Seed of the episode.
+            number: Number of the image in the episode, from the frame rate.
+        """
+        image: NDArray[Any]
+        jpeg = None
+        if self._forming is not None:
+            # `ImageFormation` makes the image and its JPEG file.
+            image, jpeg = self._forming.take(self._arena, elapsed_us, motion, seed, number)
+        else:
+            at, attitude = camera_pose(motion.position, motion.quaternion, self._mount)
+            centers = self._arena.centers_at(elapsed_us)
+            image = self._expose(
+                *(self._arena, centers, self.intrinsics, self._max_range, at, attitude), number
+            )
+        if self._noise is not None:
+            image = noisy_frame(image, self._noise, seed, number)
+        return FurtherImage(image, self.intrinsics, jpeg)
+
+
+class ExposedFrame(Frame):
+    """Frame with images that are rendered on first access, because few are read."""
+
+    def __init__(
+        self,
+        sequence: int,
+        capture_time_us: int,
+        intrinsics: Intrinsics,
+        draw: Callable[[], Mapping[str, FurtherImage]],
+    ) -> None:
+        """Store the fields and the renderer of images by camera; "" is the main camera."""
+        exposed = {"sequence": sequence, "capture_time_us": capture_time_us}
+        # Frame is frozen: write its fields past its `__setattr__`.
+        vars(self).update(exposed, intrinsics=intrinsics, draw=draw)
+
+    @cached_property
+    def images(self) -> Mapping[str, FurtherImage]:
+        """All images, by camera name."""
+        draw: Callable[[], Mapping[str, FurtherImage]] = vars(self)["draw"]
+        return draw()
+
+    @property
+    def image(self) -> NDArray[Any]:
+        """Image of the main camera."""
+        return self.images[""].image
+
+    @property
+    def jpeg(self) -> bytes | None:
+        """JPEG file of the image; None = never compressed."""
+        return self.images[""].jpeg
+
+    @cached_property
+    def further(self) -> Mapping[str, FurtherImage]:
+        """Images of the additional cameras, by name."""
+        return {name: each for name, each in self.images.items() if name}
+
+    def __reduce__(self) -> tuple[type[Frame], tuple[Any, ...]]:
+        """Return a frame with its images: another process has no camera to render them."""
+        shown = self.image, self.intrinsics, self.jpeg, self.further
+        return Frame, (self.sequence, self.capture_time_us, *shown)
+
+
+class SimulatedCamera:
+    """Camera that takes frames of an arena at a fixed rate, with images of all cameras."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        arena: Arena,
+        start_us: int = 0,
+        noise: SensorNoise | None = None,
+        seed: int = 0,
+        renderer: Renderer = "raycast",
+        further: Mapping[str, Camera] | None = None,
+    ) -> None:
+        """Create the cameras of a vehicle profile.
+
+        Args:
+            camera: Main camera.
+            arena: Arena to render.
+            start_us: Simulated time of the first frame [µs].
+            noise: Image conditions; None = the defaults.
+            seed: Seed of the noise.
+            renderer: Renderer of the images.
+            further: Additional cameras with the same trigger, by name; None = main camera only.
+        """
+        asked = noise or SensorNoise()
+        cameras = {"": camera, **(further or {})}
+        self._eyes = {
+            name: _Eye(each, arena, asked, renderer, name) for name, each in cameras.items()
+        }
+        self._intrinsics = self._eyes[""].intrinsics
+        self._in_order = any(each.follows for each in self._eyes.values())
+        self._seed = seed
+        self._rate_hz = camera.rate_hz
+        self._sequence = 0
+        # The first image loads or compiles the kernels: better here than in flight.
+        at_rest = Motion.at_rest(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+        for each in self._eyes.values():
+            each.take(0, at_rest, seed, 0)
+        self.restart(start_us)
+
+    def restart(self, time_us: int) -> None:
+        """Start an episode and its moving obstacles; the next frame is due at `time_us` [µs].
+
+        Sequence numbers continue, so frames of different episodes are distinct.
+        """
+        self._start_us = self.next_us = time_us
+        """`next_us`: simulated time at which the next frame is due [µs]."""
+        self._rate = Rate(self._rate_hz)
+        for each in self._eyes.values():
+            each.restart()
+
+    def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
+        """Take a due frame and pass it to `publish`; see `take`."""
+        publish(self.take(time_us, motion))
+
+    def skip_unread(self, read_us: int) -> None:
+        """Skip due frames that newer ones replace before `read_us`; see `OnboardCamera`."""
+        # The next frame is exposed at the first tick after its slot.
+        last_us = read_us - self._rate.period_us - TICK_US
+        while self.next_us < last_us and not self._in_order:
+            self._schedule_next(self.next_us)
+
+    def _schedule_next(self, time_us: int) -> int:
+        """Number the frame due at `time_us` [µs] and schedule the next; return the number."""
+        self._rate.due(time_us - self._start_us)
+        self.next_us = self._start_us + math.ceil(self._rate.next_us)
+        self._sequence += 1
+        return self._sequence - 1
+
+    def take(self, time_us: int, motion: Motion) -> Frame:
+        """Take a due frame; the next is due one period after the slot of this one.
+
+        Slots are at whole multiples of the period, which keeps the average rate even if the tick
+        does not divide the period. Missed slots are skipped.
+
+        The exposure is at simulated `time_us` [µs], or centred on it if it takes time, from the
+        vehicle's pose at that time; `motion` is kept, not copied. The images are rendered on
+        access, unless an image depends on the previous one.
+        """
+        number = self._schedule_next(time_us)
+        seen = time_us - self._start_us, motion, self._seed, self._rate.period
+
+        def draw() -> Mapping[str, FurtherImage]:
+            return {name: each.take(*seen) for name, each in self._eyes.items()}
+
+        frame = ExposedFrame(number, time_us, self._intrinsics, draw)
+        if self._in_order:
+            _ = frame.images
+        return frame
+
+
+class CameraServer:
+    """Publisher of frames over ZeroMQ. A subscriber receives only the newest frame, never a queue.
+
+    Publishing does not block: a slow or stopped companion cannot delay the simulator.
+    """
+
+    awaited = True
+    transport_us = None
+
+    def __init__(
+        self, endpoint: str, context: zmq.Context[zmq.Socket[bytes]] | None = None
+    ) -> None:
+        """Bind the socket.
+
+        Args:
+            endpoint: Endpoint such as "tcp://127.0.0.1:5560"; port 0 or * selects a free port.
+            context: ZeroMQ context to share; None = a new one.
+
+        Raises:
+            UsageError: The port is in use, or the endpoint is invalid.
+        """
+        self._owns_context = context is None
+        self._context = zmq.Context() if context is None else context
+        self._socket = self._context.socket(zmq.PUB)
+        # A high-water mark of 1 would keep the oldest frame and drop the newest.
+        self._socket.setsockopt(zmq.CONFLATE, 1)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        try:
+            self._socket.bind(endpoint)
+        except zmq.ZMQError as error:
+            # The constructor fails, so no other code closes the socket.
+            self.close()
+            if error.errno == zmq.EADDRINUSE:
+                port = endpoint.rsplit(":", 1)[-1]
+                raise UsageError(
+                    f"camera port {port} is taken ({endpoint}); choose another with --camera-port"
+                ) from error
+            raise UsageError(
+                f"camera endpoint {endpoint!r}: {error}; accepted: tcp://ADDRESS:PORT, ipc://PATH"
+            ) from error
+        self.endpoint: str = self._socket.getsockopt_string(zmq.LAST_ENDPOINT).rstrip("\0")
+        """Endpoint for subscribers, with the selected port."""
+
+    def publish(self, frame: Frame) -> None:
+        """Send a frame to all subscribers. Replaces a frame that is still waiting."""
+        self._socket.send(frame.to_bytes(), zmq.NOBLOCK)
+
+    def close(self) -> None:
+        """Disconnect all subscribers and free the port."""
+        self._socket.close(linger=0)
+        if self._owns_context:
+            self._context.term()
+
+
+class OnboardCamera(Protocol):
+    """Camera that takes frames when due, for example `SimulatedCamera`."""
+
+    @property
+    def next_us(self) -> int:
+        """Earliest simulated time of the next required call [µs]."""
+        ...
+
+    def restart(self, time_us: int) -> None:
+        """Start an episode and its moving obstacles; a frame is due at `time_us` [µs]."""
+        ...
+
+    def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
+        """Take the frame due at `time_us` [µs] in a motion, and publish completed frames."""
+        ...
+
+    def skip_unread(self, read_us: int) -> None:
+        """Skip due frames that newer ones replace before simulated `read_us` [µs], if possible."""
+
+
+class CameraMaker(Protocol):
+    """Factory of cameras; see `SimulatedCamera`."""
+
+    def __call__(
+        self,
+        camera: Camera,
+        arena: Arena,
+        start_us: int,
+        noise: SensorNoise | None,
+        seed: int,
+        renderer: Renderer,
+        further: Mapping[str, Camera] | None = None,
+    ) -> OnboardCamera:
+        """Return the camera of a vehicle profile, with the additional cameras it triggers."""
+        ...
+
+
+NICENESS = 10
+"""Niceness of the process: images may be late, but ticks must not be."""
+
+
+@dataclass(frozen=True)
+class _Restart:
+    """Request to start an episode."""
+
+    time_us: int
+
+
+@dataclass(frozen=True)
+class _Take:
+    """Request to take a frame."""
+
+    time_us: int
+    motion: Motion
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """Completed frame, and the time of the next one [µs]."""
+
+    frame: Frame
+    next_us: int
+
+
+class CameraProcess:
+    """Process that takes the frames of the cameras of successive episodes.
+
+    Starts with the first camera, and ends with the parent process in all cases.
+    """
+
+    def __init__(self) -> None:
+        """Create the object without a process."""
+        self._line: Connection | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._answers: SimpleQueue[_Taken | EOFError | None] = SimpleQueue()
+        self._reading: Thread | None = None
+
+    def camera(
+        self,
+        camera: Camera,
+        arena: Arena,
+        start_us: int,
+        noise: SensorNoise | None,
+        seed: int,
+        renderer: Renderer,
+        further: Mapping[str, Camera] | None = None,
+    ) -> SlowCamera:
+        """Return an episode's camera after a first image; see `SimulatedCamera`.
+
+        The camera of the previous episode takes no further frames.
+
+        Raises:
+            FirmwareLostError: The process has ended.
+        """
+        if self._process is None:
+            self._start()
+        self.send((camera, arena, start_us, noise, seed, renderer, further))
+        while self.receive() is not None:
+            pass  # Frame of the previous episode, still in progress.
+        return SlowCamera(self, start_us)
+
+    def _start(self) -> None:
+        self._line, theirs = Pipe()
+        with theirs:
+            # Not -m: sent objects would then have the classes of __main__.
+            called = f"from {__name__} import main; main({theirs.fileno()})"
+            self._process = subprocess.Popen(  # noqa: S603 (this package)
+                [sys.executable, "-c", called],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,  # The firmware's stdout may be a channel.
+                pass_fds=[theirs.fileno()],
+            )
+        self._reading = Thread(target=self._read, args=(self._line,), name="images", daemon=True)
+        self._reading.start()
+
+    def _read(self, line: Connection) -> None:
+        """Read answers until the process has ended.
+
+        An image exceeds the pipe's buffer, so a read blocks until the writer has finished.
+        """
+        with suppress(EOFError, OSError):
+            while True:
+                self._answers.put(line.recv())
+        self._answers.put(EOFError())
+
+    @property
+    def answers(self) -> bool:
+        """True if an answer has arrived, or the process has ended."""
+        return not self._answers.empty()
+
+    def send(self, what: object) -> None:
+        """Send a request. Raises FirmwareLostError."""
+        if self._line is None:
+            raise self._lost()
+        try:
+            self._line.send(what)
+        except OSError:
+            raise self._lost() from None
+
+    def receive(self) -> _Taken | None:
+        """Wait for the next answer; None = a camera is ready. Raises FirmwareLostError."""
+        if self._line is None:
+            raise self._lost()
+        answer = self._answers.get()
+        if isinstance(answer, EOFError):
+            # Keep the end in the queue: every later call must raise as well.
+            self._answers.put(answer)
+            raise self._lost()
+        return answer
+
+    def _lost(self) -> FirmwareLostError:
+        what = "the process that draws the camera's images "
+        if self._process is None:
+            return FirmwareLostError(what + "was ended")
+        code = self._process.wait()
+        how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
+        return FirmwareLostError(f"{what}has ended {how}")
+
+    def close(self) -> None:
+        """End the process. Repeated calls have no effect."""
+        if self._line is not None and self._process is not None and self._reading is not None:
+            self._process.kill()
+            self._process.wait()
+            # The reader ends with the process's end of the pipe.
+            self._reading.join()
+            self._line.close()
+        self._line = self._process = self._reading = None
+
+
+class SlowCamera:
+    """Camera in another process, one frame at a time; an `OnboardCamera`."""
+
+    def __init__(self, process: CameraProcess, start_us: int) -> None:
+        """Store the process, which has created the camera, and the time of the first frame [µs]."""
+        self._process = process
+        self._busy = False
+        """True while a frame is in progress."""
+        self._taken_us: int | None = None
+        """Exposure time of the frame in progress [µs]; None = no frame, or its episode is over."""
+        self._next_us = start_us
+
+    @property
+    def next_us(self) -> int:
+        """Earliest simulated time of the next required call [µs]."""
+        return self._next_us if self._taken_us is None else self._taken_us
+
+    def restart(self, time_us: int) -> None:
+        """Start an episode at `time_us` [µs]. A frame in progress is dropped."""
+        self._taken_us, self._next_us = None, time_us
+        self._process.send(_Restart(time_us))
+
+    def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
+        """Publish a completed frame, and request the next frame if due.
+
+        Raises:
+            FirmwareLostError: The process has ended.
+        """
+        if self._busy and self._process.answers:
+            taken, self._busy = self._process.receive(), False
+            # A frame of an earlier episode has another time and is dropped.
+            if taken is not None and taken.frame.capture_time_us == self._taken_us:
+                self._taken_us, self._next_us = None, taken.next_us
+                publish(taken.frame)
+        # At most one frame is in progress, so a slow renderer cannot build up a queue.
+        if not self._busy and time_us >= self._next_us:
+            self._process.send(_Take(time_us, motion))
+            self._busy, self._taken_us = True, time_us
+
+    def skip_unread(self, read_us: int) -> None:
+        """Skip nothing: the time to render decides which frames exist."""
+
+
+def main(number: int) -> None:
+    """Process requests until the connection closes.
+
+    Args:
+        number: File descriptor of the connection.
+    """
+    give_way(NICENESS)
+    line = Connection(number)
+    with suppress(EOFError, OSError):
+        while True:
+            match line.recv():
+                case tuple(episode):
+                    taking = SimulatedCamera(*episode)
+                    line.send(None)
+                case _Restart(time_us):
+                    taking.restart(time_us)
+                case _Take(time_us, motion):
+                    frame = taking.take(time_us, motion)
+                    line.send(_Taken(frame, taking.next_us))
+    # Immediate exit: shutting down a renderer's threads would only take time.
+    os._exit(0)
