@@ -16,8 +16,7 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import SETPOINTS, commanded
 from airl_mav.rehearsal.run_folder import MOTOR_OUTPUTS, MOTOR_TIMES, FlownEpisode
-from airl_mav.vehicle_log.clock_alignment import ClockAlignment, align
-from airl_mav.vehicle_log.ulog_reader import VehicleLog
+from airl_mav.vehicle_log import ClockAlignment, VehicleLog, align
 
 
 def logged_episode_of(box: BlackBox, log: VehicleLog) -> FlownEpisode:
