@@ -20,6 +20,7 @@ from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from firmware_sim.addons.auxiliary_estimation.range_finder import RangeFinder
 from firmware_sim.addons.auxiliary_estimation.sensors import distance_sensor
+from firmware_sim.addons.flight_log import topics
 from firmware_sim.autopilot.autopilot_state import Clearance, Result
 from firmware_sim.autopilot.error_state import V
 from firmware_sim.autopilot.flight_modes import Mode
