@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from airl_mav.profiles.parameters import SPEC_BY_NAME
 from firmware_sim.autopilot import prearm
+from firmware_sim.autopilot.events.definition import words
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     Clear,
     FailsafeAction,
@@ -122,15 +123,8 @@ def needs() -> str:
 
 def checks() -> str:
     """Return the pre-arm checks in reporting order."""
-    rows = (
-        (
-            check.text,
-            (check.part.name or "").lower().replace("_", " "),
-            _told(check),
-        )
-        for check in prearm.CHECKS
-    )
-    return _table(("text", "part", "told"), rows)
+    rows = ((check.text, words(check.component), _told(check)) for check in prearm.CHECKS)
+    return _table(("text", "component", "told"), rows)
 
 
 def _told(check: prearm.PrearmCheck) -> str:
