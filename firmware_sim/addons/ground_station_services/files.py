@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -110,12 +111,14 @@ class RefusedError(Exception):
 class FtpRequest:
     """Unpacked FTP request."""
 
+    sequence: int
     session: int
     opcode: int
     offset: int
     size: int
     """Size of the data; in a read, the requested size."""
     data: bytes
+    sender: tuple[int, int]
 
     @property
     def name(self) -> str:
@@ -201,15 +204,9 @@ def _open_to_read(request: FtpRequest, session: Session, storage: Storage) -> by
     return _SIZE.pack(session.size)
 
 
-def _create(request: FtpRequest, session: Session, storage: Storage) -> bytes:
-    return _open_to_write(request, session, storage, os.O_TRUNC)
-
-
-def _open_existing(request: FtpRequest, session: Session, storage: Storage) -> bytes:
-    return _open_to_write(request, session, storage, 0)
-
-
-def _open_to_write(request: FtpRequest, session: Session, storage: Storage, flags: int) -> bytes:
+def _open_to_write(
+    request: FtpRequest, session: Session, storage: Storage, flags: int = 0
+) -> bytes:
     path = _writable(request.name, storage)
     _check_free(session)
     storage.check_room(0)
@@ -291,10 +288,6 @@ def _rename(request: FtpRequest, _session: Session, storage: Storage) -> bytes:
     return b""
 
 
-def _nothing(_request: FtpRequest, _session: Session, _storage: Storage) -> bytes:
-    return b""
-
-
 def _check_free(session: Session) -> None:
     if session.file is not None:
         raise RefusedError(Code.NO_SESSIONS)
@@ -311,18 +304,18 @@ def _writable(name: str, storage: Storage) -> Path:
 
 
 OPERATIONS: dict[int, Operation] = {
-    0: _nothing,
+    0: lambda _request, _session, _storage: b"",
     1: _terminate,
     2: _reset,
     3: _list,
     4: _open_to_read,
     5: _read,
-    6: _create,
+    6: partial(_open_to_write, flags=os.O_TRUNC),
     7: _write,
     8: _on_path(Path.unlink),
     9: _on_path(Path.mkdir, more=True),
     10: _on_path(Path.rmdir),
-    11: _open_existing,
+    11: _open_to_write,
     12: _truncate,
     13: _rename,
 }
