@@ -23,7 +23,7 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.mavlink.codec import Decoder, WireMessage, is_signed
 from firmware_sim.mavlink.endpoint import Peer, Sender, SharedEndpoint
 from firmware_sim.mavlink.link import Link, LinkCounters
-from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services import Context
 from firmware_sim.mavlink.texts_and_events import EventSender, TextEncoder
 
 FRAMES_PER_S = 2_000

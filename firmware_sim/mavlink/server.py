@@ -27,8 +27,7 @@ from firmware_sim.mavlink.endpoint import (
 )
 from firmware_sim.mavlink.link import Link, LinkCounters, Payloads
 from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, gcs_link, onboard_link
-from firmware_sim.mavlink.services import connection, handle, send_pending, table
-from firmware_sim.mavlink.services.context import Context, sender
+from firmware_sim.mavlink.services import Context, connection, handle, send_pending, sender, table
 from firmware_sim.mavlink.streams import (
     BUILDERS,
     VEHICLE_BUILDERS,

@@ -14,7 +14,7 @@ from pathlib import Path
 from airl_mav.core.files import LogFile
 from firmware_sim.mavlink.clients import Client
 from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
-from firmware_sim.mavlink.services.context import ANY, sender
+from firmware_sim.mavlink.services import ANY, sender
 
 _TIME = struct.Struct(">Q")
 _LINK_BITS = 0b11

@@ -19,7 +19,7 @@ from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.inputs import LandingTarget, ObstacleBins
 from firmware_sim.interfaces import DistanceReading, FlowReading, Odometry, PoseFrame, VelocityFrame
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import Context, Handlers, for_anyone
+from firmware_sim.mavlink.services import Context, Handlers, for_anyone
 from firmware_sim.mavlink.streams.units import DIAGONAL
 
 _FUSED = (

@@ -20,7 +20,7 @@ from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Definition
 from firmware_sim.interfaces import SensorSample
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.context import Action, Context, ServiceState, VehicleCommand
+from firmware_sim.mavlink.services import Action, Context, ServiceState, VehicleCommand
 
 MOVING_RAD_S = 0.2
 """Minimum body rate that counts as motion [rad/s]."""

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
-from firmware_sim.mavlink.services.context import ServiceState
+from firmware_sim.mavlink.services import ServiceState
 
 GREATEST_BYTES = 64 * 1024 * 1024
 """Maximum total size of clients' files [bytes], so that no client can fill the disk."""

@@ -25,7 +25,7 @@ from firmware_sim.addons.ground_station_services.files import (
     read_at,
 )
 from firmware_sim.mavlink.codec import WireMessage, crc32part
-from firmware_sim.mavlink.services.context import (
+from firmware_sim.mavlink.services import (
     Context,
     Handlers,
     ServiceState,

@@ -23,7 +23,7 @@ from firmware_sim.autopilot.flight_modes import (
 )
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.link import OFF
-from firmware_sim.mavlink.services.context import (
+from firmware_sim.mavlink.services import (
     Action,
     Context,
     Handlers,

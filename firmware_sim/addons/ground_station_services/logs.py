@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import (
+from firmware_sim.mavlink.services import (
     Action,
     Context,
     Handlers,

@@ -15,7 +15,7 @@ from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import Context, Handlers, ServiceState, for_anyone
+from firmware_sim.mavlink.services import Context, Handlers, ServiceState, for_anyone
 
 PROMPT = "pxh> "
 

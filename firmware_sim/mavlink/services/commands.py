@@ -20,8 +20,7 @@ from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, M
 from firmware_sim.autopilot.flight_modes import MAIN_AUTO, MAIN_POSCTL, Mode
 from firmware_sim.autopilot.inputs import OrbitRequest, PositionYaw, Reposition
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services import table
-from firmware_sim.mavlink.services.context import (
+from firmware_sim.mavlink.services import (
     ANY,
     Action,
     Context,
@@ -30,6 +29,7 @@ from firmware_sim.mavlink.services.context import (
     for_anyone,
     for_vehicle,
     sender,
+    table,
 )
 from firmware_sim.mavlink.streams.units import INT32_MAX
 

@@ -13,8 +13,7 @@ from airl_mav.core.clock import NS_PER_US
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect, message_name
 from firmware_sim.mavlink.link import OFF
-from firmware_sim.mavlink.services import table
-from firmware_sim.mavlink.services.context import (
+from firmware_sim.mavlink.services import (
     ANY,
     Action,
     Context,
@@ -24,6 +23,7 @@ from firmware_sim.mavlink.services.context import (
     for_vehicle,
     for_vehicle_or_all,
     sender,
+    table,
 )
 from firmware_sim.mavlink.streams import Builder
 from firmware_sim.mavlink.streams.units import INT32_MAX

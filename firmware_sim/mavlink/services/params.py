@@ -9,7 +9,7 @@ import struct
 from firmware_sim.autopilot.autopilot_state import Arming, Result
 from firmware_sim.autopilot.port import ParameterStore, ParameterValue
 from firmware_sim.mavlink.codec import WireMessage, crc32part, dialect, param_value, payload
-from firmware_sim.mavlink.services.context import (
+from firmware_sim.mavlink.services import (
     Action,
     Context,
     Handlers,

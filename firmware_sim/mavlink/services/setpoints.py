@@ -23,7 +23,7 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Setpoint, Sever
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.inputs import FollowedTarget, Source, Sticks
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import Context, Handlers, for_anyone, for_vehicle_or_all
+from firmware_sim.mavlink.services import Context, Handlers, for_anyone, for_vehicle_or_all
 
 _CRITICAL = Severity.CRITICAL
 _POSITION_SHIFT, _VELOCITY_SHIFT, _ACCELERATION_SHIFT = 0, 3, 6
