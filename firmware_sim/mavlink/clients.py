@@ -143,25 +143,26 @@ class Complaints:
     """Operator warnings about rejected and dropped data, at a limited rate."""
 
     def __init__(self) -> None:
-        self._told: dict[tuple[str, str], tuple[int, int]] = {}
-        """Last warning by link and type: time [µs], counter value."""
+        self._last: dict[tuple[str, str], tuple[int, int]] = {}
+        """Last warning by link and problem: time [µs], counter value."""
 
     def restart(self) -> None:
         """Restart the intervals, because simulated time may restart. Keeps reported counts."""
-        self._told = {key: (-EVERY_US, count) for key, (_, count) in self._told.items()}
+        self._last = {key: (-EVERY_US, count) for key, (_, count) in self._last.items()}
 
     def due(self, name: str, refused: int, dropped: int, now_us: int) -> list[OperatorText]:
         """Return the warnings due on a link at `now_us` [µs] about rejected and dropped data."""
         texts: list[OperatorText] = []
-        for kind, count, problem in (
-            ("refused", refused, "frames refused: bad signature"),
-            ("dropped", dropped, "datagrams dropped: flood or full"),
-        ):
+        counts = {
+            "frames refused: bad signature": refused,
+            "datagrams dropped: flood or full": dropped,
+        }
+        for problem, count in counts.items():
             # The first warning is due at once.
-            told_us, told = self._told.get((name, kind), (-EVERY_US, 0))
-            if count > told and now_us - told_us >= EVERY_US:
-                self._told[name, kind] = now_us, count
-                texts.append(OperatorText(Severity.WARNING, f"{name}: {count - told} {problem}"))
+            last_us, last = self._last.get((name, problem), (-EVERY_US, 0))
+            if count > last and now_us - last_us >= EVERY_US:
+                self._last[name, problem] = now_us, count
+                texts.append(OperatorText(Severity.WARNING, f"{name}: {count - last} {problem}"))
         return texts
 
 

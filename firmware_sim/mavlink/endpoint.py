@@ -174,9 +174,9 @@ class UdpEndpoint:
         self,
         local: Address,
         remote: Address | None,
-        *,
         local_option: str,
         remote_option: str,
+        *,
         insecure: bool = False,
     ) -> None:
         """Bind the socket.

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from operator import add
 from types import MappingProxyType
 
 import numpy as np
@@ -59,15 +60,7 @@ class LinkCounters:
 
     def __add__(self, other: LinkCounters) -> LinkCounters:
         """Return the sum of two counters."""
-        return LinkCounters(
-            self.rx + other.rx,
-            self.tx + other.tx,
-            self.malformed + other.malformed,
-            self.ignored + other.ignored,
-            self.send_errors + other.send_errors,
-            self.dropped + other.dropped,
-            self.refused + other.refused,
-        )
+        return LinkCounters(*map(add, astuple(self), astuple(other)))
 
 
 class Link:
@@ -91,8 +84,8 @@ class Link:
     ) -> None:
         """Open a link that streams `builders` and replies with `replies`; None = the same builders.
 
-        `endpoint` sends to one client; None = the config's. `system_id` is the vehicle's. `signing`
-        signs sent frames, with `link_id`, and checks received frames; None = neither.
+        `endpoint` sends to one client; None = the config's. `signing` signs sent frames, with
+        `link_id`, and checks received frames; None = neither.
         """
         self.name = config.name
         self.builders = builders
@@ -109,11 +102,7 @@ class Link:
         """Callback for the frames of both directions; None = disabled."""
         self.ignored = 0
         self.endpoint: Sender = config.endpoint if endpoint is None else endpoint
-        self._streams = {
-            name: (layout(name), builder)
-            for name, builder in builders.items()
-            if builder is not None
-        }
+        self._streams = {name: (layout(name), build) for name, build in builders.items() if build}
         self._replies = builders if replies is None else replies
         self._stream_encoder = Encoder(system_id)
         self._reply_encoder = (
@@ -231,8 +220,7 @@ class Link:
                 payload = payloads[builder]
             else:
                 values = builder(state)
-                payload = None if values is None else _payload(shape, values)
-                payloads[builder] = payload
+                payload = payloads[builder] = None if values is None else _payload(shape, values)
             if payload is None:
                 # A stream without content does not wake the link.
                 quiet.add(name)

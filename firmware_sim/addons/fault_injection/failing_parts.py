@@ -1,4 +1,4 @@
-"""Sensor, motor, battery and wind faults, inserted only in episodes with faults.
+"""Sensor, motor, battery, wind and camera faults, inserted only in episodes with faults.
 
 A sensor that is off has None in the sample. Accelerometer and gyro are never None: flight
 controllers count time by their samples. If one is off, it repeats its last sample like a stuck
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -144,18 +145,18 @@ def _off(value: Any, time_us: int) -> None:
     """Return no sample."""
 
 
+@dataclass
 class Stuck:
     """Stuck sensor: repeats the first sample of the fault at the sensor's rate."""
 
-    def __init__(self) -> None:
-        self._held: Any = None
+    sample: Any = None
 
     def __call__(self, value: Any, time_us: int) -> Any:
         """Return the held sample, or None without a sample in this tick."""
         del time_us
-        if self._held is None:
-            self._held = value
-        return None if value is None else self._held
+        if self.sample is None:
+            self.sample = value
+        return None if value is None else self.sample
 
 
 class Late:
@@ -180,43 +181,36 @@ class Late:
         return self._newest if self._always else arrived
 
 
+@dataclass
 class Biased:
-    """Constant error."""
+    """Error that is constant, or grows at a constant velocity."""
 
-    def __init__(self, offset: Vector) -> None:
-        self._offset = offset
+    offset: Vector
+    velocity: Vector | None = None
+    since_us: int = 0
 
     def __call__(self, value: Any, time_us: int) -> Any:
         """Return the value with the error."""
-        del time_us
-        return None if value is None else shifted(value, self._offset)
-
-
-class Drifting:
-    """Position error that grows at a constant velocity."""
-
-    def __init__(self, velocity: Vector, since_us: int) -> None:
-        self._velocity, self._since_us = velocity, since_us
-
-    def __call__(self, value: Any, time_us: int) -> Any:
-        """Return the fix with the error."""
         if value is None:
             return None
-        return shifted(value, self._velocity * ((time_us - self._since_us) / US_PER_S))
+        if self.velocity is None:
+            return shifted(value, self.offset)
+        return shifted(value, self.velocity * ((time_us - self.since_us) / US_PER_S))
 
 
+@dataclass
 class Noisy:
     """White noise in addition to the sensor's noise."""
 
-    def __init__(self, sd: Vector, rng: np.random.Generator) -> None:
-        self._sd, self._rng = sd, rng
+    sd: Vector
+    rng: np.random.Generator
 
     def __call__(self, value: Any, time_us: int) -> Any:
         """Return the value with additional noise."""
         del time_us
         if value is None:
             return None
-        error = self._sd * self._rng.standard_normal(len(self._sd))
+        error = self.sd * self.rng.standard_normal(len(self.sd))
         moved = shifted(value, error[:3])
         if isinstance(moved, GpsFix):
             return moved._replace(velocity_ned=moved.velocity_ned + error[3:])
@@ -284,7 +278,8 @@ def effect_of(acting: Acting, profile: Sensors, tick_s: float, rng: np.random.Ge
     if kind == "bias":
         return Biased(np.array(fault.value))
     if kind == "drift":
-        return Drifting(np.array(fault.value), acting.since_us)
+        velocity = np.array(fault.value)
+        return Biased(np.zeros(3), velocity, acting.since_us)
     # `amount` is the ratio of total noise to the sensor's noise; their variances add.
     more = math.sqrt(max(0.0, fault.amount**2 - 1.0))
     return Noisy(more * noise_sd(part, profile, tick_s), rng)
