@@ -389,9 +389,9 @@ class Clients:
         messages = self._doorkeeper.feed(chunk)
         self._strangers.take(max(1, len(messages)), now_us)
         if self._signing is not None and self._signing.key is not None:
-            heard = len(messages)
+            count = len(messages)
             messages = [m for m in messages if self._signing.accepts(bytes(m.get_msgbuf()))]
-            self._gone += LinkCounters(0, 0, 0, 0, 0, refused=heard - len(messages))
+            self._gone += LinkCounters(0, 0, 0, 0, 0, refused=count - len(messages))
             if not any(is_signed(m) for m in messages):
                 # An accepted unsigned frame creates no client. Otherwise one heartbeat with a
                 # spoofed source address would direct minutes of telemetry to that address.

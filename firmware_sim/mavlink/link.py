@@ -142,9 +142,9 @@ class Link:
         messages = self._decoder.feed(chunk)
         # Frames are checked after decoding: signatures do not change the payload.
         if self._signing is not None and self._signing.key is not None:
-            heard = len(messages)
+            count = len(messages)
             messages = [m for m in messages if self._signing.accepts(bytes(m.get_msgbuf()))]
-            self._refused += heard - len(messages)
+            self._refused += count - len(messages)
         self.note(messages)
         return messages
 

@@ -422,7 +422,7 @@ class MavlinkServer:
         context.now_us = self._now_us
         self._is_transferring = True  # cleared by `send` when idle
         client.hear(source)
-        self._traffic.heard(client, message)
+        self._traffic.record_first(client, message)
         kind = message.get_type()
         effective = handle(message, kind, context)
         if effective:
@@ -476,11 +476,11 @@ def _tell(clients: Iterable[Client], text: OperatorText) -> None:
             client.link.send(chunk)
 
 
-def _share(asked: Sequence[int]) -> int:
+def _share(requests: Sequence[int]) -> int:
     """Return the maximum number of streamed messages per client and tick, given their requests."""
-    if sum(asked) <= STREAMS_PER_TICK // 2:
+    if sum(requests) <= STREAMS_PER_TICK // 2:
         return STREAMS_PER_TICK // 2
-    return max(1, STREAMS_PER_TICK // 2 // sum(1 for number in asked if number))
+    return max(1, STREAMS_PER_TICK // 2 // sum(1 for number in requests if number))
 
 
 def _system_id(port: AutopilotPort) -> int:

@@ -73,7 +73,7 @@ class TrafficLog:
             self._names[client.link.name] += 1
             self._tap(client, tlog)
 
-    def heard(self, client: Client, message: WireMessage) -> None:
+    def record_first(self, client: Client, message: WireMessage) -> None:
         """Start a client's log at its first frame."""
         main = self._main
         # The limit bounds the open files during a flood of clients.
@@ -187,7 +187,7 @@ class Forwarder:
     def __init__(self, everybody: Callable[[], Iterable[Client]]) -> None:
         """Store the callable that returns all clients of all links."""
         self._everybody = everybody
-        self._seen: OrderedDict[tuple[int, int], deque[bytes]] = OrderedDict()
+        self._recent: OrderedDict[tuple[int, int], deque[bytes]] = OrderedDict()
 
     def forward(self, message: WireMessage, origin: Client, system_id: int, now_us: int) -> bool:
         """Forward a message to the clients concerned; return True if any received it.
@@ -222,16 +222,16 @@ class Forwarder:
         return True
 
     def _is_new(self, source: tuple[int, int], frame: bytes) -> bool:
-        frames = self._seen.get(source)
+        frames = self._recent.get(source)
         if frames is None:
             # The sender that was silent longest is removed (`move_to_end` below keeps this order).
-            if len(self._seen) >= REMEMBERED_SENDERS:
-                self._seen.popitem(last=False)
-            frames = self._seen[source] = deque(maxlen=REMEMBERED_FRAMES)
+            if len(self._recent) >= REMEMBERED_SENDERS:
+                self._recent.popitem(last=False)
+            frames = self._recent[source] = deque(maxlen=REMEMBERED_FRAMES)
         if frame in frames:
             return False
         frames.append(frame)
-        self._seen.move_to_end(source)
+        self._recent.move_to_end(source)
         return True
 
 
@@ -242,5 +242,5 @@ def _concerns(target: tuple[int, int], client: Client) -> bool:
     if system == ANY:
         return bool(client.components)
     if component == ANY:
-        return any(heard[0] == system for heard in client.components)
+        return any(source[0] == system for source in client.components)
     return target in client.components

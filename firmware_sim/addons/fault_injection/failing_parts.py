@@ -102,8 +102,8 @@ def slowed(
     """
     motors = list(controls.motors)
     for index, factor in slow.items():
-        now, asked = speeds[index], steady_speed(motors[index], thrust_curve)
-        reached = now + (asked - now) * (1.0 - lag ** (1.0 / factor)) / (1.0 - lag)
+        now, target = speeds[index], steady_speed(motors[index], thrust_curve)
+        reached = now + (target - now) * (1.0 - lag ** (1.0 / factor)) / (1.0 - lag)
         motors[index] = command_for(reached * reached, thrust_curve)
     first, second, third, fourth = motors
     return controls._replace(motors=(first, second, third, fourth))
@@ -235,13 +235,13 @@ def shifted(value: Any, offset: Vector) -> Any:
     return value + offset
 
 
-def farther(told: DistanceReading, error_m: float) -> DistanceReading:
+def farther(reading: DistanceReading, error_m: float) -> DistanceReading:
     """Return a range with an error, with quality 0 if it is outside the sensor's limits."""
-    if told.quality == 0:
-        return told
-    distance_m = max(0.0, told.distance_m + error_m)
-    within = told.least_m <= distance_m <= told.greatest_m
-    return told._replace(distance_m=distance_m, quality=told.quality if within else 0)
+    if reading.quality == 0:
+        return reading
+    distance_m = max(0.0, reading.distance_m + error_m)
+    within = reading.least_m <= distance_m <= reading.greatest_m
+    return reading._replace(distance_m=distance_m, quality=reading.quality if within else 0)
 
 
 def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
@@ -250,7 +250,9 @@ def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
     gps = profile.gps
     horizontal, speed = gps.horizontal_noise_m, gps.velocity_noise_m_s
     vision = profile.vision
-    seen = (0.0, 0.0) if vision is None else (vision.position_noise_m, vision.velocity_noise_m_s)
+    vision_sd = (0.0, 0.0)
+    if vision is not None:
+        vision_sd = vision.position_noise_m, vision.velocity_noise_m_s
     ranges, flow = profile.rangefinder, profile.optical_flow
     known: dict[str, list[float]] = {
         "accel": [profile.imu.accel_noise_m_s2 * white] * 3,
@@ -258,7 +260,7 @@ def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
         "mag": [profile.magnetometer.noise_gauss] * 3,
         "baro": [profile.barometer.noise_pa / PA_PER_HPA],
         "gps": [horizontal, horizontal, gps.vertical_noise_m, speed, speed, speed],
-        "vision": [seen[0]] * 3 + [seen[1]] * 3,
+        "vision": [vision_sd[0]] * 3 + [vision_sd[1]] * 3,
         "rangefinder": [0.0 if ranges is None else ranges.noise_m],
         "flow": [0.0 if flow is None else flow.noise_rad_s] * 2,
     }
@@ -477,5 +479,5 @@ class FailingCamera:
 
 def _showing(frame: Frame, image: NDArray[Any], jpeg: bytes | None) -> Frame:
     """Return a copy of a frame with another image of the main camera."""
-    shown = image, frame.intrinsics, jpeg, frame.further
-    return Frame(frame.sequence, frame.capture_time_us, *shown)
+    picture = image, frame.intrinsics, jpeg, frame.further
+    return Frame(frame.sequence, frame.capture_time_us, *picture)

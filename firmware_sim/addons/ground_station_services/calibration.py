@@ -188,12 +188,12 @@ def _calibrate(command: VehicleCommand, context: Context) -> Result:
     """Handle PREFLIGHT_CALIBRATION: one parameter selects the sensor; all zero cancels."""
     running = context.vehicle_state(RunningCalibration)
     # NaN counts as 0: the parameter is not set.
-    asked = {number: command.integer(number) or 0 for number in range(1, 8)}
+    values = {number: command.integer(number) or 0 for number in range(1, 8)}
     if context.port.state().status.arming is Arming.ARMED:
         return Result.TEMPORARILY_REJECTED
     if running.is_running:
         # A second calibration request does not replace the running one.
-        if any(asked.values()):
+        if any(values.values()):
             return Result.TEMPORARILY_REJECTED
         # Cancelling replaces the running steps with the two final texts.
         cancelled = (_critical("[cal] calibration cancelled"), failed(running.sensor))
@@ -201,11 +201,11 @@ def _calibrate(command: VehicleCommand, context: Context) -> Result:
         return Result.ACCEPTED
     # The first match wins: PX4 evaluates the parameters in this order.
     for (number, value), (sensor, routine) in ROUTINES.items():
-        if asked[number] == value:
+        if values[number] == value:
             running.start(sensor, routine(context), context.now_us)
             running.radio = running.radio or routine is _rc_begins
             return Result.ACCEPTED
-    if asked[_ESC] == 1:
+    if values[_ESC] == 1:
         text = "[cal] calibration failed: Disconnect battery and try again"
         context.announce(OperatorText(Severity.CRITICAL, text))
         return Result.DENIED

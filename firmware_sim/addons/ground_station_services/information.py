@@ -246,12 +246,12 @@ GROUPS: dict[int, tuple[str, ...]] = {
 
 def _request_modes(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 2: number of the mode, starting at 1; 0 = all."""
-    asked = command.integer(2) or 0
+    number = command.integer(2) or 0
     modes = available_modes()
-    if not 0 <= asked <= len(modes):
+    if not 0 <= number <= len(modes):
         return Result.DENIED
     # Modes are numbered from 1.
-    for fields in modes if asked == 0 else modes[asked - 1 : asked]:
+    for fields in modes if number == 0 else modes[number - 1 : number]:
         context.link.send(dialect.MAVLink_available_modes_message(*fields))
     return Result.ACCEPTED
 
@@ -273,11 +273,11 @@ def handle_data_stream(message: WireMessage, context: Context) -> bool:
         if not start:
             scheduler.set_interval(name, scheduler.default_us(name), context.now_us)
             continue
-        asked_us = US_PER_S // message.req_message_rate
+        requested_us = US_PER_S // message.req_message_rate
         present_us = scheduler.interval_us(name)
         # Only a shorter interval is set: a request must not slow another client's stream.
-        if present_us == OFF or max(asked_us, 1) < present_us:
-            scheduler.set_interval(name, max(asked_us, 1), context.now_us)
+        if present_us == OFF or max(requested_us, 1) < present_us:
+            scheduler.set_interval(name, max(requested_us, 1), context.now_us)
     return bool(names)
 
 

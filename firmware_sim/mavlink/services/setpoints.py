@@ -272,7 +272,7 @@ def handle_channels(message: WireMessage, context: Context) -> bool:
 
     Pulling the pitch stick increases its pulse width. All four channels are required.
     """
-    context.radio.hear(message, context.now_us)
+    context.radio.receive(message, context.now_us)
     raw = (message.chan1_raw, message.chan2_raw, message.chan3_raw, message.chan4_raw)
     if any(width in _NO_CHANNEL for width in raw):
         return False
