@@ -212,9 +212,7 @@ def gust_share(elapsed_s: float, duration_s: float) -> float:
 
 PARTS: tuple[str, ...] = get_args(Part)
 
-
 PHASES: tuple[str, ...] = get_args(Phase)
-
 
 KIND_WORDS = {
     "lost": "off",
@@ -228,15 +226,11 @@ KIND_WORDS = {
 }
 """Synonyms of kinds, used only if the part has no kind with this name."""
 
-
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-
 
 _AMOUNT = re.compile(rf"({_NUMBER}(?:,{_NUMBER})*)(.*)")
 
-
 _TIME = re.compile(rf"({_NUMBER})(ms|s)")
-
 
 _MS_PER_S = 1000.0
 

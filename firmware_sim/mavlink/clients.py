@@ -191,8 +191,7 @@ class Client:
     link: Link
     texts: TextEncoder
     reply_texts: TextEncoder
-    events: EventSender | None = None
-    """Event sender; None without an autopilot."""
+    events: EventSender
     context: Context | None = None
     """Context of the handlers; None without an autopilot."""
     announced_origin: Geodetic | None = None
@@ -209,19 +208,18 @@ class Client:
     def wakes(self, now_us: int, texts: Sequence[OperatorText]) -> bool:
         """Return True if anything may be due for this client at simulated time [µs]."""
         # Ordered by cost and likelihood: the due time alone decides in most ticks.
-        events = self.events
         return bool(
             self.link.scheduler.wake_us <= now_us
             or texts
             or self.late
             or self.link.pending
             or self.announced_origin is None
-            or (events is not None and events.next_us <= now_us)
+            or self.events.next_us <= now_us
         )
 
     def next_us(self, now_us: int) -> float:
         """Return the next due time of all but the fast streams [µs]; `now_us` = immediately."""
-        events, context, plan = self.events, self.context, self.link.scheduler
+        context, plan = self.context, self.link.scheduler
         # Pending frames and running transfers need the very next tick.
         if self.late or self.link.pending or (context is not None and context.is_busy):
             return now_us
@@ -229,7 +227,7 @@ class Client:
         if self.announced_origin is None:
             # The origin is announced only on the time grid of the slow streams.
             slow_us = min(slow_us, plan.grid_us(now_us))
-        return slow_us if events is None else min(slow_us, events.next_us)
+        return min(slow_us, self.events.next_us)
 
     def due(self, now_us: int) -> list[str]:
         """Return the streams due at simulated time [µs], deferred ones first."""

@@ -78,10 +78,6 @@ class EventSender:
         self._announced_us = 0
         self._first = len(buffer) == 0
 
-    def has_news(self, now_us: int) -> bool:
-        """Return True if anything is due at simulated `now_us` [µs]. Usually False."""
-        return now_us >= self.next_us
-
     @property
     def next_us(self) -> int:
         """Time of the next message [µs]; 0 = now."""
@@ -126,14 +122,11 @@ def message(sent: SentEvent) -> WireMessage:
 
 CHUNK_BYTES = 50
 
-
 _LAST_ID = 65_535
-
 
 SAID_BY_EVENT = b"\t"
 """Suffix of a text that is also sent as an event, as in PX4. Ground stations with event support
 skip such texts."""
-
 
 REPLY_IDS = 32_768
 """First id of replies if they are numbered separately from the autopilot's texts. The ids of two

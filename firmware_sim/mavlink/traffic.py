@@ -133,7 +133,6 @@ COMMANDS = frozenset(
 )
 """Messages that change the vehicle's behaviour."""
 
-
 ANNOUNCED = (dialect.MAV_TYPE_GCS, dialect.MAV_TYPE_ONBOARD_CONTROLLER)
 """MAV_TYPE values in the heartbeat of a ground station and of a companion computer."""
 
@@ -173,9 +172,7 @@ REMEMBERED_FRAMES = 128
 """Number of recent frames per sender that are not forwarded again. Below 256, the number of
 sequence numbers: a sender of heartbeats alone repeats its frames after that."""
 
-
 REMEMBERED_SENDERS = 256
-
 
 NEVER = frozenset((dialect.MAVLINK_MSG_ID_SETUP_SIGNING,))
 """Messages that are never forwarded. A signing key is for its recipient only."""

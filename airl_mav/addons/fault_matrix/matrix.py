@@ -42,12 +42,9 @@ landing speed; crashed: faster, or upside down; flying: still in the air at the 
 further from home, or higher, than the bound; broken: NaN or infinity, or an exception.
 """
 
-
 MATRIX_PHASES: tuple[Phase, ...] = (*("ground", "climb", "hold", "offboard", "mission", "landing"),)
 
-
 SAFE: frozenset[End] = frozenset({"landed"})
-
 
 FALLS: frozenset[End] = frozenset({"landed", "crashed"})
 """Results without control: the vehicle falls, within the bounds."""
@@ -105,10 +102,8 @@ CASES: tuple[Case, ...] = (
 """Faults that PX4 is expected to survive, and faults that no quadrotor survives. Covers the flight
 controller alone: camera and link faults belong to the companion."""
 
-
 STANDS: frozenset[End] = frozenset({"landed", "flying"})
 """Results without a landing detection: safe, but the motors may keep running."""
-
 
 FITTED_CASES: tuple[Case, ...] = (
     Case("rangefinder off"),
@@ -121,9 +116,7 @@ FITTED_CASES: tuple[Case, ...] = (
 )
 """Faults of optional sensors, flown only on request."""
 
-
 CASE_OF: Mapping[str, Case] = {case.fault: case for case in (*CASES, *FITTED_CASES)}
-
 
 AFTER_S = 0.5
 """Time from the start of the phase to the fault [s]."""

@@ -37,7 +37,6 @@ STREAMED_UP = frozenset(
 )
 """Streamed messages of a companion, which have no acknowledgement."""
 
-
 Frame = TypeVar("Frame")
 
 

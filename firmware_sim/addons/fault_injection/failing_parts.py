@@ -135,7 +135,6 @@ FIELDS = {
 
 INERTIAL = ("accel", "gyro")
 
-
 Effect = Callable[[Any, int], Any]
 """Effect of a fault on one sensor: maps value and time [µs] to the measured value; None = no sample
 in this tick. May be stateful."""

@@ -79,7 +79,6 @@ class Storage(ServiceState):
 
 CHUNK_BYTES = 1 << 16
 
-
 SESSION = 0
 """Number of a client's only session, as in PX4."""
 
@@ -150,13 +149,10 @@ class Session:
 DATA_BYTES = 239
 """Maximum data in one message [bytes]."""
 
-
 READ_ONLY = "etc"
 """Folder of the vehicle's files, read-only for clients."""
 
-
 _SIZE = struct.Struct("<I")
-
 
 Operation = Callable[[FtpRequest, Session, Storage], bytes]
 """Executes a request and returns the data of the reply.

@@ -185,10 +185,8 @@ def scaled_imu(state: AutopilotState) -> Values:
 _PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900, 1_000, 1_000
 """Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
 
-
 _OUTPUTS = 16
 """Number of outputs in PX4's simulation. Outputs without a motor stay at the disarmed pulse."""
-
 
 _OUTPUT_FIELDS = 32
 """Number of slots in ACTUATOR_OUTPUT_STATUS."""

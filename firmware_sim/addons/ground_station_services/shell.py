@@ -218,5 +218,4 @@ COMMANDS: Mapping[str, Shown] = {
     "ver": _version,
 }
 
-
 HANDLERS: Handlers = {"SERIAL_CONTROL": (for_anyone, handle_input)}

@@ -171,7 +171,6 @@ class VehicleCommand:
 Action = Callable[[VehicleCommand, Context], "Result | None"]
 """Executes a command and returns its result; None = no acknowledgement, as in PX4."""
 
-
 SERVICES = {
     "params": "firmware_sim.mavlink.services.params",
     "commands": "firmware_sim.mavlink.services.commands",

@@ -178,10 +178,8 @@ def clearance(state: AutopilotState, down: float) -> tuple[float, float]:
 
 CHANNELS = 18
 
-
 _ZERO_SAYS_NOTHING = 8
 """First channel for which 0 means unused. UINT16_MAX means unused for all channels."""
-
 
 _FULL_SIGNAL = 100
 

@@ -293,7 +293,6 @@ def autopilot_state_for_gimbal_device(state: AutopilotState) -> Values:
 
 _NO_AIRSPEEDS = (0, 0)
 
-
 _UNKNOWN_TIME = -1
 """Value of unknown times: PX4 estimates only the return time."""
 
