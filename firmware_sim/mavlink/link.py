@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass
-from operator import add
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -60,7 +59,15 @@ class LinkCounters:
 
     def __add__(self, other: LinkCounters) -> LinkCounters:
         """Return the sum of two counters."""
-        return LinkCounters(*map(add, astuple(self), astuple(other)))
+        return LinkCounters(
+            self.rx + other.rx,
+            self.tx + other.tx,
+            self.malformed + other.malformed,
+            self.ignored + other.ignored,
+            self.send_errors + other.send_errors,
+            self.dropped + other.dropped,
+            self.refused + other.refused,
+        )
 
 
 class Link:
