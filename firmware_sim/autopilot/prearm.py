@@ -363,11 +363,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
     ),
     _battery(BatteryWarning.LOW, "battery_low", "Low battery", _L.WARNING, "BAT_LOW_THR"),
     _battery(
-        BatteryWarning.CRITICAL,
-        "battery_critical",
-        "Critical battery",
-        _L.CRITICAL,
-        "BAT_CRIT_THR",
+        BatteryWarning.CRITICAL, "battery_critical", "Critical battery", _L.CRITICAL, "BAT_CRIT_THR"
     ),
     _battery(
         BatteryWarning.EMERGENCY,
@@ -446,10 +442,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         "GF_ACTION GF_MAX_HOR_DIST",
     ),
     _fence(
-        "altitude",
-        "max_alt",
-        "exceeding maximum altitude above Home",
-        "GF_ACTION GF_MAX_VER_DIST",
+        "altitude", "max_alt", "exceeding maximum altitude above Home", "GF_ACTION GF_MAX_VER_DIST"
     ),
     _fence("custom", "custom_gf", "approaching or outside geofence", "GF_ACTION"),
     _check(

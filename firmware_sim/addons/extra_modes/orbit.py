@@ -22,12 +22,7 @@ from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import ModeRequest, OrbitRequest
 from firmware_sim.autopilot.modes.automatic import Hold
-from firmware_sim.autopilot.modes.interface import (
-    NAN,
-    FlightContext,
-    FlightMode,
-    since,
-)
+from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, since
 from firmware_sim.autopilot.modes.sticks import IDLE_THROTTLE, RELEASED, superexpo
 from firmware_sim.autopilot.smooth_trajectory import PathSegment, triple
 

@@ -48,11 +48,7 @@ class MotorFailure:
         self._since_us: dict[int, int] = {}
 
     def take(
-        self,
-        time_us: int,
-        told: Sequence[float],
-        outputs: Sequence[float],
-        limits: Undercurrent,
+        self, time_us: int, told: Sequence[float], outputs: Sequence[float], limits: Undercurrent
     ) -> None:
         """Check all motors.
 

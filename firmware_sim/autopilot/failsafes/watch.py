@@ -34,15 +34,7 @@ from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     FenceBreach,
 )
 from firmware_sim.autopilot.sensor_monitor import CALM_US, SensorMonitor
-from firmware_sim.engine.record import (
-    ACCEL_ROW,
-    CHANGED,
-    GYRO_ROW,
-    MAG_ROW,
-    SEEN,
-    WATCHES,
-    Record,
-)
+from firmware_sim.engine.record import ACCEL_ROW, CHANGED, GYRO_ROW, MAG_ROW, SEEN, WATCHES, Record
 from firmware_sim.interfaces import BatterySample, SensorSample
 
 _GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR

@@ -20,12 +20,7 @@ from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import ModeRequest, PositionYaw, PrecisionRequest
 from firmware_sim.autopilot.modes.automatic import landing_speed
-from firmware_sim.autopilot.modes.interface import (
-    FlightContext,
-    FlightMode,
-    here,
-    optional_mode,
-)
+from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, optional_mode
 from firmware_sim.autopilot.smooth_trajectory import PathSegment, triple
 
 _REQUIRED = 2

@@ -19,13 +19,7 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import ModeRequest, Sticks
-from firmware_sim.autopilot.modes.interface import (
-    NAN,
-    FlightContext,
-    FlightMode,
-    descend,
-    since,
-)
+from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, descend, since
 from firmware_sim.autopilot.smooth_trajectory import Axis, triple
 
 _TURNS_RAD_S = 1e-3
