@@ -35,17 +35,6 @@ class ArmingSettings(NamedTuple):
     sys_has_mag: int = 1
     sys_has_num_dist: int = 0
 
-    @classmethod
-    def read(cls, value: Callable[[str], float]) -> ArmingSettings:
-        """Read the parameters with a look-up by PX4 name."""
-        defaults = cls._field_defaults.values()
-        return cls(
-            *(
-                type(default)(value(name.upper()))
-                for name, default in zip(cls._fields, defaults, strict=True)
-            )
-        )
-
 
 class Readiness(NamedTuple):
     """Input of the checks, without measured values, so that equal inputs can be cached."""
@@ -454,13 +443,6 @@ CHECKS: tuple[PrearmCheck, ...] = (
             and r.conditions.home_position_invalid
             and r.converged
         ),
-    ),
-    _check(
-        _SYSTEM,
-        "mission_failure",
-        "Mission cannot be completed",
-        lambda r: r.conditions.mission_failure,
-        prefix="",
     ),
     _check(
         _SYSTEM,

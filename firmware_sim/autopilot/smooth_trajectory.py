@@ -397,10 +397,6 @@ class Travel:
         self.speed_m_s = math.nan
         """Horizontal speed by MAV_CMD_DO_CHANGE_SPEED or similar; NaN = MPC_XY_CRUISE."""
 
-    def stop(self) -> None:
-        """Restart the trajectory at the vehicle with the next leg."""
-        self._time_us = None
-
     def launch(self, state: Vector, time_us: int, climb_m_s: float) -> None:
         """Start at a vehicle about to leave the ground with a climb rate [m/s]."""
         self._trajectory.restart(triple(state, P), (0.0, 0.0, -climb_m_s))

@@ -110,14 +110,14 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
         self._is_new = target is not None and target.time_us != self._known_us
         if target is not None:
             self._known_us = target.time_us
-        if self._state is _State.START:
-            self._start(position, now_us)
-        elif self._state is _State.APPROACH:
-            self._approach(position, now_us)
-        elif self._state is _State.DESCEND:
-            self._descend(position, now_us)
-        elif self._state is _State.SEARCH:
-            self._search(position, now_us)
+        step = {
+            _State.START: self._start,
+            _State.APPROACH: self._approach,
+            _State.DESCEND: self._descend,
+            _State.SEARCH: self._search,
+        }.get(self._state)
+        if step is not None:
+            step(position, now_us)
 
     def _start(self, position: Vec, now_us: int) -> None:
         if self._begin_approach(position, now_us):

@@ -14,7 +14,7 @@ from firmware_sim.addons.missions import wire_items
 from firmware_sim.addons.missions.items import MOST_ITEMS
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events.definition import Definition, Level, define
-from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem
+from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem, Stored
 from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
 from firmware_sim.mavlink.services.context import ANY, Context, sender
 
@@ -152,9 +152,9 @@ def handle_list(message: WireMessage, context: Context) -> bool:
     # `heard_us` starts the transfer's timeout.
     transfer.activity, transfer.kind = _SENDING, message.mission_type
     transfer.index, transfer.partner = 0, partner
-    transfer.count = len(_items(context, transfer.kind))
+    transfer.count = len(_stored(context, transfer.kind).items)
     transfer.sent_us = transfer.heard_us = context.now_us
-    identity = _identity(context, transfer.kind)
+    identity = _stored(context, transfer.kind).identity
     context.link.send(
         dialect.MAVLink_mission_count_message(*partner, transfer.count, transfer.kind, identity)
     )
@@ -181,7 +181,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     elif index != transfer.index - 1:
         return _break_off(context, REQUEST_UNEXPECTED)
     # The list may have changed during the download.
-    if index >= len(_items(context, transfer.kind)):
+    if index >= len(_stored(context, transfer.kind).items):
         return _break_off(context, REQUEST_BEYOND_END)
     _send_item(context, index)
     return True
@@ -406,12 +406,8 @@ def _settle(transfer: MissionTransfer) -> None:
         transfer.activity = _IDLE
 
 
-def _items(context: Context, kind: int) -> tuple[object, ...]:
-    return context.port.plans.stored(MissionType(kind)).items if kind in MOST_ITEMS else ()
-
-
-def _identity(context: Context, kind: int) -> int:
-    return context.port.plans.stored(MissionType(kind)).identity if kind in MOST_ITEMS else 0
+def _stored(context: Context, kind: int) -> Stored:
+    return context.port.plans.stored(MissionType(kind)) if kind in MOST_ITEMS else Stored()
 
 
 def _request(context: Context) -> None:

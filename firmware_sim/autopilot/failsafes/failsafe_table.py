@@ -1,7 +1,8 @@
 """Table of failsafes: condition, parameter, action. One row per failsafe, pure.
 
 Source: PX4 1.16, commander/failsafe/failsafe.cpp (checkStateAndMode and its callees). Not
-applicable to this vehicle and omitted: VTOL transitions, ESC arming failure.
+applicable to this vehicle and omitted: VTOL transitions, ESC arming failure, imbalanced propellers,
+wind limits, and failures of the mission or navigator.
 """
 
 from __future__ import annotations
@@ -115,12 +116,9 @@ class Trigger(Enum):
 
     MANUAL_CONTROL = auto()
     GCS = auto()
-    MISSION = auto()
     MISSION_WITHOUT_LINKS = auto()
-    WIND = auto()
     FLIGHT_TIME = auto()
     POSITION_ACCURACY = auto()
-    NAVIGATOR = auto()
     GEOFENCE = auto()
     REMAINING_TIME = auto()
     BATTERY_UNHEALTHY = auto()
@@ -128,7 +126,6 @@ class Trigger(Enum):
     BATTERY_CRITICAL = auto()
     BATTERY_EMERGENCY = auto()
     ATTITUDE = auto()
-    PROPELLER = auto()
     MOTOR = auto()
     MODE_FALLBACK = auto()
 
@@ -186,7 +183,7 @@ _LINK_LOSS = {0: _NONE, 1: _HOLD, 2: _RETURN, 3: _LAND, 5: _TERMINATE, 6: _DISAR
 
 _ESCAPABLE_HOLD = _LASTING_HOLD._replace(takeover=Takeover.MODE_SWITCH)
 _LIMITS = {0: _NONE, 1: _WARN, 2: _ESCAPABLE_HOLD, 3: _RETURN, 4: _TERMINATE, 5: _LAND}
-"""Responses of GF_ACTION and COM_WIND_MAX_ACT."""
+"""Responses of GF_ACTION."""
 
 _POSITION_LOW = {
     value: Options(action, takeover=Takeover.MODE_SWITCH)
@@ -308,29 +305,12 @@ TABLE: tuple[Row, ...] = (
         related=("COM_DL_LOSS_T",),
     ),
     Row(
-        Trigger.MISSION,
-        "Mission cannot be completed",
-        "the mission has become infeasible, in Mission",
-        lambda s: s.intended is Mode.MISSION and s.conditions.mission_failure,
-        {0: Options(FailsafeAction.RTL)},
-    ),
-    Row(
         Trigger.MISSION_WITHOUT_LINKS,
         "No link after the mission",
         "the mission is finished, the ground station lost and NAV_DLL_ACT 0, manual control unused",
         _links_lost_after_mission,
         {0: Options(FailsafeAction.RTL)},
         related=("NAV_DLL_ACT", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
-    ),
-    Row(
-        Trigger.WIND,
-        "Wind above its limit",
-        "the estimated wind exceeds its limit",
-        lambda s: s.conditions.wind_limit_exceeded,
-        _LIMITS,
-        "COM_WIND_MAX_ACT",
-        Options(FailsafeAction.WARN),
-        related=("COM_WIND_MAX",),
     ),
     Row(
         Trigger.FLIGHT_TIME,
@@ -351,20 +331,6 @@ TABLE: tuple[Row, ...] = (
         "COM_POS_LOW_ACT",
         Options(FailsafeAction.WARN, takeover=Takeover.MODE_SWITCH),
         related=("COM_POS_LOW_EPH",),
-    ),
-    Row(
-        Trigger.NAVIGATOR,
-        "Mode failed in Takeoff or Return",
-        "what the mode flies to cannot be reached",
-        lambda s: s.conditions.navigator_failure and s.intended in (Mode.TAKEOFF, Mode.RETURN),
-        {0: _LAND},
-    ),
-    Row(
-        Trigger.NAVIGATOR,
-        "Mode failed otherwise",
-        "what the mode flies to cannot be reached",
-        lambda s: s.conditions.navigator_failure and s.intended not in (Mode.TAKEOFF, Mode.RETURN),
-        {0: _LASTING_HOLD},
     ),
     Row(
         Trigger.GEOFENCE,
@@ -443,15 +409,6 @@ TABLE: tuple[Row, ...] = (
         lambda s: s.conditions.fd_critical_failure and not _taking_off(s) and not _terminates(s),
         {0: _WARN},
         related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "CBRK_FLIGHTTERM"),
-    ),
-    Row(
-        Trigger.PROPELLER,
-        "Imbalanced propeller",
-        "the vibration exceeds its limit",
-        lambda s: s.conditions.fd_imbalanced_prop,
-        {-1: _NONE, 0: _WARN, 1: _RETURN, 2: _LAND},
-        "COM_IMB_PROP_ACT",
-        related=("FD_IMB_PROP_THR",),
     ),
     Row(
         Trigger.MOTOR,

@@ -23,6 +23,7 @@ from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     Conditions,
     FailsafeSettings,
     lacking,
+    read_settings,
 )
 from firmware_sim.autopilot.failsafes.framework import (
     NO_INTERVENTION,
@@ -103,8 +104,10 @@ class Supervisor:
     def read_parameters(self) -> None:
         """Read the parameters again."""
         self.watch.read_parameters()
-        self._settings = FailsafeSettings.read(self._value)
-        self._arming = ArmingSettings.read(self._value)
+        self._settings = FailsafeSettings(
+            *read_settings(FailsafeSettings._field_defaults, self._value)
+        )
+        self._arming = ArmingSettings(*read_settings(ArmingSettings._field_defaults, self._value))
         # Changed limits may change every result.
         self.next_us, self._calm_flight = 0, None
 
