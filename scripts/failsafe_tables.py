@@ -100,7 +100,7 @@ def offboard_loss() -> str:
     default = int(SPEC_BY_NAME["COM_OBL_RC_ACT"].default)
     rows = (
         (f"**{value}**" if value == default else f"{value}", ACTION_NAMES[action])
-        for value, (action, _) in OFFBOARD_LOSS.items()
+        for value, action in OFFBOARD_LOSS.items()
     )
     return _table(("`COM_OBL_RC_ACT`", "action"), rows)
 

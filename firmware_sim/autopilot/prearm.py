@@ -361,12 +361,6 @@ CHECKS: tuple[PrearmCheck, ...] = (
         _L.CRITICAL,
         "BAT_EMERGEN_THR",
     ),
-    _health(
-        _C.BATTERY,
-        "battery_unhealthy",
-        "Battery unhealthy",
-        lambda r: _supply_checked(r) and r.conditions.battery_unhealthy,
-    ),
     _check(
         _C.BATTERY,
         "battery_rem_flight_time_low",

@@ -32,7 +32,6 @@ from firmware_sim.autopilot.failsafes.failsafe_table import (
 )
 from firmware_sim.autopilot.failsafes.framework import (
     NO_INTERVENTION,
-    FailsafeInput,
     FailsafeResult,
     FailsafeState,
     Intervention,
@@ -70,8 +69,15 @@ class Machine:
         """Let time pass, change what is wrong, and update; return the outcome."""
         self.time_us += elapsed_us
         self.conditions = self.conditions._replace(**changes)
-        vehicle = FailsafeInput(self.armed, self.mode, self.mission_finished)
-        self.last = update(self.state, self.time_us, vehicle, self.conditions, self.options, asked)
+        now = Situation(
+            self.time_us,
+            self.conditions,
+            self.options,
+            self.mode,
+            self.mission_finished,
+            armed=self.armed,
+        )
+        self.last = update(self.state, now, asked)
         self.state, self.mode = self.last.state, self.last.intended
         if self.last.text is not None:
             self.texts.append(self.last.text.text)
@@ -476,7 +482,6 @@ RULES: list[Callable[[Known], FailsafeAction]] = [
         if k.c.battery_low_remaining_time
         else FailsafeAction.NONE
     ),
-    lambda k: FailsafeAction.WARN if k.c.battery_unhealthy else FailsafeAction.NONE,
     _low_battery,
     lambda k: (
         (FailsafeAction.WARN if k.p.cbrk_flightterm == 121212 else FailsafeAction.TERMINATE)

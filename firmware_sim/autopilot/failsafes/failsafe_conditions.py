@@ -98,7 +98,6 @@ class Conditions(NamedTuple):
     gcs_connection_lost: bool = True
     battery_warning: BatteryWarning = BatteryWarning.NONE
     battery_low_remaining_time: bool = False
-    battery_unhealthy: bool = False
     geofence: FenceBreach = NO_BREACH
     flight_time_limit_exceeded: bool = False
     fd_critical_failure: bool = False

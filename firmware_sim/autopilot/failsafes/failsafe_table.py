@@ -2,7 +2,7 @@
 
 Source: PX4 1.16, commander/failsafe/failsafe.cpp (checkStateAndMode and its callees). Not
 applicable to this vehicle and omitted: VTOL transitions, ESC arming failure, imbalanced propellers,
-wind limits, and failures of the mission or navigator.
+wind limits, and failures of battery, mission and navigator.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ MODE_OF_ACTION = {
 """Mode of each action; other actions keep the intended mode. In ascending order: if a mode cannot
 run, the next action replaces it."""
 
-OFFBOARD_LOSS: dict[int, tuple[FailsafeAction, Mode | None]] = {
-    0: (FailsafeAction.FALLBACK_POSCTRL, Mode.POSITION),
-    1: (FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE),
-    2: (FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
-    3: (FailsafeAction.RTL, Mode.RETURN),
-    4: (FailsafeAction.LAND, Mode.LAND),
-    5: (FailsafeAction.HOLD, Mode.HOLD),
-    6: (FailsafeAction.TERMINATE, Mode.TERMINATION),
-    7: (FailsafeAction.DISARM, None),
+OFFBOARD_LOSS = {
+    0: FailsafeAction.FALLBACK_POSCTRL,
+    1: FailsafeAction.FALLBACK_ALTCTRL,
+    2: FailsafeAction.FALLBACK_STABILIZED,
+    3: FailsafeAction.RTL,
+    4: FailsafeAction.LAND,
+    5: FailsafeAction.HOLD,
+    6: FailsafeAction.TERMINATE,
+    7: FailsafeAction.DISARM,
 }
-"""COM_OBL_RC_ACT: action, and the mode whose requirements apply from there on."""
+"""Actions of COM_OBL_RC_ACT."""
 
 
 def mode_of(action: FailsafeAction, intended: Mode) -> Mode:
@@ -75,10 +75,11 @@ def mode_fallback(
     action, mode = FailsafeAction.NONE, intended
     # Replacements in sequence: offboard loss first, then modes that cannot run.
     if conditions.offboard_control_signal_lost and mode.spec.needs & Need.OFFBOARD_SIGNAL:
-        action, next_mode = OFFBOARD_LOSS.get(settings.com_obl_rc_act, OFFBOARD_LOSS[0])
-        if next_mode is None:
+        action = OFFBOARD_LOSS.get(settings.com_obl_rc_act, OFFBOARD_LOSS[0])
+        if action is FailsafeAction.DISARM:
             return action
-        mode = next_mode
+        # From here on, the requirements of the action's mode apply.
+        mode = MODE_OF_ACTION[action]
     if settings.com_posctl_navl == 0:
         if mode is Mode.POSITION and not can_run(mode, conditions):
             action, mode = FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE
@@ -96,7 +97,7 @@ NOTHING = Options(FailsafeAction.NONE)
 
 
 class Situation(NamedTuple):
-    """Input of a table row."""
+    """Current state of the vehicle: input of the failsafes."""
 
     time_us: int
     conditions: Conditions
@@ -109,6 +110,7 @@ class Situation(NamedTuple):
     manual_control_lost_at_arming: bool = False
     """Manual control was lost at arming and has not returned: it is optional."""
     battery_at_arming: BatteryWarning = BatteryWarning.NONE
+    armed: bool = False
 
 
 class Trigger(Enum):
@@ -121,7 +123,6 @@ class Trigger(Enum):
     POSITION_ACCURACY = auto()
     GEOFENCE = auto()
     REMAINING_TIME = auto()
-    BATTERY_UNHEALTHY = auto()
     BATTERY_LOW = auto()
     BATTERY_CRITICAL = auto()
     BATTERY_EMERGENCY = auto()
@@ -239,16 +240,10 @@ def _links_lost_after_mission(s: Situation) -> bool:
     )
 
 
-def _in_first(s: Situation, seconds: float) -> bool:
-    return s.armed_us is not None and s.time_us < s.armed_us + seconds * US_PER_S
-
-
-def _spooling(s: Situation) -> bool:
-    return _in_first(s, s.settings.com_spoolup_time)
-
-
 def _taking_off(s: Situation) -> bool:
-    return _in_first(s, s.settings.com_lkdown_tko + s.settings.com_spoolup_time)
+    """Return whether COM_SPOOLUP_TIME + COM_LKDOWN_TKO after arming are not over."""
+    limit_s = s.settings.com_lkdown_tko + s.settings.com_spoolup_time
+    return s.armed_us is not None and s.time_us < s.armed_us + limit_s * US_PER_S
 
 
 def _terminates(s: Situation) -> bool:
@@ -350,20 +345,6 @@ TABLE: tuple[Row, ...] = (
         _caused({0: _NONE, 1: _WARN, 3: _RETURN}, FailsafeCause.LOW_REMAINING_FLIGHT_TIME),
         "COM_FLTT_LOW_ACT",
         related=("BAT1_CAPACITY", "RTL_TIME_FACTOR", "RTL_TIME_MARGIN"),
-    ),
-    Row(
-        Trigger.BATTERY_UNHEALTHY,
-        "Battery unhealthy at arming",
-        "the battery reports nothing, within COM_SPOOLUP_TIME of arming",
-        lambda s: s.conditions.battery_unhealthy and _spooling(s),
-        {0: Options(FailsafeAction.DISARM)},
-    ),
-    Row(
-        Trigger.BATTERY_UNHEALTHY,
-        "Battery unhealthy",
-        "the battery reports nothing for 5 s",
-        lambda s: s.conditions.battery_unhealthy and not _spooling(s),
-        {0: _WARN},
     ),
     _battery_row(
         Trigger.BATTERY_LOW,

@@ -25,9 +25,9 @@ from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     lacking,
     read_settings,
 )
+from firmware_sim.autopilot.failsafes.failsafe_table import Situation
 from firmware_sim.autopilot.failsafes.framework import (
     NO_INTERVENTION,
-    FailsafeInput,
     FailsafeState,
     Intervention,
     update,
@@ -213,7 +213,7 @@ class Supervisor:
             position=not seen.local_position_invalid,
             altitude=not seen.local_altitude_invalid,
             accel_error=self._estimator.recovery.doubts_inertial(now_us),
-            battery=seen.battery_warning < BatteryWarning.CRITICAL and not seen.battery_unhealthy,
+            battery=seen.battery_warning < BatteryWarning.CRITICAL,
             armable=self._armable,
         )
 
@@ -265,13 +265,15 @@ class Supervisor:
         seen = (self.conditions, armed, flight.intended, finished, self._settings)
         # Time-dependent inputs: delays, and rows with a time limit after arming.
         waiting = state.delay_us > 0 or state.start_delay_us is not None
-        timed = self.conditions.fd_critical_failure or self.conditions.battery_unhealthy
+        timed = self.conditions.fd_critical_failure
         idle = not (waiting or timed or state.taken_over)
         if idle and seen == self._decided and intervention == NO_INTERVENTION:
             return None
         self._decided = seen
-        vehicle = FailsafeInput(armed, flight.intended, finished)
-        outcome = update(state, time_us, vehicle, self.conditions, self._settings, intervention)
+        now = Situation(
+            time_us, self.conditions, self._settings, flight.intended, finished, armed=armed
+        )
+        outcome = update(state, now, intervention)
         self._state = outcome.state
         action = outcome.state.action
         followed = replace(
