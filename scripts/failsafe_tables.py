@@ -127,7 +127,7 @@ def checks() -> str:
 
 
 def _told(check: prearm.PrearmCheck) -> str:
-    if check.said:
+    if check.announced:
         return "by itself"
     return "by an event alone" if check.blocks is prearm.never else "when arming is refused"
 

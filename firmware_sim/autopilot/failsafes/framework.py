@@ -276,12 +276,12 @@ def _start_delay(
     state: FailsafeState, settings: FailsafeSettings, elapsed_us: int, delayed: FailsafeAction
 ) -> int | None:
     """Return the duration of the next delay: an intermittent condition shortens it."""
-    left = _next_delay(state, settings)
+    remaining = _next_delay(state, settings)
     if delayed is not FailsafeAction.NONE:
-        return max(0, left - elapsed_us)
+        return max(0, remaining - elapsed_us)
     # Used delay does not return at once: it recovers at a quarter of real time.
-    left += elapsed_us // 4
-    return None if left >= settings.com_fail_act_t * US_PER_S else left
+    remaining += elapsed_us // 4
+    return None if remaining >= settings.com_fail_act_t * US_PER_S else remaining
 
 
 def _select(state: FailsafeState, now: Situation, intervention: Intervention) -> _Choice:
@@ -309,14 +309,14 @@ def _select(state: FailsafeState, now: Situation, intervention: Intervention) ->
         delayed, action, strictest = action, FailsafeAction.HOLD, Takeover.MODE_SWITCH
     # A mode switch in the update that starts the action does not end the action.
     by_mode = intervention.mode_chosen and state.action is action
-    wanted = state.taken_over or by_mode
+    takes_over = state.taken_over or by_mode
     if strictest is Takeover.ALWAYS:
-        wanted = wanted or intervention.sticks_moved
+        takes_over = takes_over or intervention.sticks_moved
     taken_over = False
     if (
         FailsafeAction.HOLD <= action <= FailsafeAction.DESCEND
         and strictest < Takeover.AUTO
-        and wanted
+        and takes_over
     ):
         # Sticks take over into Position; a mode selection keeps the selected mode.
         if not state.taken_over and intervention.sticks_moved:

@@ -200,12 +200,12 @@ class Watch:
         by_position = not math.isnan(setpoint.position[0])
         return not (self._local if by_position else self._velocity).valid
 
-    def hear_escs(self, time_us: int, told: Motors, outputs: Motors) -> None:
+    def hear_escs(self, time_us: int, commands: Motors, outputs: Motors) -> None:
         """Check the motor outputs reported by the speed controllers against the commands."""
         p = self.settings
         if p.fd_act_en:
             limits = Undercurrent(p.fd_act_mot_thr, p.fd_act_mot_c2t, p.fd_act_mot_tout)
-            self.motors.take(time_us, told, outputs, limits)
+            self.motors.take(time_us, commands, outputs, limits)
 
     def look(
         self, sample: SensorSample, phase: FlightPhase
@@ -370,9 +370,13 @@ class Watch:
 
     def _charge(self, battery: BatterySample, *, armed: bool) -> BatteryWarning:
         """Return the battery warning level, which cannot decrease while armed."""
-        p, left = self.settings, battery.remaining
+        p, remaining = self.settings, battery.remaining
         # The levels are nested: each limit passed adds one.
-        below = (left < p.bat_low_thr) + (left < p.bat_crit_thr) + (left < p.bat_emergen_thr)
+        below = (
+            (remaining < p.bat_low_thr)
+            + (remaining < p.bat_crit_thr)
+            + (remaining < p.bat_emergen_thr)
+        )
         warning = _WARNINGS[below]
         return max(warning, self._battery) if armed else warning
 
