@@ -350,12 +350,7 @@ def _checked(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
 def _own(name: str) -> ActionSet:
     """Return a custom action set. Raises FieldError."""
     door = plugins.ACTION_SETS
-    found = plugins.load_part(door, name, lambda made: callable(getattr(made, "commands", None)))
-    try:
-        own = found() if isinstance(found, type) else found
-    except Exception as error:
-        problem = f"cannot be made without arguments: {type(error).__name__}: {error}"
-        raise FieldError(door.field, name, problem=problem) from error
+    own = plugins.load_object(door, name, ("commands",))
     count = getattr(own, "discrete", None)
     if not (count is None or (type(count) is int and count > 1)):
         problem = f"its number of actions is discrete = {count!r}; accepted: 2 or more, or None"
