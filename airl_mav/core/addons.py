@@ -6,10 +6,23 @@ The `__init__` of an add-on is light and may define tables, which the core reads
     COMMANDS: {command of `airl`: (purpose, module with OPTIONS and run)}
     EXECUTORS: {value of `--executor`: module with `connected`}
     LIGHT: the commands can be imported without the simulator
+    SITL_OPTIONS: {option of `airl sitl`: function to a context manager around the flights}
+
+In `companion.addons`:
+
+    CAMERAS: {"driver": function that opens a camera by the name of a driver}
+    RECORDERS: {"black_box": context manager that records a mission}
+
+In `firmware_sim.addons`:
+
+    FIRMWARE: {value of `--firmware`: `firmware_sim.external.programs.FirmwareKind`}
 
 In `firmware_sim.addons`:
 
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
+    MISSIONS: {name: subclass of `navigation.plan.Missions`}
+    SERVICES: {name: MAVLink service, a module with HANDLERS and `send_pending`}
+    EVENTS: {name: module with event `Definition`s}
 
 Values are text (`module` or `module:name`); `load` imports what they name, on first use.
 `after_import` runs a module of this package once another package is imported.
@@ -24,6 +37,8 @@ from functools import cache
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
+
+from airl_mav.core.errors import FieldError
 
 PACKAGES = ("airl_mav", "companion", "firmware_sim")
 
@@ -48,6 +63,25 @@ def load(place: str) -> Any:
     module, _, name = place.partition(":")
     loaded = importlib.import_module(module)
     return getattr(loaded, name) if name else loaded
+
+
+def load_entry(package: str, table: str, name: str, option: tuple[str, object], addon: str) -> Any:
+    """Import what an entry of a table names.
+
+    Args:
+        package: Package of the add-ons.
+        table: Table of the entry.
+        name: Name of the entry.
+        option: Option that needs the entry, and its value.
+        addon: Add-on that has the entry.
+
+    Raises:
+        FieldError: The add-on is missing.
+    """
+    place = entries(package, table).get(name)
+    if place is None:
+        raise FieldError(*option, problem=f"needs the add-on {package}/addons/{addon}")
+    return load(place)
 
 
 def addon_commands() -> dict[str, tuple[str, str]]:

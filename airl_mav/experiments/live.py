@@ -59,7 +59,7 @@ def fly_live(
     asked = scenario.scenario
     if asked.level == "gym":
         raise FieldError("level", asked.level, "lockstep or sitl; airl evaluate flies the twin")
-    check_program(asked.real)
+    check_program(asked)
     say = partial(progress.note, style="yellow")
     known = out is not None and (out / RUN_FILE).exists()
     with ExitStack() as held, terminated_as_interrupted():

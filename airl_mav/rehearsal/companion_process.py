@@ -21,9 +21,9 @@ from airl_mav.rehearsal import channel
 from airl_mav.scenario.resolve import ResolvedScenario
 from companion.frame_source import open_camera
 from companion.link_interface import LinkError
+from companion.mavsdk_connection import signed
 from companion.mavsdk_link import MavsdkLink
 from companion.offboard_mission import check_camera, fly_mission
-from companion.signing_proxy import signed
 from companion.watchdog import ThreadGuard
 
 if TYPE_CHECKING:  # Loaded only for a view.

@@ -25,7 +25,7 @@ from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.optical_flow import STUCK, OpticalFlowFusion, flow_by_errors
 from firmware_sim.engine.dynamics import WIDTH
-from firmware_sim.external.px4 import hil_messages as hil
+from firmware_sim.external import hil_messages as hil
 from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import FlowReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder, layout

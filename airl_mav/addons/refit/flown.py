@@ -17,8 +17,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import SETPOINT, commanded
 from airl_mav.report.recorded_flight import NAVIGATING, path_of, stamps_of
-from airl_mav.vehicle_log.clock_alignment import ClockAlignment, align
-from airl_mav.vehicle_log.ulog_reader import MOTORS, VehicleLog
+from airl_mav.vehicle_log import MOTORS, ClockAlignment, VehicleLog, align
 
 AIRBORNE_M = 0.8
 """Minimum height above the start position without ground effect [m]."""

@@ -36,8 +36,7 @@ from airl_mav.profiles.computer import ComputerProfile, load_computer
 from airl_mav.profiles.conditions import Payload, loaded
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.report.recorded_flight import stamps_of
-from airl_mav.vehicle_log.clock_alignment import ClockAlignment
-from airl_mav.vehicle_log.ulog_reader import read_vehicle_log
+from airl_mav.vehicle_log import ClockAlignment, read_vehicle_log
 
 LEAST = 5
 """Minimum decisions for the interval of a mean."""

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from types import MappingProxyType
+from typing import Any
 
+from airl_mav.core.addons import entries, load
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.mavlink.codec import WireMessage
 from firmware_sim.mavlink.services import (
     calibration,
@@ -13,7 +17,6 @@ from firmware_sim.mavlink.services import (
     ftp,
     logs,
     measurements,
-    missions,
     params,
     setpoints,
     shell,
@@ -65,30 +68,47 @@ HANDLERS: Mapping[str, tuple[Addressee, Handler]] = MappingProxyType(
         "LOG_REQUEST_END": (for_vehicle_or_all, logs.handle_end),
         "LOG_ERASE": (for_vehicle_or_all, logs.handle_erase),
         "LOGGING_ACK": (for_vehicle_or_all, logs.handle_ack),
-        "MISSION_REQUEST_LIST": (missions.is_addressed, missions.handle_list),
-        "MISSION_REQUEST": (missions.is_addressed, missions.handle_request),
-        "MISSION_REQUEST_INT": (missions.is_addressed, missions.handle_request),
-        "MISSION_ACK": (missions.is_addressed, missions.handle_ack),
-        "MISSION_COUNT": (missions.is_addressed, missions.handle_count),
-        "MISSION_ITEM": (missions.is_addressed, missions.handle_item),
-        "MISSION_ITEM_INT": (missions.is_addressed, missions.handle_item),
-        "MISSION_CLEAR_ALL": (missions.is_addressed, missions.handle_clear),
-        "MISSION_SET_CURRENT": (missions.is_addressed, missions.handle_set_current),
     }
 )
 
 
+@cache
+def added() -> tuple[Any, ...]:
+    """Return the services of add-ons: modules with HANDLERS and `send_pending`."""
+    return tuple(load(place) for place in entries("firmware_sim", "SERVICES").values())
+
+
+@cache
+def handlers() -> Mapping[str, tuple[Addressee, Handler]]:
+    """Return all handlers by message: of the core, and of add-ons."""
+    found = dict(HANDLERS)
+    for service in added():
+        found |= service.HANDLERS
+    return found
+
+
 def handle(message: WireMessage, kind: str, context: Context) -> bool:
     """Handle a message of a type; return True if it was for this vehicle and had an effect."""
-    is_addressed, handler = HANDLERS.get(kind, (None, None))
+    is_addressed, handler = handlers().get(kind, (None, None))
+    if handler is None and kind in _MISSION_STARTS and message.target_system == context.system_id:
+        context.announce_once(OperatorText(Severity.ERROR, "No missions without add-on missions"))
     return bool(
         is_addressed and handler and is_addressed(message, context) and handler(message, context)
     )
 
 
+_MISSION_STARTS = ("MISSION_REQUEST_LIST", "MISSION_COUNT")
+"""First messages of a download and an upload."""
+
+
+def _send_added(context: Context) -> None:
+    for service in added():
+        service.send_pending(context)
+
+
 PENDING: tuple[Callable[[Context], None], ...] = (
     params.send_pending,
-    missions.send_pending,
+    _send_added,
     ftp.send_pending,
     calibration.send_pending,
     shell.send_pending,
@@ -100,7 +120,7 @@ PENDING: tuple[Callable[[Context], None], ...] = (
 def send_pending(context: Context) -> None:
     """Send the next part of all transfers of a client."""
     if not context.is_getting:  # Usual case: only mission progress may be due.
-        missions.send_pending(context)
+        _send_added(context)
         return
     for send in PENDING:
         send(context)

@@ -26,7 +26,6 @@ from firmware_sim.autopilot.events.definition import NavigationMode
 from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, MODE_NOT_AVAILABLE
 from firmware_sim.autopilot.flight_modes import MAIN_AUTO, MAIN_POSCTL, Mode
 from firmware_sim.autopilot.inputs import OrbitRequest, PositionYaw, Reposition
-from firmware_sim.autopilot.navigation.plan import NavCommand
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services import calibration, connection, logs, params
 from firmware_sim.mavlink.services.context import (
@@ -120,7 +119,7 @@ def _start_landing(_command: VehicleCommand, context: Context) -> Result:
     """Go to the mission's landing: DO_LAND_START, or the first landing; CANCELLED without one."""
     commands = [item.command for item in context.port.plans.mission]
     # DO_LAND_START has precedence; without one the first LAND item marks the landing.
-    for marker in (NavCommand.DO_LAND_START, NavCommand.LAND):
+    for marker in (dialect.MAV_CMD_DO_LAND_START, dialect.MAV_CMD_NAV_LAND):
         if marker in commands:
             return context.port.start_mission(commands.index(marker))
     return Result.CANCELLED
@@ -140,8 +139,8 @@ def _look(command: VehicleCommand, context: Context) -> Result:
     """Handle DO_SET_ROI_LOCATION, DO_SET_ROI (parameter 1: MAV_ROI) and DO_SET_ROI_NONE."""
     place = Geodetic(*command.params[4:7])
     # DO_SET_ROI carries the region type in parameter 1.
-    located = command.number == NavCommand.DO_SET_ROI_LOCATION or (
-        command.number != NavCommand.DO_SET_ROI_NONE and command.params[0] == _ROI_LOCATION
+    located = command.number == dialect.MAV_CMD_DO_SET_ROI_LOCATION or (
+        command.number != dialect.MAV_CMD_DO_SET_ROI_NONE and command.params[0] == _ROI_LOCATION
     )
     valid = math.isfinite(place.latitude_deg) and math.isfinite(place.longitude_deg)
     context.port.look_at(place if located and valid else None)
