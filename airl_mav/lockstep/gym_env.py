@@ -37,7 +37,6 @@ from airl_mav.envs.rewards import Step, costs, reward_of
 from airl_mav.envs.spec import EnvironmentSpec, gymnasium_spec
 from airl_mav.envs.stopping import bounded, injections_of
 from airl_mav.flight.judge import Outcome, Referee
-from airl_mav.lockstep.gym_env import AskedFlight
 from airl_mav.lockstep.lockstep_flight import LockstepFlight
 from airl_mav.policy.actions import Action, AnyAction, BodyRates, command, commands
 from airl_mav.policy.layouts import Encoded, encode_layout, newest_frame
