@@ -9,8 +9,8 @@ a hundred times real time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -106,6 +106,13 @@ class FlowReading(NamedTuple):
     """(3,) angle integrated by the flow sensor's gyro, FRD [rad]; NaN = no gyro."""
 
 
+class Received(NamedTuple):
+    """Reading and its time of arrival [µs]."""
+
+    reading: Any
+    time_us: int
+
+
 class BatterySample(NamedTuple):
     """Sample of the power module."""
 
@@ -137,6 +144,8 @@ class SensorSample(NamedTuple):
     """Range of the vehicle's own rangefinder."""
     flow: FlowReading | None = None
     """Reading of the vehicle's own optical flow sensor."""
+    further: Mapping[str, Any] | None = None
+    """Readings of the vehicle's further sensors by name (`sensor_table`)."""
 
 
 class ActuatorControls(NamedTuple):

@@ -19,7 +19,9 @@ In `firmware_sim.addons`:
 
 In `firmware_sim.addons`:
 
+    AIDING: {any name: class of the `estimator.Aiding` that fuses further sensors}
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
+    SENSORS: {name in `profiles.vehicle.Sensors`: its `sensor_table.Sensor`}
     MISSIONS: {name: subclass of `navigation.plan.Missions`}
     SERVICES: {name: MAVLink service, a module with HANDLERS and `send_pending`}
     EVENTS: {name: module with event `Definition`s}

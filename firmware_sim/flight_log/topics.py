@@ -11,17 +11,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
-from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
-from airl_mav.core.frames import Vector, local_to_geodetic, quat_yaw
+from airl_mav.core.constants import TICK_US, US_PER_MS
+from airl_mav.core.frames import local_to_geodetic, quat_yaw
 from airl_mav.vehicle import atmosphere
+from firmware_sim import sensor_table
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
-from firmware_sim.autopilot.optical_flow import (
-    GREATEST_HEIGHT_M,
-    GREATEST_RAD_S,
-    LEAST_HEIGHT_M,
-)
 from firmware_sim.flight_log.ulog_writer import Topic, Values
-from firmware_sim.interfaces import PoseFrame, TrueState, VelocityFrame
+from firmware_sim.interfaces import TrueState
 
 ON_CHANGE_US = 500 * US_PER_MS
 """Maximum interval of topics that are logged on change [µs]."""
@@ -31,12 +27,6 @@ DISARMED, ARMED = 1, 2
 
 ROTARY_WING = 1
 """VehicleStatus.vehicle_type."""
-
-POSE_FRAMES: dict[PoseFrame, int] = {"ned": 1, "frd": 2}
-"""VehicleOdometry.pose_frame."""
-
-VELOCITY_FRAMES: dict[VelocityFrame, int] = {"ned": 1, "frd": 2, "body": 3}
-"""VehicleOdometry.velocity_frame."""
 
 DIST_BOTTOM_SENSOR_RANGE = 1
 """VehicleLocalPosition.dist_bottom_sensor_bitfield."""
@@ -275,93 +265,16 @@ def gps(moment: Moment) -> Values | None:
     )
 
 
-@_logged(
-    "vehicle_visual_odometry",
-    40,
-    "uint64_t timestamp_sample; uint8_t pose_frame; float[3] position; float[4] q; "
-    "uint8_t velocity_frame; "
-    "float[3] velocity angular_velocity position_variance orientation_variance "
-    "velocity_variance; uint8_t reset_counter; int8_t quality",
-)
-def visual_odometry(moment: Moment) -> Values | None:
-    """Return the newest external pose estimate."""
-    state = moment.state
-    told = state.odometry
-    if told is None:
-        return None
+def _of_sensor(name: str, logged: sensor_table.Topic) -> Logged:
+    """Return the topic of a sensor, whose values are in the flight controller's state."""
 
-    def numbers(values: Vector | None, count: int) -> list[float]:
-        return [math.nan] * count if values is None else list(map(float, values))
+    def values(moment: Moment) -> Values | None:
+        return logged.values(moment.state)
 
-    return (
-        state.odometry_us,
-        POSE_FRAMES[told.pose_frame],
-        *numbers(told.position, 3),
-        *numbers(told.quaternion, 4),
-        VELOCITY_FRAMES[told.velocity_frame],
-        *numbers(told.velocity, 3),
-        *_NO_VECTOR,
-        *numbers(told.position_variance, 3),
-        *numbers(told.orientation_variance, 3),
-        *numbers(told.velocity_variance, 3),
-        told.reset_counter,
-        told.quality,
-    )
+    return Logged(_topic(name, logged.fields), logged.interval_ms * US_PER_MS, values)
 
 
-@_logged(
-    "distance_sensor",
-    1000,
-    "uint32_t device_id; float min_distance max_distance current_distance variance; "
-    "int8_t signal_quality; uint8_t type; float h_fov v_fov; float[4] q; "
-    "uint8_t orientation mode",
-)
-def distance_sensor(moment: Moment) -> Values | None:
-    """Return the newest range [m] of the first sensor."""
-    told = moment.state.distance
-    if told is None:
-        return None
-    number, enabled = 0, 1
-    return (
-        number,
-        told.least_m,
-        told.greatest_m,
-        told.distance_m,
-        told.variance_m2,
-        told.quality,
-        told.kind,
-        *(0.0, 0.0),
-        *(0.0, 0.0, 0.0, 0.0),
-        told.orientation,
-        enabled,
-    )
-
-
-@_logged(
-    "vehicle_optical_flow",
-    500,
-    "uint64_t timestamp_sample; uint32_t device_id; float[2] pixel_flow; "
-    "float[3] delta_angle; float distance_m; uint32_t integration_timespan_us; "
-    "uint8_t quality; float max_flow_rate min_ground_distance max_ground_distance",
-)
-def optical_flow(moment: Moment) -> Values | None:
-    """Return the newest optical flow and gyro angle [rad] of the first sensor, with its limits."""
-    told, time_us = moment.state.flow, moment.state.flow_us
-    if told is None:
-        return None
-    number = 0
-    return (
-        time_us,
-        number,
-        *told.flow.tolist(),
-        *told.turned.tolist(),
-        _UNKNOWN,
-        round(told.interval_s * US_PER_S),
-        told.quality,
-        GREATEST_RAD_S,
-        LEAST_HEIGHT_M,
-        GREATEST_HEIGHT_M,
-    )
+TOPICS += [_of_sensor(*each) for s in sensor_table.sensors().values() for each in s.topics.items()]
 
 
 @_logged(

@@ -12,6 +12,7 @@ from itertools import chain
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.signing import Signing, StoredSigning
+from firmware_sim import sensor_table
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.engine.record import Record
@@ -120,6 +121,7 @@ class MavlinkServer:
         self._builders: dict[str, Builder | None] = {
             **BUILDERS,
             **{name: partial(build, self._vehicle) for name, build in VEHICLE_BUILDERS.items()},
+            **{name: each.build for name, each in sensor_table.streams().items()},
             "TIMESYNC": None,
         }
         self._forwarder = Forwarder(self._all)

@@ -107,7 +107,7 @@ def handle_vision_position(message: WireMessage, context: Context) -> bool:
 def _see(odometry: Odometry, context: Context) -> bool:
     if odometry.position is None and odometry.velocity is None and odometry.quaternion is None:
         return False
-    context.port.see(odometry)
+    context.port.receive("odometry", odometry)
     return True
 
 
@@ -166,7 +166,8 @@ def _rotation(quaternion: Vector) -> Vector | None:
 def handle_distance(message: WireMessage, context: Context) -> bool:
     """Handle DISTANCE_SENSOR: the estimator uses downward-facing sensors only."""
     # Centimetres to metres; the variance [cm²] by the square of that.
-    context.port.measure_distance(
+    context.port.receive(
+        "distance",
         DistanceReading(
             message.current_distance * 1e-2,
             message.min_distance * 1e-2,
@@ -175,7 +176,7 @@ def handle_distance(message: WireMessage, context: Context) -> bool:
             quality_of(message.signal_quality),
             message.orientation,
             message.type,
-        )
+        ),
     )
     return True
 
@@ -192,13 +193,14 @@ def handle_optical_flow(message: WireMessage, context: Context) -> bool:
     """Handle OPTICAL_FLOW_RAD. Ignores distance and temperature."""
     # Rotation of the sensor during the integration time, which the estimator removes.
     turned = (message.integrated_xgyro, message.integrated_ygyro, message.integrated_zgyro)
-    context.port.look_down(
+    context.port.receive(
+        "flow",
         FlowReading(
             np.array([message.integrated_x, message.integrated_y]),
             message.integration_time_us / US_PER_S,
             message.quality,
             np.array(turned),
-        )
+        ),
     )
     return True
 

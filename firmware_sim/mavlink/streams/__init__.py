@@ -80,11 +80,11 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "PROTOCOL_VERSION": status.protocol_version,
         "HIGH_LATENCY2": status.high_latency2,
         # Last, because start times of streams depend on their order.
-        "DISTANCE_SENSOR": sensors.distance_sensor,
-        "OPTICAL_FLOW_RAD": sensors.optical_flow_rad,
+        **dict.fromkeys(("DISTANCE_SENSOR", "OPTICAL_FLOW_RAD"), _nothing),
     }
 )
-"""Streams that need only the snapshot. None = packed by compiled code (`telemetry`)."""
+"""Streams that need only the snapshot. None = packed by compiled code (`telemetry`). The server
+adds the streams of further sensors (`sensor_table`)."""
 
 
 class Vehicle:

@@ -16,14 +16,16 @@ import numpy as np
 
 from airl_mav.core.constants import MS_PER_S, TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, quat_to_matrix
+from firmware_sim.addons.auxiliary_estimation.range_finder import RangeFinder
+from firmware_sim.addons.auxiliary_estimation.sensors import (
+    GREATEST_HEIGHT_M,
+    GREATEST_RAD_S,
+    LEAST_HEIGHT_M,
+)
+from firmware_sim.addons.auxiliary_estimation.terrain_filter import GROUND
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.error_state import FusionHorizon, Measurement, selecting
-from firmware_sim.autopilot.range_finder import RangeFinder
-from firmware_sim.autopilot.terrain_filter import GROUND
 from firmware_sim.interfaces import FlowReading
-
-LEAST_HEIGHT_M, GREATEST_HEIGHT_M, GREATEST_RAD_S = 0.08, 100.0, 8.0
-"""Valid range: defaults of SENS_FLOW_MINHGT, SENS_FLOW_MAXHGT and SENS_FLOW_MAXR."""
 
 LONGEST_S = 1.0
 """Maximum integration time of a measurement [s]."""

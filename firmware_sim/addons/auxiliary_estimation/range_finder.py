@@ -18,10 +18,10 @@ from typing import NamedTuple
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import rotate
+from firmware_sim.addons.auxiliary_estimation.terrain_filter import TerrainFilter
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Clearance
 from firmware_sim.autopilot.error_state import Measurement
-from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.interfaces import DOWNWARD, DistanceReading
 
 HEIGHT_BY_RANGE = 2

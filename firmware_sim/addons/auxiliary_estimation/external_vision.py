@@ -18,7 +18,8 @@ import numpy as np
 from airl_mav.core.frames import Vector, quat_to_matrix
 from airl_mav.vehicle.rotation import conjugate, multiply, normalize, yaw_of
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.error_state import ErrorFilter, FusionHorizon, Measurement, selecting
+from firmware_sim.autopilot.error_state import FusionHorizon, Measurement, selecting
+from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.recovery import turn_to
 from firmware_sim.autopilot.sensor_monitor import LEARN_US
 from firmware_sim.interfaces import Odometry
@@ -67,26 +68,16 @@ class _Sample(NamedTuple):
 class ExternalVision:
     """Fusion of odometry as selected by EKF2_EV_CTRL."""
 
-    def __init__(
-        self,
-        value: Callable[[str], float],
-        state: Vector,
-        error_filter: ErrorFilter,
-        fuse: Callable[[Measurement], bool],
-        judge: Callable[[Vector, Vector], float],
-    ) -> None:
+    def __init__(self, estimator: Estimator, judge: Callable[[Vector, Vector], float]) -> None:
         """Start without odometry.
 
         Args:
-            value: Look-up for EKF2_* parameters by name.
-            state: Nominal state in the layout of `error_state`; updated.
-            error_filter: Covariance filter; restarted when the state is reset.
-            fuse: Fuses a measurement now; returns whether it was within the gate.
+            estimator: Its state and covariance are corrected or reset.
             judge: Checks the innovation (3,) and variance (3,) of a velocity, restarts the filter
                 upon an inertial sensor fault, and returns the ratio of measured to stated variance.
         """
-        self._value, self._state, self._filter = value, state, error_filter
-        self._fuse, self._judge = fuse, judge
+        self._estimator, self._judge = estimator, judge
+        self._value, self._state, self._fuse = estimator.value, estimator.state, estimator.fuse
         self.horizon = FusionHorizon(0.0)
         """Vehicle motion since the measurement time of current odometry (EKF2_EV_DELAY)."""
         self.position = Measurement("vision_position", 0, selecting(es.POS, es.POS + 1))
@@ -95,8 +86,6 @@ class ExternalVision:
         self.yaw = Measurement("vision_heading", 2, np.zeros((1, es.N_STATES)))
         self.fused = Control(0)
         """Data currently fused."""
-        self.is_north_known = True
-        """True if the heading is relative to north; False: relative to the vision frame."""
         self._newest: Odometry | None = None
         self._first_us = 0
         """Time of the first odometry [µs]."""
@@ -111,10 +100,6 @@ class ExternalVision:
         self._resets_left = RESETS
         self.on_height_moved: Callable[[float], None] | None = None
         """Callback with the downward shift [m] of a height reset to vision."""
-
-    def use(self, error_filter: ErrorFilter) -> None:
-        """Continue with another filter that carries the same errors."""
-        self._filter = error_filter
 
     def take(self, odometry: Odometry, now_us: int, *, gps: bool, flying: bool) -> None:
         """Fuse the selected data of a pose.
@@ -202,12 +187,13 @@ class ExternalVision:
             anew = jumped or self._is_overdue(m, now_us)
         else:
             # There is no reference for a gate.
-            anew = not (in_ned and self.is_north_known)
+            anew = not (in_ned and self._estimator.is_north_known)
         if anew and good:
-            self._filter.restart(turn_to(self._state, self._filter.covariance, yaw, variance))
+            carried = self._estimator.filter
+            carried.restart(turn_to(self._state, carried.covariance, yaw, variance))
             # From now on the heading belongs to the vision frame, unless the pose is in NED.
             self.fused |= Control.YAW
-            self.is_north_known, m.fused_us = in_ned, now_us
+            self._estimator.is_north_known, m.fused_us = in_ned, now_us
         elif good:
             q = es.attitude(self._state)
             m.innovation[0] = math.remainder(yaw - yaw_of(q), 2.0 * math.pi)
@@ -257,7 +243,7 @@ class ExternalVision:
     def _take_position(self, sample: _Sample, *, flying: bool) -> None:
         odometry, now_us, good, begins, jumped = sample
         active = bool(self.fused & Control.HORIZONTAL)
-        needs_north = odometry.pose_frame == "ned" and not self.is_north_known
+        needs_north = odometry.pose_frame == "ned" and not self._estimator.is_north_known
         # A NED position is useless while local NED has no north.
         if odometry.position is None or needs_north or not (active or begins):
             self.fused &= ~Control.HORIZONTAL
@@ -328,10 +314,10 @@ class ExternalVision:
         # Shift by the difference at the measurement time, so that motion since then stays.
         moved = place[:2] - self._then()[:2]
         self._state[es.P : es.P + 2] += moved
-        covariance = self._filter.covariance.copy()
+        covariance = self._estimator.filter.covariance.copy()
         for i in range(2):
             _forget(covariance, es.POS + i, variance.item(i))
-        self._filter.restart(covariance)
+        self._estimator.filter.restart(covariance)
 
     def _put_height(self, down: float, variance: float) -> None:
         """Reset the height; the barometer offset shifts with it."""
@@ -341,9 +327,9 @@ class ExternalVision:
         self._state[es.BARO_OFFSET] += moved
         if self.on_height_moved is not None:
             self.on_height_moved(moved)
-        covariance = self._filter.covariance.copy()
+        covariance = self._estimator.filter.covariance.copy()
         _forget(covariance, es.POS + 2, variance)
-        self._filter.restart(covariance)
+        self._estimator.filter.restart(covariance)
 
     # --- vision's frame
 
