@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.addons.view import view_messages
+from airl_mav.addons.view.view_messages import OFFBOARD, STRIP_S, TRAIL_STEP_M, Shown
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
@@ -22,8 +24,6 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE, RUN_FILE, LoadedRun, load
 from airl_mav.report.forensics.evidence import ranked
 from airl_mav.report.run_arenas import arenas_of, spec_of, vehicle_of
-from airl_mav.view import view_messages
-from airl_mav.view.shown import OFFBOARD, STRIP_S, TRAIL_STEP_M, Shown
 
 INFO, WARNING = 6, 4
 """Levels of MAV_SEVERITY."""

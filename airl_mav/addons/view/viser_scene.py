@@ -10,16 +10,15 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from airl_mav.addons.view.panel import camera_picture
+from airl_mav.addons.view.view_messages import Episode, Shown, VehicleShape, VehicleState
 from airl_mav.arena.finishes import OBSTACLE
 from airl_mav.arena.geometry import Arena, Bounds, Shape
 from airl_mav.arena.triangles import drawn, standing
 from airl_mav.core import frames
 from airl_mav.core.frames import goal_height_m
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE
-from airl_mav.view import style
-from airl_mav.view.panel import camera_picture
-from airl_mav.view.shown import Shown
-from airl_mav.view.view_messages import Episode, VehicleShape, VehicleState
+from airl_mav.report import scene
 
 FRUSTUM_M = 0.6
 """Distance of the drawn camera image: ahead, or above for a 360° camera [m]."""
@@ -55,7 +54,7 @@ class FlightScene:
         self,
         server: viser.ViserServer,
         root: str = "/flight",
-        look: style.FlightColours = style.FIRST,
+        look: scene.FlightColours = scene.FIRST,
     ) -> None:
         """Prepare an empty scene with all nodes below `root`."""
         self._server = server
@@ -124,7 +123,7 @@ class FlightScene:
 
     def _surround(self, episode: Episode, arena: Arena | None) -> None:
         if self._look.whole:
-            bounds = style.OPEN if arena is None else arena.bounds
+            bounds = scene.OPEN if arena is None else arena.bounds
             self._build_floor(bounds)
             self._build_ends(episode, 0.6 * bounds.height, _below(arena, episode.goal))
             if arena is not None:
@@ -135,10 +134,10 @@ class FlightScene:
         none = np.zeros((0, 2, 3), np.float32)
         # Children of a frame at the vehicle's position, so that they move in sync with it.
         self._place = self._add("frame", "/place", show_axes=False)
-        self._drop = self._add("line_segments", "/place/drop", none, style.DROP, thickness=0.015)
+        self._drop = self._add("line_segments", "/place/drop", none, scene.DROP, thickness=0.015)
         sizes = {"shaft_radius": 0.025, "head_radius": 0.07, "head_length": 0.16}
-        self._flown = self._add("arrows", "/place/flown", none, style.FLOWN, **sizes)
-        self._commanded = self._add("arrows", "/place/commanded", none, style.COMMANDED, **sizes)
+        self._flown = self._add("arrows", "/place/flown", none, scene.FLOWN, **sizes)
+        self._commanded = self._add("arrows", "/place/commanded", none, scene.COMMANDED, **sizes)
 
     def _build_floor(self, b: Bounds) -> None:
         length, width = b.north_max - b.north_min, b.east_max - b.east_min
@@ -150,9 +149,9 @@ class FlightScene:
             plane="xy",
             cell_size=1.0,
             section_size=5.0,
-            cell_color=style.GRID,
-            section_color=style.SECTION,
-            plane_color=style.FLOOR,
+            cell_color=scene.GRID,
+            section_color=scene.SECTION,
+            plane_color=scene.FLOOR,
             plane_opacity=1.0,
             fade_distance=400.0,
             position=(*middle, 0.0),
@@ -162,12 +161,12 @@ class FlightScene:
 
     def _build_arena(self, arena: Arena) -> None:
         # Drawn from inside only: transparent from outside.
-        look = {"color": arena.wall_colour, "opacity": style.WALL_OPACITY, "side": "front"}
+        look = {"color": arena.wall_colour, "opacity": scene.WALL_OPACITY, "side": "front"}
         self._add(
-            "mesh_simple", "/arena/walls", *style.walls(arena.bounds), **look, flat_shading=True
+            "mesh_simple", "/arena/walls", *scene.walls(arena.bounds), **look, flat_shading=True
         )
         if arena.ground is not None:
-            self._add_surface("/arena/ground", arena.ground.points, arena.ground.faces, style.HILLS)
+            self._add_surface("/arena/ground", arena.ground.points, arena.ground.faces, scene.HILLS)
         shown = drawn(arena.meshes)
         for each in shown:
             colour = arena.look.finish.colour(OBSTACLE + each.first)
@@ -176,20 +175,20 @@ class FlightScene:
             if arena.mesh_of(i) in shown:
                 continue
             moves = i >= arena.n_static
-            colour = style.MOVING if moves else arena.look.finish.colour(OBSTACLE + i)
+            colour = scene.MOVING if moves else arena.look.finish.colour(OBSTACLE + i)
             glass = arena.clear is not None and bool(arena.clear[i])
-            node = self._obstacle(arena, i, colour, style.GLASS_OPACITY if glass else None)
+            node = self._obstacle(arena, i, colour, scene.GLASS_OPACITY if glass else None)
             if moves:
                 self._movers.append(node)
 
     def _add_surface(
-        self, name: str, places: Floats, faces: NDArray[np.int32], colour: style.Colour
+        self, name: str, places: Floats, faces: NDArray[np.int32], colour: scene.Colour
     ) -> None:
         mesh = places.astype(np.float32), faces.astype(np.uint32)
         self._add("mesh_simple", name, *mesh, color=colour, side="double", flat_shading=True)
 
     def _build_ends(self, episode: Episode, height: float, base: float) -> None:
-        (north, east), green = episode.goal[:2], {"color": style.GOAL}
+        (north, east), green = episode.goal[:2], {"color": scene.GOAL}
         within = {"radius": episode.goal_radius_m, **green}
         if (height_m := goal_height_m(episode.goal)) is not None:
             height = height_m - base
@@ -200,10 +199,10 @@ class FlightScene:
         self._add("cylinder", "/goal/pole", **green, radius=0.04, height=height, position=at)
         at = (north, east, -base - height - 0.2)
         self._add("label", "/goal/label", "goal", position=at)
-        disc = {"radius": 0.4, "height": 0.03, "color": style.START, "opacity": 0.5}
+        disc = {"radius": 0.4, "height": 0.03, "color": scene.START, "opacity": 0.5}
         self._add("cylinder", "/start", **disc, position=(0.0, 0.0, -0.02))
 
-    def _obstacle(self, arena: Arena, i: int, colour: style.Colour, opacity: float | None) -> Any:
+    def _obstacle(self, arena: Arena, i: int, colour: scene.Colour, opacity: float | None) -> Any:
         half, at = arena.obstacles.half_size[i].tolist(), tuple(arena.obstacles.center[i].tolist())
         name = f"/arena/obstacle/{i}"
         if arena.obstacles.shape[i] == Shape.BOX:
@@ -223,7 +222,7 @@ class FlightScene:
         size = 0.45 * min(forward, right)
         body = {"color": self._look.body, "dimensions": (3.4 * size, 2.2 * size, height)}
         self._add("box", "/vehicle/body", **body)
-        nose = {"color": style.NOSE, "dimensions": (0.9 * size, 1.0 * size, 0.6 * height)}
+        nose = {"color": scene.NOSE, "dimensions": (0.9 * size, 1.0 * size, 0.6 * height)}
         self._add("box", "/vehicle/nose", **nose, position=(2.0 * size, 0.0, 0.0))
         arm = {**body, "dimensions": (2.0 * math.hypot(forward, right), 0.025, 0.02)}
         for name, side in (("right", 1.0), ("left", -1.0)):
@@ -238,7 +237,7 @@ class FlightScene:
             name = f"/vehicle/rotor/{corner.replace(' ', '-')}"
             disc = {"radius": radius, "height": 0.006, "color": self._look.disc, "opacity": 0.5}
             self._add("cylinder", f"{name}/disc", position=at, **disc)
-            blade = {"dimensions": (2.0 * radius, 0.12 * radius, 0.008), "color": style.BLADE}
+            blade = {"dimensions": (2.0 * radius, 0.12 * radius, 0.008), "color": scene.BLADE}
             self._blades.append(self._add("box", f"{name}/blade", position=at, **blade))
         if self._look.whole:
             self._build_camera(shape)
@@ -267,7 +266,7 @@ class FlightScene:
             aspect=shape.camera_aspect,
             scale=FRUSTUM_M,
             thickness=0.012,
-            color=style.FLOWN,
+            color=scene.FLOWN,
             position=(shape.camera_forward_m, shape.camera_right_m, -shape.camera_up_m),
             wxyz=frames.quat_multiply(turn, frames.FRD_FROM_OPTICAL),
         )
@@ -287,11 +286,11 @@ class FlightScene:
                 node.position = center
         above = -at[2] - _below(shown.arena, vehicle.position)
         self._drop.points = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, above]]], np.float32)
-        self._flown.points = style.arrow(np.array(vehicle.velocity))
+        self._flown.points = scene.arrow(np.array(vehicle.velocity))
         command = shown.command if self._look.whole else None
         if command is not None:
             command = frames.heading_to_ned(command, frames.quat_yaw(np.array(vehicle.quaternion)))
-        self._commanded.points = style.arrow(command)
+        self._commanded.points = scene.arrow(command)
         self._extend_trail(shown.trail)
 
     def _extend_trail(self, trail: list[tuple[float, float, float]]) -> None:
@@ -300,7 +299,7 @@ class FlightScene:
             return
         self._trail_points = len(trail)
         for part in range(max(0, len(self._trail) - 1), (len(trail) - 2) // CHUNK + 1):
-            segments = style.segments_of(trail[part * CHUNK : (part + 1) * CHUNK + 1])
+            segments = scene.segments_of(trail[part * CHUNK : (part + 1) * CHUNK + 1])
             if part == len(self._trail):
                 name = f"/trail/{part}"
                 self._trail.append(

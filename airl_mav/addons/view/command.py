@@ -10,6 +10,7 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
+from airl_mav.addons.view.replayed_flight import ReplayedRuns, run_folders
 from airl_mav.cli.options import POSITIONAL
 from airl_mav.cli.shared_options import TrustArenas, folder_of
 from airl_mav.core.constants import LOOPBACK
@@ -17,7 +18,6 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.progress import new_console
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.replay.replayed_flight import ReplayedRuns, run_folders
 from airl_mav.report.run_arenas import trust_arenas
 from airl_mav.scenario.aircraft import GREATEST_PORT
 
@@ -76,7 +76,7 @@ def run(options: ViewOptions, console: Console | None = None) -> int:
         if (same := each.same(first)) is not None:
             each.check(same)
     # Imported here: the viewer is an extra.
-    from airl_mav.view.view_server import LocalServer
+    from airl_mav.addons.view.view_server import LocalServer
 
     # Its output repeats the address.
     with redirect_stdout(io.StringIO()):
@@ -89,7 +89,7 @@ def run(options: ViewOptions, console: Console | None = None) -> int:
         console.file.flush()
         # The browser loads the page while the flight is prepared. These imports, with compiled
         # and drawing code, take longer than all of the above.
-        from airl_mav.report.replay.page import ReplayPage
+        from airl_mav.addons.view.replay_page import ReplayPage
 
         ReplayPage(server, replayed, others[0] if others else None, first, runs).run()
     except KeyboardInterrupt:

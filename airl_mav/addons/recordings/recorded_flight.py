@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter
 
-from airl_mav.black_box.mcap_file import BlackBox
+from airl_mav.black_box.mcap_file import BlackBox, read_black_box
 from airl_mav.black_box.messages import Decision, End, Phase, Resources, Status, Telemetry
 from airl_mav.core.constants import UNMEASURED_A, US_PER_S, CommandKind
-from airl_mav.core.files import typed
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import sha256_of, typed
 from airl_mav.core.frames import Goal, goal_distance_m
 from airl_mav.core.resource_use import ProcessUse
 from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.quality import measure_quality
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.trajectory import Trajectory, measure_quality
 from airl_mav.latency.stamps import NO_STAMP, SETPOINTS, STAMPS
-from airl_mav.rehearsal.run_folder import FlownEpisode, RunInfo, run_info
+from airl_mav.rehearsal.run_folder import (
+    RUN_FILE,
+    FlownEpisode,
+    RunFolder,
+    RunInfo,
+    load_info,
+    run_info,
+)
 from companion.limits import OUT_OF_TIME
 
 NAVIGATING = "navigating"
@@ -213,3 +222,30 @@ def _use(resources: list[Resources]) -> ProcessUse | None:
         power_w=None,
         power_source="not measured by the black box",
     )
+
+
+WITH_LOG = "-with-log"
+"""Suffix of the run folder's name for a flight with a vehicle log."""
+
+
+def take_in(path: Path, ulg: Path | None = None) -> Path:
+    """Return the run folder of a black box and its vehicle's log, created beside it if missing."""
+    box = read_black_box(path)
+    folder = path.with_suffix("") if ulg is None else path.with_name(f"{path.stem}{WITH_LOG}")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if ulg is not None:
+        # Imported here: pyulog is an extra.
+        from airl_mav.addons.recordings.logged_episode import logged_episode_of
+        from airl_mav.vehicle_log import read_vehicle_log
+
+        log = read_vehicle_log(ulg)
+        digest = hashlib.sha256(f"{digest} {sha256_of(ulg)}".encode()).hexdigest()
+    if (folder / RUN_FILE).exists():
+        if load_info(folder).config.get(DIGEST) != digest:
+            raise UsageError(
+                f"{folder}: holds another run; accepted: that of {path.name}, or no such folder"
+            )
+        return folder
+    episode = episode_of(box) if ulg is None else logged_episode_of(box, log)
+    RunFolder.adopt(folder, info_of(box, digest)).save_episodes([episode])
+    return folder

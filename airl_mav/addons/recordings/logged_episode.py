@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.addons.recordings.recorded_flight import episode_of, path_of, stamps_of
 from airl_mav.black_box.mcap_file import BlackBox
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import SETPOINTS, commanded
-from airl_mav.rehearsal.run_folder import FlownEpisode
-from airl_mav.report.recorded_flight import episode_of, path_of, stamps_of
-from airl_mav.report.tracking import MOTOR_OUTPUTS, MOTOR_TIMES
+from airl_mav.rehearsal.run_folder import MOTOR_OUTPUTS, MOTOR_TIMES, FlownEpisode
 from airl_mav.vehicle_log import ClockAlignment, VehicleLog, align
 
 

@@ -12,10 +12,9 @@ import viser
 from numpy.typing import NDArray
 from viser import uplot
 
+from airl_mav.addons.view.view_messages import STRIP_S, Decided, Image, Shown
 from airl_mav.camera.frame import nearness, rgb_of
 from airl_mav.core.constants import US_PER_S
-from airl_mav.view.shown import STRIP_S, Shown
-from airl_mav.view.view_messages import Decided, Image
 
 _COLOURS = """
 44015444025544035745055845065a45085b46095c460b5e460c5f460e61470f62471163471265471466471567471669

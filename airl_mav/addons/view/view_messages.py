@@ -1,4 +1,4 @@
-"""Messages from a flight to its view, and their encoding.
+"""Messages from a flight to its view, their encoding, and the state of a view from them.
 
 Positions and velocities are local NED [m, m/s], attitudes body FRD -> NED [w, x, y, z], times
 simulated [µs]. A message is one part of JSON. An image follows as a second part: little-endian
@@ -8,6 +8,8 @@ uint16 millimetres of depth, or bytes of colour.
 from __future__ import annotations
 
 import math
+from collections import deque
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -15,10 +17,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.core.constants import CommandKind
-from airl_mav.core.frames import Goal
+from airl_mav.core.constants import US_PER_MS, US_PER_S, CommandKind
+from airl_mav.core.frames import Goal, goal_distance_m
 from airl_mav.profiles.projections import Projection
 from airl_mav.profiles.vehicle import Momentum, VehicleProfile
+from airl_mav.rehearsal.live_view import ViewEnds
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -237,3 +240,158 @@ def shape_of(image: Image) -> Shape:
 
 def _number(shape: tuple[int, ...]) -> str:
     return "<u2" if len(shape) == 2 else "u1"
+
+
+class ViewSettings(BaseModel):
+    """Configuration of a view process."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    run: str
+    port: int | None
+    """TCP port of the page; None = any free port."""
+    paced: bool
+    """True if viewers may set the pace."""
+    speed: float | None
+    steerable: bool
+    """True if viewers may set the latency."""
+    compensable: bool
+    """True if the vehicle's response is known, which latency compensation requires."""
+    compensated: bool
+
+
+class ViewAnswer(BaseModel):
+    """Port and addresses of a started view."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    port: int = 0
+    ends: ViewEnds | None = None
+    """ZeroMQ addresses; None = the requested port is in use."""
+
+
+STRIP_S = 20.0
+"""Time span of the latency strip [simulated s]."""
+
+TEXTS = 6
+"""Number of recent texts shown."""
+
+TRAIL_STEP_M = 0.05
+"""Minimum distance between points of the trail [m]."""
+
+OFFBOARD = "offboard"
+"""Flight mode that follows setpoints."""
+
+Point = tuple[float, float, float]
+
+
+@dataclass
+class Shown:
+    """Data of the scene and the panel."""
+
+    flight: Flight | None = None
+    phase: str = ""
+    texts: deque[Said] = field(default_factory=lambda: deque(maxlen=TEXTS))
+    episode: Episode | None = None
+    arena: Arena | None = None
+    is_surrounded: bool = True
+    """True if the surroundings are known; False while an arena is being generated."""
+    episodes: int = 0
+    """Number of episodes started so far; a new number requires a new scene."""
+    vehicle: VehicleState | None = None
+    trail: list[Point] = field(default_factory=list)
+    """Past positions of the vehicle in this episode, NED [m]."""
+    picture: Image | None = None
+    decided: Decided | None = None
+    decided_image: Image | None = None
+    """Policy's input image of that decision."""
+    trained: Trained | None = None
+    """Result of a training's newest decision; None outside training."""
+    decisions: int = 0
+    """Number of decisions received in this episode."""
+    ages: deque[tuple[float, float, float]] = field(default_factory=deque)
+    """Time since the episode's start [s], command age and t2 of its decision [ms]."""
+
+    def take(self, message: Told, image: Image | None) -> None:
+        """Update the state with a message and its image."""
+        if isinstance(message, VehicleState):
+            self._move(message)
+        elif isinstance(message, CameraImage):
+            self.picture = image
+        elif isinstance(message, Decided):
+            self.decided, self.decided_image = message, image
+            self.decisions += 1
+        elif isinstance(message, Episode):
+            self._begin(message)
+        elif isinstance(message, PhaseStart):
+            self.phase = message.phase
+        elif isinstance(message, Said):
+            self.texts.append(message)
+        elif isinstance(message, Trained):
+            self.trained = message
+        else:
+            self.flight, self.phase = message, "booting"
+
+    def _begin(self, episode: Episode) -> None:
+        self.episode = episode
+        self.arena = episode.arena
+        self.episodes += 1
+        self.vehicle = self.picture = self.decided = self.decided_image = None
+        self.trail, self.decisions = [], 0
+        self.ages.clear()
+
+    def _move(self, vehicle: VehicleState) -> None:
+        self.vehicle = vehicle
+        if not self.trail or math.dist(self.trail[-1], vehicle.position) >= TRAIL_STEP_M:
+            self.trail.append(vehicle.position)
+        age_ms, t2_ms = self.age_ms, self.t2_ms
+        if age_ms is not None and t2_ms is not None:
+            self.ages.append((self.seconds, age_ms, t2_ms))
+        while self.ages and self.ages[0][0] < self.seconds - STRIP_S:
+            self.ages.popleft()
+
+    @property
+    def seconds(self) -> float:
+        """Time since the episode's start [simulated s]."""
+        if self.vehicle is None or self.episode is None:
+            return 0.0
+        return (self.vehicle.time_us - self.episode.started_us) / US_PER_S
+
+    @property
+    def flies_setpoints(self) -> bool:
+        """True if the vehicle is armed and follows setpoints."""
+        vehicle = self.vehicle
+        return vehicle is not None and vehicle.armed and vehicle.mode == OFFBOARD
+
+    @property
+    def age_ms(self) -> float | None:
+        """Age of the image behind the current command [ms]; None without such a command."""
+        if self.decided is None or self.vehicle is None or not self.flies_setpoints:
+            return None
+        return max(0.0, (self.vehicle.time_us - self.decided.captured_us) / US_PER_MS)
+
+    @property
+    def t2_ms(self) -> float | None:
+        """Inference time t2 of the newest decision [ms]; None before the first decision."""
+        if self.decided is None:
+            return None
+        return (self.decided.ready_us - self.decided.began_us) / US_PER_MS
+
+    @property
+    def command(self) -> NDArray[np.float64] | None:
+        """Commanded velocity (3,): forward, right, down [m/s]; None without one."""
+        if self.decided is None or self.vehicle is None or not self.flies_setpoints:
+            return None
+        if self.decided.commands != "velocity":
+            return None
+        expires_us = self.decided.expires_us
+        if expires_us is not None and self.vehicle.time_us >= expires_us:
+            return np.zeros(3)
+        return np.array(self.decided.setpoint[:3])
+
+    @property
+    def to_goal_m(self) -> float | None:
+        """Distance to the goal [m]; horizontal for a goal without a height."""
+        if self.vehicle is None or self.episode is None:
+            return None
+        return goal_distance_m(self.episode.goal, self.vehicle.position)

@@ -15,6 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.addons.view import view_messages
+from airl_mav.addons.view.view_messages import OFFBOARD, ViewSettings
+from airl_mav.addons.view.viewer import Feed, Pace
 from airl_mav.camera.frame import MM_PER_M
 from airl_mav.core.constants import US_PER_S
 from airl_mav.envs.evaluation import Trace
@@ -23,12 +26,10 @@ from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.actions import commands, discrete_actions
 from airl_mav.policy.layouts import Encoded, newest_frame
+
+
+from airl_mav.rehearsal.live_view import ViewEnds
 from airl_mav.training.training_folder import Evaluation, TrainingProgress
-from airl_mav.view import view_messages
-from airl_mav.view.ends import ViewEnds, ViewSettings
-from airl_mav.view.feed import Feed
-from airl_mav.view.shown import OFFBOARD
-from airl_mav.view.viewer import Pace
 
 SPEED = 2.0
 """Default replay speed; viewers can change it [simulated s per wall s]."""

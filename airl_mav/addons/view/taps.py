@@ -1,24 +1,30 @@
-"""Sources of a view's messages: the simulation and the companion's decisions."""
+"""Sources of a view's messages: simulation, companion, rehearsal and lockstep flight."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.addons.view import view_messages as messages
+from airl_mav.addons.view.view_messages import Flight, PhaseStart, Said
+from airl_mav.addons.view.viewer import REAL_TIME, Asked, Feed, Pace
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.frames import Goal
+from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.latency.injection import LatencySampler
 from airl_mav.policy.observation import Kinematics
 from airl_mav.prediction.compensator import Compensator
+from airl_mav.rehearsal.channel import State, Text
+from airl_mav.rehearsal.live_view import ViewEnds
+from airl_mav.rehearsal.observer import WARNING, Observer
 from airl_mav.scenario.resolve import ResolvedScenario
-from airl_mav.view import view_messages as messages
-from airl_mav.view.ends import ViewEnds
-from airl_mav.view.feed import Asked, Feed
-from companion.pilot import SentDecision as Decision
+from companion.pilot import SentDecision
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.engine.dynamics import POSITION, QUATERNION, VELOCITY
 from firmware_sim.simulation import Simulation
@@ -204,7 +210,7 @@ class CompanionTap:
             return None
         return HandCompensator(self._hand, self._scenario)
 
-    def decided(self, decision: Decision) -> None:
+    def decided(self, decision: SentDecision) -> None:
         """Send a decision of the companion."""
         first, second, third, fourth = (float(number) for number in decision.setpoint)
         shown = messages.Decided(
@@ -224,3 +230,94 @@ class CompanionTap:
         """Disconnect."""
         self._asked.close()
         self._feed.close()
+
+
+INFO = 6
+"""MAV_SEVERITY_INFO."""
+
+
+class ViewObserver(Observer):
+    """Reports to a view, and forwards all events to another observer."""
+
+    def __init__(self, ends: ViewEnds, onwards: Observer) -> None:
+        """Connect to a view."""
+        self._feed = Feed(ends)
+        self._onwards = onwards
+        self.shows_states = onwards.shows_states
+
+    def waiting(self, what: str) -> None:
+        """Forward the reason of a wait."""
+        self._onwards.waiting(what)
+
+    def episode(self, index: int, seed: int, goal: Goal) -> None:
+        """Report the start of an episode."""
+        self._feed.send(Flight(index=index, seed=seed, goal=goal))
+        self._onwards.episode(index, seed, goal)
+
+    def phase(self, phase: str, time_us: int) -> None:
+        """Report the phase."""
+        self._feed.send(PhaseStart(time_us=time_us, phase=phase))
+        self._onwards.phase(phase, time_us)
+
+    def state(self, state: State, started_us: int) -> None:
+        """Forward the state: the view gets it from the simulation, and more often."""
+        self._onwards.state(state, started_us)
+
+    def text(self, text: Text) -> None:
+        """Report a text of the autopilot."""
+        self._feed.send(Said(time_us=text.time_us, severity=text.severity, text=text.text))
+        self._onwards.text(text)
+
+    def finished(self, record: EpisodeRecord) -> None:
+        """Report the end of an episode."""
+        how = f"flight {record.index:03d}: {record.outcome.value}, {record.reason}"
+        self._feed.send(Said(time_us=record.ended_us, severity=INFO, text=how))
+        for note in record.notes:
+            self._feed.send(Said(time_us=None, severity=WARNING, text=note))
+        self._onwards.finished(record)
+
+    def lost(self, what: str) -> None:
+        """Report that an episode begins again."""
+        self._feed.send(Said(time_us=None, severity=WARNING, text=what))
+        self._onwards.lost(what)
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._feed.close()
+
+
+class FlightTap:
+    """Connection of one flight to a viewer, until it is closed.
+
+    Call the companion's methods on its thread, all others on the waiting conductor's thread.
+    """
+
+    def __init__(self, ends: ViewEnds, scenario: ResolvedScenario) -> None:
+        """Connect to a viewer; the pace is real time until a spectator changes it."""
+        self._open = ExitStack()
+        self._simulation = self._open.enter_context(closing(SimulationTap(ends, scenario)))
+        self.companion = self._open.enter_context(closing(CompanionTap(ends, scenario)))
+        """Companion's part of the connection."""
+        self._pace = self._open.enter_context(closing(Pace(ends, scenario.speed or REAL_TIME)))
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._open.close()
+
+    def begin(self, seed: int, arena: Arena, started_us: int) -> None:
+        """Show the start of an episode, at a simulated time [µs]."""
+        self._simulation.begin(seed, arena, started_us)
+
+    def frame(self, frame: Frame) -> None:
+        """Show a camera frame."""
+        self._simulation.frame(frame)
+
+    def tick(self, simulation: Simulation, collision: str | None) -> None:
+        """Show the newest ticks, and wait as the pace requires."""
+        self._simulation.tick(simulation, collision, self._pace.tick)
+        self._pace.tick(simulation.time_us)
+
+    def decided(self, decision: SentDecision) -> None:
+        """Show an executed decision."""
+        self.companion.decided(decision)
+        self._pace.decided()

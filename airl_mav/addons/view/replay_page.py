@@ -7,21 +7,21 @@ from typing import Any
 
 import viser
 
-from airl_mav.core.clock import Clock, WallClock
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
-from airl_mav.flight.episode_record import EpisodeRecord
-from airl_mav.report.replay.replayed_flight import (
+from airl_mav.addons.view.panel import Panel
+from airl_mav.addons.view.replayed_flight import (
     ReplayedFlight,
     ReplayedRun,
     ReplayedRuns,
     parting_s,
 )
-from airl_mav.view.panel import Panel
-from airl_mav.view.shown import Shown
-from airl_mav.view.style import OTHER
-from airl_mav.view.viser_scene import FlightScene
-from airl_mav.view.watchers import Watchers
+from airl_mav.addons.view.view_messages import Shown
+from airl_mav.addons.view.view_server import Watchers
+from airl_mav.addons.view.viser_scene import FlightScene
+from airl_mav.core.clock import Clock, WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.flight.episode_record import EpisodeRecord
+from airl_mav.report.scene import OTHER
 
 DRAW_US = 33_000
 """Period of scene updates [wall µs]."""
