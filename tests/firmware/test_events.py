@@ -25,6 +25,8 @@ from firmware_sim.autopilot.events.definition import (
     FORMATS,
     ArmingReason,
     Component,
+    FailsafeAction,
+    FailsafeCause,
     Level,
     MavlinkEvent,
     ModeGroup,
@@ -33,8 +35,6 @@ from firmware_sim.autopilot.events.definition import (
 from firmware_sim.autopilot.events.health_report import ALL_MODES, HealthReport, health_report
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     Conditions,
-    FailsafeAction,
-    FailsafeReason,
 )
 from firmware_sim.autopilot.failsafes.framework import announcement
 from firmware_sim.autopilot.flight_modes import Mode, Need
@@ -167,38 +167,38 @@ def test_levels_are_two_halves_of_a_byte() -> None:
     [
         (
             FailsafeAction.HOLD,
-            FailsafeAction.RETURN,
-            FailsafeReason.GCS_LOSS,
+            FailsafeAction.RTL,
+            FailsafeCause.GCS_CONNECTION_LOSS,
             "GCS connection loss: switching to Return in 5 seconds",
         ),
         (
             FailsafeAction.HOLD,
             FailsafeAction.LAND,
-            FailsafeReason.GENERIC,
+            FailsafeCause.GENERIC,
             "Failsafe activated: switching to Land in 5 seconds",
         ),
         (
             FailsafeAction.WARN,
             FailsafeAction.NONE,
-            FailsafeReason.BATTERY_LOW,
+            FailsafeCause.LOW_BATTERY_LEVEL,
             "Low battery level, return advised",
         ),
         (
             FailsafeAction.DESCEND,
             FailsafeAction.NONE,
-            FailsafeReason.GENERIC,
+            FailsafeCause.GENERIC,
             "Failsafe activated: Autopilot disengaged, switching to Descend",
         ),
         (
-            FailsafeAction.RETURN,
+            FailsafeAction.RTL,
             FailsafeAction.NONE,
-            FailsafeReason.BATTERY_CRITICAL,
+            FailsafeCause.CRITICAL_BATTERY_LEVEL,
             "Critical battery level: switching to Return",
         ),
     ],
 )
 def test_a_failsafes_event_names_its_cause_and_what_follows(
-    action: FailsafeAction, delayed: FailsafeAction, cause: FailsafeReason, expected: str
+    action: FailsafeAction, delayed: FailsafeAction, cause: FailsafeCause, expected: str
 ) -> None:
     told = announcement(action, delayed, cause, Mode.OFFBOARD, 5 * US_PER_S)
     assert told.event is not None

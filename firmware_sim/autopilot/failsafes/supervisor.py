@@ -16,12 +16,11 @@ from firmware_sim.autopilot.autopilot_state import Health, OperatorText, Setpoin
 from firmware_sim.autopilot.commander import CommanderState, FlightPhase
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import MavlinkEvent
+from firmware_sim.autopilot.events.definition import FailsafeAction, MavlinkEvent
 from firmware_sim.autopilot.events.health_report import REPORT_US, HealthReporter
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
     Conditions,
-    FailsafeAction,
     FailsafeSettings,
     lacking,
 )

@@ -18,8 +18,7 @@ from typing import Any
 from airl_mav.core.addons import entries, load
 from airl_mav.profiles.parameters import SPECS, ParameterSpec
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.autopilot.events import check_events, flight_events
-from firmware_sim.autopilot.events.check_events import CheckEvent
+from firmware_sim.autopilot.events import flight_events, health_report
 from firmware_sim.autopilot.events.definition import (
     ENUMERATIONS,
     Definition,
@@ -29,6 +28,7 @@ from firmware_sim.autopilot.events.definition import (
     words,
 )
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.prearm import CHECKS
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.services.context import Context, VehicleCommand
 from firmware_sim.mavlink.services.transfers import crc32part
@@ -126,12 +126,12 @@ def _parameter_described(spec: ParameterSpec) -> dict[str, Any]:
 def definitions() -> Iterator[Definition]:
     """Yield all events that this vehicle can send."""
     added = map(load, entries("firmware_sim", "EVENTS").values())
-    for module in (flight_events, check_events, *added):
+    for module in (flight_events, health_report, *added):
         for value in vars(module).values():
             if isinstance(value, Definition):
                 yield value
-            elif isinstance(value, CheckEvent):
-                yield value.definition
+    for check in CHECKS:
+        yield check.event
 
 
 def _event_document() -> dict[str, Any]:
