@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 from pydantic import Field, Strict, model_validator
 
@@ -51,46 +51,6 @@ class Training(ProfileModel):
     date_utc: str | None = optional("when it was exported, ISO 8601")
 
 
-class Measured(Protocol):
-    """A figure with its 95 % interval: `flight.statistics.Estimate`, or a published one."""
-
-    @property
-    def value(self) -> float | None:
-        """Estimate; None = no data."""
-
-    @property
-    def low(self) -> float | None:
-        """Lower end of the interval."""
-
-    @property
-    def high(self) -> float | None:
-        """Upper end of the interval."""
-
-    @property
-    def n(self) -> int:
-        """Number of flights."""
-
-
-class MeasuredQuality(Protocol):
-    """Figures of flown episodes: `flight.statistics.Aggregate`, or a published run."""
-
-    @property
-    def success_rate(self) -> Measured:
-        """Fraction, 0 to 1."""
-
-    @property
-    def flight_time_s(self) -> Measured:
-        """Mean over the successful flights, as are the following properties."""
-
-    @property
-    def distance_m(self) -> Measured:
-        """Flown distance [m]."""
-
-    @property
-    def energy_j(self) -> Measured:
-        """Energy of the vehicle without its computer [J]."""
-
-
 class MeasuredResult(ProfileModel):
     """Measured quality over a set of episodes; means over the successful ones."""
 
@@ -115,8 +75,11 @@ class MeasuredResult(ProfileModel):
     behaviour: str | None = optional("fingerprint of the flight behaviour that it was flown with")
 
     @classmethod
-    def of(cls, quality: MeasuredQuality, **conditions: Any) -> MeasuredResult:
-        """Return a result with the figures of a quality; `conditions` are the other fields."""
+    def of(cls, quality: Any, **conditions: Any) -> MeasuredResult:
+        """Return a result with the figures of a quality; `conditions` are the other fields.
+
+        `quality` is a `flight.statistics.Aggregate`, or a published run with the same estimates.
+        """
         rate = quality.success_rate
         return cls(
             episodes=rate.n,

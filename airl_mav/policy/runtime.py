@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,21 +43,18 @@ _ONNX_TYPES: dict[type[np.generic], str] = {
 }
 
 
-class Runtime(Protocol):
-    """A network ready for inference."""
-
-    def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        """Return the outputs (n, k) for the arrays of a layout, each with n rows."""
-
-
-@runtime_checkable
-class RecurrentRuntime(Runtime, Protocol):
-    """A runtime that also supports networks with memory."""
+class Runtime:
+    """A network ready for inference; base class."""
 
     def step(
         self, encoded: Mapping[str, NDArray[Any]], memory: Memory
     ) -> tuple[NDArray[np.float32], Memory]:
-        """Return the outputs (n, k) of a network with memory, and its next memory."""
+        """Return the outputs (n, k) for the arrays of a layout, each with n rows; next memory."""
+        raise NotImplementedError(f"{type(self).__name__} runs no network with a memory")
+
+    def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+        """Return the outputs (n, k) of a network without memory."""
+        return self.step(encoded, {})[0]
 
 
 def blank_memory(shapes: Shapes, n: int) -> Memory:
@@ -70,8 +67,8 @@ def outputs_of(actions: ActionSpec) -> int:
     return discrete_actions(actions) or continuous_numbers(actions)
 
 
-class OnnxRuntime:
-    """A network in ONNX Runtime, on the CPU. Implements `RecurrentRuntime`."""
+class OnnxRuntime(Runtime):
+    """A network in ONNX Runtime, on the CPU."""
 
     def __init__(
         self,
@@ -106,22 +103,17 @@ class OnnxRuntime:
         self._state = tuple(state or {})
         _check_signature(self._session, observation, actions, state or {})
 
-    def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        """Return the outputs (n, k) for the arrays of a layout."""
-        found: NDArray[np.float32] = self._session.run([ACTION], dict(encoded))[0]
-        return found
-
     def step(
         self, encoded: Mapping[str, NDArray[Any]], memory: Memory
     ) -> tuple[NDArray[np.float32], Memory]:
-        """Return the outputs (n, k) of a network with memory, and its next memory."""
+        """Return the outputs and the next memory; see `Runtime`."""
         names = [ACTION, *(f"{NEXT}{name}" for name in self._state)]
         found, *after = self._session.run(names, {**encoded, **memory})
         return found, dict(zip(self._state, after, strict=True))
 
 
-class TorchRuntime:
-    """A network as a torch program (`torch.export`), on the CPU. Implements `RecurrentRuntime`."""
+class TorchRuntime(Runtime):
+    """A network as a torch program (`torch.export`), on the CPU."""
 
     def __init__(
         self,
@@ -147,19 +139,15 @@ class TorchRuntime:
         self._torch = torch
         self._keys, self._state = tuple(boxes(observation)), tuple(state or {})
 
-    def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        """Return the outputs (n, k) for the arrays of a layout."""
-        with self._torch.inference_mode():
-            found: NDArray[np.float32] = self._module(*self._tensors(encoded, self._keys)).numpy()
-        return found
-
     def step(
         self, encoded: Mapping[str, NDArray[Any]], memory: Memory
     ) -> tuple[NDArray[np.float32], Memory]:
-        """Return the outputs (n, k) of a network with memory, and its next memory."""
+        """Return the outputs and the next memory; see `Runtime`."""
         with self._torch.inference_mode():
             tensors = self._tensors(encoded, self._keys) + self._tensors(memory, self._state)
-            found, *after = (each.numpy() for each in self._module(*tensors))
+            outputs = self._module(*tensors)
+            outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+            found, *after = (each.numpy() for each in outputs)
         return found, dict(zip(self._state, after, strict=True))
 
     def _tensors(self, arrays: Mapping[str, NDArray[Any]], keys: tuple[str, ...]) -> list[Any]:

@@ -35,7 +35,7 @@ from airl_mav.policy.runtime import (
     NEXT,
     Memory,
     OnnxRuntime,
-    RecurrentRuntime,
+    Runtime,
     Shapes,
     TorchRuntime,
     first_line,
@@ -162,9 +162,7 @@ def memory_of(module: nn.Module) -> Shapes:
     return module.state if isinstance(module, RecurrentNetwork) else {}
 
 
-def _compare(
-    module: nn.Module, runtime: RecurrentRuntime, spec: ObservationSpec, name: str
-) -> None:
+def _compare(module: nn.Module, runtime: Runtime, spec: ObservationSpec, name: str) -> None:
     """Raise ValueError unless a runtime and the network have the same outputs."""
     rng = np.random.default_rng(1)
     for n in CHECKED_ROWS:

@@ -23,6 +23,7 @@ from airl_mav.addons.refit.refly import (
     NOTHING,
     VEHICLE,
     WIND,
+    Rehearsals,
     refly_parts,
     turned_wind,
 )
@@ -314,7 +315,7 @@ def test_the_same_flight_gives_the_same_refit(refitted: Refitted) -> None:
 def test_rehearsed_on_what_was_fitted_it_is_the_flight(refitted: Refitted, tmp_path: Path) -> None:
     """Once each: with all of the refit, with its parts, and with nothing of it."""
     path, out = refitted.flight.black_box, tmp_path / "out"
-    whole, parts = refly_parts(path, out, refitted.out, arena="static-obstacles", episodes=1)
+    whole, parts = refly_parts(path, out, refitted.out, Rehearsals("static-obstacles", episodes=1))
     by_name = {each.part: each for each in parts}
     assert set(by_name) == {NOTHING, LATENCY, VEHICLE, WIND, ALL}
     everything, nothing = by_name[ALL], by_name[NOTHING]

@@ -22,6 +22,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json
 from airl_mav.policy.card import read_card
 from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.policy.runtime import Runtime
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.profiles.vehicle import load_vehicle
 
@@ -157,7 +158,7 @@ def test_the_page_stands_alone(shown: tuple[Path, str]) -> None:
 # --- taking notice
 
 
-class StopsBefore:
+class StopsBefore(Runtime):
     """Network that turns away from objects nearer than a depth, above the horizon."""
 
     def __init__(self, depth_m: float) -> None:

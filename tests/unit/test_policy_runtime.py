@@ -81,7 +81,7 @@ def scene(seed: int = 1, lens: Intrinsics = LENS) -> Observation:
     return encode(frame, state, (20.0, -5.0))
 
 
-class Answers:
+class Answers(Runtime):
     """Network that returns given outputs and records its inputs."""
 
     def __init__(self, outputs: Any) -> None:

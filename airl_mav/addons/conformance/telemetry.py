@@ -9,7 +9,7 @@ import json
 import math
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -404,7 +404,7 @@ MANOEUVRES: tuple[tuple[HeldSetpoint, ...], ...] = (
 up; a second, mirrored pass returns."""
 
 
-def plan(names: tuple[StepName, ...], *, mirrored: bool) -> list[HeldSetpoint]:
+def plan(names: Collection[str], *, mirrored: bool) -> list[HeldSetpoint]:
     """Return the legs of the manoeuvres that contain the named steps; others are not measured."""
     legs = []
     for manoeuvre in MANOEUVRES:

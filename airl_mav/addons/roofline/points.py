@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,9 @@ from airl_mav.policy.observation import InFlight, Kinematics, observe
 from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import VehicleProfile
+
+if TYPE_CHECKING:
+    from airl_mav.addons.roofline.roofline import RooflineRequest
 
 Bound = Literal["body", "sensor", "computer", "hold", "link"]
 """Component that limits the speed."""
@@ -130,11 +133,7 @@ def roofline_point(
     computer: ComputerProfile,
     task: StoppingTask,
     injection: Injection,
-    *,
-    knee_share: float,
-    mission_m: float,
-    draws: int,
-    seed: int,
+    request: RooflineRequest,
 ) -> RooflinePoint:
     """Compute a computer's point on the roofline of its vehicle, and fly it.
 
@@ -143,10 +142,7 @@ def roofline_point(
         computer: The computer.
         task: The vehicle with this computer, its decision loop and its sensing distance.
         injection: t2 as measured on the computer; must have a latency.
-        knee_share: Share of the roof at which the knee lies, 0 < q < 1.
-        mission_m: Length of a mission [m].
-        draws: Flights at each tested speed.
-        seed: Seed of the draws.
+        request: Knee, mission, number of flights and seed.
 
     Raises:
         ValueError: The injection has no latency.
@@ -165,7 +161,7 @@ def roofline_point(
     }
     braking, room, a = braking_of(vehicle), task.room_m, max_acceleration(vehicle)
     roof = braking.safe_velocity(0.0, room)
-    at_knee = knee_share * roof
+    at_knee = request.knee_share * roof
     braked = braking.stopping_m(at_knee, 0.0)
     knee_hz = (braking.stopping_m(at_knee, 1.0) - braked) / (room - braked)
     power_w = float(level_powers_w(vehicle, np.array([measured]))[0]) + computer.onboard_watts
@@ -183,15 +179,15 @@ def roofline_point(
         max_acceleration_m_s2=a,
         f1_m_s=f1_velocity(reaction, room, a),
         f1_roof_m_s=f1_velocity(0.0, room, a),
-        f1_knee_hz=f1_knee_hz(knee_share, room, a),
+        f1_knee_hz=f1_knee_hz(request.knee_share, room, a),
         braking=braking,
         measured_m_s=measured,
         roof_m_s=roof,
         knee_hz=knee_hz,
-        flown_m_s=greatest_speed(task, injection, t2_s, draws, seed),
+        flown_m_s=greatest_speed(task, injection, t2_s, request.draws, request.seed),
         binds="body" if 1.0 / reaction >= knee_hz else max(parts, key=lambda part: parts[part]),
         power_w=power_w,
-        missions_per_charge=pack_j * measured / (power_w * mission_m),
+        missions_per_charge=pack_j * measured / (power_w * request.mission_m),
     )
 
 
