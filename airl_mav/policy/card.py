@@ -15,7 +15,7 @@ from pydantic import Field, Strict, model_validator
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import UsageError, usage_errors
 from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
 from airl_mav.core.files import read_json
 from airl_mav.policy.actions import ACTION_SETS, ActionSpec, DecisionTiming
@@ -277,10 +277,8 @@ def vehicle_mismatch(
 
 def _read_bound(path: Path, sha256: str) -> bytes:
     """Return a file's bytes if they match the digest. Raises UsageError."""
-    try:
+    with usage_errors(path):
         data = path.read_bytes()
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from None
     if (found := digest(data)) != sha256:
         raise UsageError(
             f"{path}: SHA-256 {found[:12]}...; accepted: {sha256[:12]}..., that of {CARD_FILE}"

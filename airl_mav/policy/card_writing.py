@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import UsageError, usage_errors
 from airl_mav.core.fields import validated
 from airl_mav.core.files import replace_file, write_json
 from airl_mav.policy.actions import ActionSpec
@@ -195,7 +195,7 @@ def copy_policy(
         raise UsageError(f"{out}: not a folder")
     plain = card.model_dump(mode="json") | {"results": ()} | changes
     copied = validated(PolicyCard, plain)
-    try:
+    with usage_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         replace_file(out / ONNX_FILE, read_model(source, card))
         if card.torch_sha256 is not None:
@@ -203,8 +203,6 @@ def copy_policy(
         write_card(out, copied)
         if card.torch_sha256 is None:
             (out / TORCH_FILE).unlink(missing_ok=True)
-    except OSError as error:
-        raise UsageError(f"{out}: {error.strerror}") from None
     return copied
 
 

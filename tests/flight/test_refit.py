@@ -36,11 +36,11 @@ from airl_mav.experiments.experiment import load_run
 from airl_mav.latency.injection import parse_latency
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.conditions import WindSettings
+from airl_mav.profiles.loading import read_toml
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.tracking import track
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.scenario_file import read_scenario_file
 from airl_mav.vehicle_log import Series, VehicleLog, align, read_vehicle_log
 from tests.support.recorded_flights import RecordedFlight
 from tests.support.refit_truths import Truth, drawn_truth, errors_of, true_dead_time_s, uplink_s
@@ -104,7 +104,7 @@ def test_what_is_written_loads_as_it_is(refitted: Refitted) -> None:
     assert "measured in flight" in computer.workloads["flown"].source
     injection = parse_latency(str(out / "latency.txt"))
     assert injection.latency is not None and injection.latency.samples_ms == samples
-    scenario = Scenario(**read_scenario_file(out / "scenario.toml"), level="lockstep")
+    scenario = Scenario(**read_toml(out / "scenario.toml"), level="lockstep")
     assert scenario.wind.north_m_s == found.estimate("wind_north_m_s").value
     told = json.loads((out / "refit.json").read_text(encoding="utf-8"))
     assert told["estimates"]["mass_kg"]["value"] == found.estimate("mass_kg").value
@@ -153,7 +153,7 @@ def test_two_logs_tell_of_the_vehicle_together(refitted: Refitted, tmp_path: Pat
     assert both.flights[0].air.wind == both.flights[1].air.wind
     assert both.flights[0].air.wind is not None
     assert load_vehicle(str(out / "vehicle.toml")).body.mass_kg == both.vehicle.body.mass_kg
-    assert "wind" not in read_scenario_file(out / "scenario.toml")
+    assert "wind" not in read_toml(out / "scenario.toml")
     held = json.loads((out / "refit.json").read_text(encoding="utf-8"))
     assert [Path(each["ulg"]).name for each in held["flights"]] == ["flight.ulg", "again.ulg"]
 
@@ -176,7 +176,7 @@ def test_the_vehicles_log_alone_tells_all_but_the_computer(
     assert {each.name for each in out.iterdir()} == {"vehicle.toml", "scenario.toml", "refit.json"}
     vehicle = load_vehicle(str(out / "vehicle.toml"))
     assert vehicle.body.mass_kg == found.vehicle.body.mass_kg
-    scenario = Scenario(**read_scenario_file(out / "scenario.toml"), level="lockstep")
+    scenario = Scenario(**read_toml(out / "scenario.toml"), level="lockstep")
     assert scenario.wind.north_m_s == found.estimate("wind_north_m_s").value
     assert scenario.latency is None
     with pytest.raises(FieldError, match=r"nothing beside .*which is a log already"):

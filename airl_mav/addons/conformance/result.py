@@ -27,7 +27,7 @@ from airl_mav.addons.conformance.telemetry import (
     StepResponse,
 )
 from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.errors import FieldError, usage_errors
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import write_json
 from airl_mav.profiles.loading import list_profiles, load_profile
@@ -290,10 +290,8 @@ class ConformanceResult:
 
     def write(self, path: Path) -> None:
         """Write all results to a .json. Raises UsageError if it cannot be written."""
-        try:
+        with usage_errors(path):
             write_json(path, self.as_data())
-        except OSError as error:
-            raise UsageError(f"{path}: {error.strerror}") from None
 
 
 def _without_nan(response: StepResponse) -> dict[str, float | None]:
