@@ -22,6 +22,7 @@ from airl_mav.core.fields import validated
 from airl_mav.core.files import replace_file, write_json
 from airl_mav.policy.actions import ActionSpec
 from airl_mav.policy.card import (
+    ACTION,
     CARD_FILE,
     ONNX_FILE,
     SCHEMA,
@@ -31,13 +32,13 @@ from airl_mav.policy.card import (
     PolicyFacts,
     digest,
     load_card,
+    outputs_of,
     read_card,
     read_model,
     read_torch_program,
 )
 from airl_mav.policy.layouts import GOAL, VELOCITY
 from airl_mav.policy.observation_spec import ObservationSpec
-from airl_mav.policy.runtime import ACTION, outputs_of
 
 MODEL_CARD_FILE = "README.md"
 

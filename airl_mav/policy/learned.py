@@ -15,23 +15,21 @@ from airl_mav.core.errors import UsageError
 from airl_mav.policy.actions import ActionSpec, AnyAction, command, discrete_actions
 from airl_mav.policy.card import (
     TORCH_FILE,
+    Memory,
     PolicyCard,
+    Runtime,
+    RuntimeName,
+    TorchRuntime,
+    blank_memory,
     check_trust,
     open_model,
+    outputs_of,
     read_card,
     read_torch_program,
 )
 from airl_mav.policy.layouts import ablated, boxes, encode_layout
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import camera_mismatch, further_mismatch
-from airl_mav.policy.runtime import (
-    Memory,
-    Runtime,
-    RuntimeName,
-    TorchRuntime,
-    blank_memory,
-    outputs_of,
-)
 from airl_mav.profiles.loading import profiles_dir
 
 

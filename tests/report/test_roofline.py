@@ -16,13 +16,12 @@ from rich.console import Console
 from scipy.optimize import brentq
 
 from airl_mav.addons.roofline import roofline as command
-from airl_mav.addons.roofline.points import Roofline, RooflinePoint, noticed_m
+from airl_mav.addons.roofline.page import Roofline, RooflinePoint, noticed_m
 from airl_mav.addons.roofline.roofline import RooflineRequest, roofline
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json
-from airl_mav.policy.card import read_card
+from airl_mav.policy.card import Runtime, read_card
 from airl_mav.policy.learned import LearnedPolicy
-from airl_mav.policy.runtime import Runtime
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.profiles.vehicle import load_vehicle
 

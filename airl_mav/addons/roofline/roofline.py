@@ -12,12 +12,12 @@ import numpy as np
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.addons.roofline.page import roofline_document
-from airl_mav.addons.roofline.points import (
+from airl_mav.addons.roofline.page import (
     LeftOut,
     Roofline,
     RooflinePoint,
     noticed_m,
+    roofline_document,
     roofline_point,
 )
 from airl_mav.core.clock import utc_now
