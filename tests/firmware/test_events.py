@@ -18,6 +18,8 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Geodetic
+from firmware_sim.addons.ground_station_services import component_metadata
+from firmware_sim.addons.ground_station_services.component_metadata import definitions
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events
 from firmware_sim.autopilot.events.definition import (
@@ -42,8 +44,6 @@ from firmware_sim.autopilot.inputs import Source, Sticks
 from firmware_sim.autopilot.prearm import ArmingSettings, Readiness, can_arm
 from firmware_sim.autopilot.sensor_monitor import ACCEL, BARO, GPS, GYRO, MAG, SensorWatch
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services import component_metadata
-from firmware_sim.mavlink.services.component_metadata import definitions
 from firmware_sim.mavlink.texts_and_events import FIRST_SEQUENCE, KEPT
 from tests.support import flight_rig
 from tests.support.flown_by_mavsdk import Flown, flown

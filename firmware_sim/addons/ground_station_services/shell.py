@@ -8,13 +8,14 @@ from __future__ import annotations
 import fnmatch
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services.context import Context, Handlers, ServiceState, for_anyone
 
 PROMPT = "pxh> "
 
@@ -34,6 +35,19 @@ _LONGEST_OUTPUT = 1 << 17
 """Unsent output above which new commands are dropped [bytes]."""
 
 
+@dataclass(slots=True)
+class Shell(ServiceState):
+    """Shell state of one client."""
+
+    line: bytearray = field(default_factory=bytearray)
+    output: bytearray = field(default_factory=bytearray)
+
+    @property
+    def is_running(self) -> bool:
+        """True if output remains to be sent."""
+        return bool(self.output)
+
+
 def handle_input(message: WireMessage, context: Context) -> bool:
     """Read input and run each complete line."""
     if (
@@ -41,7 +55,7 @@ def handle_input(message: WireMessage, context: Context) -> bool:
         or message.flags & dialect.SERIAL_CONTROL_FLAG_REPLY
     ):
         return False
-    shell = context.shell
+    shell = context.state(Shell)
     # The client may send a line in several messages, or several lines in one.
     for byte in bytes(message.data[: message.count]):
         if byte not in b"\r\n":
@@ -59,7 +73,10 @@ def handle_input(message: WireMessage, context: Context) -> bool:
 
 def send_pending(context: Context) -> None:
     """Send the next part of the output; call once per tick."""
-    output = context.shell.output
+    shell = context.states.get(Shell)
+    if shell is None:
+        return
+    output = shell.output
     for _ in range(MESSAGES_PER_TICK):
         if not output:
             return
@@ -200,3 +217,6 @@ COMMANDS: Mapping[str, Shown] = {
     "uptime": _uptime,
     "ver": _version,
 }
+
+
+HANDLERS: Handlers = {"SERIAL_CONTROL": (for_anyone, handle_input)}

@@ -9,20 +9,73 @@ cancelled. Source: PX4 1.16, Commander::handle_command and the texts of a runnin
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
+from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.interfaces import SensorSample
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.context import Action, Context, VehicleCommand
-from firmware_sim.mavlink.services.transfers import CalibrationText
+from firmware_sim.mavlink.services.context import Action, Context, ServiceState, VehicleCommand
 
 MOVING_RAD_S = 0.2
 """Minimum body rate that counts as motion [rad/s]."""
 
 _GYRO_STEP_S, _LEVEL_STEP_S, _REST_S, _AGAIN_S = 0.15, 0.5, 1.0, 5.0
+
+
+class CalibrationText(NamedTuple):
+    """Text of a calibration."""
+
+    after_s: float
+    """Time after the previous text [s]."""
+    message: OperatorText
+
+
+class RunningCalibration(ServiceState):
+    """Calibration in progress of one vehicle, common to all its clients."""
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Start without a calibration."""
+        self.sensor = ""
+        self.radio = False
+        """True while a ground station calibrates a radio; a cancellation ends it."""
+        self._steps: Iterator[CalibrationText] = iter(())
+        self._next: CalibrationText | None = None
+        self._due_us = 0
+
+    @property
+    def forbids_arming(self) -> bool:
+        """True if PX4 rejects arming because of the calibration."""
+        return self.is_running or self.radio
+
+    @property
+    def is_running(self) -> bool:
+        """True if steps remain."""
+        return self._next is not None
+
+    def start(self, sensor: str, steps: Iterator[CalibrationText], now_us: int) -> None:
+        """Start calibrating a sensor. Replaces a running calibration."""
+        self.sensor, self._steps, self._due_us = sensor, steps, now_us
+        self._plan()
+
+    def due(self, now_us: int) -> list[OperatorText]:
+        """Return the messages due at `now_us` [µs], in order."""
+        messages: list[OperatorText] = []
+        while self._next is not None and self._due_us <= now_us:
+            messages.append(self._next.message)
+            self._plan()
+        return messages
+
+    def _plan(self) -> None:
+        self._next = next(self._steps, None)
+        if self._next is not None:
+            self._due_us += round(self._next.after_s * US_PER_S)
 
 
 def _info(text: str, after_s: float = 0.0) -> CalibrationText:
@@ -150,12 +203,12 @@ _ESC = 7
 
 def _calibrate(command: VehicleCommand, context: Context) -> Result:
     """Handle PREFLIGHT_CALIBRATION: one parameter selects the sensor; all zero cancels."""
-    running = context.calibration
+    running = context.vehicle_state(RunningCalibration)
     # NaN counts as 0: the parameter is not set.
     asked = {number: command.integer(number) or 0 for number in range(1, 8)}
     if context.port.state().status.arming is Arming.ARMED:
         return Result.TEMPORARILY_REJECTED
-    if running.active:
+    if running.is_running:
         # A second calibration request does not replace the running one.
         if any(asked.values()):
             return Result.TEMPORARILY_REJECTED
@@ -184,7 +237,10 @@ def _calibrate(command: VehicleCommand, context: Context) -> Result:
 
 def _quick_magnetometer(command: VehicleCommand, context: Context) -> Result:
     """Handle FIXED_MAG_CAL_YAW, parameter 1: heading [deg]."""
-    if context.calibration.active or context.port.state().status.arming is Arming.ARMED:
+    if (
+        context.vehicle_state(RunningCalibration).is_running
+        or context.port.state().status.arming is Arming.ARMED
+    ):
         return Result.TEMPORARILY_REJECTED
     heading = command.integer(1) or 0
     for text in (
@@ -197,8 +253,8 @@ def _quick_magnetometer(command: VehicleCommand, context: Context) -> Result:
 
 def send_pending(context: Context) -> None:
     """Announce the due texts of a running calibration; call once per tick."""
-    running = context.calibration
-    if running.active:
+    running = context.vehicle_states.get(RunningCalibration)
+    if running is not None and running.is_running:
         for message in running.due(context.now_us):
             context.announce(message)
 
