@@ -55,7 +55,7 @@ from airl_mav.flight.trajectory import Trajectory, commanded_velocity
 from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT
 from airl_mav.profiles.projections import CameraKind
-from airl_mav.report.forensics.camera_view import PolicyCamera
+from airl_mav.report.policy_view import PolicyCamera
 from airl_mav.report.scene import FIRST, OTHER
 
 ENDED = "ended"

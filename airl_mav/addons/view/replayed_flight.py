@@ -17,12 +17,11 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.files import Arrays
-from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord
+from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord, ranked
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import SETPOINT, commanded, setpoint_column
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE, RUN_FILE, LoadedRun, load
-from airl_mav.report.forensics.evidence import ranked
 from airl_mav.report.run_arenas import arenas_of, spec_of, vehicle_of
 
 INFO, WARNING = 6, 4
@@ -120,7 +119,7 @@ class ReplayedFlight:
         # Imported here, as they load numba and a flight is shown before its arena.
         from airl_mav.camera.exposure import expose
         from airl_mav.camera.render import camera_pose
-        from airl_mav.report.forensics.camera_view import PolicyCamera
+        from airl_mav.report.policy_view import PolicyCamera
 
         camera = PolicyCamera.of(self.vehicle.camera)
         position, _, quaternion = pose_at(self.path, time_us)
@@ -275,7 +274,9 @@ class ReplayedRun:
         self.title = f"{self._run.info.setup.policy.name} in {self._run.info.setup.arena.name}"
         """Title of the run: policy and arena."""
         paths = self._run.trajectories
-        recorded = [e for e in ranked(self._run) if e.index in paths and len(paths[e.index])]
+        recorded = [
+            e for e in ranked(self._run.episodes) if e.index in paths and len(paths[e.index])
+        ]
         if not recorded:
             raise UsageError(f"{path}: no flight is recorded")
         self.records: tuple[EpisodeRecord, ...] = tuple(recorded)
