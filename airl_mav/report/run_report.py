@@ -26,12 +26,8 @@ from airl_mav.latency.stages import STAGES, decision_series
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.report import document, run_tables
-from airl_mav.report.document import (
-    Section,
-    ms,
-    tables_section,
-)
+from airl_mav.report import document
+from airl_mav.report.document import Section, ms, tables_section
 from airl_mav.report.energy_section import energy_section
 from airl_mav.report.measures import RunSummary, conduct_table, rate_digits, summarize_run
 from airl_mav.report.plotly_scene import (
@@ -41,15 +37,18 @@ from airl_mav.report.plotly_scene import (
     scene_json,
     top_speed,
 )
-from airl_mav.report.policy_view import (
-    PolicyAgain,
-    SeenDecision,
-    policy_again,
-    seen_decisions,
-)
+from airl_mav.report.policy_view import PolicyAgain, SeenDecision, policy_again, seen_decisions
 from airl_mav.report.run_arenas import arenas_of, flown_path, vehicle_of
 from airl_mav.report.run_figures import map_figure, overview_picture
-from airl_mav.report.run_tables import MAX_FLIGHTS, episodes_table
+from airl_mav.report.run_tables import (
+    MAX_FLIGHTS,
+    episodes_table,
+    estimation_table,
+    faults_table,
+    quality_table,
+    real_time_table,
+    setup_rows,
+)
 from airl_mav.report.run_verdict import OverallVerdict, save_verdict, verdict_of
 from airl_mav.report.theme import FigureImage, palette, shades
 from airl_mav.report.timeline import latency_section
@@ -376,27 +375,15 @@ def write_report(
     return page
 
 
-def _setup(page: ReportInput) -> list[Section]:
-    return [Section("What flew", facts=run_tables.setup_rows(page.run))]
-
-
 def _quality(page: ReportInput) -> tuple[Section, ...]:
     feeds = not page.run.info.setup.computer_on_ground
-    quality = run_tables.quality_table(page.summary, computer=feeds)
+    quality = quality_table(page.summary, computer=feeds)
     return tables_section(quality, conduct_table(page.run, page.summary))
-
-
-def _real_time(page: ReportInput) -> tuple[Section, ...]:
-    return tables_section(run_tables.real_time_table(page.run, page.summary))
 
 
 def _worst(page: ReportInput) -> tuple[Section, ...]:
     section = addons.entries("airl_mav", "FORENSICS").get("section")
     return tuple(addons.load(section)(page)) if section else ()
-
-
-def _estimator(page: ReportInput) -> tuple[Section, ...]:
-    return tables_section(run_tables.estimation_table([flight.tracked for flight in page.view]))
 
 
 def _provenance(page: ReportInput) -> list[Section]:
@@ -418,13 +405,21 @@ class PageSection(NamedTuple):
 
 
 SECTIONS = (
-    PageSection("setup", "What flew", _setup),
+    PageSection(
+        "setup", "What flew", lambda page: [Section("What flew", facts=setup_rows(page.run))]
+    ),
     PageSection("quality", "Quality of flight", _quality),
-    PageSection("", "Faults", lambda page: tables_section(run_tables.faults_table(page.run))),
-    PageSection("", "Real time", _real_time),
+    PageSection("", "Faults", lambda page: tables_section(faults_table(page.run))),
+    PageSection(
+        "", "Real time", lambda page: tables_section(real_time_table(page.run, page.summary))
+    ),
     PageSection("worst", "Worst flights", _worst),
     PageSection("by-flight", "Flight by flight", by_flight_section),
-    PageSection("estimator", "Estimator", _estimator),
+    PageSection(
+        "estimator",
+        "Estimator",
+        lambda page: tables_section(estimation_table([each.tracked for each in page.view])),
+    ),
     PageSection("latency", "Decision latency", latency_section),
     PageSection("energy", "Energy", energy_section),
     PageSection("flights", "Flights", flights_section),

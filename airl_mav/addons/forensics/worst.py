@@ -313,10 +313,7 @@ def examine_worst(
             camera,
             brake,
         )
-        lost_s, excess = (
-            time_lost_s(record, usual),
-            path_excess(record),
-        )
+        lost_s, excess = (time_lost_s(record, usual), path_excess(record))
         examined.append(ExaminedFlight(record, cause_of(flight, usual), lost_s, excess))
     return examined
 
@@ -331,7 +328,7 @@ def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView | Non
     shown = judged[:LISTED]
     notes = [
         "Failed flights first, each by time lost: its time less that of the run's median pace over "
-        "the same straight way. Causes are worked out from what was recorded.",
+        "the same straight way. Causes are worked out from what was recorded."
     ]
     if len(shown) < total:
         notes.append(f"The {len(shown)} worst of {total:,} flights.")

@@ -116,17 +116,11 @@ class ReplayedFlight:
         """Return the camera image at a time, without noise; None without an arena."""
         if self.arena is None:
             return None
-        # Imported here, as they load numba and a flight is shown before its arena.
-        from airl_mav.camera.exposure import expose
-        from airl_mav.camera.render import camera_pose
-        from airl_mav.report.policy_view import PolicyCamera
+        # Imported here, as it loads numba and a flight is shown before its arena.
+        from airl_mav.report.policy_view import Lens, PolicyCamera
 
         camera = PolicyCamera.of(self.vehicle.camera)
-        position, _, quaternion = pose_at(self.path, time_us)
-        from_us = time_us - self.record.started_us
-        at, attitude = camera_pose(position, quaternion, camera.mount)
-        centers = self.arena.centers_at(from_us)
-        return expose(self.arena, centers, camera.intrinsics, camera.range_m, at, attitude)
+        return Lens(self.arena, camera, self.path, self.record.started_us).image(time_us)
 
     def show(self, shown: Shown, seconds: float) -> None:
         """Set `shown` to a time after the reset [s]; its episode and arena remain."""
