@@ -92,8 +92,8 @@ class LiveFlight(ServerListener):
         """Newest message by channel number: channel, data, time [ns]."""
         self._lock = threading.Lock()
         self._watched, self._another = threading.Event(), threading.Event()
-        for channel in dict.fromkeys(message.channel for message in self._told):
-            self._channels[channel] = self._new(channel)
+        for each in dict.fromkeys(message.channel for message in self._told):
+            self._channels[each] = self._new(each)
         try:
             self._server = foxglove.start_server(
                 name="airl export-log",

@@ -81,10 +81,8 @@ def view_obstacle(
 ) -> ObstacleView:
     """Return direction and visibility of obstacle i in a frame; it may move since `began_us`."""
     position, _, quaternion = pose_at(path, frame_us)
-    centers, centers_then = (
-        arena.centers_at(frame_us - began_us),
-        arena.centers_at(hit_us - began_us),
-    )
+    centers = arena.centers_at(frame_us - began_us)
+    centers_then = arena.centers_at(hit_us - began_us)
     spot = nearest_spot(arena.obstacles, i, centers_then[i], pose_at(path, hit_us)[0])
     offset = spot + (centers[i] - centers_then[i])[:2] - position[:2]
     eye, attitude = camera_pose(position, quaternion, camera.mount)

@@ -129,16 +129,12 @@ def examine_collision(flight: Evidence) -> CollisionAnalysis | None:
     if decisions.size:
         frames = stamps["capture_us"][decisions[-LOOK_BACK:]]
         frame_us = int(frames[-1])
-        before_s, blind_m = (
-            (hit_us - frame_us) / US_PER_S,
-            measure_leg(path, frame_us, hit_us).distance_m,
-        )
+        before_s = (hit_us - frame_us) / US_PER_S
+        blind_m = measure_leg(path, frame_us, hit_us).distance_m
         motor_us = int(stamps.get("motor_us", stamps["sent_us"])[decisions[-1]])
         if motor_us != NO_STAMP:
-            lag_s, lag_m = (
-                (motor_us - frame_us) / US_PER_S,
-                measure_leg(path, frame_us, motor_us).distance_m,
-            )
+            lag_s = (motor_us - frame_us) / US_PER_S
+            lag_m = measure_leg(path, frame_us, motor_us).distance_m
             answer_m_s = float(np.linalg.norm(pose_at(path, motor_us)[1]))
         if arena is not None and flight.camera is not None:
             if number is not None:
@@ -362,14 +358,8 @@ def causes_table(judged: Sequence[ExaminedFlight], run: LoadedRun) -> TableView 
     for kind, count in counts.most_common():
         which = [f"{j.record.index}" for j in failed if j.cause.kind == kind]
         more = ", …" if len(which) > NAMED else ""
-        rows.append(
-            (
-                kind,
-                f"{count}",
-                f"{100.0 * count / len(failed):.0f}",
-                ", ".join(which[:NAMED]) + more,
-            )
-        )
+        share = f"{100.0 * count / len(failed):.0f}"
+        rows.append((kind, f"{count}", share, ", ".join(which[:NAMED]) + more))
     columns = columns_of("<cause | flights | of those that failed [%] | <which")
     all_failed = sum(e.outcome is not Outcome.SUCCESS for e in run.episodes)
     notes: tuple[str, ...] = ()

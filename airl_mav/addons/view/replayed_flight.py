@@ -128,14 +128,11 @@ class ReplayedFlight:
         position, velocity, quaternion = pose_at(self.path, time_us)
         navigates = record.navigates(time_us)
         flies = navigates or -position[2] > STANDING_M
-        x, y, z = position.tolist()
-        vx, vy, vz = velocity.tolist()
-        q0, q1, q2, q3 = quaternion.tolist()
         shown.vehicle = view_messages.VehicleState(
             time_us=time_us,
-            position=(x, y, z),
-            velocity=(vx, vy, vz),
-            quaternion=(q0, q1, q2, q3),
+            position=tuple(position.tolist()),
+            velocity=tuple(velocity.tolist()),
+            quaternion=tuple(quaternion.tolist()),
             rotors=TURNING if flies else (0.0, 0.0, 0.0, 0.0),
             battery=None,
             mode=OFFBOARD if navigates else "",
@@ -163,7 +160,6 @@ class ReplayedFlight:
             for name in ("capture_us", "infer_start_us", "action_ready_us", "sent_us")
         )
         column = setpoint_column(self.stamps) or SETPOINT
-        first, second, third, fourth = (float(part) for part in self.stamps[column][number])
         image = self.image(captured_us)
         shown.decided_image, shown.decisions = image, number + 1
         shown.decided = view_messages.Decided(
@@ -172,7 +168,7 @@ class ReplayedFlight:
             ready_us=ready_us,
             sent_us=sent_us,
             expires_us=None,
-            setpoint=(first, second, third, fourth),
+            setpoint=tuple(self.stamps[column][number].tolist()),
             commands=commanded(self.stamps),
             compensated=self.compensated,
             shape=(1, 1) if image is None else view_messages.shape_of(image),
