@@ -19,9 +19,6 @@ In `companion.addons`:
 In `firmware_sim.addons`:
 
     FIRMWARE: {value of `--firmware`: `firmware_sim.external.programs.FirmwareKind`}
-
-In `firmware_sim.addons`:
-
     AIDING: {any name: class of the `estimator.Aiding` that fuses further sensors}
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
     SENSORS: {name in `profiles.vehicle.Sensors`: its `sensor_table.Sensor`}
@@ -91,16 +88,6 @@ def load_entry(package: str, table: str, name: str, option: tuple[str, object], 
     if place is None:
         raise FieldError(*option, problem=f"needs the add-on {package}/addons/{addon}")
     return load(place)
-
-
-def addon_commands() -> dict[str, tuple[str, str]]:
-    """Return the subcommands of add-ons: purpose and module by name."""
-    return entries("airl_mav", "COMMANDS")
-
-
-def addon_executors() -> dict[str, str]:
-    """Return the executors of add-ons: modules by name."""
-    return entries("airl_mav", "EXECUTORS")
 
 
 def after_import(package: str, ours: str) -> None:
