@@ -15,7 +15,7 @@ from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import Context, Handlers, ServiceState, for_anyone
+from firmware_sim.mavlink.services import Context, Handlers, ServiceState, for_anyone
 
 PROMPT = "pxh> "
 
@@ -129,8 +129,8 @@ def _parameters(words: Sequence[str], port: AutopilotPort, _now_us: int) -> str:
         if found is not None and fnmatch.fnmatchcase(found.name, pattern):
             value = found.value
             # PX4 prints floats with four decimals.
-            shown = f"{value}" if isinstance(value, int) else f"{value:.4f}"
-            lines.append(f"x   {found.name} [{index},{index}] : {shown}")
+            text = f"{value}" if isinstance(value, int) else f"{value:.4f}"
+            lines.append(f"x   {found.name} [{index},{index}] : {text}")
     return "\n".join([*lines, "", f" {len(store)}/{len(store)} parameters used.", ""])
 
 
@@ -139,13 +139,13 @@ def _commander(words: Sequence[str], port: AutopilotPort, _now_us: int) -> str:
         return "usage: commander status\n"
     status = port.state().status
     armed = "Armed" if status.arming is Arming.ARMED else "Disarmed"
-    said = (
+    lines = (
         armed,
         f"navigation mode: {_title(status.mode)}",
         f"user intended navigation mode: {_title(status.intended_mode)}",
         f"in failsafe: {'yes' if status.failsafe else 'no'}",
     )
-    return "".join(f"INFO  [commander] {line}\n" for line in said)
+    return "".join(f"INFO  [commander] {line}\n" for line in lines)
 
 
 def _title(mode: Mode) -> str:
@@ -201,11 +201,11 @@ def _listener(words: Sequence[str], port: AutopilotPort, now_us: int) -> str:
     state = port.state()
     age_s = (now_us - state.time_us) / US_PER_S
     lines = [f"    timestamp: {state.time_us} ({age_s:.6f} seconds ago)"]
-    lines += [f"    {name}: {_shown(value)}" for name, value in fields(state).items()]
+    lines += [f"    {name}: {_formatted(value)}" for name, value in fields(state).items()]
     return "\n".join(["", f"TOPIC: {topic}", f" {topic}", *lines, "", ""])
 
 
-def _shown(value: float) -> str:
+def _formatted(value: float) -> str:
     return f"{value:.4f}" if isinstance(value, float) else f"{value}"
 
 
@@ -217,6 +217,5 @@ COMMANDS: Mapping[str, Shown] = {
     "uptime": _uptime,
     "ver": _version,
 }
-
 
 HANDLERS: Handlers = {"SERIAL_CONTROL": (for_anyone, handle_input)}

@@ -13,15 +13,14 @@ from operator import attrgetter
 
 from airl_mav.core.frames import Geodetic, geodetic_to_local
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import NavigationMode
 from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, MODE_NOT_AVAILABLE
 from firmware_sim.autopilot.flight_modes import MAIN_AUTO, MAIN_POSCTL, Mode
 from firmware_sim.autopilot.inputs import OrbitRequest, PositionYaw, Reposition
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services import table
-from firmware_sim.mavlink.services.context import (
+from firmware_sim.mavlink.services import (
     ANY,
     Action,
     Context,
@@ -30,6 +29,7 @@ from firmware_sim.mavlink.services.context import (
     for_anyone,
     for_vehicle,
     sender,
+    table,
 )
 from firmware_sim.mavlink.streams.units import INT32_MAX
 
@@ -178,46 +178,6 @@ _NAVIGATION: dict[int, Action] = {
 }
 
 
-# Commands without effect here are answered as by a running PX4 1.16 SITL.
-
-ACCEPTED = (
-    dialect.MAV_CMD_DO_SET_ACTUATOR,
-    dialect.MAV_CMD_DO_GO_AROUND,
-    dialect.MAV_CMD_EXTERNAL_WIND_ESTIMATE,
-)
-
-NOT_ACKNOWLEDGED = [
-    int(getattr(dialect, f"MAV_CMD_{name}"))
-    for name in (
-        *("CONFIGURE_ACTUATOR", "DO_FIGURE_EIGHT", "DO_SET_CAM_TRIGG_DIST"),
-        *("DO_SET_CAM_TRIGG_INTERVAL", "OBLIQUE_SURVEY", "SET_CAMERA_ZOOM"),
-        *("SET_CAMERA_FOCUS", "START_RX_PAIR", "SET_CAMERA_MODE", "DO_DIGICAM_CONTROL"),
-        *("DO_TRIGGER_CONTROL", "DO_GRIPPER", "DO_WINCH", "DO_MOUNT_CONTROL"),
-        *("DO_MOUNT_CONFIGURE", "DO_MOUNT_CONTROL_QUAT", "DO_GIMBAL_MANAGER_PITCHYAW"),
-        *("DO_GIMBAL_MANAGER_CONFIGURE", "REQUEST_CAMERA_INFORMATION", "NAV_DELAY"),
-        *("DO_VTOL_TRANSITION", "PREFLIGHT_SET_SENSOR_OFFSETS", "PREFLIGHT_UAVCAN"),
-        *("PAYLOAD_PREPARE_DEPLOY", "PAYLOAD_CONTROL_DEPLOY"),
-    )
-]
-"""Commands to parts that the vehicle lacks."""
-
-
-def _answer(result: Result | None) -> Action:
-    """Return an action without effect that returns this result."""
-    return lambda _command, _context: result
-
-
-def _actuator_test(_command: VehicleCommand, context: Context) -> Result | None:
-    """Handle ACTUATOR_TEST: PX4 rejects it while armed; disarmed, it has no effect here."""
-    armed = context.port.state().status.arming is Arming.ARMED
-    return Result.DENIED if armed else None
-
-
-def _high_latency(_command: VehicleCommand, context: Context) -> Result:
-    context.announce(OperatorText.of(Severity.CRITICAL, events.NO_HIGH_LATENCY))
-    return Result.FAILED
-
-
 FORCE_MAGIC = 21_196
 """Value of MAV_CMD_COMPONENT_ARM_DISARM param2 that skips the checks."""
 
@@ -329,12 +289,6 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_RUN_PREARM_CHECKS: _run_checks,
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     **_NAVIGATION,
-    **dict.fromkeys(ACCEPTED, _answer(Result.ACCEPTED)),
-    **dict.fromkeys(NOT_ACKNOWLEDGED, _answer(None)),
-    dialect.MAV_CMD_ACTUATOR_TEST: _actuator_test,
-    dialect.MAV_CMD_CONTROL_HIGH_LATENCY: _high_latency,
-    # The estimator accepts an external position only while it has none.
-    dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE: _answer(Result.TEMPORARILY_REJECTED),
 }
 """Actions by command. Commands without an action in any service are UNSUPPORTED."""
 
