@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from firmware_sim.autopilot.autopilot_state import OperatorText
     from firmware_sim.autopilot.commander import CommanderState
 
+ULOG_SUFFIX = ".ulg"
+"""Suffix of PX4's flight logs."""
+
 UNKNOWN_VARIANCE = np.full(3, np.nan)
 UNKNOWN_VARIANCE.setflags(write=False)
 
