@@ -5,6 +5,10 @@ The `__init__` of an add-on is light and may define tables, which the core reads
 
     COMMANDS: {command of `airl`: (purpose, module with OPTIONS and run)}
     EXECUTORS: {value of `--executor`: module with `connected`}
+    VIEW: {part of the live view: its class or function} (`rehearsal.live_view`)
+    RECORDINGS: {suffix of a flight's recording: function that makes a run folder of it}
+    FORENSICS: {`examine` or `section`: function for the causes of a run's failed flights}
+    NOTEBOOK: {`run` or `comparison`: function that returns its HTML}
     LIGHT: the commands can be imported without the simulator
     ENVIRONMENTS: {id of a Gymnasium environment: class}
     LOCKSTEP: {"firmware" or "companion": function that flies one side of two processes}
@@ -19,10 +23,16 @@ In `companion.addons`:
 In `firmware_sim.addons`:
 
     FIRMWARE: {value of `--firmware`: `firmware_sim.external.programs.FirmwareKind`}
+    AIDING: {any name: class of the `estimator.Aiding` that fuses further sensors}
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
+    SENSORS: {name in `profiles.vehicle.Sensors`: its `sensor_table.Sensor`}
     MISSIONS: {name: subclass of `navigation.plan.Missions`}
-    SERVICES: {name: MAVLink service, a module with HANDLERS and `send_pending`}
+    SERVICES: {name: MAVLink service, a module as described in `firmware_sim.mavlink.services`}
+    STREAMS: {name: module with BUILDERS of streamed messages, as `firmware_sim.mavlink.streams`}
+    CAPABILITIES: {name: bit of MAV_PROTOCOL_CAPABILITY}
     EVENTS: {name: module with event `Definition`s}
+    FLIGHT_LOGS: {name: function that opens a `firmware_sim.firmware.FlightLog`}
+    FAULT_EFFECTS: {`parts`, `camera` or `link`: class that executes faults there}
 
 Values are text (`module` or `module:name`); `load` imports what they name, on first use.
 `after_import` runs a module of this package once another package is imported.
@@ -82,16 +92,6 @@ def load_entry(package: str, table: str, name: str, option: tuple[str, object], 
     if place is None:
         raise FieldError(*option, problem=f"needs the add-on {package}/addons/{addon}")
     return load(place)
-
-
-def addon_commands() -> dict[str, tuple[str, str]]:
-    """Return the subcommands of add-ons: purpose and module by name."""
-    return entries("airl_mav", "COMMANDS")
-
-
-def addon_executors() -> dict[str, str]:
-    """Return the executors of add-ons: modules by name."""
-    return entries("airl_mav", "EXECUTORS")
 
 
 def after_import(package: str, ours: str) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from airl_mav.addons.fault_matrix.matrix import load, markdown
-from airl_mav.addons.roofline.points import Roofline, RooflinePoint
+from airl_mav.addons.roofline.page import Roofline, RooflinePoint
 from airl_mav.addons.roofline.roofline import RESULT_FILE as ROOFLINE_FILE
 from airl_mav.addons.roofline.roofline import SCHEMA as ROOFLINE_SCHEMA
 from airl_mav.addons.sweep.summary import SCHEMA as SWEEP_SCHEMA
@@ -21,7 +21,7 @@ from airl_mav.experiments.experiment import load_run
 from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate
 from airl_mav.rehearsal.run_folder import RunInfo, load_info
 from airl_mav.report.comparison.comparison_model import Comparison, load_comparison
-from airl_mav.report.table import read_table
+from airl_mav.report.document import read_table
 from published.declared import Declared
 from published.record import (
     MEASURES,

@@ -12,15 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.addons.export_log.recorded import RecordedFlight, charge_of
+from airl_mav.addons.view.replayed_flight import INFO, STANDING_M, WARNING
 from airl_mav.core.frames import quat_from_euler, quats_to_euler
-from airl_mav.flight.quality import commanded_velocity
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.trajectory import Trajectory, commanded_velocity
 from airl_mav.latency.stamps import ATTITUDE, RATES, SETPOINT
-from airl_mav.report.replay.replayed_flight import INFO, STANDING_M, WARNING
+from firmware_sim.addons.flight_log.flight_log import DESCRIBED
+from firmware_sim.addons.flight_log.topics import ARMED, DISARMED, ON_CHANGE_US, ROTARY_WING, TOPICS
+from firmware_sim.addons.flight_log.ulog_writer import Topic, UlogWriter, Values
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.flight_log.flight_log import DESCRIBED
-from firmware_sim.flight_log.topics import ARMED, DISARMED, ON_CHANGE_US, ROTARY_WING, TOPICS
-from firmware_sim.flight_log.ulog_writer import Topic, UlogWriter, Values
 
 _LOGGED = {logged.topic.name: logged for logged in TOPICS}
 
@@ -61,11 +60,7 @@ def write_ulog(flight: RecordedFlight, path: Path) -> None:
     began_us = int(flight.replayed.path.time_us[0])
     later_us = max(0, -began_us)
     writer = UlogWriter(
-        path,
-        began_us + later_us,
-        EXPORTED,
-        (("sys_name", "airl-mav export-log"), *DESCRIBED),
-        (),
+        path, began_us + later_us, EXPORTED, (("sys_name", "airl-mav export-log"), *DESCRIBED), ()
     )
     try:
         texts = [(time_us, "", (severity, words)) for time_us, severity, words in _texts(flight)]

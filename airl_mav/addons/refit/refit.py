@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import bootstrap
 
+from airl_mav.addons.recordings.recorded_flight import stamps_of
 from airl_mav.addons.refit import files
 from airl_mav.addons.refit.air import WIND, Air, Known, Thrust, fit_air, fit_thrust, thrust_of
 from airl_mav.addons.refit.files import overrides_of, refitted, vehicle_toml, write_refit
@@ -35,7 +36,6 @@ from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.computer import ComputerProfile, load_computer
 from airl_mav.profiles.conditions import Payload, loaded
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from airl_mav.report.recorded_flight import stamps_of
 from airl_mav.vehicle_log import ClockAlignment, read_vehicle_log
 
 LEAST = 5
@@ -143,13 +143,9 @@ class Refit:
     @property
     def estimates(self) -> tuple[FittedQuantity, ...]:
         """All fitted or unobservable quantities."""
-        response, thrust, air, late = self.response, self.thrust, self.air, self.latencies
-        return (
-            *(response.dead_time_s, response.velocity_time_s, response.yaw_rate_time_s),
-            *(thrust.hover, thrust.ratio_m_s2, thrust.mass_kg, thrust.thrust_max_n),
-            *(air.drag_1_s, air.wind_north_m_s, air.wind_east_m_s),
-            *(late.t1_ms, late.t2_ms, late.link_ms),
-        )
+        parts = (self.response, self.thrust, self.air, self.latencies)
+        found = (value for part in parts for value in vars(part).values())
+        return tuple(value for value in found if isinstance(value, FittedQuantity))
 
     def estimate(self, key: str) -> FittedQuantity:
         """Return an estimate by key. Raises KeyError."""
