@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from airl_mav.addons.colour.picture import ColourArrays, Work, render_colour
+from airl_mav.addons.colour.shading import Gloss
+from airl_mav.addons.colour.textures import atlas
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import Meshes
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import ColourArrays, Work, render_colour
 from airl_mav.camera.projection import Bent
-from airl_mav.camera.shading import Gloss
-from airl_mav.camera.textures import atlas
 from airl_mav.core.kernels import kernel
 
 SIZES = ((32, 24), (64, 48), (128, 96))

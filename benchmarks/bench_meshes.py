@@ -31,14 +31,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from airl_mav.addons.colour.picture import ColourArrays, Work
+from airl_mav.addons.colour.textures import atlas
 from airl_mav.arena.geometry import Arena, PlacedMesh
 from airl_mav.arena.triangles import Triangles, encoded, triangles_of
 from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.intrinsics import Intrinsics, rays_of
-from airl_mav.camera.picture import ColourArrays, Work
 from airl_mav.camera.projection import bent_of
 from airl_mav.camera.render import render
-from airl_mav.camera.textures import atlas
 from airl_mav.core.frames import quat_to_matrix
 from airl_mav.profiles.assets import MeshFile
 

@@ -4,8 +4,11 @@ The `__init__` of an add-on is light and may define tables, which the core reads
 `airl_mav.addons`:
 
     COMMANDS: {command of `airl`: (purpose, module with OPTIONS and run)}
+    COLOUR: {part of colour cameras, see `camera.render.colour`: object}
     EXECUTORS: {value of `--executor`: module with `connected`}
     LIGHT: the commands can be imported without the simulator
+    PROFILE_SECTIONS: {section of a profile such as "arena.appearance": its model}
+    RENDERERS: {value of `--renderer`: factory of its images by camera, with a method `check`}
 
 In `firmware_sim.addons`:
 
@@ -20,6 +23,8 @@ import importlib
 import pkgutil
 from functools import cache
 from typing import Any
+
+from airl_mav.core.errors import UsageError
 
 PACKAGES = ("airl_mav", "companion", "firmware_sim")
 
@@ -44,6 +49,14 @@ def load(place: str) -> Any:
     module, _, name = place.partition(":")
     loaded = importlib.import_module(module)
     return getattr(loaded, name) if name else loaded
+
+
+def part(table: str, name: str, what: str) -> Any:
+    """Import an entry of a table of `airl_mav.addons`; UsageError naming `what` if none has it."""
+    place = entries("airl_mav", table).get(name)
+    if place is None:
+        raise UsageError(f"{what}: requires an add-on that is not installed in airl_mav/addons")
+    return load(place)
 
 
 def addon_commands() -> dict[str, tuple[str, str]]:

@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
-from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import DepthNoise, noise_of, noisy_frame
+from airl_mav.camera.projection import Bent, bent_of
 from airl_mav.camera.raycast import render_depth
-from airl_mav.camera.render import Motion, Mount, camera_pose
+from airl_mav.camera.render import Motion, Mount, camera_pose, colour
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arena_batch import ArenaBatch, move_obstacles, relief_of
-from airl_mav.envs.colour_images import ColourImages, LensConstants, Looks, lens_of
 from airl_mav.envs.decision import FrameTimes
 from airl_mav.envs.faults import delays_of, later_us, twin_faults
 from airl_mav.envs.fleet import Fleet, FramePoses
@@ -54,7 +53,7 @@ class Eyes:
         n: int,
         camera: Camera,
         noise: SensorNoise,
-        looks: Looks | None,
+        looks: Any,
         meshes: MeshesSeen | None,
         name: str = "",
     ) -> None:
@@ -66,18 +65,18 @@ class Eyes:
         self._mount = Mount.of(camera)
         self._lens = lens_of(self.intrinsics, camera.range_m)
         self._meshes = MeshesSeen(0) if meshes is None else meshes
-        self._colour: ColourImages | None = None
+        self._colour: Any = None
         """Renderer of colour images; None for depth cameras."""
         if self.intrinsics.kind != "depth":
             # Colour needs the appearance of an arena, which the depth kernels do not have.
             assert looks is not None  # noqa: S101 - colour cameras require arenas
-            self._colour = ColourImages(self.intrinsics, self._mount, looks, self._meshes)
-        self._formed: ImageFormation | None = None
+            self._colour = colour("batch")(self.intrinsics, self._mount, looks, self._meshes)
+        self._formed: Any = None
         """Image formation for single images, as in the rehearsal; None without a table `imaging`.
-        It keeps no state between images (`imaging_checks.check_twin_imaging`), so it serves all
+        It keeps no state between images (`check_twin_imaging`), so it serves all
         vehicles."""
         if camera.imaging is not None and looks is not None:
-            self._formed, self._looks = ImageFormation(camera, name), looks
+            self._formed, self._looks = colour("sensor")(camera, name), looks
 
     @property
     def eye(self) -> Eye | None:
@@ -138,7 +137,7 @@ class Cameras(Stateful):
         transport_us: int,
         noise: SensorNoise,
         faults: Sequence[Fault] = (),
-        looks: Looks | None = None,
+        looks: Any = None,
         meshes: MeshesSeen | None = None,
         further: Mapping[str, Camera] | None = None,
     ) -> None:
@@ -350,3 +349,26 @@ def _to_z16(depth_m: NDArray[np.float32], out: NDArray[np.uint16]) -> None:
         for u in range(depth_m.shape[1]):
             mm = np.rint(depth_m[v, u] * np.float32(MM_PER_M))
             out[v, u] = np.uint16(min(mm, np.float32(MAX_MM)))
+
+
+class LensConstants(NamedTuple):
+    """Constants of a camera; a tuple, because compiled loops require one."""
+
+    focal: float
+    """Focal length [px] of a pinhole, columns per angle [px/rad] of a cylinder."""
+    cx: float
+    """Column of the optical axis [px]; pixel centres are at whole numbers."""
+    cy: float
+    """Row of the optical axis [px]."""
+    range_m: float
+    """Maximum depth of a return [m]."""
+    cylindrical: bool = False
+    """True if the image is cylindrical."""
+    bent: Bent | None = None
+    """Rays of a fisheye."""
+
+
+def lens_of(intrinsics: Intrinsics, range_m: float) -> LensConstants:
+    """Return the lens of a camera with a range `range_m` [m]."""
+    k = intrinsics
+    return LensConstants(k.focal, k.cx, k.cy, range_m, k.cylindrical, bent_of(k))

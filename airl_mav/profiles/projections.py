@@ -16,22 +16,26 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, Final, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core.addons import entries
 from airl_mav.core.errors import FieldError
 
 CameraKind = Literal["depth", "rgb", "grey"]
 """`depth`: uint16 (h, w), Z16 in millimetres. `rgb`: uint8 (h, w, 3), sRGB. `grey`: uint8
 (h, w, 1), luma of the sRGB numbers."""
 
-Renderer = Literal["raycast", "mitsuba"]
-"""Renderer of images: the ray caster, or Mitsuba's path tracer as the reference for colour."""
+SLOW: Final = frozenset(entries("airl_mav", "RENDERERS"))
+"""Renderers of add-ons, which need longer than a tick for an image."""
 
-SLOW: Final[frozenset[Renderer]] = frozenset({"mitsuba"})
-"""Renderers that need longer than a tick for an image."""
+if TYPE_CHECKING:
+    Renderer: TypeAlias = str
+else:
+    Renderer = Literal[("raycast", *sorted(SLOW))]
+"""Renderer of images: the ray caster, or one of an add-on."""
 
 KINDS: Final[tuple[CameraKind, ...]] = get_args(CameraKind)
 

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.exposure import expose
-from airl_mav.camera.render import camera_pose
+from airl_mav.camera.render import camera_pose, expose
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import Arrays

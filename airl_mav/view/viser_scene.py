@@ -10,7 +10,6 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import OBSTACLE
 from airl_mav.arena.geometry import Arena, Bounds, Shape
 from airl_mav.arena.triangles import drawn, standing
 from airl_mav.core import frames
@@ -170,13 +169,13 @@ class FlightScene:
             self._add_surface("/arena/ground", arena.ground.points, arena.ground.faces, style.HILLS)
         shown = drawn(arena.meshes)
         for each in shown:
-            colour = arena.look.finish.colour(OBSTACLE + each.first)
+            colour = arena.colour_of(each.first)
             self._add_surface(f"/arena/mesh/{each.first}", *standing(each), colour)
         for i in range(len(arena.obstacles)):
             if arena.mesh_of(i) in shown:
                 continue
             moves = i >= arena.n_static
-            colour = style.MOVING if moves else arena.look.finish.colour(OBSTACLE + i)
+            colour = style.MOVING if moves else arena.colour_of(i)
             glass = arena.clear is not None and bool(arena.clear[i])
             node = self._obstacle(arena, i, colour, style.GLASS_OPACITY if glass else None)
             if moves:

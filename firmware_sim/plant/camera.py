@@ -27,12 +27,10 @@ import zmq
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.exposure import exposure_by
 from airl_mav.camera.frame import Frame, FurtherImage
-from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import noise_of, noisy_frame
-from airl_mav.camera.render import Motion, Mount, camera_pose
+from airl_mav.camera.render import Motion, Mount, camera_pose, colour, exposure_by
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
 from airl_mav.core.scheduling import give_way
@@ -52,7 +50,7 @@ class _Eye:
         """Store camera, arena, conditions and renderer; `name` is an additional camera's."""
         self._expose = exposure_by(renderer, name)
         self._noise = noise_of(camera, noise, name)
-        self._forming = ImageFormation(camera, name) if camera.imaging is not None else None
+        self._forming = colour("sensor")(camera, name) if camera.imaging is not None else None
         self.intrinsics = Intrinsics.of(camera)
         self._mount, self._max_range = Mount.of(camera), camera.range_m
         self._arena = arena

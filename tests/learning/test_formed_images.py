@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from airl_mav.camera.imaging import ImageFormation
+from airl_mav.addons.colour.image_sensor import ImageFormation
 from airl_mav.camera.render import Motion
 from airl_mav.core.errors import FieldError
 from airl_mav.envs.evaluation import Trace

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from airl_mav.camera.exposure import expose
 from airl_mav.camera.noise import noise_of, noisy_frame
-from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.camera.render import Mount, camera_pose, expose
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.vector import NavigationVectorEnv

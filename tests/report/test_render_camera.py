@@ -10,11 +10,11 @@ import pytest
 from PIL import Image, ImageSequence
 from rich.console import Console
 
-from airl_mav.addons.render.camera_pictures import CameraMotion, _rates, optical_flow, velocities_of
+from airl_mav.addons.colour.image_sensor import ImageFormation
+from airl_mav.addons.colour.picture import render_picture
+from airl_mav.addons.colour.pictures import CameraMotion, _rates, optical_flow, velocities_of
 from airl_mav.arena.generate import generate
-from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import render_picture
 from airl_mav.camera.render import Motion
 from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
@@ -47,7 +47,7 @@ def vehicle(tmp_path: Path) -> Path:
 
 def render(*words: str) -> None:
     code = carry_out(
-        "airl render", "airl_mav.addons.render.command", list(words), console=Console(quiet=True)
+        "airl render", "airl_mav.addons.colour.command", list(words), console=Console(quiet=True)
     )
     assert code == 0
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from airl_mav.addons.colour.profile import Appearance
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Shape, Tour
 from airl_mav.camera.render import camera_pose
 from airl_mav.core.frames import quat_to_matrix
@@ -17,7 +18,6 @@ from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.forensics.camera_view import (
     PolicyCamera,

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from airl_mav.addons.colour.picture import render_picture
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics, fisheye_places, fisheye_rays
-from airl_mav.camera.picture import render_picture
 from airl_mav.camera.primitives import OBSTACLE
 from airl_mav.camera.render import render
 from airl_mav.core.errors import FieldError, UsageError
@@ -23,7 +23,7 @@ from airl_mav.policy.observation import Kinematics, observe
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
 from airl_mav.policy.scans import rays_of
 from airl_mav.prediction.compensator import CameraPose, PosedImage, Reprojector
-from airl_mav.profiles.appearance import DEFAULT
+from airl_mav.profiles.arena import DEFAULT_APPEARANCE
 from airl_mav.profiles.projections import UNDISTORTED, Distortion
 from airl_mav.profiles.vehicle import load_vehicle
 from tests.support.lenses import BARREL, OPENING, published, rays_of_fisheye
@@ -104,7 +104,7 @@ def test_a_pixel_shows_what_a_pinhole_shows_that_looks_along_its_ray(
     k = Intrinsics.from_fov(64, 48, math.radians(150.0), "fisheye", distortion=distortion)
     small = Intrinsics(3, 3, k.focal, 1.0, 1.0)
     rays, rng = fisheye_rays(k), np.random.default_rng(2)
-    scene = replace(arena(busy(1), sun=sun(200.0, 40.0)), appearance=DEFAULT)
+    scene = replace(arena(busy(1), sun=sun(200.0, 40.0)), appearance=DEFAULT_APPEARANCE)
     same = total = 0
     for position, attitude in poses(1, 6):
         centers, at = scene.obstacles.center, np.array(position)

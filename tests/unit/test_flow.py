@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from airl_mav.addons.render.camera_pictures import (
+from airl_mav.addons.colour.picture import Picture, render_picture
+from airl_mav.addons.colour.pictures import (
     CameraMotion,
     motion_of_camera,
     optical_flow,
@@ -18,7 +19,6 @@ from airl_mav.addons.render.camera_pictures import (
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import Picture, render_picture
 from airl_mav.camera.primitives import FLOOR, OBSTACLE, SKY
 from airl_mav.camera.render import Motion, Mount
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix

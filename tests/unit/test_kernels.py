@@ -17,7 +17,7 @@ from numba import TypingError
 from numpy.typing import NDArray
 
 from airl_mav import camera, envs
-from airl_mav.camera.picture import Work
+from airl_mav.addons.colour.picture import Work
 from airl_mav.core import compiling, kernels
 from tests.support.processes import run_alone
 

@@ -12,16 +12,16 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from airl_mav.addons.colour.picture import render_picture
+from airl_mav.addons.colour.profile import Appearance
 from airl_mav.arena.geometry import Arena, Obstacles, PlacedMesh, Shape
 from airl_mav.arena.triangles import Triangles, decoded, encoded, triangles_of
 from airl_mav.camera.bvh import LEAF, build_bvh
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import render_picture
 from airl_mav.camera.primitives import OBSTACLE, SKY
 from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
-from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.projections import PROJECTIONS, UNDISTORTED, Projection, sees_to
 from tests.support.lenses import AT_NIGHT_THE_FISHEYE, BARREL, ENDING, OPENING, rays_of_fisheye
 from tests.support.meshes import ROOM, kept, ring, scene_of, triangles

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from airl_mav.arena.finishes import linear_of, srgb_of
+from airl_mav.addons.colour.appearance import linear_of, srgb_of
+from airl_mav.addons.colour.mitsuba import PathTracer, cube_of, resampled
+from airl_mav.addons.colour.picture import antialiased, render_picture
+from airl_mav.addons.colour.profile import Appearance
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics, fisheye_rays
-from airl_mav.camera.mitsuba import PathTracer, cube_of, resampled
-from airl_mav.camera.picture import antialiased, render_picture
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
-from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.support.lenses import BARREL

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena, Obstacles, PlacedMesh, Shape
 from airl_mav.arena.ground import Ground
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import RANGE_M
-from airl_mav.camera.render import Mount, camera_pose, render
+from airl_mav.camera.render import RANGE_M, Mount, camera_pose, render
 from airl_mav.control.loops import heading_of
 from airl_mav.flight.trajectory import Trajectory, pose_at
-from airl_mav.profiles.appearance import DEFAULT
+from airl_mav.profiles.arena import DEFAULT_APPEARANCE
 from airl_mav.profiles.camera import Camera
 
 Floats = NDArray[np.float64]
@@ -145,10 +144,8 @@ def view_obstacle(
             half = np.where(clear[:, None], NOTHING_M, half)
         some = Obstacles(o.shape[keep], o.center[keep], half[keep], o.yaw[keep])
         # Without appearance and statics, all remaining obstacles are opaque.
-        bare = replace(
-            arena, obstacles=some, tours=(), meshes=meshes, ground=ground, appearance=DEFAULT,
-            statics=None,
-        )  # fmt: skip
+        bare = replace(arena, obstacles=some, tours=(), meshes=meshes, ground=ground, statics=None)
+        bare = replace(bare, appearance=DEFAULT_APPEARANCE)
         return render(bare, centers[keep], camera.intrinsics, camera.range_m, eye, attitude)
 
     whole = depth(slice(None), arena.meshes, arena.ground)

@@ -118,8 +118,7 @@ class ReplayedFlight:
         if self.arena is None:
             return None
         # Imported here, as they load numba and a flight is shown before its arena.
-        from airl_mav.camera.exposure import expose
-        from airl_mav.camera.render import camera_pose
+        from airl_mav.camera.render import camera_pose, expose
         from airl_mav.report.forensics.camera_view import PolicyCamera
 
         camera = PolicyCamera.of(self.vehicle.camera)

@@ -12,14 +12,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import FLOOR as FLOOR_ROW
-from airl_mav.arena.finishes import OBSTACLE as OBSTACLE_ROW
-from airl_mav.arena.finishes import WALLS as WALLS_ROW
-from airl_mav.camera import primitives, shading
-from airl_mav.camera.bvh import Meshes, material_row
-from airl_mav.camera.meshes import Faces
-from airl_mav.camera.projection import MIN_DEPTH_M, Optics, Pose, ProjectedBody
-from airl_mav.camera.shading import (
+from airl_mav.addons.colour import shading
+from airl_mav.addons.colour.appearance import FLOOR as FLOOR_ROW
+from airl_mav.addons.colour.appearance import OBSTACLE as OBSTACLE_ROW
+from airl_mav.addons.colour.appearance import WALLS as WALLS_ROW
+from airl_mav.addons.colour.shading import (
     F32,
     I32,
     LEAST,
@@ -29,12 +26,17 @@ from airl_mav.camera.shading import (
     Lit,
     PixelRays,
     SceneLook,
+    material_row,
     packed,
     paint,
     surface_of,
     texel_at,
 )
-from airl_mav.camera.shadows import along32, ray32, start32, widened
+from airl_mav.addons.colour.shadows import along32, ray32, start32, widened
+from airl_mav.camera import primitives
+from airl_mav.camera.bvh import Meshes
+from airl_mav.camera.meshes import Faces
+from airl_mav.camera.projection import MIN_DEPTH_M, Optics, Pose, ProjectedBody
 from airl_mav.core.kernels import borrowing_kernel, large_borrowing_kernel
 from airl_mav.vehicle.rotation import Vec
 

@@ -18,11 +18,14 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import FLOOR as FLOOR_ROW
-from airl_mav.arena.finishes import OBSTACLE as OBSTACLE_ROW
-from airl_mav.arena.finishes import WALLS as WALLS_ROW
-from airl_mav.camera import shading
-from airl_mav.camera.bvh import STACK, Meshes, is_owned, material_row
+from airl_mav.addons.colour import shading
+from airl_mav.addons.colour.appearance import FLOOR as FLOOR_ROW
+from airl_mav.addons.colour.appearance import OBSTACLE as OBSTACLE_ROW
+from airl_mav.addons.colour.appearance import WALLS as WALLS_ROW
+from airl_mav.addons.colour.shading import material_row
+from airl_mav.addons.colour.shadows import ABOVE_M
+from airl_mav.addons.colour.surfaces import FOG_LAYER_M
+from airl_mav.camera.bvh import STACK, Meshes, is_owned
 from airl_mav.camera.meshes import distance_to, inverse_of, stopped_by
 from airl_mav.camera.primitives import (
     BOX,
@@ -38,8 +41,6 @@ from airl_mav.camera.primitives import (
     turn_axes,
 )
 from airl_mav.camera.projection import Scene, dot
-from airl_mav.camera.shadows import ABOVE_M
-from airl_mav.camera.surfaces import FOG_LAYER_M
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
 

@@ -18,15 +18,16 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import LUMINANCE, linear_of
+from airl_mav.addons.colour.appearance import LUMINANCE, linear_of
+from airl_mav.addons.colour.picture import expose_colour
+from airl_mav.addons.colour.profile import AutoExposure, Imaging
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import image_of, jpeg_of
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import grey, render_picture
 from airl_mav.camera.render import Motion, Mount, camera_pose, carried_on
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.streams import Stream, stream, words_of
-from airl_mav.profiles.camera import AutoExposure, Camera, Imaging
+from airl_mav.profiles.camera import Camera
 
 MOST_METERED: Final = 5
 """Maximum images to settle a gain: an all-white or all-black image contains little information."""
@@ -130,8 +131,7 @@ class ImageFormation:
         position, quaternion = carried_on(motion, since_us / US_PER_S)
         at, attitude = camera_pose(np.array(position), np.array(quaternion), self._mount)
         centers = arena.centers_at(elapsed_us)
-        rgb = render_picture(arena, centers, self._camera, at, attitude, gain).rgb
-        return rgb if self._camera.kind == "rgb" else grey(rgb)[..., None]
+        return expose_colour(arena, centers, self._camera, at, attitude, gain)
 
     def _metered(
         self,

@@ -1,19 +1,31 @@
-"""Appearance drawn from a seed: a material for each surface, and the light."""
+"""Appearance drawn from a seed: a material for each surface, and the light.
+
+A camera without global illumination needs the mean irradiance of floor and walls below a ceiling.
+The balance of floor, walls and ceiling is solved for a square room with the same height and the
+same share of walls (radiosity method: Goral et al., Modeling the interaction of light between
+diffuse surfaces, SIGGRAPH 1984). The ceiling reflects nothing.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Annotated, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.fields import ArrayField
+from airl_mav.addons.colour.profile import (
+    Appearance,
+    ImageFile,
+    Material,
+    SurfaceName,
+    Surfaces,
+    TextureName,
+)
+from airl_mav.arena.geometry import Arena, Statics
 from airl_mav.core.streams import Stream, stream
-from airl_mav.profiles.appearance import Appearance, Material, SurfaceName, Surfaces, TextureName
-from airl_mav.profiles.assets import ImageFile
 
 Floats = NDArray[np.float64]
 Rgb = tuple[int, int, int]
@@ -61,20 +73,6 @@ class Finish:
 
 
 @dataclass(frozen=True)
-class Statics:
-    """Owners of the static primitives, where some are parts of one asset."""
-
-    names: tuple[str, ...]  # (k,) name of the shape or asset of each owner
-    of: Annotated[NDArray[np.int64], ArrayField(np.int64)]
-    """(n_static,) index of the owner of each primitive, ascending."""
-    materials: tuple[str | None, ...]  # (n_static,) None = the owner's drawn material
-
-    def name_of(self, i: int) -> str:
-        """Return the name of the owner of primitive i."""
-        return self.names[int(self.of[i])]
-
-
-@dataclass(frozen=True)
 class Inside:
     """Mean irradiance of surfaces below a ceiling."""
 
@@ -110,6 +108,43 @@ class Drawn:
 
     finish: Finish
     light: Light
+
+    def colour_of(self, i: int) -> Rgb:
+        """Return the sRGB 0-255 of obstacle i seen from far away."""
+        return self.finish.colour(OBSTACLE + i)
+
+
+def look_of(arena: Arena) -> Drawn:
+    """Draw the materials of all surfaces of an arena, and the light."""
+    look = draw_appearance(
+        arena.appearance,
+        arena.seed,
+        arena.n_static,
+        len(arena.tours),
+        arena.wall_colour,
+        arena.statics,
+    )
+    b, n = arena.bounds, arena.n_static
+    if not b.ceiling:
+        return look
+    length, width = b.north_max - b.north_min, b.east_max - b.east_min
+    walls = [(WALLS, 2.0 * (length + width) * b.height)]
+    boxes = 0 if arena.building is None else arena.building.boxes
+    for i in range(n - boxes, n):
+        # Both sides are visible.
+        half = arena.obstacles.half_size[i]
+        walls.append((OBSTACLE + i, float(8.0 * half[:2].max() * half[2])))
+    return indoors(look, length * width, tuple(walls))
+
+
+def clear_of(arena: Arena) -> NDArray[np.bool_] | None:
+    """Return a mask (n,) of an arena's glass obstacles; None = no glass."""
+    parts = () if arena.statics is None else arena.statics.materials
+    # The appearance is drawn only if a material can be glass.
+    if not arena.appearance.may_have("glass", (name for name in parts if name is not None)):
+        return None
+    glass = arena.look.finish.surface[OBSTACLE:] == SURFACES.index("glass")
+    return glass if glass.any() else None
 
 
 def draw_appearance(
@@ -274,3 +309,59 @@ def srgb_bytes(linear: Floats) -> tuple[int, int, int]:
     """Return linear RGB (3,) as sRGB 0-255."""
     red, green, blue = (round(255.0 * float(channel)) for channel in srgb_of(linear))
     return red, green, blue
+
+
+def indoors(look: Drawn, floor_m2: float, walls: tuple[tuple[int, float], ...]) -> Drawn:
+    """Return an appearance lit by a ceiling of the sky's colour, without a sun.
+
+    The mean luminance on the floor equals the luminance of a level surface outdoors, including
+    interreflections of walls and floor. `walls` are row in the `Finish` and visible area [m²] of
+    each wall surface.
+    """
+    light, albedo = look.light, look.finish.albedo.mean(axis=1)
+    areas = np.array([area for _, area in walls])
+    of_walls = areas @ albedo[[row for row, _ in walls]] / areas.sum()
+    floor, upright = _irradiances(albedo[FLOOR], of_walls, floor_m2, float(areas.sum()))
+    luminance = float(LUMINANCE @ light.sky)
+    # Without sky light the ceiling is white.
+    colour = light.sky / luminance if luminance > 0.0 else np.ones(3)
+    # The brightness of the ceiling that gives the floor its outdoor luminance.
+    glow = colour * luminance / float(LUMINANCE @ (colour * floor))
+    inside = Light(
+        to_sun=light.to_sun,
+        sun=np.zeros(3),
+        zenith=glow,
+        horizon=glow,
+        extinction=light.extinction,
+        inside=Inside(floor * glow, upright * glow),
+    )
+    return replace(look, light=inside)
+
+
+def _irradiances(
+    floor_albedo: Floats, wall_albedo: Floats, floor_m2: float, walls_m2: float
+) -> tuple[Floats, Floats]:
+    """Return mean irradiance (3,) of floor and walls for a ceiling of radiosity 1."""
+    across = seen_across(4.0 * floor_m2 / walls_m2)
+    # Reciprocity of view factors: floor area times factor equals wall area times factor.
+    to_floor = (1.0 - across) * floor_m2 / walls_m2
+    # A wall sees floor and ceiling alike; the rest of its view is walls.
+    among = 1.0 - 2.0 * to_floor
+    # floor = across + (1 - across) wall_albedo walls
+    # walls = to_floor + to_floor floor_albedo floor + among wall_albedo walls
+    gain = to_floor * floor_albedo
+    walls = (to_floor + gain * across) / (
+        1.0 - among * wall_albedo - gain * (1.0 - across) * wall_albedo
+    )
+    return across + (1.0 - across) * wall_albedo * walls, walls
+
+
+def seen_across(x: float) -> float:
+    """Return the view factor between two squares, of side / distance `x`, one above the other.
+
+    Howell and Menguc, A catalog of radiation heat transfer configuration factors, C-11.
+    """
+    square, root = x * x, math.sqrt(1.0 + x * x)
+    log = 0.5 * math.log((1.0 + square) ** 2 / (1.0 + 2.0 * square))
+    turns = 2.0 * x * root * math.atan(x / root) - 2.0 * x * math.atan(x)
+    return 2.0 / (math.pi * square) * (log + turns)

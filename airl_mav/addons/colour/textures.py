@@ -14,9 +14,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import TEXTURES, Finish, image_number, linear_of
+from airl_mav.addons.colour.appearance import TEXTURES, Finish, image_number, linear_of
+from airl_mav.addons.colour.profile import MOST_IMAGES, ImageFile
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.assets import MOST_IMAGES, ImageFile, read_checked
+from airl_mav.profiles.loading import read_checked
 
 Floats = NDArray[np.float64]
 

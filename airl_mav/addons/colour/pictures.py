@@ -21,15 +21,14 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 from PIL import Image
 
+from airl_mav.addons.colour.image_sensor import ImageFormation
+from airl_mav.addons.colour.picture import Picture, antialiased, grey, render_picture
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera import primitives
-from airl_mav.camera.exposure import expose
 from airl_mav.camera.frame import depth_to_z16
-from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics, rays_of
-from airl_mav.camera.picture import Picture, antialiased, grey, render_picture
 from airl_mav.camera.primitives import OBSTACLE
-from airl_mav.camera.render import Motion, Mount, camera_pose
+from airl_mav.camera.render import Motion, Mount, camera_pose, expose
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file

@@ -8,17 +8,39 @@ Depth, light and colour are stored as planes of 32 bits, so that every loop alon
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import FLOOR as FLOOR_ROW
-from airl_mav.arena.finishes import OBSTACLE as OBSTACLE_ROW
-from airl_mav.arena.finishes import WALLS as WALLS_ROW
-from airl_mav.arena.finishes import Drawn, linear_of, srgb_of
+from airl_mav.addons.colour import surfaces
+from airl_mav.addons.colour.appearance import FLOOR as FLOOR_ROW
+from airl_mav.addons.colour.appearance import OBSTACLE as OBSTACLE_ROW
+from airl_mav.addons.colour.appearance import WALLS as WALLS_ROW
+from airl_mav.addons.colour.appearance import Drawn, linear_of, srgb_of
+from airl_mav.addons.colour.reflections import draw_reflections
+from airl_mav.addons.colour.shading import (
+    F32,
+    ZERO,
+    Canvas,
+    Gloss,
+    Lit,
+    Packed,
+    PixelRays,
+    Plane,
+    Points,
+    SceneLook,
+    let_through,
+)
+from airl_mav.addons.colour.shadows import (
+    CORNERS,
+    Shaded,
+    shade_by_meshes,
+    shade_by_obstacle,
+    shade_by_walls,
+)
+from airl_mav.addons.colour.textures import atlas, mean_of, periods
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera import surfaces
 from airl_mav.camera.bvh import Meshes, count_of, is_owned, meshes_of, raised
 from airl_mav.camera.intrinsics import Intrinsics, finer
 from airl_mav.camera.meshes import Faces
@@ -32,29 +54,7 @@ from airl_mav.camera.raycast import (
     invert,
     write_transposed,
 )
-from airl_mav.camera.reflections import draw_reflections
-from airl_mav.camera.render import pose_of
-from airl_mav.camera.shading import (
-    F32,
-    ZERO,
-    Canvas,
-    Gloss,
-    Lit,
-    Packed,
-    PixelRays,
-    Plane,
-    Points,
-    SceneLook,
-    let_through,
-)
-from airl_mav.camera.shadows import (
-    CORNERS,
-    Shaded,
-    shade_by_meshes,
-    shade_by_obstacle,
-    shade_by_walls,
-)
-from airl_mav.camera.textures import atlas, mean_of, periods
+from airl_mav.camera.render import RANGE_M, pose_of
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
@@ -147,6 +147,19 @@ def render_picture(
     return picture
 
 
+def expose_colour(
+    arena: Arena,
+    centers: NDArray[np.float64],
+    intrinsics: Intrinsics,
+    position: Vec | NDArray[np.float64],
+    quaternion: Quat | NDArray[np.float64],
+    gain: float = 1.0,
+) -> NDArray[np.uint8]:
+    """Return the image (h, w, channels) of a colour camera; arguments as in `render_picture`."""
+    rgb = render_picture(arena, centers, intrinsics, position, quaternion, gain).rgb
+    return rgb if intrinsics.kind == "rgb" else grey(rgb)[..., None]
+
+
 def _brightened(lights: NDArray[np.float32], gain: float) -> NDArray[np.float32]:
     """Return the lights (7, 3) of `ColourArrays` times a gain; direction and fog are unchanged."""
     brighter = lights.copy()
@@ -192,9 +205,6 @@ def antialiased(
 
 
 U32 = np.uint32
-
-RANGE_M: Final = 10_000.0
-"""Range of a colour camera [m]; exceeds every arena."""
 
 
 class Work(NamedTuple):

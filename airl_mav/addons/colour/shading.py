@@ -15,9 +15,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import LUMINANCE, SURFACES, TEXTURES, WALLS, Finish
+from airl_mav.addons.colour.appearance import FLOOR as FLOOR_ROW
+from airl_mav.addons.colour.appearance import LUMINANCE, SURFACES, TEXTURES, WALLS, Finish
+from airl_mav.addons.colour.appearance import OBSTACLE as OBSTACLE_ROW
+from airl_mav.addons.colour.textures import LEVELS, SIDE, STRIDE
+from airl_mav.camera.bvh import GROUND_FIRST, Meshes
 from airl_mav.camera.projection import dot
-from airl_mav.camera.textures import LEVELS, SIDE, STRIDE
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Vec
 
@@ -493,3 +496,10 @@ def facet_gives(alpha: float, normal: Vec, away: Vec) -> float:
     """Return the weight of a direction `away` mirrored by a sampled facet; 0 below the surface."""
     cosine = dot(normal, away)
     return _visible(alpha, cosine) if cosine > 0.0 else 0.0
+
+
+@borrowing_kernel
+def material_row(meshes: Meshes, k: int) -> int:
+    """Return the row of mesh k's material in `Finish`."""
+    first = meshes.first[k]
+    return FLOOR_ROW if first == GROUND_FIRST else OBSTACLE_ROW + first

@@ -14,7 +14,18 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.bvh import STACK, Meshes, material_row
+from airl_mav.addons.colour.shading import (
+    F32,
+    ONE,
+    ZERO,
+    Canvas,
+    Gloss,
+    Plane,
+    Vec32,
+    let_through,
+    material_row,
+)
+from airl_mav.camera.bvh import STACK, Meshes
 from airl_mav.camera.meshes import Faces, inverse_of, seen_from, stopped_by
 from airl_mav.camera.primitives import BOX, CYLINDER, OBSTACLE, SKY, Ids, turned
 from airl_mav.camera.projection import (
@@ -28,7 +39,6 @@ from airl_mav.camera.projection import (
     is_pinhole,
     ray_of,
 )
-from airl_mav.camera.shading import F32, ONE, ZERO, Canvas, Gloss, Plane, Vec32, let_through
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
 

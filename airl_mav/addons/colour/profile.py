@@ -1,17 +1,32 @@
-"""Appearance of an arena for colour cameras: materials, textures, sun, sky, fog.
+"""Profile tables of colour cameras: the appearance of an arena, and image formation.
 
-Every pair of numbers is [minimum, maximum], drawn uniformly for each seed. Colours are sRGB, 0-255.
+An appearance is materials, textures, sun, sky and fog. Every pair of numbers is [minimum, maximum],
+drawn uniformly for each seed. Colours are sRGB, 0-255.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
-from airl_mav.core.fields import Each, ProfileModel, later_field, quantity
-from airl_mav.profiles.assets import MOST_IMAGES, ImageFile
+from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.errors import FieldError
+from airl_mav.core.fields import Each, ProfileModel, later_field, optional, quantity, switch
+from airl_mav.core.streams import words_of
+from airl_mav.profiles.loading import CheckedFile
+
+if TYPE_CHECKING:
+    from airl_mav.camera.render import Exposure
+    from airl_mav.profiles.arena import ArenaSpec
+    from airl_mav.profiles.camera import Camera
 
 TextureName = Literal["plain", "checker", "noise", "brick", "foliage"]
 SurfaceName = Literal["matt", "glossy", "metal", "glass"]
@@ -20,6 +35,19 @@ Materials = Annotated[tuple[str, ...], Field(min_length=1)]
 
 WALL_COLOUR = "wall_colour"
 """The plain material whose albedo is the arena's `wall_colour`."""
+
+
+MOST_IMAGES = 16
+"""Maximum images of an arena."""
+
+
+class ImageFile(CheckedFile):
+    """An image that repeats on a surface."""
+
+    file: str = Field(
+        min_length=1,
+        description="a PNG or JPEG, as wide as it is high; a path from the profile's folder",
+    )
 
 
 class Material(ProfileModel):
@@ -286,5 +314,160 @@ class Appearance(ProfileModel):
         return self.materials[name] if name in self.materials else MATERIALS[name]
 
 
-DEFAULT = Appearance()
-"""Appearance of an arena whose profile does not define one."""
+class AutoExposure(ProfileModel):
+    """A gain that follows the brightness of the image; see `colour.image_sensor`."""
+
+    target: float = quantity(
+        "mean light of the image that it aims at; 1 is white", "1", ge=0.01, le=0.9, default=0.18
+    )
+    time_constant_s: float = quantity(
+        "time in which it covers 63 % of the way to the gain that is due; 0: it is there at once,"
+        " which is all that the batch twin has",
+        "s",
+        ge=0,
+        le=10,
+        default=0.3,
+    )
+    least_gain: float = quantity("least gain", "1", ge=0.001, le=1, default=0.05)
+    most_gain: float = quantity("greatest gain", "1", ge=1, le=1000, default=16.0)
+
+
+class Imaging(ProfileModel):
+    """Image formation from light to pixel values; every effect is off by default."""
+
+    exposure_ms: float = quantity(
+        "exposure time, in which motion blurs the image; the frame's stamp is its middle. No longer"
+        " than the time between two frames",
+        "ms",
+        ge=0,
+        le=1000,
+        default=0.0,
+    )
+    samples: int = quantity("images of which an exposure is the mean", "1", ge=1, le=64, default=8)
+    readout_ms: float = quantity(
+        "readout time of a rolling shutter: of h rows, row r is exposed r / h of it later than the"
+        " first. The frame's stamp is the middle of it. 0: a global shutter. No longer than the"
+        " time between two frames",
+        "ms",
+        ge=0,
+        le=1000,
+        default=0.0,
+    )
+    readout_bands: int = quantity(
+        "bands of rows that are exposed together, at most one for each row: a row's moment is right"
+        " to readout_ms / (2 readout_bands), and an image takes so many times as long; only matters"
+        " with readout_ms",
+        "1",
+        ge=1,
+        le=480,
+        default=16,
+    )
+    gain: float = quantity(
+        "times this the light; 1: a white surface under the irradiance 1 is white",
+        "1",
+        ge=0.001,
+        le=1000,
+        default=1.0,
+    )
+    gain_spread_ev: float = quantity(
+        "the gain, or what auto exposure aims at, is off by a power of two from minus to plus this,"
+        " drawn with every episode",
+        "1",
+        ge=0,
+        le=8,
+        default=0.0,
+    )
+    auto_exposure: AutoExposure | None = optional(
+        "how the gain follows the light; left out: it is `gain`"
+    )
+    vignetting: float = quantity(
+        "share of the light that the farthest corner lacks; it grows with the square of the"
+        " distance from the optical axis",
+        "1",
+        ge=0,
+        le=1,
+        default=0.0,
+    )
+    full_well_e: float | None = quantity(
+        "electrons that a white pixel holds at a gain of 1 or less, which set the noise of photons;"
+        " left out: no noise",
+        "1",
+        ge=10,
+        le=1_000_000,
+        default=None,
+    )
+    read_noise_e: float = quantity(
+        "noise of reading a pixel, sd in electrons; only with full_well_e",
+        "1",
+        ge=0,
+        le=10_000,
+        default=0.0,
+    )
+    bayer: bool = switch(
+        "whether each pixel measures one colour (mosaic RGGB) and the others are"
+        " interpolated bilinearly; only of kind rgb"
+    )
+    jpeg_quality: int | None = quantity(
+        "images are compressed as JPEG of this quality, by libjpeg's scale; left out: they are not",
+        "1",
+        ge=1,
+        le=100,
+        default=None,
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_the_default(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Profiles with a global shutter keep their digests.
+        data: dict[str, Any] = dump(self)
+        if not self.readout_ms:
+            data.pop("readout_ms", None)
+            data.pop("readout_bands", None)
+        return data
+
+    @model_validator(mode="after")
+    def _goes_together(self) -> Imaging:
+        if self.read_noise_e and self.full_well_e is None:
+            raise ValueError(
+                f"read_noise_e = {self.read_noise_e:g}: accepted: 0 without full_well_e"
+            )
+        if self.gain != 1.0 and self.auto_exposure is not None:
+            raise ValueError(f"gain = {self.gain:g}: accepted: 1 with a table auto_exposure")
+        return self
+
+    def check(self, camera: Camera) -> None:
+        """Raise FieldError for settings that the camera's kind or rate does not support."""
+        if self.bayer and camera.kind != "rgb":
+            accepted = f"false with a camera of kind {camera.kind!r}"
+            raise FieldError("camera.imaging.bayer", True, accepted)
+        period_ms = camera.period_us / US_PER_MS
+        for name in ("exposure_ms", "readout_ms"):
+            if (value := getattr(self, name)) > period_ms:
+                accepted = f"value <= {period_ms:.4g} ms, the time between two frames"
+                raise FieldError(f"camera.imaging.{name}", value, accepted)
+
+
+class PathTracing:
+    """Renderer `mitsuba`: a path tracer, the reference of the ray caster's colour images."""
+
+    @staticmethod
+    def images_of(name: str) -> Exposure:
+        """Return the image function of a camera by its name; "" is the main one."""
+        # Imported here: Mitsuba is optional, and commands check options early.
+        from airl_mav.addons.colour.mitsuba import PathTraced
+
+        return PathTraced(1 + sum(words_of(name)))
+
+    @staticmethod
+    def check(camera: Camera, arena: ArenaSpec) -> None:
+        """Raise FieldError for a camera or an arena that Mitsuba does not support."""
+        accepted = None
+        if camera.kind == "depth":
+            accepted = "raycast with a depth camera; mitsuba draws colour"
+        elif camera.imaging is not None:
+            accepted = "raycast with a camera that has a table imaging"
+        elif arena.appearance.fog.drawn:
+            accepted = "raycast in an arena with fog"
+        elif find_spec("mitsuba") is None:
+            accepted = "raycast: mitsuba is not installed (pip install 'airl-mav[render]')"
+        if accepted is not None:
+            raise FieldError("renderer", "mitsuba", accepted)

@@ -16,17 +16,26 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import FLOOR, OBSTACLE, TEXTURES, WALLS, Finish, Light, srgb_of
+from airl_mav.addons.colour.appearance import (
+    FLOOR,
+    OBSTACLE,
+    TEXTURES,
+    WALLS,
+    Finish,
+    Light,
+    srgb_of,
+)
+from airl_mav.addons.colour.picture import RANGE_M, grey
+from airl_mav.addons.colour.shading import GLASS, GLOSSY, INDEX, METAL, is_smooth
+from airl_mav.addons.colour.textures import mean_of, periods, texels
 from airl_mav.arena.geometry import Arena, PlacedMesh, Shape
 from airl_mav.arena.ground import Ground
 from airl_mav.arena.triangles import standing, triangles_of
 from airl_mav.camera.intrinsics import Intrinsics, finer, rays_of
-from airl_mav.camera.picture import RANGE_M
-from airl_mav.camera.shading import GLASS, GLOSSY, INDEX, METAL, is_smooth
-from airl_mav.camera.textures import mean_of, periods, texels
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_to_matrix
 from airl_mav.profiles.projections import sees_to, steepness
+from airl_mav.vehicle.rotation import Quat, Vec
 
 Floats = NDArray[np.float64]
 
@@ -523,3 +532,32 @@ def _cube_face(rays: Floats, places: NDArray[np.intp], axis: int, sign: float, p
     width, height = int(column.max()) - left + 1, int(row.max()) - top + 1
     source = (row - top) * width + column - left
     return Face(axes, pixels, left, top, width, height, places, source)
+
+
+PATHS = 16
+"""Mitsuba paths per pixel; the noise resembles a sensor in daylight."""
+
+
+class PathTraced:
+    """Colour images from Mitsuba's path tracer; each image number has different noise."""
+
+    def __init__(self, first: int = 0) -> None:
+        """Store the noise seed of image 0; later images count up from it, modulo 2^32."""
+        self._tracer = PathTracer(PATHS)
+        self._first = first
+
+    def __call__(
+        self,
+        arena: Arena,
+        centers: NDArray[np.float64],
+        intrinsics: Intrinsics,
+        max_range: float,  # noqa: ARG002 (colour has no limit)
+        position: Vec | NDArray[np.float64],
+        quaternion: Quat | NDArray[np.float64],
+        number: int = 0,
+    ) -> NDArray[Any]:
+        """Return the image; see `expose`. Raises as `mitsuba.PathTracer`."""
+        pose = np.asarray(position), np.asarray(quaternion)
+        seed = (self._first + number) % _SEEDS
+        rgb = self._tracer(arena, centers, intrinsics, *pose, seed=seed)
+        return rgb if intrinsics.kind == "rgb" else grey(rgb)[..., None]

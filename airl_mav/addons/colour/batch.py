@@ -8,20 +8,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import OBSTACLE
+from airl_mav.addons.colour.appearance import OBSTACLE
+from airl_mav.addons.colour.picture import ColourArrays, Work, render_colour, write_grey
+from airl_mav.addons.colour.profile import ImageFile
+from airl_mav.addons.colour.shading import MATT, Gloss
+from airl_mav.addons.colour.textures import atlas
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import ColourArrays, Work, render_colour, write_grey
-from airl_mav.camera.projection import Bent, bent_of
 from airl_mav.camera.render import Mount, camera_pose
-from airl_mav.camera.shading import MATT, Gloss
-from airl_mav.camera.textures import atlas
 from airl_mav.core.errors import UsageError
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arena_batch import ArenaBatch, copy_rows, move_obstacles, relief_of
+from airl_mav.envs.cameras import LensConstants, lens_of
 from airl_mav.envs.fleet import Fleet, FramePoses
 from airl_mav.envs.mesh_batch import MeshBatch, MeshesSeen, meshes_in
-from airl_mav.profiles.assets import ImageFile
 
 
 class LookBatch(NamedTuple):
@@ -110,29 +110,6 @@ class Looks:
         if self.gloss is not None and look.gloss is not None:
             for name, rows in look.gloss._asdict().items():
                 getattr(self.gloss, name)[i, :count] = rows
-
-
-class LensConstants(NamedTuple):
-    """Constants of a camera; a tuple, because compiled loops require one."""
-
-    focal: float
-    """Focal length [px] of a pinhole, columns per angle [px/rad] of a cylinder."""
-    cx: float
-    """Column of the optical axis [px]; pixel centres are at whole numbers."""
-    cy: float
-    """Row of the optical axis [px]."""
-    range_m: float
-    """Maximum depth of a return [m]."""
-    cylindrical: bool = False
-    """True if the image is cylindrical."""
-    bent: Bent | None = None
-    """Rays of a fisheye."""
-
-
-def lens_of(intrinsics: Intrinsics, range_m: float) -> LensConstants:
-    """Return the lens of a camera with a range `range_m` [m]."""
-    k = intrinsics
-    return LensConstants(k.focal, k.cx, k.cy, range_m, k.cylindrical, bent_of(k))
 
 
 class ImageBuffers(NamedTuple):

@@ -12,8 +12,8 @@ import numpy as np
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.addons.render import camera_pictures
-from airl_mav.addons.render.camera_pictures import CameraMotion
+from airl_mav.addons.colour import pictures
+from airl_mav.addons.colour.pictures import CameraMotion
 from airl_mav.arena.generate import generate
 from airl_mav.black_box.messages import SUFFIX
 from airl_mav.camera.intrinsics import Intrinsics
@@ -94,7 +94,7 @@ class RenderOptions(ProfileModel):
     seed: int | None = quantity(
         "seed of the arena; by default the profile's", "1", ge=0, le=GREATEST_SEED, default=None
     )
-    show: camera_pictures.Shown = Field(
+    show: pictures.Shown = Field(
         default="rgb",
         description="colour, its luma, depth (near is bright), segmentation (what is seen), or flow"
         " (how fast it moves over the image)",
@@ -209,14 +209,14 @@ def _check(options: RenderOptions, filmed: bool) -> None:
         if value != RenderOptions.model_fields[name].default:
             subject = "a flight" if filmed else "an arena"
             raise FieldError(name, value, problem=f"not for the picture of {subject}")
-    suffixes = (*(camera_pictures.FILMS if filmed else (".png",)), camera_pictures.ARRAY)
+    suffixes = (*(pictures.FILMS if filmed else (".png",)), pictures.ARRAY)
     if options.out is not None and options.out.suffix.lower() not in suffixes:
         names = " or ".join(", ".join(suffixes).rsplit(", ", 1))
         raise FieldError("out", f"{options.out}", f"a file name that ends in {names}")
-    numbers = options.out is not None and options.out.suffix.lower() == camera_pictures.ARRAY
-    if numbers and (options.camera is not None or options.show not in camera_pictures.TRUTHS):
-        accepted = " or ".join(", ".join(camera_pictures.TRUTHS).rsplit(", ", 1))
-        accepted += f" in a file {camera_pictures.ARRAY}, without --camera"
+    numbers = options.out is not None and options.out.suffix.lower() == pictures.ARRAY
+    if numbers and (options.camera is not None or options.show not in pictures.TRUTHS):
+        accepted = " or ".join(", ".join(pictures.TRUTHS).rsplit(", ", 1))
+        accepted += f" in a file {pictures.ARRAY}, without --camera"
         raise FieldError("show", options.show, accepted)
     for name in _not_asked_for(options):
         value = getattr(options, name)
@@ -225,7 +225,7 @@ def _check(options: RenderOptions, filmed: bool) -> None:
             raise FieldError(name, value, problem=problem)
     check_fov("fov_deg", options.projection, options.fov_deg)
     check_distortion("distortion", options.projection, options.fov_deg, options.distortion)
-    if options.out is not None and options.out.suffix.lower() == camera_pictures.VIDEO:
+    if options.out is not None and options.out.suffix.lower() == pictures.VIDEO:
         check_installed("film")
     if options.renderer == "mitsuba":
         check_installed("render")
@@ -240,20 +240,20 @@ def _not_asked_for(options: RenderOptions) -> tuple[str, ...]:
     return OF_A_VEHICLE[-1:] if options.show == "flow" else OF_A_VEHICLE
 
 
-def _taking(vehicle: str, name: str | None) -> camera_pictures.TakingCamera:
+def _taking(vehicle: str, name: str | None) -> pictures.TakingCamera:
     """Return a camera of a vehicle profile, the main one or an additional one by name."""
     profile = load_vehicle(vehicle)
     if name is None:
-        return camera_pictures.TakingCamera(profile.camera)
+        return pictures.TakingCamera(profile.camera)
     if name not in profile.cameras:
         known = ", ".join(profile.cameras) or f"none: vehicle {vehicle} has its main camera alone"
         raise FieldError("camera_name", name, known)
-    return camera_pictures.TakingCamera(profile.cameras[name], name)
+    return pictures.TakingCamera(profile.cameras[name], name)
 
 
 def _is_truth(options: RenderOptions, out: Path) -> bool:
     """Return True for ground truth as numbers, or as a drawing of optical flow."""
-    return options.show == "flow" or out.suffix.lower() == camera_pictures.ARRAY
+    return options.show == "flow" or out.suffix.lower() == pictures.ARRAY
 
 
 def _camera(options: RenderOptions, size: tuple[int, int]) -> Intrinsics:
@@ -267,15 +267,15 @@ def _camera(options: RenderOptions, size: tuple[int, int]) -> Intrinsics:
     )
 
 
-def _drawn(options: RenderOptions, samples: int) -> camera_pictures.Drawn:
+def _drawn(options: RenderOptions, samples: int) -> pictures.Drawn:
     """Return the renderer, with a number of rays or paths per pixel."""
     if options.renderer == "mitsuba":
         # Imported here: Mitsuba is an extra.
-        from airl_mav.camera.mitsuba import PathTracer
+        from airl_mav.addons.colour.mitsuba import PathTracer
 
         return partial(PathTracer(samples), seed=0)
     rays = math.ceil(math.sqrt(samples))
-    return partial(camera_pictures.still, show=options.show, rays=rays, range_m=options.range_m)
+    return partial(pictures.still, show=options.show, rays=rays, range_m=options.range_m)
 
 
 def _picture(options: RenderOptions, out: Path) -> str:
@@ -296,20 +296,20 @@ def _picture(options: RenderOptions, out: Path) -> str:
     if options.camera is not None:
         motion = Motion(position, attitude, velocity, rates)
         camera_of = _taking(options.camera, options.camera_name)
-        camera_pictures.write_png(out, camera_of(arena, elapsed_us, motion, arena.seed))
+        pictures.write_png(out, camera_of(arena, elapsed_us, motion, arena.seed))
         return "picture"
     centers = arena.centers_at(elapsed_us)
     camera = _camera(options, STILL_PX)
     if _is_truth(options, out):
         moves = CameraMotion(position, attitude, velocity, rates)
-        truth = camera_pictures.truth_of(options.show, arena, elapsed_us, camera, moves)
-        if out.suffix.lower() == camera_pictures.ARRAY:
-            camera_pictures.write_array(out, truth)
+        truth = pictures.truth_of(options.show, arena, elapsed_us, camera, moves)
+        if out.suffix.lower() == pictures.ARRAY:
+            pictures.write_array(out, truth)
             return options.show
-        camera_pictures.write_png(out, camera_pictures.coloured_flow(truth))
+        pictures.write_png(out, pictures.coloured_flow(truth))
         return "picture"
     drawn = _drawn(options, options.samples or SAMPLES[options.renderer])
-    camera_pictures.write_png(out, drawn(arena, centers, camera, position, attitude))
+    pictures.write_png(out, drawn(arena, centers, camera, position, attitude))
     return "picture"
 
 
@@ -322,7 +322,7 @@ def _film(options: RenderOptions, path: Path, out: Path, console: Console) -> st
     drawn = _drawn(options, options.samples or FILM_SAMPLES[options.renderer])
     camera = _camera(options, FILM_PX)
     flight = run.flight(record)
-    times = camera_pictures.moments(flight, options.rate_hz)
+    times = pictures.moments(flight, options.rate_hz)
     taking = None if options.camera is None else _taking(options.camera, options.camera_name)
     with RichProgress(console) as progress:
         bar = progress.bar("film", len(times), unit="pictures")
@@ -332,17 +332,17 @@ def _film(options: RenderOptions, path: Path, out: Path, console: Console) -> st
                 yield time_us
                 bar.advance()
 
-        pictures: Iterator[camera_pictures.Pixels]
+        shown: Iterator[pictures.Pixels]
         if _is_truth(options, out):
-            truths = camera_pictures.truth_film(options.show, flight, camera, told())
-            if out.suffix.lower() == camera_pictures.ARRAY:
+            truths = pictures.truth_film(options.show, flight, camera, told())
+            if out.suffix.lower() == pictures.ARRAY:
                 stack = np.stack(list(truths))
-                camera_pictures.write_array(out, stack)
+                pictures.write_array(out, stack)
                 return f"{options.show} of flight {record.index}, {len(stack)} pictures"
-            pictures = map(camera_pictures.coloured_flow, truths)
+            shown = map(pictures.coloured_flow, truths)
         elif taking is None:
-            pictures = camera_pictures.film(flight, camera, drawn, told())
+            shown = pictures.film(flight, camera, drawn, told())
         else:
-            pictures = camera_pictures.taken_film(flight, taking, told())
-        count = camera_pictures.write_film(out, pictures, options.rate_hz)
+            shown = pictures.taken_film(flight, taking, told())
+        count = pictures.write_film(out, shown, options.rate_hz)
     return f"film of flight {record.index}, {count} pictures"
