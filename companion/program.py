@@ -24,6 +24,7 @@ from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import camera_refused, find_policy
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.projections import PROJECTIONS
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario import piloting
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
@@ -88,7 +89,7 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
     vehicle, compensator = load_vehicle(asked.vehicle), None
     needs = {
         "gives depth": vehicle.camera.kind == "depth",
-        "is a pinhole or a cylinder": vehicle.camera.projection != "fisheye",
+        "is a pinhole or a cylinder": not PROJECTIONS[vehicle.camera.projection].tabled,
         "looks ahead (camera.yaw_deg = 0)": vehicle.camera.yaw_deg == 0.0,
     }
     for need, met in needs.items():

@@ -159,7 +159,7 @@ class Arena:
     def clear(self) -> NDArray[np.bool_] | None:
         """Mask (n,) of glass obstacles, which depth cameras see through; None = no glass."""
         clear_of = entries("airl_mav", "COLOUR").get("clear")
-        return None if clear_of is None else load(clear_of)(self)  # type: ignore[no-any-return]
+        return None if clear_of is None else load(clear_of)(self)
 
     def colour_of(self, i: int) -> tuple[int, int, int]:
         """Return the sRGB colour 0-255 of obstacle i seen from far away; grey without colours."""

@@ -12,7 +12,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.projection import bent_of
+from airl_mav.camera.projection import Scene, lens_of
 from airl_mav.camera.raycast import render_depth
 from airl_mav.core.addons import part
 from airl_mav.core.kernels import kernel
@@ -94,6 +94,12 @@ def pose_of(
     return (north, east, down), (w, x, y, z)
 
 
+def scene_of(arena: Arena, centers: NDArray[np.float64]) -> Scene:
+    """Return room and obstacles of an arena for kernels, with centres (n, 3) NED [m]."""
+    o = arena.obstacles
+    return Scene(arena.bounds.as_array(), o.shape, centers, o.half_size, o.yaw)
+
+
 def render(
     arena: Arena,
     centers: NDArray[np.float64],
@@ -108,22 +114,10 @@ def render(
     result of `Arena.centers_at`. The pose is the camera's, NED [m], camera -> NED. Raises
     UsageError if a mesh's file is missing or has changed.
     """
-    k, obstacles = intrinsics, arena.obstacles
-    image = np.empty((k.height, k.width), np.float32)
-    render_depth(
-        image,
-        *pose_of(position, quaternion),
-        *(float(k.focal), float(k.cx), float(k.cy)),
-        k.cylindrical,
-        float(max_range),
-        arena.bounds.as_array(),
-        obstacles.shape,
-        centers,
-        obstacles.half_size,
-        obstacles.yaw,
-        meshes_of(arena.meshes, len(obstacles), arena.ground, arena.clear),
-        bent_of(k),
-    )
+    image = np.empty((intrinsics.height, intrinsics.width), np.float32)
+    meshes = meshes_of(arena.meshes, len(arena.obstacles), arena.ground, arena.clear)
+    pose = pose_of(position, quaternion)
+    render_depth(image, *pose, lens_of(intrinsics, max_range), scene_of(arena, centers), meshes)
     return image
 
 

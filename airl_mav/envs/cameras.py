@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import DepthNoise, noise_of, noisy_frame
-from airl_mav.camera.projection import Bent, bent_of
+from airl_mav.camera.projection import LensConstants, Scene, lens_of
 from airl_mav.camera.raycast import render_depth
 from airl_mav.camera.render import Motion, Mount, camera_pose, colour
 from airl_mav.core.constants import TICK_US, US_PER_S
@@ -298,6 +298,14 @@ def _make_noisy(
         image[i] = noisy_frame(image[i], noise, int(seeds[i]), int(frames[i]))
 
 
+@kernel
+def scene_in(arenas: ArenaBatch, i: int) -> Scene:
+    """Return room and obstacles of arena i."""
+    n = arenas.n_obstacles[i]
+    shape, center = arenas.shape[i, :n], arenas.center[i, :n]
+    return Scene(arenas.bounds[i], shape, center, arenas.half_size[i, :n], arenas.yaw[i, :n])
+
+
 @large_kernel
 def render_images(
     fleet: Fleet | FramePoses, arenas: ArenaBatch, who: NDArray[np.bool_], eye: Eye | None
@@ -313,7 +321,6 @@ def render_images(
     """
     if eye is None:
         return
-    lens = eye.lens
     image = np.empty(eye.image.shape[1:], np.float32)
     for i in range(len(who)):
         # `_to_z16` overwrites the same buffer for each vehicle.
@@ -322,23 +329,9 @@ def render_images(
         move_obstacles(arenas, i, fleet.time_us[i])
         count = arenas.n_obstacles[i]
         position, quaternion = camera_pose(fleet.position[i], fleet.quaternion[i], eye.mount)
-        render_depth(
-            image,
-            position,
-            quaternion,
-            lens.focal,
-            lens.cx,
-            lens.cy,
-            lens.cylindrical,
-            lens.range_m,
-            arenas.bounds[i],
-            arenas.shape[i, :count],
-            arenas.center[i, :count],
-            arenas.half_size[i, :count],
-            arenas.yaw[i, :count],
-            meshes_in(eye.meshes, i, count, relief_of(arenas, i)),
-            lens.bent,
-        )
+        scene = scene_in(arenas, i)
+        meshes = meshes_in(eye.meshes, i, count, relief_of(arenas, i))
+        render_depth(image, position, quaternion, eye.lens, scene, meshes)
         _to_z16(image, eye.image[i])
 
 
@@ -349,26 +342,3 @@ def _to_z16(depth_m: NDArray[np.float32], out: NDArray[np.uint16]) -> None:
         for u in range(depth_m.shape[1]):
             mm = np.rint(depth_m[v, u] * np.float32(MM_PER_M))
             out[v, u] = np.uint16(min(mm, np.float32(MAX_MM)))
-
-
-class LensConstants(NamedTuple):
-    """Constants of a camera; a tuple, because compiled loops require one."""
-
-    focal: float
-    """Focal length [px] of a pinhole, columns per angle [px/rad] of a cylinder."""
-    cx: float
-    """Column of the optical axis [px]; pixel centres are at whole numbers."""
-    cy: float
-    """Row of the optical axis [px]."""
-    range_m: float
-    """Maximum depth of a return [m]."""
-    cylindrical: bool = False
-    """True if the image is cylindrical."""
-    bent: Bent | None = None
-    """Rays of a fisheye."""
-
-
-def lens_of(intrinsics: Intrinsics, range_m: float) -> LensConstants:
-    """Return the lens of a camera with a range `range_m` [m]."""
-    k = intrinsics
-    return LensConstants(k.focal, k.cx, k.cy, range_m, k.cylindrical, bent_of(k))

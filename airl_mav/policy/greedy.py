@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.intrinsics import fisheye_rays
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 
@@ -107,11 +106,11 @@ def near_points(observation: Observation, band_m: float) -> NDArray[np.float64]:
     z = depth[seen].astype(np.float64)
     right, down = (u - k.cx) / k.focal * z, (v - k.cy) / k.focal * z
     ahead = z
-    if k.cylindrical:
+    if k.model.cylindrical:
         angle = (u - k.cx) / k.focal
         ahead, right = np.cos(angle) * z, np.sin(angle) * z
-    elif k.projection == "fisheye":
-        ahead, right, down = fisheye_rays(k)[:, v, u] * z
+    elif k.model.tabled:
+        ahead, right, down = k.rays[:, v, u] * z
     # Heading frame from body: R_y(pitch) R_x(roll).
     cr, sr = math.cos(observation.roll), math.sin(observation.roll)
     cp, sp = math.cos(observation.pitch), math.sin(observation.pitch)

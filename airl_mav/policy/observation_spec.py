@@ -18,6 +18,7 @@ from airl_mav.profiles.camera import Coefficients, camera_named
 from airl_mav.profiles.projections import (
     CHANNELS,
     CYLINDER_MOST_DEG,
+    PROJECTIONS,
     UNDISTORTED,
     CameraKind,
     Projection,
@@ -199,9 +200,10 @@ class ObservationSpec(ProfileModel):
             raise ValueError(f"frames = {self.frames}: accepted: 1 with layout 'paper'")
         if self.kind != "depth" and self.layout in ("paper", "scan"):
             raise ValueError(f"kind = {self.kind!r}: accepted: 'depth' with layout {self.layout!r}")
-        if self.projection == "fisheye" and self.layout == "scan":
+        if PROJECTIONS[self.projection].tabled and self.layout == "scan":
             raise ValueError(
-                "projection = 'fisheye': accepted: pinhole or cylindrical with layout 'scan'"
+                f"projection = {self.projection!r}: accepted: pinhole or cylindrical with layout"
+                " 'scan'"
             )
         if self.goal_height and self.layout == "paper":
             raise ValueError("goal_height = true: accepted: false with layout 'paper'")

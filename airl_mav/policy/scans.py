@@ -79,11 +79,13 @@ class Scanning(NamedTuple):
 @cache
 def rays_of(camera: Intrinsics) -> ScanRays:
     """Return the rays of a pinhole or cylindrical camera. Raises UsageError for a fisheye."""
-    if camera.projection == "fisheye":
-        raise UsageError("a fisheye gives no level scan; accepted: a pinhole or a cylinder")
+    if camera.model.tabled:
+        raise UsageError(
+            f"a {camera.projection} gives no level scan; accepted: a pinhole or a cylinder"
+        )
     columns: Floats = (np.arange(camera.width, dtype=np.float64) - camera.cx) / camera.focal
     down: Floats = (np.arange(camera.height, dtype=np.float64) - camera.cy) / camera.focal
-    if camera.cylindrical:
+    if camera.model.cylindrical:
         return ScanRays(np.cos(columns), np.sin(columns), down, camera.horizontal_fov_rad)
     return ScanRays(np.ones(camera.width), columns, down, camera.horizontal_fov_rad)
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
-from airl_mav.camera.intrinsics import Intrinsics, fisheye_places, fisheye_rays
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Vector, quat_from_euler, quat_to_matrix, quats_to_euler
@@ -67,13 +67,13 @@ class Reprojector:
         u = (np.arange(k.width, dtype=np.float32) - np.float32(k.cx)) / np.float32(k.focal)
         v = (np.arange(k.height, dtype=np.float32) - np.float32(k.cy)) / np.float32(k.focal)
         rays = np.ones((3, k.height, k.width), np.float32)
-        if k.projection == "fisheye":
-            rays[:] = fisheye_rays(k)
-        elif k.cylindrical:
+        if k.model.tabled:
+            rays[:] = k.rays
+        elif k.model.cylindrical:
             rays[0], rays[1] = np.cos(u)[None, :], np.sin(u)[None, :]
         else:
             rays[1] = u[None, :]
-        if k.projection != "fisheye":
+        if not k.model.tabled:
             rays[2] = v[:, None]
         self._rays = rays.reshape(3, -1)
         """(3, h w) viewing direction of each pixel at a depth of 1: forward, right, down."""
@@ -109,24 +109,24 @@ class Reprojector:
         depth[empty] = self._range_m
         points = (turn @ self._rays) * depth
         forward, right = points[0] + shift[0], points[1] + shift[1]
-        if k.projection == "fisheye":
-            return self._on_fisheye(np.stack([forward, right, points[2] + shift[2]]), empty)
-        there = np.hypot(forward, right) if k.cylindrical else forward
+        if k.model.tabled:
+            return self._on_table(np.stack([forward, right, points[2] + shift[2]]), empty)
+        there = np.hypot(forward, right) if k.model.cylindrical else forward
         kept = there > LEAST_DEPTH_M
         scale = np.float32(k.focal) / np.maximum(there, np.float32(LEAST_DEPTH_M))
-        if k.cylindrical:
+        if k.model.cylindrical:
             column = self._bearing_column(forward, right)
         else:
             column = np.rint(right * scale + np.float32(k.cx))
         row = np.rint((points[2] + shift[2]) * scale + np.float32(k.cy))
         return self._fallen(column, row, there, kept, empty)
 
-    def _on_fisheye(
+    def _on_table(
         self, points: Floats, empty: NDArray[np.bool_]
     ) -> tuple[NDArray[np.intp], NDArray[np.uint32]]:
-        """Return as `_carried` the fisheye pixels of points (3, h w) from the camera."""
+        """Return as `_carried` the pixels of a tabled projection that see points (3, h w)."""
         there = np.sqrt((points * points).sum(axis=0))
-        column, row = (np.rint(place) for place in fisheye_places(self._k, points))
+        column, row = (np.rint(place) for place in self._k.model.places(self._k, points))
         kept = self._sees & (there > LEAST_DEPTH_M)
         return self._fallen(column, row, there, kept, empty)
 

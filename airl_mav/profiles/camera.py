@@ -19,6 +19,7 @@ from airl_mav.core.fields import Each, ProfileModel, later_field, quantity, sect
 from airl_mav.profiles.projections import (
     CYLINDER_MOST_DEG,
     MOST_COEFFICIENT,
+    PROJECTIONS,
     UNDISTORTED,
     CameraKind,
     Distortion,
@@ -36,9 +37,6 @@ if TYPE_CHECKING:
     Imaging: TypeAlias = Any
 else:
     Imaging = section("camera.imaging")
-
-LEAST_ROWS = 6
-"""Minimum rows of an image, except with a cylindrical projection."""
 
 Coefficients = Annotated[Distortion, Each(-MOST_COEFFICIENT, MOST_COEFFICIENT)]
 """Distortion coefficients of a fisheye."""
@@ -146,7 +144,7 @@ class Camera(ProfileModel):
             "camera.distortion", self.projection, self.horizontal_fov_deg, self.distortion
         )
         check_rows("camera.height_px", self)
-        if self.stereo is not None and self.projection != "pinhole":
+        if self.stereo is not None and not PROJECTIONS[self.projection].planar:
             raise FieldError(
                 "camera.stereo", self.projection, "left out where the projection is not pinhole"
             )
@@ -182,8 +180,9 @@ def check_matched(field: str, camera: Camera) -> None:
 
 def check_rows(field: str, camera: Camera) -> None:
     """Raise FieldError, naming the field, for an image with too few rows for its projection."""
-    if camera.height_px < LEAST_ROWS and camera.projection != "cylindrical":
-        accepted = f"value >= {LEAST_ROWS} px with projection {camera.projection!r}"
+    least = PROJECTIONS[camera.projection].least_rows
+    if camera.height_px < least:
+        accepted = f"value >= {least} px with projection {camera.projection!r}"
         raise FieldError(field, camera.height_px, accepted)
 
 

@@ -14,6 +14,7 @@ from airl_mav.arena.geometry import Arena, Bounds, Shape
 from airl_mav.arena.triangles import drawn, standing
 from airl_mav.core import frames
 from airl_mav.core.frames import goal_height_m
+from airl_mav.profiles.projections import PROJECTIONS
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE
 from airl_mav.view import style
 from airl_mav.view.panel import camera_picture
@@ -245,7 +246,7 @@ class FlightScene:
     def _build_camera(self, shape: VehicleShape) -> None:
         pitch, yaw = map(math.radians, (shape.camera_pitch_up_deg, shape.camera_yaw_deg))
         turn = frames.quat_from_euler(0.0, pitch, yaw)
-        if shape.camera_projection == "cylindrical":
+        if PROJECTIONS[shape.camera_projection].cylindrical:
             # A 360° camera: the unrolled image is above the vehicle, centred on forward.
             self._camera = self._add(
                 "image",

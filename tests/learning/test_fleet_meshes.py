@@ -15,10 +15,11 @@ from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.projection import lens_of
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arena_batch import batch_of
-from airl_mav.envs.cameras import Eye, lens_of, render_images
+from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.fleet import FramePoses
 from airl_mav.envs.mesh_batch import MeshesSeen
 from airl_mav.profiles.arena import ArenaSpec

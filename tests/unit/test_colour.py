@@ -219,7 +219,7 @@ def rays_of(k: Intrinsics, attitude: NDArray[np.float64]) -> NDArray[np.float64]
     """Rays (h, w, 3) NED, as `Intrinsics` defines them."""
     v, u = np.mgrid[: k.height, : k.width]
     x, y = (u - k.cx) / k.focal, (v - k.cy) / k.focal
-    ahead, right = (np.cos(x), np.sin(x)) if k.cylindrical else (np.ones_like(x), x)
+    ahead, right = (np.cos(x), np.sin(x)) if k.model.cylindrical else (np.ones_like(x), x)
     if k.projection == "fisheye":
         ahead, right, y = np.moveaxis(np.nan_to_num(rays_of_fisheye(k)), -1, 0)
     rays: NDArray[np.float64] = np.stack([ahead, right, y], -1) @ quat_to_matrix(attitude).T

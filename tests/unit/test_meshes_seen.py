@@ -50,7 +50,7 @@ def rays_of(k: Intrinsics, quaternion: Floats) -> Floats:
     """Return the ray (h w, 3) of each pixel, NED, of the length 1 in depth; 0: it sees nothing."""
     v, u = np.mgrid[: k.height, : k.width].reshape(2, -1)
     x, y = (u - k.cx) / k.focal, (v - k.cy) / k.focal
-    ahead, right = (np.cos(x), np.sin(x)) if k.cylindrical else (np.ones(len(x)), x)
+    ahead, right = (np.cos(x), np.sin(x)) if k.model.cylindrical else (np.ones(len(x)), x)
     own = np.stack([ahead, right, y], axis=1)
     if k.projection == "fisheye":
         own = np.nan_to_num(rays_of_fisheye(k).reshape(-1, 3))

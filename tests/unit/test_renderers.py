@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -39,7 +38,7 @@ def _arrays(look: Any) -> ColourArrays:
     arrays = _of(look)
     zeros = np.zeros(len(arrays.texture), np.float32)
     matt = Gloss(np.full(len(zeros), MATT, np.int8), zeros, zeros)
-    return replace(arrays, gloss=arrays.gloss or matt)
+    return arrays._replace(gloss=arrays.gloss or matt)
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,11 +14,12 @@ from airl_mav.addons.colour.shading import MATT, Gloss
 from airl_mav.addons.colour.textures import atlas
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.camera.projection import LensConstants, lens_of
+from airl_mav.camera.render import RANGE_M, Mount, camera_pose
 from airl_mav.core.errors import UsageError
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arena_batch import ArenaBatch, copy_rows, move_obstacles, relief_of
-from airl_mav.envs.cameras import LensConstants, lens_of
+from airl_mav.envs.cameras import scene_in
 from airl_mav.envs.fleet import Fleet, FramePoses
 from airl_mav.envs.mesh_batch import MeshBatch, MeshesSeen, meshes_in
 
@@ -129,12 +129,11 @@ class ColourImages:
     ) -> None:
         """Store camera, mounting, arena appearance and meshes."""
         k, shape = intrinsics, (intrinsics.height, intrinsics.width)
-        # Colour has no maximum depth.
-        self._lens = lens_of(k, math.inf)
+        self._lens = lens_of(k, RANGE_M)
         self._mount, self._looks, self._meshes = mount, looks, meshes
         rgb = np.zeros((*shape, 3), np.uint8)
         depth, seen = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
-        work = Work.of(k.width, k.height, k.cylindrical)
+        work = Work.of(k)
         self._canvas = ImageBuffers(work, rgb, depth, seen)
 
     def render(
@@ -185,6 +184,14 @@ def _render(
         count = arenas.n_obstacles[i]
         surfaces = OBSTACLE + count
         position, quaternion = camera_pose(fleet.position[i], fleet.quaternion[i], mount)
+        colours = ColourArrays(
+            looks.texture[i, :surfaces],
+            looks.per_m[i, :surfaces],
+            looks.offset[i, :surfaces],
+            looks.albedo[i, :surfaces],
+            _gloss_in(gloss, i, surfaces),
+            looks.lights[i],
+        )
         render_colour(
             # Grey is computed from a buffer; RGB is rendered into the output.
             rgb if grey else out[i],
@@ -193,24 +200,11 @@ def _render(
             canvas.work,
             position,
             quaternion,
-            lens.focal,
-            lens.cx,
-            lens.cy,
-            lens.cylindrical,
-            arenas.bounds[i],
-            arenas.shape[i, :count],
-            arenas.center[i, :count],
-            arenas.half_size[i, :count],
-            arenas.yaw[i, :count],
+            lens,
+            scene_in(arenas, i),
             meshes_in(meshes, i, count, relief_of(arenas, i)),
-            looks.texture[i, :surfaces],
-            looks.per_m[i, :surfaces],
-            looks.offset[i, :surfaces],
-            looks.albedo[i, :surfaces],
-            _gloss_in(gloss, i, surfaces),
-            looks.lights[i],
+            colours,
             patterns,
-            lens.bent,
         )
         if grey:
             pixels = rgb.shape[0] * rgb.shape[1]

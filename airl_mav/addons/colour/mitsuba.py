@@ -25,16 +25,16 @@ from airl_mav.addons.colour.appearance import (
     Light,
     srgb_of,
 )
-from airl_mav.addons.colour.picture import RANGE_M, grey
+from airl_mav.addons.colour.picture import grey
 from airl_mav.addons.colour.shading import GLASS, GLOSSY, INDEX, METAL, is_smooth
 from airl_mav.addons.colour.textures import mean_of, periods, texels
 from airl_mav.arena.geometry import Arena, PlacedMesh, Shape
 from airl_mav.arena.ground import Ground
 from airl_mav.arena.triangles import standing, triangles_of
-from airl_mav.camera.intrinsics import Intrinsics, finer, rays_of
+from airl_mav.camera.intrinsics import Intrinsics, finer
+from airl_mav.camera.render import RANGE_M
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_to_matrix
-from airl_mav.profiles.projections import sees_to, steepness
 from airl_mav.vehicle.rotation import Quat, Vec
 
 Floats = NDArray[np.float64]
@@ -87,7 +87,7 @@ class PathTracer:
             bodies = _lights(mi, arena.look.light) | _bodies(mi, arena, centers)
             self._scene = mi.load_dict({"type": "scene", "integrator": integrator, **bodies})
         axes, k = quat_to_matrix(quaternion).T, intrinsics
-        if k.projection == "pinhole":
+        if k.model.planar:
             whole = _Film(k.width, k.height, 0, 0, k.width, k.height, k.horizontal_fov_rad)
             light = self._rendered(mi, axes, position, whole, self._samples, seed)
         else:
@@ -472,13 +472,13 @@ def cube_of(camera: Intrinsics, side: int) -> Cube:
     `side`. Around it a fisheye's image is finer, by half at 90 degrees.
     """
     k, fine = camera, finer(camera, side)
-    rays = rays_of(fine)
+    rays = fine.rays
     # A pixel outside the field of view is entirely black.
-    blind = ~rays_of(k).any(axis=0)
+    blind = ~k.rays.any(axis=0)
     rays[:, np.repeat(np.repeat(blind, side, axis=0), side, axis=1)] = 0.0
     rays = rays.reshape(3, -1)
     # A pinhole of 90 degrees is two focal lengths wide.
-    pixels = 2 * math.ceil(fine.focal * _finest(k))
+    pixels = 2 * math.ceil(fine.focal * k.model.finest(k))
     # A ray leaves the cube through the face of its largest component.
     across = np.abs(rays).argmax(axis=0)
     sees = rays.any(axis=0)
@@ -504,15 +504,6 @@ def resampled(cube: Cube, images: list[Floats]) -> Floats:
     count = seen.reshape(blocks).sum(axis=(1, 3))
     mean: Floats = total / np.maximum(count, 1.0)[..., None]
     return mean
-
-
-def _finest(k: Intrinsics) -> float:
-    """Return the maximum pixels per angle of an image, relative to the focal length."""
-    if k.projection != "fisheye":
-        return 1.0
-    # The slope of the lens polynomial is sampled over half the field of view.
-    angles = np.linspace(0.0, min(0.5 * k.horizontal_fov_rad, sees_to(k.distortion)), 65)
-    return float(np.max(steepness(angles, k.distortion)))
 
 
 def _cube_face(rays: Floats, places: NDArray[np.intp], axis: int, sign: float, pixels: int) -> Face:

@@ -7,7 +7,6 @@ Depth, light and colour are stored as planes of 32 bits, so that every loop alon
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -45,7 +44,7 @@ from airl_mav.camera.bvh import Meshes, count_of, is_owned, meshes_of, raised
 from airl_mav.camera.intrinsics import Intrinsics, finer
 from airl_mav.camera.meshes import Faces
 from airl_mav.camera.primitives import FLOOR, GROUND, OBSTACLE, SKY, Ids, Rectangles
-from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Optics, Scene, bent_of
+from airl_mav.camera.projection import MIN_DEPTH_M, Bent, LensConstants, Optics, Scene, lens_of
 from airl_mav.camera.raycast import (
     aim,
     blank,
@@ -54,7 +53,7 @@ from airl_mav.camera.raycast import (
     invert,
     write_transposed,
 )
-from airl_mav.camera.render import RANGE_M, pose_of
+from airl_mav.camera.render import RANGE_M, pose_of, scene_of
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
@@ -71,16 +70,18 @@ class Picture(NamedTuple):
     seen: NDArray[np.int32]  # (height, width) CEILING, SKY, ... of `primitives`, OBSTACLE + i
 
 
-@dataclass(frozen=True)
-class ColourArrays:
-    """Appearance of an arena as arrays for `render_colour`."""
+class ColourArrays(NamedTuple):
+    """Appearance of an arena for `render_colour`; rows as in `Finish`."""
 
     texture: NDArray[np.int8]  # (m,)
-    per_m: NDArray[np.float32]  # (m,) [1/m]
+    per_m: NDArray[np.float32]  # (m,) periods of the pattern per metre [1/m]
     offset: NDArray[np.float32]  # (m, 2)
     albedo: NDArray[np.float32]  # (m, 2, 3)
     gloss: Gloss | None
-    lights: NDArray[np.float32]  # (7, 3)
+    """Properties of surfaces that are not matt; None = all are matt, at no cost."""
+    lights: NDArray[np.float32]
+    """(7, 3) direction of the sun, irradiance of sun and sky, the floor's mean radiosity, zenith,
+    horizon, and the fog's extinction [1/m] in the first column."""
 
     @classmethod
     def of(cls, look: Drawn) -> ColourArrays:
@@ -115,34 +116,22 @@ def render_picture(
     gain: float = 1.0,
 ) -> Picture:
     """Return the picture of an arena, light times `gain`; arguments as in `render`."""
-    k, obstacles, look = intrinsics, arena.obstacles, ColourArrays.of(arena.look)
+    k, look = intrinsics, ColourArrays.of(arena.look)
+    if gain != 1.0:
+        look = look._replace(lights=_brightened(look.lights, gain))
     shape = (k.height, k.width)
-    lights = look.lights if gain == 1.0 else _brightened(look.lights, gain)
     picture = Picture(
         np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.int32)
     )
     render_colour(
         *picture,
-        Work.of(k.width, k.height, k.cylindrical),
+        Work.of(k),
         *pose_of(position, quaternion),
-        float(k.focal),
-        float(k.cx),
-        float(k.cy),
-        k.cylindrical,
-        arena.bounds.as_array(),
-        obstacles.shape,
-        centers,
-        obstacles.half_size,
-        obstacles.yaw,
-        meshes_of(arena.meshes, len(obstacles), arena.ground),
-        look.texture,
-        look.per_m,
-        look.offset,
-        look.albedo,
-        look.gloss,
-        lights,
+        lens_of(k, RANGE_M),
+        scene_of(arena, centers),
+        meshes_of(arena.meshes, len(arena.obstacles), arena.ground),
+        look,
         atlas(arena.look.finish.images),
-        bent_of(k),
     )
     return picture
 
@@ -222,9 +211,9 @@ class Work(NamedTuple):
     corners: NDArray[np.float64]  # (CORNERS, 3)
 
     @classmethod
-    def of(cls, width: int, height: int, cylindrical: bool) -> Work:
-        """Return buffers for an image size; lines are rows, or columns of a cylinder."""
-        n, m = (width, height) if cylindrical else (height, width)
+    def of(cls, k: Intrinsics) -> Work:
+        """Return buffers for a camera's images; lines are rows, or columns of a cylinder."""
+        n, m = (k.width, k.height) if k.model.cylindrical else (k.height, k.width)
         # A block has at least one whole line.
         block = max(surfaces.BLOCK, m)
 
@@ -253,54 +242,36 @@ def render_colour(
     work: Work,
     position: Vec | NDArray[np.float64],
     quaternion: Quat | NDArray[np.float64],
-    focal: float,
-    cx: float,
-    cy: float,
-    cylindrical: bool,
-    bounds: NDArray[np.float64],
-    shape: NDArray[np.int8],
-    center: NDArray[np.float64],
-    half_size: NDArray[np.float64],
-    yaw: NDArray[np.float64],
+    lens: LensConstants,
+    scene: Scene,
     meshes: Meshes | None,
-    texture: NDArray[np.int8],
-    per_m: NDArray[np.float32],
-    offset: NDArray[np.float32],
-    albedo: NDArray[np.float32],
-    gloss: Gloss | None,
-    lights: NDArray[np.float32],
+    colours: ColourArrays,
     atlas: Plane,
-    bent: Bent | None,
 ) -> None:
     """Render the colour image of an arena; arguments not listed as in `render_depth`.
 
     The outputs are `rgb` (height, width, 3) sRGB, `depth` (height, width) unlimited [m], 0 = no
     surface, and `seen`. Inside an obstacle the image is black. `seen` is CEILING, SKY, ... of
     `primitives`, FLOOR also for hills, or OBSTACLE + the number of an obstacle or of a mesh's
-    first. `texture` (2 + n,), `offset` (2 + n, 2) and `albedo` (2 + n, 2, 3) are fields of
-    `Finish`, `per_m` (2 + n,) is the number of pattern periods per metre, `atlas` is
-    `textures.atlas()`. `gloss` describes surfaces that are not matt; None has no cost. `lights` (7,
-    3): direction of the sun, irradiance of sun and sky, the floor's mean radiosity, zenith,
-    horizon, and the fog's extinction [1/m] in the first column.
+    first. `atlas` is `textures.atlas()`.
     """
     camera = raised(meshes, position)
-    lines, xs = work.lines, work.xs
-    view, axes = aim(lines, xs, quaternion, focal, cx, cy, cylindrical, RANGE_M)
+    lines, xs, bent, cylindrical = work.lines, work.xs, lens.bent, lens.cylindrical
+    view, axes = aim(lines, xs, quaternion, lens)
     # A cylinder is drawn by columns into work buffers, and transposed at the end.
     far, ids = (work.far, work.ids) if cylindrical else (depth, seen)
-    rectangles = np.zeros((len(shape) + count_of(meshes), 3, 4), np.int32)
+    rectangles = np.zeros((len(scene.shape) + count_of(meshes), 3, 4), np.int32)
     faces = None if meshes is None else np.empty(far.shape, np.int32)
     optics = Optics(lines, xs, bent, view, axes, camera)
-    scene = Scene(bounds, shape, center, half_size, yaw)
     inside = draw_bodies(far, ids, rectangles, optics, scene, meshes, faces)
     if inside >= 0:
         _show_inside(rgb, depth, seen, inside, bent)
         return
     invert(far)
     pixel2 = F32(1.0 / (view.focal * view.focal))
-    light = _lit(lights)
-    look = SceneLook(texture, per_m, offset, albedo, gloss, light, atlas, pixel2)  # type: ignore[arg-type]
-    _show(rgb, far, ids, rectangles, faces, work, optics, scene, meshes, look, gloss)
+    c, light = colours, _lit(colours.lights)
+    look = SceneLook(c.texture, c.per_m, c.offset, c.albedo, c.gloss, light, atlas, pixel2)  # type: ignore[arg-type]
+    _show(rgb, far, ids, rectangles, faces, work, optics, scene, meshes, look, c.gloss)
     if cylindrical:
         write_transposed(depth, far)
         write_transposed(seen, ids)

@@ -26,7 +26,7 @@ from airl_mav.addons.colour.picture import Picture, antialiased, grey, render_pi
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera import primitives
 from airl_mav.camera.frame import depth_to_z16
-from airl_mav.camera.intrinsics import Intrinsics, rays_of
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.primitives import OBSTACLE
 from airl_mav.camera.render import Motion, Mount, camera_pose, expose
 from airl_mav.core.constants import US_PER_MS, US_PER_S
@@ -35,7 +35,6 @@ from airl_mav.core.files import replace_file
 from airl_mav.core.frames import quat_to_matrix
 from airl_mav.flight.trajectory import pose_at
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.projections import distorted, steepness
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.replay.replayed_flight import ReplayedFlight
 from airl_mav.report.theme import coloured
@@ -311,9 +310,6 @@ Floats = NDArray[np.float64]
 MOVED_OVER_US = 1_000
 """Half interval of the central difference for velocities of moving obstacles [µs]."""
 
-# Distance from the optical axis below which 1 / z replaces theta_d / aside.
-_ON_AXIS = 1e-9
-
 
 class CameraMotion(NamedTuple):
     """Pose and velocity of a camera."""
@@ -351,7 +347,7 @@ def optical_flow(
     picture: Picture, camera: Intrinsics, motion: CameraMotion, velocities: Floats
 ) -> NDArray[np.float32]:
     """Return the flow (h, w, 2) of a picture [px/s]; NaN outside a fisheye's field of view."""
-    rays = rays_of(camera)
+    rays = camera.rays
     axes = quat_to_matrix(motion.quaternion)
     depth = picture.depth_m.astype(np.float64)
     # Depth 0 is infinitely distant. Such points only turn, for which any depth will do.
@@ -365,30 +361,6 @@ def optical_flow(
     apart = (moves - motion.velocity) @ axes
     apart[far] = 0.0
     turning = np.cross(motion.rates, np.moveaxis(points, 0, -1))
-    flow = np.stack(_pushed(camera, points, np.moveaxis(apart - turning, -1, 0)), axis=-1)
+    flow = np.stack(camera.model.flow(camera, points, np.moveaxis(apart - turning, -1, 0)), axis=-1)
     flow[~rays.any(axis=0)] = np.nan
     return flow.astype(np.float32)
-
-
-def _pushed(camera: Intrinsics, points: Floats, moves: Floats) -> tuple[Any, Any]:
-    """Return the image velocity [px/s] of points (3, h, w) with velocities `moves` (3, h, w)."""
-    (z, x, y), (dz, dx, dy), f = points, moves, camera.focal
-    # On the optical axis `aside` is 0; `np.where` selects the limit there.
-    with np.errstate(invalid="ignore", divide="ignore"):
-        if camera.projection == "pinhole":
-            return f * (dx - x / z * dz) / z, f * (dy - y / z * dz) / z
-        if camera.cylindrical:
-            # Derivatives of focal * atan2(x, z) and focal * y / hypot(x, z).
-            square = x * x + z * z
-            away = np.sqrt(square)
-            receding = (x * dx + z * dz) / square
-            return f * (z * dx - x * dz) / square, f * (dy - y * receding) / away
-        aside = np.hypot(x, y)
-        off = np.arctan2(aside, z)
-        growing = (x * dx + y * dy) / aside
-        # Columns and rows are f c x and f c y, with c = theta_d / aside: 1 / z on the axis.
-        share = np.where(aside > _ON_AXIS, distorted(off, camera.distortion) / aside, 1.0 / z)
-        opening = (z * growing - aside * dz) / (aside * aside + z * z)
-        opening = steepness(off, camera.distortion) * opening
-        changing = np.where(aside > _ON_AXIS, (opening - share * growing) / aside, -dz / (z * z))
-        return f * (changing * x + share * dx), f * (changing * y + share * dy)

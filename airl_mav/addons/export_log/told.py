@@ -134,7 +134,7 @@ class FlightMessages:
         yield self._drawn(time_us, "/scene/vehicle", self._vehicle(VEHICLE, time_us))
         if self.flight.estimate is not None:
             yield self._drawn(time_us, "/scene/estimate", self._vehicle(ESTIMATE, time_us))
-        if self._camera.intrinsics.projection != "cylindrical":
+        if self._camera.intrinsics.model.calibration is not None:
             yield self._drawn(time_us, "/camera/calibration", self._calibration(time_us))
 
     def _vehicle(self, frame: str, time_us: int) -> messages.SceneUpdate:
@@ -191,15 +191,13 @@ class FlightMessages:
     def _calibration(self, time_us: int) -> messages.CameraCalibration:
         k = self._camera.intrinsics
         f, cx, cy = k.focal, k.cx, k.cy
-        # Foxglove's name for OpenCV's fisheye model; a pinhole without distortion has no model.
-        bent = k.projection == "fisheye"
         return messages.CameraCalibration(
             timestamp=timestamp(self._unix_us(time_us)),
             frame_id=CAMERA,
             width=k.width,
             height=k.height,
-            distortion_model="kannala_brandt" if bent else "",
-            D=list(k.distortion) if bent else [],
+            distortion_model=k.model.calibration or "",
+            D=list(k.distortion) if k.model.calibration else [],
             K=[f, 0.0, cx, 0.0, f, cy, 0.0, 0.0, 1.0],
             R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
             P=[f, 0.0, cx, 0.0, 0.0, f, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
