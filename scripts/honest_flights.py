@@ -24,15 +24,15 @@ import tyro
 from flown_lines import FlownLines
 from plants_compared import PAIRS
 
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_USAGE, UsageError
-from airl_mav.core.provenance import provenance
+from airl_mav.core.machine import provenance
+from airl_mav.core.progress import new_console
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import wilson
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.profiles.conditions import WindSettings
-from airl_mav.report.table import Column, TableView, print_table, write_table
+from airl_mav.report.document import Column, TableView, print_table, write_table
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from companion.limits import REASONS

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.ground import Ground
-from airl_mav.core.addons import entries, load, part
+from airl_mav.core.addons import entries, load, load_entry
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.fields import ArrayField
 from airl_mav.core.frames import Goal
@@ -153,7 +153,7 @@ class Arena:
     @cached_property
     def look(self) -> Any:
         """Materials of all surfaces, and the light; drawn on first access."""
-        return part("COLOUR", "look", "colours of an arena")(self)
+        return load_entry("airl_mav", "COLOUR", "look", ("appearance", self.name), "colour")(self)
 
     @cached_property
     def clear(self) -> NDArray[np.bool_] | None:

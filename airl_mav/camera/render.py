@@ -14,7 +14,7 @@ from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.projection import Scene, lens_of
 from airl_mav.camera.raycast import render_depth
-from airl_mav.core.addons import part
+from airl_mav.core.addons import load_entry
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.projections import Renderer
@@ -144,14 +144,16 @@ def colour(name: str) -> Any:
     images of n vehicles and `looks` holds the appearance of their arenas, `look` and `clear` are an
     arena's appearance and its mask of glass.
     """
-    return part("COLOUR", name, "images of kind rgb and grey")
+    return load_entry("airl_mav", "COLOUR", name, ("camera.kind", "rgb or grey"), "colour")
 
 
 def exposure_by(renderer: Renderer, name: str = "") -> Exposure:
     """Return the image function of a camera for a renderer; "" is the main camera."""
     if renderer == "raycast":
         return expose
-    made: Exposure = part("RENDERERS", renderer, f"renderer {renderer}").images_of(name)
+    option = "renderer", renderer
+    path_tracing = load_entry("airl_mav", "RENDERERS", renderer, option, "colour")
+    made: Exposure = path_tracing.images_of(name)
     return made
 
 

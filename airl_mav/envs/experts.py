@@ -23,9 +23,15 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.planner import Planner
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.spec import ExpertName
-from airl_mav.policy.action_sets import VELOCITIES, VERTICAL, ActionSpec, commands, discrete_actions
-from airl_mav.policy.actions import fastest_climb
-from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
+from airl_mav.policy.actions import (
+    VELOCITIES,
+    VERTICAL,
+    ActionSpec,
+    commands,
+    discrete_actions,
+    fastest_climb,
+)
+from airl_mav.policy.registry import GreedyPolicy, GreedySettings
 
 AHEAD_S = 0.4
 """Prediction time of the position [s]: about the dead time plus half the response time."""

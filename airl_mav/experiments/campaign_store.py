@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_typed, write_json
-from airl_mav.core.provenance import provenance
+from airl_mav.core.machine import provenance
 from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE, another_config, check_folder, locked
 
 SCHEMA = 1

@@ -12,7 +12,7 @@ from pydantic import (
     model_validator,
 )
 
-from airl_mav.core.addons import part
+from airl_mav.core.addons import load_entry
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import Each, ProfileModel, later_field, quantity, section
@@ -294,8 +294,9 @@ def check_renderer(
     """Raise FieldError for cameras or arenas that a renderer does not support."""
     if renderer == "raycast":
         return
+    drawn = load_entry("airl_mav", "RENDERERS", renderer, ("renderer", renderer), "colour")
     for each in (camera, *further):
-        part("RENDERERS", renderer, f"renderer {renderer}").check(each, arena)
+        drawn.check(each, arena)
 
 
 def check_twin_imaging(camera: Camera, name: str = "") -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Gains, RateDemand
 from airl_mav.control.loops import Motors
@@ -48,9 +49,8 @@ from firmware_sim.autopilot.inputs import (
     Sticks,
 )
 from firmware_sim.autopilot.land_detector import LandDetector
-from firmware_sim.autopilot.navigation.flown_item import ExecutorState
 from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator, Whereabouts
-from firmware_sim.autopilot.navigation.plan import Plans
+from firmware_sim.autopilot.navigation.plan import NavigationState, Plans
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
@@ -60,15 +60,9 @@ from firmware_sim.engine.record import LANDING, LIFT_OFF, NOTHING
 from firmware_sim.engine.ticks import ALIGN, CLIMBED, REPEATED_BITS, control_record, detect_record
 from firmware_sim.interfaces import (
     ActuatorControls,
-    DistanceReading,
-    FlowReading,
-    Odometry,
     SensorSample,
     TrueState,
 )
-
-CLIENTS_SENSOR = 1
-"""Source id of ranges from a client, as opposed to the vehicle's sensor."""
 
 # Bound once: looking up an enum member in every tick is slow.
 _GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR
@@ -94,6 +88,7 @@ class BuiltinAutopilot:
         self._guidance = Guidance(value, self._say, record)
         self._navigator = Navigator(self.plans, value, self)
         self._guidance.context.return_place = self._return_place
+        self._guidance.context.missions = self._navigator.missions
         self._manual_control = ManualControl(value)
         self._events: list[Told] = []
         self.supervisor = Supervisor(value, self.estimator, self._events.append)
@@ -147,6 +142,8 @@ class BuiltinAutopilot:
             value,
         )
         self._snapshot: AutopilotState | None = None
+        self._unfused: set[str] = set()
+        """Kinds of client sensors that were reported as not fused."""
         self.failures: Failures | None = None
         """Failure injection for client requests. Set by the simulation."""
         self.logs: LogStore = NoLogs()
@@ -186,9 +183,9 @@ class BuiltinAutopilot:
         self.estimator.step(sensors.trusted(sample) if sensors.distrusted else sample)
         self._taken_us, self._snapshot = sample.time_us, None
         self._newest.take(sample)
-        finder = self.estimator.range
-        if finder is not None:
-            self._guidance.context.ground = ground = finder.clearance()
+        ground = self.estimator.aiding.ground
+        if ground is not None:
+            self._guidance.context.ground = ground
             self._land_detector.see(ground)
         if sample.esc_outputs is not None:
             self.supervisor.watch.hear_escs(sample.time_us, self._motors, sample.esc_outputs)
@@ -389,7 +386,7 @@ class BuiltinAutopilot:
         home = PositionYaw(context.home, context.home_yaw)
         return home if now is None else self._navigator.return_place(now, home)
 
-    def _situation(self) -> ExecutorState | None:
+    def _situation(self) -> NavigationState | None:
         return self._whereabouts.situation(landed=self._commander.flight.phase is not _AIR)
 
     def _handle_detected(self) -> None:
@@ -555,7 +552,7 @@ class BuiltinAutopilot:
             self.plans.set_current(index)
         return Result.ACCEPTED
 
-    # --- towards the mission (navigation.executor.Crew)
+    # --- towards the mission (navigation.plan.Crew)
 
     def say(self, message: OperatorText) -> None:
         """Send a text to the operator."""
@@ -583,11 +580,7 @@ class BuiltinAutopilot:
 
     def look_at(self, place: Geodetic | None) -> None:
         """Turn the nose to a place during a mission; None = cancel."""
-        roi = self._navigator.mission.roi
-        if place is None:
-            roi.reset()
-        else:
-            roi.look_at(place)
+        self._navigator.missions.look_at(place)
 
     def return_to_launch(self) -> None:
         """Abort the mission and return."""
@@ -629,19 +622,12 @@ class BuiltinAutopilot:
             self._commander.handle(Ask(Mode.POSITION))
             self._say(OperatorText.of(Severity.INFO, events.PILOT_TOOK_OVER))
 
-    def see(self, odometry: Odometry) -> None:
-        """Pass on a pose from an external estimator."""
-        self.estimator.see(odometry)
-        self._snapshot = None
-
-    def measure_distance(self, reading: DistanceReading) -> None:
-        """Pass on a range from a client's distance sensor."""
-        self.estimator.measure(reading, CLIENTS_SENSOR)
-        self._snapshot = None
-
-    def look_down(self, reading: FlowReading) -> None:
-        """Pass on a reading from a client's optical flow sensor."""
-        self.estimator.look_down(reading)
+    def receive(self, name: str, reading: Any) -> None:
+        """Pass on a reading of a client's sensor: odometry, distance or flow."""
+        fused, self._snapshot = self.estimator.receive(name, reading), None
+        if not fused and name not in self._unfused:
+            self._unfused.add(name)
+            self._say(OperatorText(Severity.WARNING, f"No add-on fuses the sensor: {name}"))
 
     def see_obstacles(self, obstacles: ObstacleBins) -> None:
         """Pass on the distances to obstacles."""

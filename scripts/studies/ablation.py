@@ -18,14 +18,14 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import fly_and_show
 from airl_mav.cli.options import run_command, scenario_of
-from airl_mav.core.console import new_console
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.progress import new_console
 from airl_mav.experiments.experiment import Experiment, make_cell
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.published import load_published
+from airl_mav.report.document import NONE, Column, TableView, print_table
 from airl_mav.report.measures import rate_with_interval
-from airl_mav.report.table import NONE, Column, TableView, print_table
 from airl_mav.scenario.model import Scenario
 
 OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)

@@ -14,13 +14,14 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.signing import StoredSigning
+from firmware_sim.addons.ground_station_services.files import Storage
+from firmware_sim.addons.ground_station_services.ftp import FtpClient
 from firmware_sim.autopilot.autopilot_state import Arming
-from firmware_sim.mavlink import clients, codec, rate_limits, server, tlog
+from firmware_sim.mavlink import clients, codec, server, traffic
 from firmware_sim.mavlink.codec import Decoder, WireMessage
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import gcs_link, onboard_link
-from firmware_sim.mavlink.tlog import TlogWriter
-from firmware_sim.storage import Storage
+from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
+from firmware_sim.mavlink.traffic import TlogWriter
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import BOOT_UNIX_US, RawClient, Rig, text_of
 from tests.support.memory_hub import MemoryHub
@@ -48,8 +49,9 @@ class Field:
             boot_unix_us=BOOT_UNIX_US,
             clock=clock,
             signing=signing,
-            storage=storage,
         )
+        if storage is not None:
+            self.server.vehicle_states[Storage] = storage
         self.run(50)
 
     def run(self, ticks: int) -> None:
@@ -123,7 +125,7 @@ def test_one_datagram_full_of_commands_takes_no_more_than_its_part_of_a_tick(
     dispatch = server.MavlinkServer._dispatch
 
     def slow(this: server.MavlinkServer, sender: clients.Client, message: WireMessage) -> bool:
-        clock.advance(rate_limits.LISTEN_US // 10)
+        clock.advance(clients.LISTEN_US // 10)
         return dispatch(this, sender, message)
 
     monkeypatch.setattr(server.MavlinkServer, "_dispatch", slow)
@@ -233,7 +235,7 @@ def test_who_pretends_to_be_the_vehicle_is_heard_by_nobody() -> None:
 
 
 def test_strangers_fill_no_disk_with_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tlog, "MAX_BYTES", 5_000)
+    monkeypatch.setattr(traffic, "MAX_BYTES", 5_000)
     field = Field()
     main = TlogWriter(tmp_path / "flight-001.tlog", 0)
     field.server.log_to(main, "gcs")
@@ -243,7 +245,7 @@ def test_strangers_fill_no_disk_with_logs(tmp_path: Path, monkeypatch: pytest.Mo
     field.server.log_to(None, "gcs")
     main.close()
     logs = sorted(tmp_path.glob("flight-001.*.tlog"))
-    assert len(logs) == tlog.MAX_LOGS
+    assert len(logs) == traffic.MAX_LOGS
     assert max(path.stat().st_size for path in logs) < 6_000
     assert (tmp_path / "flight-001.tlog").stat().st_size > 20_000
 
@@ -284,7 +286,8 @@ def test_sessions_end_with_their_clients(tmp_path: Path) -> None:
         ftp(field.hub.client(port), 1, 4, b"file")
     field.run(1)
     links = field.server._links[0]
-    sessions = [client.context.ftp.session for client in links if client.context is not None]
+    contexts = [client.context for client in links if client.context is not None]
+    sessions = [context.state(FtpClient).session for context in contexts]
     files = [session.file for session in sessions if session.file is not None]
     assert len(files) == clients.MAX_CLIENTS
     links.forget_silent(field.autopilot.time_us + clients.SILENT_US + US_PER_S)

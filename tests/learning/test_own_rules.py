@@ -14,7 +14,7 @@ from airl_mav.core import plugins
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.envs.vector import NavigationVectorEnv
-from airl_mav.policy.action_sets import ActionSpec, commands
+from airl_mav.policy.actions import ActionSpec, commands
 from airl_mav.policy.learned import load_learned
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profile_digest
@@ -27,7 +27,7 @@ import numpy as np
 from airl_mav.arena.generate import local_bounds
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.policy.layouts import boxes, encode_layout
-from airl_mav.policy.observation_spec import Box
+from airl_mav.policy.layouts import Box
 
 
 class Tilted:

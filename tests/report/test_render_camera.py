@@ -13,6 +13,7 @@ from rich.console import Console
 from airl_mav.addons.colour.image_sensor import ImageFormation
 from airl_mav.addons.colour.picture import render_picture
 from airl_mav.addons.colour.pictures import CameraMotion, _rates, optical_flow, velocities_of
+from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.arena.generate import generate
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion
@@ -22,7 +23,6 @@ from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.report.replay.replayed_flight import ReplayedRun
 from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.run_demo import write_demo_run
 

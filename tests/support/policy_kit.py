@@ -16,10 +16,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from torch import nn
 
-from airl_mav.policy.action_sets import ActionSpec, discrete_actions
+from airl_mav.policy.actions import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
-from airl_mav.policy.layouts import boxes, image_key
-from airl_mav.policy.observation_spec import Encoded, ObservationSpec
+from airl_mav.policy.layouts import Encoded, boxes, image_key
+from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.training.algorithms import DepthExtractor, dense_units
 from airl_mav.training.config import NetworkSpec
 from airl_mav.training.export import export_sb3

@@ -26,8 +26,8 @@ from airl_mav.envs.arena_batch import NOTHING, batch_of, touches
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
+from airl_mav.scenario.checks import check_goal_height
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.piloting import check_goal_height
 from airl_mav.scenario.resolve import resolve
 
 WIDTH_M = 0.55

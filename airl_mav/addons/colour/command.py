@@ -14,18 +14,18 @@ from rich.console import Console
 
 from airl_mav.addons.colour import pictures
 from airl_mav.addons.colour.pictures import CameraMotion
+from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.arena.generate import generate
 from airl_mav.black_box.messages import SUFFIX
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.shared_options import folder_of
-from airl_mav.core.console import new_console
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.frames import quat_from_euler
-from airl_mav.core.progress import RichProgress
+from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import Coefficients
 from airl_mav.profiles.loading import load_profile
@@ -38,7 +38,6 @@ from airl_mav.profiles.projections import (
 )
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.replay.replayed_flight import ReplayedRun
 from airl_mav.report.run_arenas import trust_arenas
 from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED
 

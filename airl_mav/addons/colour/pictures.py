@@ -23,6 +23,7 @@ from PIL import Image
 
 from airl_mav.addons.colour.image_sensor import ImageFormation
 from airl_mav.addons.colour.picture import Picture, antialiased, grey, render_picture
+from airl_mav.addons.view.replayed_flight import ReplayedFlight
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera import primitives
 from airl_mav.camera.frame import depth_to_z16
@@ -36,7 +37,6 @@ from airl_mav.core.frames import quat_to_matrix
 from airl_mav.flight.trajectory import pose_at
 from airl_mav.profiles.camera import Camera
 from airl_mav.report.forensics.camera_view import PolicyCamera
-from airl_mav.report.replay.replayed_flight import ReplayedFlight
 from airl_mav.report.theme import coloured
 
 ROOM = {

@@ -23,8 +23,8 @@ from firmware_sim.autopilot.inputs import (
     PositionYaw,
     Sticks,
 )
-from firmware_sim.autopilot.navigation.plan import STANDING, Triplet
-from firmware_sim.autopilot.smooth_trajectory import Travel
+from firmware_sim.autopilot.navigation.plan import Missions
+from firmware_sim.autopilot.smooth_trajectory import Travel, triple
 
 NAN: float = math.nan
 FREE: Vec = (NAN, NAN, NAN)
@@ -62,10 +62,8 @@ class FlightContext:
     """Newest offboard setpoint by type."""
     return_place: Callable[[], PositionYaw | None] | None = None
     """Returns Return's destination, or None if it flies mission items. None = home."""
-    triplet: Triplet = STANDING
-    """Waypoints of Mission mode, and of Return if it flies mission items."""
-    mission_over: bool = False
-    """True if the mission has ended."""
+    missions: Missions = field(default_factory=Missions)
+    """Missions of Mission mode, and of Return if it flies mission items."""
     armed: bool = False
     """True if armed: a mode selected earlier is only entered."""
     standing: bool = True
@@ -179,12 +177,6 @@ def descend(yaw: float) -> Demand:
 def since(before_us: int | None, now_us: int) -> float:
     """Return the time since the last tick [s]; 0 at the first."""
     return 0.0 if before_us is None else (now_us - before_us) / US_PER_S
-
-
-def triple(state: Vector, start: int) -> Vec:
-    """Return three consecutive numbers of a state."""
-    north, east, down = state[start : start + 3].tolist()
-    return north, east, down
 
 
 def here(state: Vector) -> PositionYaw:

@@ -2,12 +2,7 @@
 
 Replies and rejections follow PX4's Commander.cpp and mavlink_receiver.cpp, checked against a
 running PX4 1.16. A command to the vehicle is acknowledged to its sender, on the same link. Clients
-repeat commands, so actions are idempotent. Services with commands have a table `ACTIONS`, which is
-merged into the table here.
-
-MAV_CMD_INJECT_FAILURE injects a fault into the simulated part, as a scenario does. Known units and
-types, and those without a reply, match PX4 (SimulatorMavlink, FailureInjector, BatterySimulator;
-1.16).
+repeat commands, so actions are idempotent. The actions are those of all services (`ACTIONS`).
 """
 
 from __future__ import annotations
@@ -17,22 +12,22 @@ from dataclasses import replace
 from operator import attrgetter
 
 from airl_mav.core.frames import Geodetic, geodetic_to_local
-from airl_mav.faults.fault import Fault
-from airl_mav.faults.kinds import MOTORS, Part
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.events.definition import NavigationMode
+from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, MODE_NOT_AVAILABLE
+from firmware_sim.autopilot.flight_modes import MAIN_AUTO, MAIN_POSCTL, Mode
 from firmware_sim.autopilot.inputs import OrbitRequest, PositionYaw, Reposition
-from firmware_sim.autopilot.navigation.plan import NavCommand
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.px4_custom_mode import requested_mode
-from firmware_sim.mavlink.services import calibration, logs, message_requests, params
+from firmware_sim.mavlink.services import table
 from firmware_sim.mavlink.services.context import (
     ANY,
     Action,
     Context,
+    Handlers,
     VehicleCommand,
+    for_anyone,
     for_vehicle,
     sender,
 )
@@ -119,7 +114,7 @@ def _start_landing(_command: VehicleCommand, context: Context) -> Result:
     """Go to the mission's landing: DO_LAND_START, or the first landing; CANCELLED without one."""
     commands = [item.command for item in context.port.plans.mission]
     # DO_LAND_START has precedence; without one the first LAND item marks the landing.
-    for marker in (NavCommand.DO_LAND_START, NavCommand.LAND):
+    for marker in (dialect.MAV_CMD_DO_LAND_START, dialect.MAV_CMD_NAV_LAND):
         if marker in commands:
             return context.port.start_mission(commands.index(marker))
     return Result.CANCELLED
@@ -139,8 +134,8 @@ def _look(command: VehicleCommand, context: Context) -> Result:
     """Handle DO_SET_ROI_LOCATION, DO_SET_ROI (parameter 1: MAV_ROI) and DO_SET_ROI_NONE."""
     place = Geodetic(*command.params[4:7])
     # DO_SET_ROI carries the region type in parameter 1.
-    located = command.number == NavCommand.DO_SET_ROI_LOCATION or (
-        command.number != NavCommand.DO_SET_ROI_NONE and command.params[0] == _ROI_LOCATION
+    located = command.number == dialect.MAV_CMD_DO_SET_ROI_LOCATION or (
+        command.number != dialect.MAV_CMD_DO_SET_ROI_NONE and command.params[0] == _ROI_LOCATION
     )
     valid = math.isfinite(place.latitude_deg) and math.isfinite(place.longitude_deg)
     context.port.look_at(place if located and valid else None)
@@ -181,80 +176,6 @@ _NAVIGATION: dict[int, Action] = {
     # Effective only as a mission item.
     dialect.MAV_CMD_DO_SET_ROI_WPNEXT_OFFSET: _look,
 }
-
-
-ENABLED = "SYS_FAILURE_EN"
-
-OK, OFF = dialect.FAILURE_TYPE_OK, dialect.FAILURE_TYPE_OFF
-STUCK, WRONG = dialect.FAILURE_TYPE_STUCK, dialect.FAILURE_TYPE_WRONG
-
-SENSORS: dict[int, tuple[Part | None, tuple[int, ...]]] = {
-    dialect.FAILURE_UNIT_SENSOR_GYRO: ("gyro", (OK, OFF, STUCK)),
-    dialect.FAILURE_UNIT_SENSOR_ACCEL: ("accel", (OK, OFF, STUCK)),
-    dialect.FAILURE_UNIT_SENSOR_MAG: ("mag", (OK, OFF, STUCK)),
-    dialect.FAILURE_UNIT_SENSOR_BARO: ("baro", (OK, OFF, STUCK)),
-    dialect.FAILURE_UNIT_SENSOR_GPS: ("gps", (OK, OFF)),
-    dialect.FAILURE_UNIT_SENSOR_VIO: ("vision", (OK, OFF)),
-    # The vehicle has no such sensor, but PX4 accepts the command.
-    dialect.FAILURE_UNIT_SENSOR_AIRSPEED: (None, (OK, OFF, WRONG)),
-}
-"""Part and accepted types of each sensor; other types are UNSUPPORTED."""
-
-WITHOUT_INSTANCE: tuple[Part, ...] = ("baro", "gps", "vision")
-"""Sensors that PX4 has once, for any requested instance."""
-
-KINDS = {OFF: "off", STUCK: "stuck"}
-
-GREATEST_MOTOR = 8
-"""Maximum number of ESCs in PX4."""
-
-
-def _inject(command: VehicleCommand, context: Context) -> Result | None:
-    """Handle INJECT_FAILURE, parameters: unit, type, instance (0 = all)."""
-    enabled = context.port.parameters.by_name(ENABLED)
-    # PX4 requires SYS_FAILURE_EN against accidental failures in flight.
-    if enabled is None or not enabled.value:
-        return Result.DENIED
-    unit, kind, instance = command.integer(1), command.integer(2), command.integer(3) or 0
-    if unit is None or kind is None:
-        return None
-    if unit in SENSORS:
-        part, known = SENSORS[unit]
-        if kind not in known:
-            return Result.UNSUPPORTED
-        # The vehicle has one of each sensor: another instance has no effect.
-        meant = part is not None and (part in WITHOUT_INSTANCE or instance in (0, 1))
-        _act(context, (part,) if part is not None and meant else (), kind)
-        return Result.ACCEPTED
-    if unit == dialect.FAILURE_UNIT_SYSTEM_BATTERY and kind in (OK, OFF):
-        if instance:
-            return Result.UNSUPPORTED
-        _act(context, ("battery",), kind)
-        return Result.ACCEPTED
-    if unit == dialect.FAILURE_UNIT_SYSTEM_MOTOR:
-        return _motor(context, kind, instance)
-    return None  # PX4 sends no reply
-
-
-def _motor(context: Context, kind: int, instance: int) -> Result:
-    if kind not in (OK, OFF, WRONG) or (kind == OK and not 0 <= instance <= GREATEST_MOTOR):
-        return Result.UNSUPPORTED
-    if kind != WRONG:  # WRONG would affect the readings alone
-        # Instances start at 1; a number above the motors gives an empty slice.
-        motors = MOTORS if instance == 0 else MOTORS[instance - 1 : instance]
-        _act(context, motors if instance >= 0 else (), kind)
-    return Result.ACCEPTED
-
-
-def _act(context: Context, parts: tuple[Part, ...], kind: int) -> None:
-    failures = context.port.failures
-    if failures is None:
-        return
-    # A new fault replaces the old one of the same part.
-    for part in parts:
-        failures.clear(part)
-        if kind != OK:
-            failures.inject(Fault(part=part, kind=KINDS[kind]))
 
 
 # Commands without effect here are answered as by a running PX4 1.16 SITL.
@@ -315,7 +236,7 @@ _RELATIVE_FRAMES = (
 def _arm_disarm(command: VehicleCommand, context: Context) -> Result | None:
     force = command.integer(2) == FORCE_MAGIC
     if command.integer(1) == 1:
-        if context.calibration.forbids_arming:
+        if any(state.forbids_arming for state in context.vehicle_states.values()):
             context.announce(OperatorText.of(Severity.CRITICAL, events.ARM_WHILE_CALIBRATING))
             return Result.TEMPORARILY_REJECTED
         return context.port.arm(force=force)
@@ -407,12 +328,7 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
     dialect.MAV_CMD_RUN_PREARM_CHECKS: _run_checks,
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
-    dialect.MAV_CMD_INJECT_FAILURE: _inject,
-    **logs.ACTIONS,
-    **message_requests.ACTIONS,
-    **calibration.ACTIONS,
     **_NAVIGATION,
-    **params.ACTIONS,
     **dict.fromkeys(ACCEPTED, _answer(Result.ACCEPTED)),
     **dict.fromkeys(NOT_ACKNOWLEDGED, _answer(None)),
     dialect.MAV_CMD_ACTUATOR_TEST: _actuator_test,
@@ -420,7 +336,7 @@ ACTIONS: dict[int, Action] = {
     # The estimator accepts an external position only while it has none.
     dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE: _answer(Result.TEMPORARILY_REJECTED),
 }
-"""Actions by command. Other commands are UNSUPPORTED."""
+"""Actions by command. Commands without an action in any service are UNSUPPORTED."""
 
 
 def handle_command_long(message: WireMessage, context: Context) -> bool:
@@ -450,7 +366,7 @@ def handle_set_mode(message: WireMessage, context: Context) -> bool:
 
 def _handle(command: VehicleCommand, context: Context) -> bool:
     # None means no COMMAND_ACK at all: PX4 leaves some commands unanswered.
-    action = ACTIONS.get(command.number)
+    action = table("ACTIONS").get(command.number)
     result = Result.UNSUPPORTED if action is None else action(command, context)
     if result is not None:
         context.link.send(
@@ -464,3 +380,63 @@ def is_addressed(message: WireMessage, context: Context) -> bool:
     if message.command in (_REQUEST_CAPABILITIES, _REQUEST_PROTOCOL):
         return message.target_system in (context.system_id, ANY)
     return for_vehicle(message, context)
+
+
+_CRITICAL = Severity.CRITICAL
+_UNSUPPORTED = OperatorText.of(_CRITICAL, AUTO_MODE_UNSUPPORTED)
+
+
+def _unavailable(name: str, mode: NavigationMode, main: int, sub: int) -> OperatorText:
+    """Return PX4's rejection of a known but unavailable mode."""
+    number = sub << 24 | main << 16
+    text = f"Switching to {name} is currently not available"
+    return OperatorText.of(_CRITICAL, MODE_NOT_AVAILABLE, number, mode, text=text)
+
+
+# Modes by main and sub mode. Texts stand for modes that a real PX4 knows by name but never makes
+# available; a mode of the table replaces them.
+_REQUESTABLE: dict[tuple[int, int], Mode | OperatorText] = {
+    (MAIN_AUTO, 0): Mode.MISSION,
+    (MAIN_POSCTL, 2): _unavailable("Position Slow", NavigationMode.POSITION_SLOW, MAIN_POSCTL, 2),
+    # External modes exist in PX4 only after a ROS 2 node registers them.
+    **{
+        (MAIN_AUTO, 10 + n): _unavailable(
+            f"External {n}", NavigationMode(15 + n), MAIN_AUTO, 10 + n
+        )
+        for n in range(1, 9)
+    },
+    **{(mode.spec.main, mode.spec.sub): mode for mode in Mode if mode.spec.requestable},
+}
+
+
+def requested_mode(base: int, main: int, sub: int) -> Mode | OperatorText | None:
+    """Return the mode requested by DO_SET_MODE, given parameters 1 to 3.
+
+    The parameters are MAV_MODE_FLAG bits, main mode and sub mode. A message is PX4's explanation of
+    an unavailable mode. None: PX4 accepts the request without effect (unknown main mode).
+    """
+    if not base & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+        # Clients without custom modes describe the mode by bits.
+        return _from_base_mode(base)
+    # PX4 treats an unknown sub mode of POSCTL as Position.
+    other = _UNSUPPORTED if main == MAIN_AUTO else _REQUESTABLE.get((main, 0))
+    return _REQUESTABLE.get((main, sub), other)
+
+
+def _from_base_mode(base: int) -> Mode | None:
+    """Return the mode that PX4 derives from the bits of clients without custom modes."""
+    if base & dialect.MAV_MODE_FLAG_AUTO_ENABLED:
+        return Mode.MISSION
+    if not base & dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED:
+        return None
+    if base & dialect.MAV_MODE_FLAG_GUIDED_ENABLED:
+        return Mode.POSITION
+    return Mode.STABILIZED if base & dialect.MAV_MODE_FLAG_STABILIZE_ENABLED else Mode.MANUAL
+
+
+HANDLERS: Handlers = {
+    "COMMAND_LONG": (is_addressed, handle_command_long),
+    "COMMAND_INT": (is_addressed, handle_command_int),
+    "SET_MODE": (for_anyone, handle_set_mode),
+    "SET_GPS_GLOBAL_ORIGIN": (for_anyone, handle_set_origin),
+}

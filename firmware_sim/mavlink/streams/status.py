@@ -1,21 +1,34 @@
-"""Vehicle status: identity, heartbeat, health, landed state, estimator, clock.
+"""Vehicle status: identity, heartbeat, modes, health, estimator, mission, home, orbit, times.
 
-Source of the gimbal message: PX4 1.16, streams/AUTOPILOT_STATE_FOR_GIMBAL_DEVICE.hpp.
+Sources: PX4 1.16, src/lib/modes, src/modules/mavlink/streams/*.hpp (AVAILABLE_MODES, CURRENT_MODE,
+HEARTBEAT, AUTOPILOT_STATE_FOR_GIMBAL_DEVICE), src/modules/commander/px4_custom_mode.h, and the
+messages of a running PX4.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Final
 
-from airl_mav.core.frames import local_to_geodetic, quat_yaw
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
-from firmware_sim.autopilot.flight_modes import Mode
+import numpy as np
+
+from airl_mav.core.addons import entries
+from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local, local_to_geodetic
+from firmware_sim.autopilot.autopilot_state import (
+    Arming,
+    AutopilotState,
+    CommanderStatus,
+    Landed,
+)
+from firmware_sim.autopilot.flight_modes import (
+    MAIN_AUTO,
+    WITH_STICKS,
+    Mode,
+)
+from firmware_sim.autopilot.modes.return_to_launch import return_time_s
+from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import Values, dialect
-from firmware_sim.mavlink.px4_custom_mode import base_mode, system_status
 from firmware_sim.mavlink.streams import units
-from firmware_sim.mavlink.streams.sensor_streams import percent
 
 CAPABILITIES: int = (
     dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
@@ -29,9 +42,9 @@ CAPABILITIES: int = (
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
-    | dialect.MAV_PROTOCOL_CAPABILITY_FTP
+    | sum(entries("firmware_sim", "CAPABILITIES").values())
 )
-"""Capabilities, equal to a real PX4's 0xE8FF."""
+"""Capabilities, with all add-ons equal to a real PX4's 0xE8FF."""
 
 _FIRMWARE_VERSION = 1 << 24 | 16 << 16 | 0 << 8 | 255
 """Emulated PX4 release: 1.16.0, FIRMWARE_VERSION_TYPE_OFFICIAL."""
@@ -48,7 +61,7 @@ _UID = 0x4149_524C_4D41_5601
 _MAVLINK_VERSION = 3
 """HEARTBEAT.mavlink_version of all MAVLink 1 and 2 systems."""
 
-_NO_MISSION = 0xFFFF
+NO_MISSION = 0xFFFF
 """MISSION_CURRENT.total and HIGH_LATENCY2.wp_num without a stored mission."""
 
 _UNKNOWN_STATE = 0
@@ -237,22 +250,9 @@ def _estimator_flags(state: AutopilotState) -> int:
 def mission_current(state: AutopilotState) -> Values:
     """Return the current item, the number of items, and the ids of stored lists, as in PX4."""
     mission = state.mission
-    total = mission.total or _NO_MISSION
+    total = mission.total or NO_MISSION
     ids = (mission.mission_id, mission.fence_id, mission.rally_points_id)
     return mission.current, total, _UNKNOWN_STATE, _UNKNOWN_STATE, *ids
-
-
-def fence_status(state: AutopilotState) -> Values:
-    """Return geofence breaches. PX4 has no such stream; sent on request only."""
-    fence = state.fence
-    kind = dialect.FENCE_BREACH_NONE
-    # Distance and custom fences are boundaries; MAVLink has no separate type for a custom fence.
-    if fence.distance or fence.custom:
-        kind = dialect.FENCE_BREACH_BOUNDARY
-    elif fence.altitude:
-        kind = dialect.FENCE_BREACH_MAXALT
-    breached = int(any(fence.breached))
-    return breached, units.uint16(fence.breaches), kind, units.boot_ms(fence.time_us)
 
 
 def autopilot_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder
@@ -267,13 +267,9 @@ def autopilot_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a buil
     )
 
 
-def system_time(boot_unix_us: int) -> Callable[[AutopilotState], Values]:
-    """Return the builder of SYSTEM_TIME, given the calendar time of boot [µs since 1970, UTC]."""
-
-    def build(state: AutopilotState) -> Values:
-        return boot_unix_us + state.time_us, units.boot_ms(state.time_us)
-
-    return build
+def system_time(state: AutopilotState, boot_unix_us: int) -> Values:
+    """Return the present time [µs since 1970, UTC], given that of boot, and the time since boot."""
+    return boot_unix_us + state.time_us, units.boot_ms(state.time_us)
 
 
 _ALL = 0
@@ -303,94 +299,146 @@ def autopilot_state_for_gimbal_device(state: AutopilotState) -> Values:
     )
 
 
-# --- summary of the vehicle in 42 bytes, for satellite links; sent on request here
-
-# Source: PX4 1.16, streams/HIGH_LATENCY2.hpp. PX4 sends the mean or the maximum since the last
-# message; here it is the current value.
-
-_UINT8_MAX: Final = 255
-_INT8_MIN: Final = -128
-_NO_TARGET = (0, 0)
-"""Altitude and distance of a target: PX4 sends them for fixed-wing vehicles only."""
 _NO_AIRSPEEDS = (0, 0)
-_NO_WIND = (0, 0)
-_CUSTOM = (_INT8_MIN, _INT8_MIN, _INT8_MIN)
 
 
-def high_latency2(state: AutopilotState) -> Values:
-    """Return position, headings, speeds, charge and failures for HIGH_LATENCY2.
+_UNKNOWN_TIME = -1
+"""Value of unknown times: PX4 estimates only the return time."""
 
-    Units: [1e-7 deg, m], [2 deg], [0.2 m/s, 0.1 m/s], [%].
+
+def time_estimate_to_target(state: AutopilotState, value: Callable[[str], float]) -> Values | None:
+    """Return the duration of a safe return [s]; 0 on the ground, None without home.
+
+    `value` returns the current value of a PX4 parameter by name.
     """
-    estimate, gps = state.estimate, state.gps
-    north, east, down = estimate.velocity.tolist()
-    armed = state.status.arming is Arming.ARMED
+    home, origin = state.home, state.origin
+    if home is None or origin is None:
+        return None
+    took = 0.0
+    # On the ground the return takes no time.
+    if state.status.landed is not Landed.ON_GROUND:
+        target = geodetic_to_local(home, origin).tolist()
+        north, east, down = (
+            b - a for a, b in zip(target, state.estimate.position.tolist(), strict=True)
+        )
+        took = return_time_s(value, -down, math.hypot(north, east))
+    unknown = (_UNKNOWN_TIME,) * 4
+    return int(took) if math.isfinite(took) else _UNKNOWN_TIME, *unknown
+
+
+def current_mode(state: AutopilotState) -> Values:
+    """Return the active mode and the mode requested by the user."""
+    active, intended = state.status.mode.spec, state.status.intended_mode.spec
+    return intended.standard, active.custom_mode, intended.custom_mode
+
+
+_NO_APPROACH = (0.0, 0.0, 0.0)
+"""Approach vector of HOME_POSITION: no special approach."""
+
+
+def orbit_execution_status(state: AutopilotState) -> Values | None:
+    """Return the current orbit, with its global centre; None in other modes."""
+    orbit, origin = state.orbit, state.origin
+    if orbit is None or origin is None:
+        return None
+    centre = local_to_geodetic(np.array(orbit.centre), origin)
     return (
-        units.boot_ms(state.time_us),
-        dialect.MAV_TYPE_QUADROTOR,
-        dialect.MAV_AUTOPILOT_PX4,
-        # The message has room for main and sub mode only: the upper 16 bits of custom_mode.
-        state.status.mode.spec.custom_mode >> 16,
-        *_place(state),
-        _NO_TARGET[0],
-        _heading(quat_yaw(estimate.quaternion)),
-        _heading(quat_yaw(state.attitude_setpoint)),
-        _NO_TARGET[1],
-        percent(state.thrust_setpoint) if armed else 0,
-        *_NO_AIRSPEEDS,
-        # The unit of speed is 0.2 m/s, hence the factor 5.
-        _uint8(math.hypot(north, east) * 5.0),
-        *_NO_WIND,
-        _UINT8_MAX if gps is None else _uint8(gps.eph_m * 10.0),
-        _UINT8_MAX if gps is None else _uint8(gps.epv_m * 10.0),
-        # -128 marks the unknown temperature.
-        _INT8_MIN,
-        # The climb rate has no sign here: [0.1 m/s] in one byte.
-        units.saturate(abs(down) * 10.0, 0, 127, 0),
-        percent(state.battery.remaining),
-        state.mission.current if state.mission.total else _NO_MISSION,
-        _failures(state),
-        *_CUSTOM,
+        state.time_us,
+        orbit.radius_m,
+        dialect.MAV_FRAME_GLOBAL,
+        units.deg_e7(centre.latitude_deg),
+        units.deg_e7(centre.longitude_deg),
+        centre.altitude_m,
     )
 
 
-def _place(state: AutopilotState) -> tuple[int, int, int]:
-    """Return latitude, longitude [1e-7 deg] and altitude [m]; zeros if unknown."""
-    position = state.estimate.position
-    if state.origin is None or not all(map(math.isfinite, position.tolist())):
-        return 0, 0, 0
-    place = local_to_geodetic(position, state.origin)
+def home_position(state: AutopilotState) -> Values | None:
+    """Return home in global coordinates and in local NED; None if unset."""
+    home, origin = state.home, state.origin
+    if home is None:
+        return None
+    # Without an origin the home position has no local coordinates.
+    local = (
+        [math.nan, math.nan, math.nan]
+        if origin is None
+        else geodetic_to_local(home, origin).tolist()
+    )
+    return *_wire(home), *local, *_level(state.home_yaw), *_NO_APPROACH, state.time_us
+
+
+def gps_global_origin(state: AutopilotState) -> Values | None:
+    """Return the origin of local NED in global coordinates; None if unset."""
+    return None if state.origin is None else (*_wire(state.origin), state.time_us)
+
+
+def _wire(place: Geodetic) -> Values:
+    """Return latitude, longitude [degE7] and altitude [mm]."""
     return (
         units.deg_e7(place.latitude_deg),
         units.deg_e7(place.longitude_deg),
-        units.int16(place.altitude_m),
+        units.mm(place.altitude_m),
     )
 
 
-def _heading(yaw_rad: float) -> int:
-    """Return a heading in units of 2 deg."""
-    return int(math.degrees(yaw_rad % units.TWO_PI) / 2.0) if math.isfinite(yaw_rad) else 0
+def _level(yaw: float) -> Values:
+    """Return a level attitude w, x, y, z with a heading [rad]."""
+    return math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)
 
 
-def _uint8(value: float) -> int:
-    return units.saturate(value, 0, _UINT8_MAX, _UINT8_MAX)
+# HIL_STATE_QUATERNION is sent on request only, as PX4 SITL sends its simulator's state. Real
+# firmware receives it from the same function. No flight code reads it. Source: PX4 1.16,
+# streams/HIL_STATE_QUATERNION.hpp.
 
 
-def _failures(state: AutopilotState) -> int:
-    """Return the HL_FAILURE_FLAG bits of failed parts."""
-    health, status = state.health, state.status
-    # Offboard counts as lost when the failsafe replaces the intended mode.
-    offboard_lost = status.failsafe and status.intended_mode is Mode.OFFBOARD
-    failed = {
-        dialect.HL_FAILURE_FLAG_GPS: not health.gps,
-        dialect.HL_FAILURE_FLAG_ABSOLUTE_PRESSURE: not health.baro,
-        dialect.HL_FAILURE_FLAG_3D_ACCEL: not health.accel,
-        dialect.HL_FAILURE_FLAG_3D_GYRO: not health.gyro,
-        dialect.HL_FAILURE_FLAG_3D_MAG: not health.mag,
-        dialect.HL_FAILURE_FLAG_BATTERY: not health.battery,
-        dialect.HL_FAILURE_FLAG_RC_RECEIVER: state.sticks is None,
-        dialect.HL_FAILURE_FLAG_OFFBOARD_LINK: offboard_lost,
-        dialect.HL_FAILURE_FLAG_GEOFENCE: any(state.fence.breached),
-        dialect.HL_FAILURE_FLAG_ESTIMATOR: not (health.attitude and health.position),
-    }
-    return sum(bit for bit, has_failed in failed.items() if has_failed)
+_NO_ACCELERATION = (0, 0, 0)
+"""Placeholder: `TrueState` has no acceleration, and PX4 only logs it."""
+
+
+def hil_state_quaternion(truth: TrueState, time_us: int) -> Values:
+    """Return attitude (w, x, y, z, body -> NED), rates [rad/s], position and velocity [cm/s].
+
+    Args:
+        truth: True state.
+        time_us: Time stamp on the receiver's clock [µs].
+    """
+    place = local_to_geodetic(truth.position, HOME)
+    return (
+        time_us,
+        *truth.quaternion.tolist(),
+        *truth.angular_velocity.tolist(),
+        units.deg_e7(place.latitude_deg),
+        units.deg_e7(place.longitude_deg),
+        units.mm(place.altitude_m),
+        *(units.cm_s(v) for v in truth.velocity.tolist()),
+        *_NO_AIRSPEEDS,
+        *_NO_ACCELERATION,
+    )
+
+
+def base_mode(status: CommanderStatus) -> int:
+    """Return the MAV_MODE_FLAG bits of HEARTBEAT."""
+    bits: int = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+    if status.mode.spec.stabilized:
+        bits |= dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
+    if status.mode.spec.main == MAIN_AUTO:
+        bits |= dialect.MAV_MODE_FLAG_AUTO_ENABLED | dialect.MAV_MODE_FLAG_GUIDED_ENABLED
+    if status.mode in WITH_STICKS:
+        bits |= dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+    if status.arming is Arming.ARMED:
+        bits |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
+    return bits
+
+
+def system_status(status: CommanderStatus, *, can_arm: bool) -> int:
+    """Return the MAV_STATE of HEARTBEAT.
+
+    Armed: ACTIVE, or CRITICAL in a failsafe. Disarmed: STANDBY, or UNINIT if the mode cannot be
+    armed. After a termination: FLIGHT_TERMINATION, armed or not.
+    """
+    if status.mode is Mode.TERMINATION:
+        return int(dialect.MAV_STATE_FLIGHT_TERMINATION)
+    if status.arming is Arming.ARMED:
+        # ACTIVE or CRITICAL applies only to an armed vehicle.
+        return int(dialect.MAV_STATE_CRITICAL if status.failsafe else dialect.MAV_STATE_ACTIVE)
+    standby = status.arming is Arming.STANDBY and can_arm
+    return int(dialect.MAV_STATE_STANDBY if standby else dialect.MAV_STATE_UNINIT)
