@@ -22,7 +22,7 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.scenario.model import DEFAULT_ARENA, ArenaName
 
 if TYPE_CHECKING:
-    from airl_mav.arena.mesh_boxes import MeshBoxes
+    from airl_mav.addons.meshes.mesh_boxes import MeshBoxes
 
 EXTRAS = ("mesh",)
 
@@ -69,7 +69,7 @@ OPTIONS = AssetOptions
 def run(options: AssetOptions, console: Console | None = None) -> int:
     """Write the asset's profile; return 0."""
     # Imported here: trimesh is an extra.
-    from airl_mav.arena.mesh_boxes import boxes_of_mesh
+    from airl_mav.addons.meshes.mesh_boxes import boxes_of_mesh
 
     console = console or new_console()
     if options.out.suffix.lower() != ".toml":
