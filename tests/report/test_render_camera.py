@@ -12,7 +12,7 @@ from rich.console import Console
 
 from airl_mav.addons.colour.image_sensor import ImageFormation
 from airl_mav.addons.colour.picture import render_picture
-from airl_mav.addons.colour.pictures import CameraMotion, _rates, optical_flow, velocities_of
+from airl_mav.addons.colour.pictures import _rates, optical_flow, velocities_of
 from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.arena.generate import generate
 from airl_mav.camera.intrinsics import Intrinsics
@@ -121,7 +121,7 @@ def test_ground_truth_is_written_as_numbers(tmp_path: Path) -> None:
         found[show] = np.load(out)
     np.testing.assert_array_equal(found["depth"], picture.depth_m)
     np.testing.assert_array_equal(found["segmentation"], picture.seen)
-    motion = CameraMotion(at, north, np.array([4.0, 0.0, 0.0]), np.zeros(3))
+    motion = Motion(at, north, np.array([4.0, 0.0, 0.0]), np.zeros(3))
     flow = optical_flow(picture, k, motion, velocities_of(arena, 1_500_000))
     np.testing.assert_array_equal(found["flow"], flow)
     # As a picture, too: static surfaces are white.

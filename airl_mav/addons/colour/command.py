@@ -13,7 +13,6 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.addons.colour import pictures
-from airl_mav.addons.colour.pictures import CameraMotion
 from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.arena.generate import generate
 from airl_mav.black_box.messages import SUFFIX
@@ -292,16 +291,15 @@ def _picture(options: RenderOptions, out: Path) -> str:
     attitude = quat_from_euler(0.0, pitch, yaw)
     velocity = options.speed_m_s * np.array([math.cos(yaw), math.sin(yaw), 0.0])
     rates = np.array([0.0, 0.0, math.radians(options.yaw_rate_deg_s)])
+    motion = Motion(position, attitude, velocity, rates)
     if options.camera is not None:
-        motion = Motion(position, attitude, velocity, rates)
         camera_of = _taking(options.camera, options.camera_name)
         pictures.write_png(out, camera_of(arena, elapsed_us, motion, arena.seed))
         return "picture"
     centers = arena.centers_at(elapsed_us)
     camera = _camera(options, STILL_PX)
     if _is_truth(options, out):
-        moves = CameraMotion(position, attitude, velocity, rates)
-        truth = pictures.truth_of(options.show, arena, elapsed_us, camera, moves)
+        truth = pictures.truth_of(options.show, arena, elapsed_us, camera, motion)
         if out.suffix.lower() == pictures.ARRAY:
             pictures.write_array(out, truth)
             return options.show

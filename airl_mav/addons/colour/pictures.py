@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, get_args
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from matplotlib import colormaps
@@ -113,18 +113,24 @@ def moments(flight: ReplayedFlight, rate_hz: float) -> range:
     return range(begin, end + 1, period_ms(rate_hz) * US_PER_MS)
 
 
+def _replayed(
+    flight: ReplayedFlight, moments: Iterable[int]
+) -> Iterator[tuple[Arena, int, Motion]]:
+    """Yield arena, time since the start and the vehicle's motion; UsageError without the arena."""
+    if flight.arena is None:
+        raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
+    for time_us in moments:
+        yield flight.arena, time_us - flight.record.started_us, recorded_motion(flight, time_us)
+
+
 def film(
     flight: ReplayedFlight, camera: Intrinsics, drawn: Drawn, moments: Iterable[int]
 ) -> Iterator[Pixels]:
     """Yield pictures at the vehicle's camera pose; raise UsageError without the arena."""
-    if flight.arena is None:
-        raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
     mount = PolicyCamera.of(flight.vehicle.camera).mount
-    for time_us in moments:
-        position, _, quaternion = pose_at(flight.path, time_us)
-        at, attitude = camera_pose(position, quaternion, mount)
-        centers = flight.arena.centers_at(time_us - flight.record.started_us)
-        yield drawn(flight.arena, centers, camera, np.array(at), np.array(attitude))
+    for arena, elapsed_us, motion in _replayed(flight, moments):
+        at, attitude = camera_pose(motion.position, motion.quaternion, mount)
+        yield drawn(arena, arena.centers_at(elapsed_us), camera, np.array(at), np.array(attitude))
 
 
 def period_ms(rate_hz: float) -> int:
@@ -212,12 +218,8 @@ def taken_film(
     flight: ReplayedFlight, camera: TakingCamera, moments: Iterable[int]
 ) -> Iterator[Pixels]:
     """Yield a camera's pictures along a recorded flight; raise UsageError without its arena."""
-    if flight.arena is None:
-        raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
-    for time_us in moments:
-        motion = recorded_motion(flight, time_us)
-        elapsed_us = time_us - flight.record.started_us
-        yield camera(flight.arena, elapsed_us, motion, flight.record.seed)
+    for arena, elapsed_us, motion in _replayed(flight, moments):
+        yield camera(arena, elapsed_us, motion, flight.record.seed)
 
 
 def recorded_motion(flight: ReplayedFlight, time_us: int) -> Motion:
@@ -247,7 +249,7 @@ TRUTHS: Final = tuple(name for name in get_args(Shown) if name not in ("rgb", "g
 
 
 def truth_of(
-    show: Shown, arena: Arena, elapsed_us: int, camera: Intrinsics, motion: CameraMotion
+    show: Shown, arena: Arena, elapsed_us: int, camera: Intrinsics, motion: Motion
 ) -> NDArray[Any]:
     """Return the ground truth of each pixel at a time after the episode's start [µs].
 
@@ -269,14 +271,9 @@ def truth_film(
     show: Shown, flight: ReplayedFlight, camera: Intrinsics, moments: Iterable[int]
 ) -> Iterator[NDArray[Any]]:
     """Yield `truth_of` along a recorded flight for a camera at the vehicle's camera mount."""
-    if flight.arena is None:
-        raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
     mount = PolicyCamera.of(flight.vehicle.camera).mount
-    for time_us in moments:
-        vehicle: Motion = recorded_motion(flight, time_us)
-        motion = motion_of_camera(vehicle, mount)
-        elapsed_us = time_us - flight.record.started_us
-        yield truth_of(show, flight.arena, elapsed_us, camera, motion)
+    for arena, elapsed_us, vehicle in _replayed(flight, moments):
+        yield truth_of(show, arena, elapsed_us, camera, motion_of_camera(vehicle, mount))
 
 
 def coloured_flow(flow: NDArray[np.float32]) -> Pixels:
@@ -311,27 +308,14 @@ MOVED_OVER_US = 1_000
 """Half interval of the central difference for velocities of moving obstacles [µs]."""
 
 
-class CameraMotion(NamedTuple):
-    """Pose and velocity of a camera."""
-
-    position: Floats
-    """(3,) NED [m]."""
-    quaternion: Floats
-    """(4,) camera -> NED; its x axis is the optical axis."""
-    velocity: Floats
-    """(3,) NED [m/s]."""
-    rates: Floats
-    """(3,) angular velocity about the camera's axes forward, right, down [rad/s]."""
-
-
-def motion_of_camera(vehicle: Motion, mount: Mount) -> CameraMotion:
-    """Return the motion of a camera mounted on a vehicle."""
+def motion_of_camera(vehicle: Motion, mount: Mount) -> Motion:
+    """Return the motion of a camera mounted on a vehicle; rates are about the camera's axes."""
     at, attitude = camera_pose(vehicle.position, vehicle.quaternion, mount)
     body = quat_to_matrix(vehicle.quaternion)
     lever = np.cross(vehicle.rates, np.array(mount.offset))
     axes = quat_to_matrix(np.array(attitude))
     rates = axes.T @ body @ vehicle.rates
-    return CameraMotion(np.array(at), np.array(attitude), vehicle.velocity + body @ lever, rates)
+    return Motion(np.array(at), np.array(attitude), vehicle.velocity + body @ lever, rates)
 
 
 def velocities_of(arena: Arena, elapsed_us: int) -> Floats:
@@ -344,7 +328,7 @@ def velocities_of(arena: Arena, elapsed_us: int) -> Floats:
 
 
 def optical_flow(
-    picture: Picture, camera: Intrinsics, motion: CameraMotion, velocities: Floats
+    picture: Picture, camera: Intrinsics, motion: Motion, velocities: Floats
 ) -> NDArray[np.float32]:
     """Return the flow (h, w, 2) of a picture [px/s]; NaN outside a fisheye's field of view."""
     rays = camera.rays
