@@ -55,7 +55,7 @@ class Stereographic(ProjectionModel):
 SEEN = """\
 import json, sys
 
-import airl_mav.profiles
+import airl_mav.profiles.loading
 
 airl_mav.profiles.__path__.insert(0, sys.argv[1])
 
