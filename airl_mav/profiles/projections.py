@@ -373,11 +373,11 @@ class Fisheye(ProjectionModel):
         return min(float(off), sees_to(k.distortion))
 
 
-def _scaled_grid(k: Intrinsics) -> tuple[Floats, Floats]:
+def _scaled_grid(k: Intrinsics) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return columns (w,) and rows (h, 1) from the optical axis, in focal lengths."""
     across = (np.arange(k.width) - k.cx) / k.focal
-    down: Floats = ((np.arange(k.height) - k.cy) / k.focal)[:, None]
-    return across, down
+    down = (np.arange(k.height) - k.cy) / k.focal
+    return across, down[:, None]
 
 
 PROJECTIONS: Final[dict[str, ProjectionModel]] = {
