@@ -9,6 +9,7 @@ The `__init__` of an add-on is light and may define tables, which the core reads
 
 In `firmware_sim.addons`:
 
+    BODIES: {value of `--plant`: class of the vehicle's `plant.body.PlantBody`}
     AIDING: {any name: class of the `estimator.Aiding` that fuses further sensors}
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
     SENSORS: {name in `profiles.vehicle.Sensors`: its `sensor_table.Sensor`}

@@ -15,9 +15,8 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import BodyProfile
-from airl_mav.vehicle.rotation import Quat, Vec
+from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
 from firmware_sim.engine.dynamics import quaternion
-from firmware_sim.plant.contacts.convex import reach_along
 
 WALL_THICKNESS_M = 0.2
 
@@ -280,3 +279,16 @@ def _among_solids(solids: Solids, motion: Vector, radius: float, moving_us: int)
         solids.center[n - moving + i, 0] = north
         solids.center[n - moving + i, 1] = east
     return room_among(solids, (motion[0], motion[1], motion[2]), radius)
+
+
+BREAKING_SHARE = 0.02
+"""Distance below which bodies are close, as a fraction of the box's half diagonal (Bullet's
+gContactBreakingThreshold)."""
+
+
+@kernel
+def reach_along(q: Quat, half: Vector, n: Vec) -> float:
+    """Return the extent [m] of a box at attitude q from its centre along a unit vector."""
+    a = rotate(conjugate(q), n)
+    reach: float = abs(a[0]) * half[0] + abs(a[1]) * half[1] + abs(a[2]) * half[2]
+    return reach

@@ -455,7 +455,7 @@ class BulletBody:
             linearDamping=0.0,
             angularDamping=0.0,
             restitution=0.0,
-            # pybullet multiplies it with the other body's 0.5; see `contacts.solver.FRICTION`.
+            # pybullet multiplies it with the other body's 0.5; see `kernel_body.FRICTION`.
             lateralFriction=0.8,
             rollingFriction=0.0,
             # A sleeping body does not move.

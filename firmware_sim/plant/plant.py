@@ -8,8 +8,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.core.addons import load
+from airl_mav.core.addons import entries, load
 from airl_mav.core.constants import TICK_HZ, US_PER_S
+from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import Vector
 from airl_mav.core.streams import sensors_and_gusts
 from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
@@ -49,10 +50,14 @@ from firmware_sim.engine.ticks import (
     stretch,
 )
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, TrueState
-from firmware_sim.plant.body import FLOOR, PlantBody, Room, Touch
-from firmware_sim.plant.contacts.convex import BREAKING_SHARE
+from firmware_sim.plant.body import BREAKING_SHARE, FLOOR, PlantBody, Room, Touch
 from firmware_sim.plant.sensors import SensorSuite, SimulatedSensor, Site
 from firmware_sim.sensor_table import add_readings, fitted
+
+
+BODIES = {"pybullet": "firmware_sim.plant.bullet_body:BulletBody"}
+"""Classes of bodies by name; add-ons have more. Imported on first use: pybullet is not available
+everywhere, and numba compiles on import."""
 
 
 def new_body(
@@ -67,14 +72,11 @@ def new_body(
         airframe: Mass and inertia.
         tick_s: Length of a tick [s].
     """
-    # Local imports: pybullet is not available everywhere, and numba compiles on import.
-    if name == "kernel":
-        from firmware_sim.plant.contacts.solver import KernelBody
-
-        return KernelBody(arena, body, airframe, tick_s)
-    from firmware_sim.plant.bullet_body import BulletBody
-
-    return BulletBody(arena, body, airframe, tick_s)
+    place = BODIES.get(name) or entries("firmware_sim", "BODIES").get(name)
+    if place is None:
+        raise UsageError(f"--plant {name}: no add-on of firmware_sim has this plant")
+    made: PlantBody = load(place)(arena, body, airframe, tick_s)
+    return made
 
 
 REST_SPEED_M_S = 0.1

@@ -22,7 +22,7 @@ from airl_mav.arena.relief import extreme_within, plane_at
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
-from firmware_sim.plant.contacts.convex import corner_of, note
+from firmware_sim.addons.kernel_plant.convex import corner_of, note
 
 KEPT = 4
 """Maximum number of stored points (MANIFOLD_CACHE_SIZE)."""

@@ -14,6 +14,7 @@ from airl_mav.arena.geometry import Shape
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, multiply, rotate
+from firmware_sim.plant.body import reach_along
 
 ROW = 8
 """Number of values in a contact row: arm from the vehicle's centre NED [m], normal NED from the
@@ -21,10 +22,6 @@ other body to the vehicle, distance [m], and owner (`FLOOR_ID`, and so on)."""
 
 MOST = 32
 """Maximum number of contacts."""
-
-BREAKING_SHARE = 0.02
-"""Distance below which bodies are close, as a fraction of the box's half diagonal (Bullet's
-gContactBreakingThreshold)."""
 
 
 @kernel
@@ -35,14 +32,6 @@ def corner_of(k: int, half: Vector) -> Vec:
         half[1] if k & 2 else -half[1],
         half[2] if k & 4 else -half[2],
     )
-
-
-@kernel
-def reach_along(q: Quat, half: Vector, n: Vec) -> float:
-    """Return the extent [m] of a box at attitude q from its centre along a unit vector."""
-    a = rotate(conjugate(q), n)
-    reach: float = abs(a[0]) * half[0] + abs(a[1]) * half[1] + abs(a[2]) * half[2]
-    return reach
 
 
 @kernel

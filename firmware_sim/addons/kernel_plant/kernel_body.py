@@ -20,8 +20,17 @@ from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
 from airl_mav.vehicle.airframe import Airframe, accelerate, airframe_of, drift
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
+from firmware_sim.addons.kernel_plant.convex import MOST, ROW, touch_obstacle
+from firmware_sim.addons.kernel_plant.ground_contact import (
+    FLOOR_ID,
+    KEPT,
+    near_ground,
+    touch_floor,
+    touch_ground,
+)
 from firmware_sim.engine.dynamics import WIDTH, quaternion, rates, velocity, write
 from firmware_sim.plant.body import (
+    BREAKING_SHARE,
     FLOOR,
     NOTHING,
     Solids,
@@ -30,14 +39,6 @@ from firmware_sim.plant.body import (
     place_at,
     room_among,
     solids_of,
-)
-from firmware_sim.plant.contacts.convex import BREAKING_SHARE, MOST, ROW, touch_obstacle
-from firmware_sim.plant.contacts.ground_contact import (
-    FLOOR_ID,
-    KEPT,
-    near_ground,
-    touch_floor,
-    touch_ground,
 )
 
 FRICTION = 0.4
