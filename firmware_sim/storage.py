@@ -6,7 +6,9 @@ import errno
 import os
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 GREATEST_BYTES = 64 * 1024 * 1024
 """Maximum total size of clients' files [bytes], so that no client can fill the disk."""
@@ -67,3 +69,39 @@ class Storage:
         if self._temporary and self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
             self._folder = None
+
+
+class LogEntry(NamedTuple):
+    """Flight log on board."""
+
+    utc_s: int
+    """Start or completion time of the log [s since 1970]."""
+    size_bytes: int
+
+
+class OpenLog(NamedTuple):
+    """Log currently being written."""
+
+    number: int
+    """Index in `LogStore.entries`."""
+    head_bytes: int
+    """Size of the log header: format, parameters."""
+    size_bytes: int
+    """Current size, at a message boundary."""
+
+
+class LogStore:
+    """Flight logs on board; a log's number is its index in `entries`. This one is empty."""
+
+    def entries(self) -> Sequence[LogEntry]:
+        """Return the logs, oldest first."""
+        return ()
+
+    def read(self, number: int, offset: int, count: int) -> bytes:
+        """Return up to `count` bytes of a log, fewer at its end; none if the log does not exist."""
+        del number, offset, count
+        return b""
+
+    def open_log(self) -> OpenLog | None:
+        """Return the log currently being written; None = no open log."""
+        return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Gains, RateDemand
 from airl_mav.control.loops import Motors
@@ -52,7 +52,6 @@ from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator, Whereabouts
 from firmware_sim.autopilot.navigation.plan import NavigationState, Plans
 from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
 from firmware_sim.autopilot.snapshot import Parts, Snapshot
 from firmware_sim.engine.controller import Controller
@@ -63,13 +62,20 @@ from firmware_sim.interfaces import (
     SensorSample,
     TrueState,
 )
+from firmware_sim.storage import LogStore
+
+if TYPE_CHECKING:
+    from firmware_sim.faults.fault_timeline import ClientFaults
 
 # Bound once: looking up an enum member in every tick is slow.
 _GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR
 
 
 class BuiltinAutopilot:
-    """Autopilot: `FlightController` towards the plant, `port.AutopilotPort` towards MAVLink."""
+    """Autopilot: `FlightController` towards the plant, commands in and state out towards MAVLink.
+
+    Every call happens between two ticks, on one thread.
+    """
 
     rate_hz = TICK_HZ
 
@@ -144,9 +150,9 @@ class BuiltinAutopilot:
         self._snapshot: AutopilotState | None = None
         self._unfused: set[str] = set()
         """Kinds of client sensors that were reported as not fused."""
-        self.failures: Failures | None = None
-        """Failure injection for client requests. Set by the simulation."""
-        self.logs: LogStore = NoLogs()
+        self.failures: ClientFaults | None = None
+        """Failure injection for client requests; None: not supported. Set by the simulation."""
+        self.logs = LogStore()
         """Flight logs for clients. Set by the log writer."""
         self.on_setpoint: Callable[[Wire, int], None] | None = None
         """Callback for accepted setpoints: setpoint as received, time of receipt [µs]."""
@@ -434,7 +440,7 @@ class BuiltinAutopilot:
     def _now_us(self) -> int:
         return max(0, self._taken_us)
 
-    # --- towards MAVLink (port.AutopilotPort)
+    # --- towards MAVLink
 
     @property
     def attitude(self) -> Vector:
@@ -505,7 +511,10 @@ class BuiltinAutopilot:
         return self._commander.handle(CommanderEvent.KILL if force else CommanderEvent.DISARM)
 
     def takeoff(self, altitude_m: float | None, place: tuple[float, float] | None = None) -> Result:
-        """Request a take-off to a height above home [m] and a place; None = default."""
+        """Request a take-off to a height above home [m] and a place, local NED north, east [m].
+
+        Default height: MIS_TAKEOFF_ALT; default place: straight up.
+        """
         flying = self.flight.phase is _AIR
         self._guidance.take_off_to(altitude_m, place, self._state, flying=flying)
         return self._ask(Mode.TAKEOFF)
@@ -513,7 +522,10 @@ class BuiltinAutopilot:
     def set_mode(
         self, mode: Mode, request: ModeRequest | None = None, *, commanded: bool = False
     ) -> Result:
-        """Request a mode with its optional arguments; see `port.AutopilotPort`."""
+        """Request a mode with its optional arguments.
+
+        `commanded` is True for a specific command (NAV_LAND), whose acceptance is reported.
+        """
         if mode is Mode.TAKEOFF:
             return self.takeoff(None)
         return self._ask(mode, request, COMMANDED.get(mode) if commanded else None)
@@ -596,7 +608,11 @@ class BuiltinAutopilot:
     def offer_attitude(
         self, demand: AttitudeDemand | RateDemand, time_us: int, wire: Wire = UNTOLD
     ) -> None:
-        """Pass on an offboard setpoint of attitude or body rates, received at `time_us`."""
+        """Pass on an offboard setpoint of attitude or body rates, received at `time_us`.
+
+        `wire` identifies it in latency analysis: roll, pitch, yaw [rad] or their rates [rad/s], and
+        thrust.
+        """
         self._guidance.context.offer(demand)
         self.supervisor.setpoint(None, time_us)
         if self.on_setpoint is not None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.parameters import SPEC_BY_NAME, SPECS, flown_values, parameter_values
-from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
-from firmware_sim.autopilot.port import ParameterValue
+from firmware_sim.autopilot.autopilot_state import (
+    OperatorText,
+    Severity,
+)
 
 _INDEX = {spec.name: i for i, spec in enumerate(SPECS)}
 FLOAT32_RELATIVE = 1e-6
@@ -29,7 +32,7 @@ class Keeper(Protocol):
 
 
 class Parameters:
-    """Parameters of a vehicle. Implements `port.ParameterStore`.
+    """Parameters of a vehicle.
 
     As in PX4, values are stored as given. Flight code reads them clipped to supported limits.
     """
@@ -184,3 +187,13 @@ class Parameters:
     def _bounded_text(self, name: str) -> OperatorText:
         value, flown = self._values[_INDEX[name]], self._flown[name]
         return OperatorText(Severity.WARNING, f"{name} {value:g} is flown as {flown:g}")
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterValue:
+    """Parameter as stored."""
+
+    name: str
+    value: int | float
+    """Value: int for INT32 parameters, float for REAL32."""
+    index: int

@@ -18,13 +18,14 @@ from firmware_sim.autopilot.autopilot_state import (
     Setpoint,
     StateEstimate,
 )
-from firmware_sim.autopilot.port import LogEntry, OpenLog, ParameterStore
+from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.snapshot import setpoint_of
 from firmware_sim.engine.dynamics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.engine.record import Record
 from firmware_sim.flight_log.topics import SENSOR_COMBINED, TOPICS, Moment, sensor_combined
 from firmware_sim.flight_log.ulog_writer import UlogWriter, Values
 from firmware_sim.interfaces import BatterySample, TrueState
+from firmware_sim.storage import LogEntry, LogStore, OpenLog
 
 
 def truth_of(tick: Any) -> TrueState:
@@ -115,7 +116,7 @@ class FlightLog:
     def __init__(
         self,
         path: Path,
-        parameters: ParameterStore,
+        parameters: Parameters,
         start_us: int,
         boot_unix_us: int,
         on_lost: Callable[[str], None] = lambda _: None,
@@ -187,7 +188,7 @@ class FlightLog:
             self.writer.sample(1 + i, now_us, values)
 
 
-def _values(parameters: ParameterStore) -> Iterable[tuple[str, int | float]]:
+def _values(parameters: Parameters) -> Iterable[tuple[str, int | float]]:
     for index in range(len(parameters)):
         parameter = parameters.by_index(index)
         if parameter is not None:
@@ -200,8 +201,8 @@ OPEN_FILES = 8
 """Maximum number of log files kept open for downloads, which read a few bytes per tick."""
 
 
-class LogFolder:
-    """Complete logs by name, then the open log; rescans changed folders. Implements `LogStore`."""
+class LogFolder(LogStore):
+    """Complete logs by name, then the open log; rescans changed folders."""
 
     def __init__(self, folder: Path, current: FlightLog) -> None:
         """Set the folder and the log currently written in it."""

@@ -54,7 +54,6 @@ from firmware_sim.plant.body import BREAKING_SHARE, FLOOR, PlantBody, Room, Touc
 from firmware_sim.plant.sensors import SensorSuite, SimulatedSensor, Site
 from firmware_sim.sensor_table import add_readings, fitted
 
-
 BODIES = {"pybullet": "firmware_sim.plant.bullet_body:BulletBody"}
 """Classes of bodies by name; add-ons have more. Imported on first use: pybullet is not available
 everywhere, and numba compiles on import."""

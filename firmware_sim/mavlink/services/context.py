@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from airl_mav.core.signing import Signing
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result
-from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
 from firmware_sim.mavlink.link import Link
 from firmware_sim.mavlink.services.transfers import (
@@ -39,7 +39,7 @@ class Context:
 
     link: Link
     """Replies and streams of this client."""
-    port: AutopilotPort
+    port: BuiltinAutopilot
     now_us: int
     """Simulated time [µs]."""
     announce: Callable[[OperatorText], None]

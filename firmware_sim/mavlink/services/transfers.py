@@ -12,7 +12,7 @@ from typing import BinaryIO, NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import OperatorText
-from firmware_sim.autopilot.port import LogEntry
+from firmware_sim.storage import LogEntry
 
 _ALL_ONES = 0xFFFF_FFFF
 
