@@ -25,8 +25,8 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_S, TICK_US, US_PER_S
 from airl_mav.lockstep.digest import FlightDigest
 from airl_mav.lockstep.lockstep_flight import fly
-from airl_mav.lockstep.lockstep_link import lockstep_link
-from airl_mav.lockstep.threaded import ThreadPartner
+from airl_mav.lockstep.stage import ThreadPartner
+from airl_mav.lockstep.vehicle import lockstep_link
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.model import Scenario

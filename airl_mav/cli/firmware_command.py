@@ -16,7 +16,7 @@ from airl_mav.lockstep.remote import fly_vehicle_in_lockstep
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from airl_mav.rehearsal.stand_alone_vehicle import Listener, aircraft_of, fly_vehicle
+from airl_mav.rehearsal.firmware_process import Listener, aircraft_of, fly_vehicle
 from airl_mav.scenario.resolve import FIRMWARE_TITLES, flight_plan
 from airl_mav.scenario.stand_alone import StandAloneVehicle
 from firmware_sim.autopilot.autopilot_state import OperatorText

@@ -302,7 +302,7 @@ EXTRAS = {
 }
 """Packages of the extras, by their names in pyproject.toml."""
 
-LIGHT = ("companion", "computers", "export", "list", "train", "video")
+LIGHT = ("companion", "computers", "export", "list", "train")
 """Commands that can be imported without the simulator; light add-ons define `LIGHT` themselves."""
 
 

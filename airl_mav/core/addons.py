@@ -5,7 +5,20 @@ The `__init__` of an add-on is light and may define tables, which the core reads
 
     COMMANDS: {command of `airl`: (purpose, module with OPTIONS and run)}
     EXECUTORS: {value of `--executor`: module with `connected`}
+    VIEW: {part of the live view: its class or function} (`rehearsal.live_view`)
+    RECORDINGS: {suffix of a flight's recording: function that makes a run folder of it}
+    NOTEBOOK: {`run` or `comparison`: function that returns its HTML}
     LIGHT: the commands can be imported without the simulator
+    SITL_OPTIONS: {option of `airl sitl`: function to a context manager around the flights}
+
+In `companion.addons`:
+
+    CAMERAS: {"driver": function that opens a camera by the name of a driver}
+    RECORDERS: {"black_box": context manager that records a mission}
+
+In `firmware_sim.addons`:
+
+    FIRMWARE: {value of `--firmware`: `firmware_sim.external.programs.FirmwareKind`}
 
 In `firmware_sim.addons`:
 
@@ -31,6 +44,8 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
+from airl_mav.core.errors import FieldError
+
 PACKAGES = ("airl_mav", "companion", "firmware_sim")
 
 
@@ -54,6 +69,25 @@ def load(place: str) -> Any:
     module, _, name = place.partition(":")
     loaded = importlib.import_module(module)
     return getattr(loaded, name) if name else loaded
+
+
+def load_entry(package: str, table: str, name: str, option: tuple[str, object], addon: str) -> Any:
+    """Import what an entry of a table names.
+
+    Args:
+        package: Package of the add-ons.
+        table: Table of the entry.
+        name: Name of the entry.
+        option: Option that needs the entry, and its value.
+        addon: Add-on that has the entry.
+
+    Raises:
+        FieldError: The add-on is missing.
+    """
+    place = entries(package, table).get(name)
+    if place is None:
+        raise FieldError(*option, problem=f"needs the add-on {package}/addons/{addon}")
+    return load(place)
 
 
 def addon_commands() -> dict[str, tuple[str, str]]:

@@ -19,8 +19,8 @@ from airl_mav.experiments.executors import Executor, Flier, FlyEpisodes, Stop, W
 from airl_mav.experiments.live import Ended
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.rehearsal import run_folder
+from airl_mav.rehearsal.observer import Tally
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, locked
-from airl_mav.rehearsal.tally import Tally
 from airl_mav.scenario.resolve import PlannedEpisode, ResolvedScenario, plan_of
 
 INTERVAL_S = 2.0

@@ -8,22 +8,19 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.constants import MAX_ATTEMPTS
-from airl_mav.flight.judge import Outcome, Referee, Verdict
+from airl_mav.flight.judge import BY_HAND, Outcome, Referee, Verdict
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.flight.validity import BY_HAND
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.lockstep.digest import FlightDigest, Unwitnessed, WitnessedPolicy
 from airl_mav.lockstep.judging import Judge
-from airl_mav.lockstep.lockstep_link import real_vehicle
-from airl_mav.lockstep.stage import LockstepStage
-from airl_mav.lockstep.threaded import PATIENCE_S
+from airl_mav.lockstep.stage import PATIENCE_S, LockstepStage
 from airl_mav.lockstep.turns import LockstepError
+from airl_mav.lockstep.vehicle import real_vehicle
 from airl_mav.policy.actions import Policy
 from airl_mav.rehearsal.channel import Text
 from airl_mav.rehearsal.episode import (
@@ -35,19 +32,16 @@ from airl_mav.rehearsal.episode import (
     part_of,
 )
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
+from airl_mav.rehearsal.live_view import FlightTap, ViewEnds, view_part
 from airl_mav.rehearsal.observer import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.resolve import ResolvedScenario
-from airl_mav.view.ends import ViewEnds
 from companion.offboard_mission import MissionResult, Start, check_camera, fly_mission
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.simulation import Simulation
 from firmware_sim.warm_up import warm_up
-
-if TYPE_CHECKING:  # Not loaded without a viewer.
-    from airl_mav.lockstep.watched_flight import Watched
 
 LOADING = "loading"
 """Status text before the first flight."""
@@ -179,7 +173,7 @@ class LockstepFlight:
             ticked: Called after every tick, with the first object that was hit.
         """
         self._view = view
-        self._watched: Watched | None = None
+        self._watched: FlightTap | None = None
         self._patience_s = patience_s
         self._lands = lands
         self._ticked = ticked
@@ -221,11 +215,9 @@ class LockstepFlight:
         asked = resolved.scenario
         vehicle = real_vehicle(asked, resolved.vehicle, log)
         with ExitStack() as held:
-            # Imported on demand: a flight without viewer needs no web server.
             if self._view is not None:
-                from airl_mav.lockstep.watched_flight import Watched
-
-                self._watched = held.enter_context(closing(Watched(self._view, resolved)))
+                tap = view_part("flight")(self._view, resolved)
+                self._watched = held.enter_context(closing(tap))
             self._stage = held.enter_context(
                 LockstepStage(
                     transport_us=TRANSPORT_US,

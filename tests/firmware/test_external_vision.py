@@ -22,7 +22,7 @@ from firmware_sim.addons.auxiliary_estimation.external_vision import Control, ya
 from firmware_sim.addons.auxiliary_estimation.simulated_sensors import PlantVision
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.external.px4 import hil_messages as hil
+from firmware_sim.external import hil_messages as hil
 from firmware_sim.interfaces import Odometry
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.plant.sensors import Site

@@ -35,7 +35,7 @@ from firmware_sim.addons.auxiliary_estimation.simulated_sensors import (
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.engine.dynamics import WIDTH
-from firmware_sim.external.px4 import hil_messages as hil
+from firmware_sim.external import hil_messages as hil
 from firmware_sim.interfaces import FlowReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder, layout
 from firmware_sim.mavlink.telemetry import payload

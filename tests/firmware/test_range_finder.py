@@ -30,7 +30,7 @@ from firmware_sim.autopilot.modes.automatic import landing_speed
 from firmware_sim.autopilot.modes.sticks import Piloting, TerrainHold
 from firmware_sim.engine.record import LANDING, new_controller
 from firmware_sim.engine.ticks import detect_record
-from firmware_sim.external.px4 import hil_messages as hil
+from firmware_sim.external import hil_messages as hil
 from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import DOWNWARD, DistanceReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder

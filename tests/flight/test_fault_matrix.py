@@ -22,7 +22,7 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.faults.fault import Fault
 from airl_mav.faults.kinds import CASES, FALLS, MATRIX_PHASES, End, Phase
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.report.table import print_table
+from airl_mav.report.document import print_table
 from tests.support.flight_rig import quad
 
 

@@ -19,8 +19,7 @@ from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from airl_mav.vehicle_log.clock_alignment import marzullo
-from airl_mav.vehicle_log.ulog_reader import Series, VehicleLog, empty, read_vehicle_log
+from airl_mav.vehicle_log import Series, VehicleLog, empty, marzullo, read_vehicle_log
 from firmware_sim.flight_log.topics import TOPICS
 from firmware_sim.flight_log.ulog_writer import UlogWriter
 

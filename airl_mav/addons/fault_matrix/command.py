@@ -19,7 +19,7 @@ from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.faults.fault import Fault
 from airl_mav.faults.kinds import CASES, LINKS, MATRIX_PHASES, PROCESSES, Phase
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.report.table import Column, TableView, print_table
+from airl_mav.report.document import Column, TableView, print_table
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, IN_WORDS, VehicleName
 from airl_mav.scenario.model import GREATEST_SEED, GREATEST_WORKERS
 

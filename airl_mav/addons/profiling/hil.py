@@ -38,8 +38,8 @@ from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.link_interface import LinkError
 from companion.mavsdk_link import MavsdkLink
 from companion.offboard_mission import MissionResult, check_camera, fly_mission
-from companion.presence import every
 from companion.program import mission_camera, prepare
+from companion.status_reports import every
 from companion.watchdog import ThreadGuard
 
 GOAL = 9_000.0, 0.0

@@ -42,7 +42,7 @@ from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.flight.statistics import QUANTILE
 from airl_mav.latency.stages import integrated_time
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
-from airl_mav.vehicle_log.ulog_reader import VehicleLog
+from airl_mav.vehicle_log import VehicleLog
 
 WINDOW = 13
 """Samples of a window: half a second of telemetry."""
