@@ -12,7 +12,6 @@ from airl_mav.core.constants import TICK_HZ
 from airl_mav.core.frames import Geodetic, Vector
 from firmware_sim.autopilot.autopilot_state import (
     UNTOLD,
-    AutopilotState,
     OperatorText,
     Result,
     Setpoint,
@@ -53,7 +52,7 @@ from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator, Wher
 from firmware_sim.autopilot.navigation.plan import NavigationState, Plans
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
-from firmware_sim.autopilot.snapshot import Parts, Snapshot
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.controller import Controller
 from firmware_sim.engine.record import LANDING, LIFT_OFF, NOTHING
 from firmware_sim.engine.ticks import ALIGN, CLIMBED, REPEATED_BITS, control_record, detect_record
@@ -134,18 +133,6 @@ class BuiltinAutopilot:
             self._newest,
             self._state,
             self._say,
-        )
-        self._parts = Parts(
-            self.estimator,
-            self._commander,
-            self.supervisor,
-            self._guidance,
-            self._navigator,
-            self._controller,
-            self._newest,
-            self._home,
-            self.plans,
-            value,
         )
         self._snapshot: AutopilotState | None = None
         self._unfused: set[str] = set()
@@ -671,5 +658,5 @@ class BuiltinAutopilot:
         # Without findings and ESC reports, only `_told` can change logged data.
         calm = self.supervisor.is_calm and self._newest.esc_outputs is None
         revision = self._told if calm else None
-        self._snapshot = Snapshot(self._parts, self._taken_us, self._demand, revision)
+        self._snapshot = AutopilotState(self, status, self._taken_us, self._demand, revision)
         return self._snapshot

@@ -7,19 +7,14 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.autopilot_state import (
-    AutopilotState,
-    OperatorText,
-    Setpoint,
-    StateEstimate,
-)
+from firmware_sim.autopilot.autopilot_state import OperatorText, Setpoint, StateEstimate
 from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.autopilot.snapshot import setpoint_of
+from firmware_sim.autopilot.snapshot import AutopilotState, setpoint_of
 from firmware_sim.engine.dynamics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.engine.record import Record
 from firmware_sim.flight_log.topics import SENSOR_COMBINED, TOPICS, Moment, sensor_combined
@@ -153,9 +148,8 @@ class FlightLog:
             self.writer.sample(_SAMPLES, time_us, sensor_combined(gyro, accel))
             truth = truths[k - 1] if k else self._truth
             if time_us % GRID_US == 0 and truth is not None:
-                moment = Moment(
-                    FlownState(state, flown[k]), truth_of(truth), self._boot_unix_us + time_us
-                )
+                logged = cast(AutopilotState, FlownState(state, flown[k]))
+                moment = Moment(logged, truth_of(truth), self._boot_unix_us + time_us)
                 self._log(moment, time_us)
         self._truth = truths[-1].copy()
 

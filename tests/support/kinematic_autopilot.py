@@ -79,7 +79,7 @@ DEFAULT_PARAMETERS: dict[str, int | float] = {
 
 
 class KnownState(NamedTuple):
-    """Implements `AutopilotState` by plain values."""
+    """Answers as `AutopilotState` with plain values."""
 
     time_us: int
     estimate: StateEstimate
@@ -330,7 +330,7 @@ class KinematicAutopilot(BuiltinAutopilot):
     def attitude(self) -> Vector:
         return quat_from_euler(self.roll, self.pitch, self.yaw)
 
-    def state(self) -> KnownState:
+    def state(self) -> Any:
         zero = np.zeros(3)
         estimate = StateEstimate(
             time_us=self.time_us,

@@ -11,8 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
+from firmware_sim.autopilot.autopilot_state import Arming
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import AutopilotState
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import SYSTEM_ID, Values
 from firmware_sim.mavlink.streams import sensors, status

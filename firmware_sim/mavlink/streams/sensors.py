@@ -10,8 +10,9 @@ import numpy as np
 
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.kernels import kernel
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Vector
+from firmware_sim.autopilot.autopilot_state import Arming, Vector
 from firmware_sim.autopilot.parameter_store import Parameters
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.streams import units

@@ -14,12 +14,7 @@ from typing import Final
 import numpy as np
 
 from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local, local_to_geodetic, quat_yaw
-from firmware_sim.autopilot.autopilot_state import (
-    Arming,
-    AutopilotState,
-    CommanderStatus,
-    Landed,
-)
+from firmware_sim.autopilot.autopilot_state import Arming, CommanderStatus, Landed
 from firmware_sim.autopilot.flight_modes import (
     BY_CUSTOM_MODE,
     MAIN_AUTO,
@@ -28,6 +23,7 @@ from firmware_sim.autopilot.flight_modes import (
     ModeSpec,
 )
 from firmware_sim.autopilot.modes.return_to_launch import return_time_s
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams import units
