@@ -59,11 +59,9 @@ class FieldCheck(NamedTuple):
         )
 
     def disturbed(self, field: Vector, attitude: Quat) -> bool:
-        """Return whether the field differs from the earth's field.
+        """Return whether a measured field (3,) FRD [gauss] differs from the earth's field.
 
-        Args:
-            field: Measured field (3,) FRD [gauss].
-            attitude: Rotation from body to world; its heading has no effect.
+        The heading of the attitude, body to world, has no effect.
         """
         strength = float(np.linalg.norm(field))
         # Written with "not <=" so that a NaN counts as disturbed.
@@ -111,12 +109,7 @@ class Alignment:
     """Alignment that waits for the required sensors and for the vehicle to be at rest."""
 
     def __init__(self, value: Callable[[str], float], record: Record) -> None:
-        """Start without samples.
-
-        Args:
-            value: Look-up for EKF2_* parameters by name.
-            record: Flight controller's record, which holds the sums of all samples.
-        """
+        """Start without samples. The flight controller's record holds the sums of all samples."""
         self._value = value
         self._record = record
         self.field: Vector | None = None

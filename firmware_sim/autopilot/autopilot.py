@@ -316,11 +316,9 @@ class BuiltinAutopilot:
             self._due_us = min(self._due_us, self._taken_us + DECIDE_US)
 
     def fuse(self, sample: SensorSample, left: int) -> None:
-        """Fuse the measurements that a compiled tick leaves to Python.
+        """Fuse the measurements of a sample that a compiled tick leaves to Python.
 
-        Args:
-            sample: Sensors of the tick.
-            left: Bits of the remaining work, as returned by `engine.ticks.estimate`.
+        `left` has the bits of the remaining work, from `engine.ticks.estimate`.
         """
         sensors = self.supervisor.sensors
         sensors.repeated(sample.time_us, left, left >> REPEATED_BITS)
@@ -329,9 +327,7 @@ class BuiltinAutopilot:
     def flown(self, read: Callable[[], SensorSample], event: int) -> bool:
         """Process the results of compiled ticks; return whether the commander's state has changed.
 
-        Args:
-            read: Returns the newest sample, which is already in the estimate.
-            event: Event that ended the ticks (`engine.ticks`).
+        `read` returns the newest sample, which is already in the estimate; `event` ended the ticks.
         """
         before, self._snapshot = self._commander.flight, None
         self._taken_us = self.estimator.flown()

@@ -136,12 +136,9 @@ class Estimator:
         new_filter: NewFilter = KernelFilter,
         record: Record | None = None,
     ) -> None:
-        """Start unaligned.
+        """Start unaligned, with a look-up for EKF2_* parameters and a factory of the filter.
 
-        Args:
-            value: Look-up for EKF2_* parameters by name.
-            new_filter: Factory for the covariance filter.
-            record: Flight controller's record with state and covariance; None = a new record.
+        `record` is the flight controller's, with state and covariance; None = a new record.
         """
         self.record = record = new_controller() if record is None else record
         """Record of the flight controller."""

@@ -44,14 +44,9 @@ class Parameters:
     ) -> None:
         """Start from the defaults.
 
-        Args:
-            overrides: Values of a vehicle profile, checked by `parameter_values`; this vehicle's
-                defaults.
-            keeper: Persistent storage of the user's values; None: no storage. Unknown names and
-                values of the wrong type are ignored.
-
-        Raises:
-            UsageError: An override is unknown or out of range, or the storage cannot be read.
+        `overrides` of a vehicle profile, checked by `parameter_values`, are this vehicle's
+        defaults. `keeper` stores the user's values; unknown names and values of the wrong type are
+        ignored. Raises UsageError for an invalid override, or if the storage cannot be read.
         """
         values = parameter_values(overrides or {})
         self._defaults = dict(values)

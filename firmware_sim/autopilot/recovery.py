@@ -81,10 +81,7 @@ class EmergencyYaw:
     def is_due(self, time_us: int, yaw: YawEstimator, fused_us: int | None) -> bool:
         """Return whether a suspected heading must be reset now.
 
-        Args:
-            time_us: Current time [µs].
-            yaw: Yaw estimator.
-            fused_us: Time of the last GPS velocity within the gate; None = never.
+        `fused_us` is the time of the last GPS velocity within the gate; None = never.
         """
         refused = fused_us is not None and time_us - fused_us >= REFUSED_US
         doubted = self.is_doubted(time_us)
@@ -97,13 +94,7 @@ def turn_to(state: Vector, covariance: Vector, yaw: float, variance: float) -> V
     """Turn the nominal state about the world's down axis to a heading; return its covariance.
 
     Correlations learned with the wrong heading are cleared. The uncertainty of velocity and biases
-    returns to at least the initial values.
-
-    Args:
-        state: Nominal state, updated.
-        covariance: Covariance of the error (16, 16).
-        yaw: Heading [rad].
-        variance: Variance of the heading [rad²].
+    returns to at least the initial values. The heading is `yaw` [rad], its variance [rad²].
     """
     # Half angles make the quaternion.
     half = 0.5 * (yaw - yaw_of(es.attitude(state)))
@@ -195,15 +186,9 @@ class Recovery:
     ) -> None:
         """Reset heading to the yaw estimator and motion to GPS, and disable the compass.
 
-        Tilt and biases learned since a restart are discarded.
-
-        Args:
-            place: Measured position (3,) NED [m].
-            velocity: Measured velocity (3,) NED [m/s].
-            then: Filter's position and velocity (6,) at the time of the measurement.
-            r_p: Variance of the position [m²].
-            r_v: Variance of the velocity [m²/s²].
-            now: Time and flight state.
+        Tilt and biases learned since a restart are discarded. `place` and `velocity` are measured,
+        (3,) NED, with variances `r_p` [m²] and `r_v` [m²/s²]; `then` are the filter's position and
+        velocity (6,) at the time of the measurement.
         """
         state = self._state
         if self.doubts_inertial(now.time_us):
@@ -409,10 +394,7 @@ class Compass:
 def note_velocity(record: Any, deviations: Vector, acceleration: Vector) -> None:
     """Record a velocity's noise and the vehicle's acceleration in a flight controller's record.
 
-    Args:
-        record: Updated.
-        deviations: Innovation in standard deviations (3,).
-        acceleration: Estimate (3,) NED [m/s²].
+    `deviations` (3,) are the innovation in standard deviations; `acceleration` (3,) is NED [m/s²].
     """
     square, slot = 0.0, record.fixes % LOOK_BACK
     for i in range(3):
@@ -467,16 +449,10 @@ class Consistency:
     def velocity(
         self, innovation: Vector, sigma: Vector, acceleration: Vector, time_us: int
     ) -> Restart | None:
-        """Check a GPS velocity.
+        """Check a GPS velocity; return the standard deviations of a filter restart; None = none.
 
-        Args:
-            innovation: Measured minus expected (3,) NED [m/s].
-            sigma: Expected standard deviation of the innovation (3,) [m/s].
-            acceleration: Estimate (3,) NED [m/s²].
-            time_us: Current time [µs].
-
-        Returns:
-            Standard deviations for a filter restart; None: no restart needed.
+        The innovation (3,) is measured minus expected, NED [m/s], `sigma` (3,) its expected
+        standard deviation, `acceleration` (3,) the estimate [m/s²].
         """
         deviations = innovation / sigma
         if not np.isfinite(deviations).all():

@@ -196,12 +196,9 @@ class SensorMonitor:
             self._take(self.gps, sample)
 
     def repeated(self, time_us: int, measured: int, repeated: int) -> None:
-        """Process the slow sensors of a compiled tick, including repeated values.
+        """Process the slow sensors of a compiled tick at `time_us`.
 
-        Args:
-            time_us: Time of the tick [µs].
-            measured: Bits of the sensors with data, as in `engine.record`.
-            repeated: Bits of the sensors with repeated data.
+        The bits of sensors with data, and with repeated data, are those of `engine.record`.
         """
         self.distrusted = False
         for bit, watch in ((MAG_BIT, self.mag), (PRESSURE_BIT, self.baro), (GPS_BIT, self.gps)):

@@ -48,14 +48,7 @@ EXCUSED = 2.0
 
 @kernel
 def note_motion(record: Any, north: float, east: float, accuracy: float) -> None:
-    """Record a fix in the record of a flight controller.
-
-    Args:
-        record: Updated; its yaw estimator holds the IMU-only velocity up to a constant.
-        north: GPS velocity [m/s].
-        east: GPS velocity [m/s].
-        accuracy: Standard deviation of each component [m/s].
-    """
+    """Record a GPS velocity [m/s] with its standard deviation per axis (`accuracy`)."""
     slot = record.motions % WINDOW
     record.felt_motion[slot, 0] = record.yaw_shared[FELT]
     record.felt_motion[slot, 1] = record.yaw_shared[FELT + 1]
@@ -87,13 +80,9 @@ class TurnedMotion:
         return velocities
 
     def explained(self, turn: float) -> float:
-        """Return the share of the disagreement that another heading would explain.
+        """Return the share, 0 to 1, of the disagreement that another heading would explain.
 
-        Args:
-            turn: Angle from the IMU velocity's axes to the tested heading [rad].
-
-        Returns:
-            0 to 1; 0 if there is no disagreement.
+        `turn` is the angle from the IMU velocity's axes to the tested heading [rad].
         """
         w = self._seen
         if not len(w):
@@ -254,14 +243,9 @@ def _add_change(shared: Vector, north: float, east: float) -> None:
 
 @large_kernel
 def advance(models: Vector, shared: Vector, gyro: Vector, accel: Vector, dt: float) -> None:
-    """Advance all models by IMU samples.
+    """Advance all models by n IMU samples (3 n,): gyro [rad/s] and specific force [m/s²], FRD.
 
-    Args:
-        models: (N_MODELS, MODEL_SIZE), updated.
-        shared: (SHARED_SIZE,), updated.
-        gyro: Samples (3 n,), FRD [rad/s].
-        accel: Samples (3 n,), specific force FRD [m/s²].
-        dt: Time step [s].
+    Updates `models` (N_MODELS, MODEL_SIZE) and `shared` (SHARED_SIZE,); `dt` is the time step [s].
     """
     # Low-pass for the specific force, ten times faster than the tilt correction.
     share = min(ACCEL_FILTER * dt * TILT_GAIN, 1.0)
@@ -354,14 +338,9 @@ def _correct(m: Vector, north: float, east: float, variance: float) -> float:
 
 @large_kernel
 def fuse(models: Vector, shared: Vector, north: float, east: float, accuracy: float) -> None:
-    """Fuse a GPS velocity, and write heading and variance of the sum.
+    """Fuse a GPS velocity [m/s], and write heading and variance of the sum.
 
-    Args:
-        models: (N_MODELS, MODEL_SIZE), updated.
-        shared: (SHARED_SIZE,), updated.
-        north: Velocity [m/s].
-        east: Velocity [m/s].
-        accuracy: Standard deviation of each component [m/s].
+    Updates `models` and `shared`; `accuracy` is the standard deviation of each component [m/s].
     """
     if shared[ALIGNED] == 0.0:
         return
@@ -489,11 +468,8 @@ class YawEstimator:
     ) -> None:
         """Process a GPS velocity; on the ground, without information on heading, restart.
 
-        Args:
-            velocity: NED (3,) [m/s].
-            accuracy: Standard deviation of an axis [m/s].
-            gyro_bias: Estimated gyro bias (3,) [rad/s], copied on the ground.
-            flying: True if the vehicle is in the air.
+        The velocity is NED (3,) [m/s], `accuracy` its standard deviation per axis; the estimated
+        gyro bias (3,) [rad/s] is copied on the ground.
         """
         self._record["flying"] = flying
         self._record["state"][0, _GYRO_BIAS : _GYRO_BIAS + 3] = gyro_bias

@@ -52,17 +52,11 @@ class PlantBody(Protocol):
         """Contacts in the newest tick."""
 
     def move(self, at: Vec, force: Vec, torque: Vec, before: Vector, moving_us: int) -> Vector:
-        """Move the body by one tick.
+        """Move the body by one tick; return the motion (16,) after it, a new array.
 
-        Args:
-            at: Position, NED [m].
-            force: All forces except gravity and contacts, NED [N].
-            torque: NED [N m].
-            before: (16,) motion before the tick.
-            moving_us: Time since the moving obstacles started, at the end of the tick [µs].
-
-        Returns:
-            (16,) motion after the tick, see `engine.dynamics`; a new array.
+        Position [m], force without gravity and contacts [N] and torque [N m] are NED; `before`
+        (16,) is the motion before the tick (`engine.dynamics`), `moving_us` the time since the
+        moving obstacles started, at the end of the tick [µs].
         """
 
     def follow(self, motion: Vector) -> None:
@@ -79,11 +73,7 @@ class PlantBody(Protocol):
     ) -> Vector:
         """Place the body in a motion and clear its contacts; return the motion (16,).
 
-        Args:
-            position: NED [m].
-            velocity: NED [m/s].
-            quaternion: Body -> NED.
-            rates: Angular velocity FRD [rad/s].
+        Position [m] and velocity [m/s] are NED, the attitude body -> NED, rates FRD [rad/s].
         """
 
     def close(self) -> None:
@@ -136,14 +126,10 @@ def tour_arrays(arena: Arena) -> tuple[Vector, Vector]:
 def place_at(
     time_us: int, times_s: Vector, points: Vector, leg: NDArray[np.int64], i: int
 ) -> tuple[float, float]:
-    """Return north, east [m] of moving obstacle i.
+    """Return north, east [m] of moving obstacle i, `time_us` [µs] after the start of the episode.
 
-    Args:
-        time_us: Time since the start of the episode [µs].
-        times_s: (n, 1 + k) from `tour_arrays`.
-        points: (n, k, 2) from `tour_arrays`.
-        leg: (n,) index of the last waypoint passed; updated.
-        i: Index of the obstacle.
+    `times_s` and `points` are from `tour_arrays`; `leg` (n,), the index of the last waypoint
+    passed, is updated.
     """
     # Tours repeat with their period.
     t = (time_us / US_PER_S) % times_s[i, 0]
@@ -255,11 +241,9 @@ class Room:
         return lowest_m - self._top_m
 
     def among_solids_m(self, motion: Vector, moving_us: int) -> float:
-        """Return a lower bound of the distance to walls and obstacles [m].
+        """Return a lower bound of the distance to walls and obstacles [m] in a motion (16,).
 
-        Args:
-            motion: (16,) motion of the vehicle.
-            moving_us: Time since the moving obstacles started [µs].
+        `moving_us` is the time since the moving obstacles started [µs].
         """
         room: float = _among_solids(self._solids, motion, self.reach_m, moving_us)
         return room

@@ -65,13 +65,9 @@ class _Eye:
             self._forming.restart()
 
     def take(self, elapsed_us: int, motion: Motion, seed: int, number: int) -> FurtherImage:
-        """Return an image of an episode.
+        """Return an image of an episode, `elapsed_us` [µs] after its start, in a motion.
 
-        Args:
-            elapsed_us: Time since the episode's start [µs].
-            motion: Motion of the vehicle at this time.
-            seed: Seed of the episode.
-            number: Number of the image in the episode, from the frame rate.
+        `number` counts the images of the episode, from the frame rate.
         """
         image: NDArray[Any]
         jpeg = None
@@ -144,16 +140,10 @@ class SimulatedCamera:
         renderer: Renderer = "raycast",
         further: Mapping[str, Camera] | None = None,
     ) -> None:
-        """Create the cameras of a vehicle profile.
+        """Create the main camera of a vehicle profile, and additional ones on its trigger.
 
-        Args:
-            camera: Main camera.
-            arena: Arena to render.
-            start_us: Simulated time of the first frame [µs].
-            noise: Image conditions; None = the defaults.
-            seed: Seed of the noise.
-            renderer: Renderer of the images.
-            further: Additional cameras with the same trigger, by name; None = main camera only.
+        The first frame is due at `start_us` [µs]; `noise` are the image conditions (None = the
+        defaults), `seed` is the seed of the noise.
         """
         asked = noise or SensorNoise()
         cameras = {"": camera, **(further or {})}
@@ -234,14 +224,9 @@ class CameraServer:
     def __init__(
         self, endpoint: str, context: zmq.Context[zmq.Socket[bytes]] | None = None
     ) -> None:
-        """Bind the socket.
+        """Bind the socket to an endpoint such as "tcp://127.0.0.1:5560"; port 0 or * = any.
 
-        Args:
-            endpoint: Endpoint such as "tcp://127.0.0.1:5560"; port 0 or * selects a free port.
-            context: ZeroMQ context to share; None = a new one.
-
-        Raises:
-            UsageError: The port is in use, or the endpoint is invalid.
+        Raises UsageError if the port is in use, or if the endpoint is invalid.
         """
         self._owns_context = context is None
         self._context = zmq.Context() if context is None else context
@@ -489,11 +474,7 @@ class SlowCamera:
 
 
 def main(number: int) -> None:
-    """Process requests until the connection closes.
-
-    Args:
-        number: File descriptor of the connection.
-    """
+    """Process requests on a connection, given by its file descriptor, until it closes."""
     give_way(NICENESS)
     line = Connection(number)
     with suppress(EOFError, OSError):

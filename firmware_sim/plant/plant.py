@@ -64,12 +64,7 @@ def new_body(
 ) -> PlantBody:
     """Return a vehicle's body at rest on the floor at the start, facing north.
 
-    Args:
-        name: Type of body.
-        arena: Arena; None = an endless floor.
-        body: Collision box.
-        airframe: Mass and inertia.
-        tick_s: Length of a tick [s].
+    Without an arena the floor is endless. Raises UsageError for an unknown name.
     """
     place = BODIES.get(name) or entries("firmware_sim", "BODIES").get(name)
     if place is None:
@@ -133,8 +128,7 @@ class Plant:
             arena: Arena; None = an endless floor.
             rng: Random generator of sensors and wind.
             start_us: Simulated time of the first state [µs].
-            aircraft: Scenario settings: wind as from `wind_of_episode`, sensors, battery charge,
-                body type; None = the defaults.
+            aircraft: Scenario settings, with the wind of `wind_of_episode`; None = the defaults.
             airframe: Airframe of this vehicle; None = from the profile.
             rate_hz: Tick rate [Hz].
             computer_w: Power of the onboard computer from the pack [W].
@@ -267,16 +261,10 @@ class Plant:
     def glide(
         self, controller: Record, ticks: int, truths: Record, flown: Record
     ) -> tuple[int, int]:
-        """Fly up to `ticks` compiled ticks.
+        """Fly up to `ticks` compiled ticks with the record of a flight controller.
 
-        Args:
-            controller: Record of the flight controller.
-            ticks: Maximum number of ticks.
-            truths: (ticks,) log of the aircraft, written.
-            flown: (ticks,) log of the flight controller, written.
-
-        Returns:
-            Number of complete ticks, and the event that ended them (`engine.ticks`).
+        Writes the logs of aircraft and flight controller (ticks,). Returns the number of complete
+        ticks, and the event that ended them (`engine.ticks`).
         """
         done = flew = 0
         while True:
@@ -454,14 +442,7 @@ class Plant:
         quaternion: Quat = (1.0, 0.0, 0.0, 0.0),
         rates: Vec = (0.0, 0.0, 0.0),
     ) -> None:
-        """Place the vehicle in a motion; clears contacts and collisions.
-
-        Args:
-            position: NED [m].
-            velocity: NED [m/s].
-            quaternion: Body -> NED.
-            rates: Angular velocity FRD [rad/s].
-        """
+        """Place the vehicle in a motion (`PlantBody.put`); clears contacts and collisions."""
         self._motion[:] = self.body.put(position, velocity, quaternion, rates)
         self._touching, self._away = frozenset(), False
         self.record["room_m"] = -math.inf
