@@ -185,7 +185,7 @@ class BuiltinFlightStack:
             return
         self._save_us = None
         if not self._autopilot.parameters.save():
-            self._autopilot.report(OperatorText(Severity.CRITICAL, "Parameters could not be saved"))
+            self._autopilot.say(OperatorText(Severity.CRITICAL, "Parameters could not be saved"))
 
 
 @dataclass(frozen=True)

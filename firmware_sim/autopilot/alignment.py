@@ -24,7 +24,6 @@ from airl_mav.vehicle.atmosphere import altitude_m
 from airl_mav.vehicle.rotation import Quat, rotate
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.engine.record import GPS, MAG, PRESSURE, Record
-from firmware_sim.interfaces import SensorSample
 
 STRENGTH_GAUSS = float(np.linalg.norm(MAGNETIC_FIELD_NED))
 INCLINATION_RAD = math.asin(MAGNETIC_FIELD_NED[2] / STRENGTH_GAUSS)
@@ -114,11 +113,6 @@ class Alignment:
         self._record = record
         self.field: Vector | None = None
         """Mean field (3,) FRD [gauss], also set if the field is too disturbed to use."""
-
-    def take(self, sample: SensorSample) -> None:
-        """Add one tick's sensors, already stored in the record, to the sums."""
-        measured = MAG * (sample.mag is not None) | PRESSURE * (sample.pressure_hpa is not None)
-        add_record(self._record, measured | GPS * (sample.gps is not None))
 
     def finish(self) -> Aligned | None:
         """Return the alignment, or None until there are enough samples."""

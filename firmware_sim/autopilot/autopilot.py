@@ -90,7 +90,7 @@ class BuiltinAutopilot:
         self.record = record = self.estimator.record
         """Record of samples, estimate and control loops."""
         self._state = self.estimator.state
-        self._guidance = Guidance(value, self._say, record)
+        self._guidance = Guidance(value, self.say, record)
         self._navigator = Navigator(self.plans, value, self)
         self._guidance.context.return_place = self._return_place
         self._guidance.context.missions = self._navigator.missions
@@ -132,7 +132,7 @@ class BuiltinAutopilot:
             ),
             self._newest,
             self._state,
-            self._say,
+            self.say,
         )
         self._snapshot: AutopilotState | None = None
         self._unfused: set[str] = set()
@@ -391,7 +391,8 @@ class BuiltinAutopilot:
             self.supervisor.watch.reports.mission_missing = not valid
         self._commander.look()
 
-    def _say(self, message: OperatorText) -> None:
+    def say(self, message: OperatorText) -> None:
+        """Send a text to the operator."""
         self._messages.append(message)
         if message.event is not None:
             self._events.append(message.event)
@@ -407,7 +408,7 @@ class BuiltinAutopilot:
 
     def _say_all(self, messages: Sequence[OperatorText]) -> None:
         for message in messages:
-            self._say(message)
+            self.say(message)
 
     @property
     def flight(self) -> CommanderState:
@@ -450,10 +451,6 @@ class BuiltinAutopilot:
 
     def close(self) -> None:
         """Do nothing: there are no resources to release."""
-
-    def report(self, message: OperatorText) -> None:
-        """Send a text to the operator that does not come from flying."""
-        self._say(message)
 
     def take_messages(self) -> list[OperatorText]:
         """Return texts for the operator since the last call."""
@@ -517,7 +514,7 @@ class BuiltinAutopilot:
         self, mode: Mode, request: ModeRequest | None = None, granted: OperatorText | None = None
     ) -> Result:
         if not self._guidance.flies(mode):
-            self._say(unavailable(mode))
+            self.say(unavailable(mode))
             return Result.TEMPORARILY_REJECTED
         self._look_anew(mode)
         # The geofence may forbid the place of the request.
@@ -548,10 +545,6 @@ class BuiltinAutopilot:
         return Result.ACCEPTED
 
     # --- towards the mission (navigation.plan.Crew)
-
-    def say(self, message: OperatorText) -> None:
-        """Send a text to the operator."""
-        self._say(message)
 
     def set_home(self, place: Geodetic | None) -> Result:
         """Move home; None = the current position."""
@@ -619,14 +612,14 @@ class BuiltinAutopilot:
             return
         if takes_over and self.flight.phase is _AIR and flown is not Mode.ORBIT:
             self._commander.handle(Ask(Mode.POSITION))
-            self._say(OperatorText.of(Severity.INFO, events.PILOT_TOOK_OVER))
+            self.say(OperatorText.of(Severity.INFO, events.PILOT_TOOK_OVER))
 
     def receive(self, name: str, reading: Any) -> None:
         """Pass on a reading of a client's sensor: odometry, distance or flow."""
         fused, self._snapshot = self.estimator.receive(name, reading), None
         if not fused and name not in self._unfused:
             self._unfused.add(name)
-            self._say(OperatorText(Severity.WARNING, f"No add-on fuses the sensor: {name}"))
+            self.say(OperatorText(Severity.WARNING, f"No add-on fuses the sensor: {name}"))
 
     def see_obstacles(self, obstacles: ObstacleBins) -> None:
         """Pass on the distances to obstacles."""

@@ -131,12 +131,9 @@ class Recovery:
     """Monitor of velocities and headings that restarts the filter after faults."""
 
     def __init__(
-        self, state: Vector, error_filter: ErrorFilter, yaw: YawEstimator, record: Any = None
+        self, state: Vector, error_filter: ErrorFilter, yaw: YawEstimator, record: Any
     ) -> None:
-        """Store the nominal state, its filter (both updated), and the yaw estimator.
-
-        `record` is the flight controller's record; None = a new one.
-        """
+        """Store the nominal state and its filter, both updated, yaw estimator and record."""
         self._state, self._filter, self._yaw = state, error_filter, yaw
         self.consistency = Consistency(record)
         """Detector of inertial sensor faults."""
@@ -275,27 +272,6 @@ _OUTLIER = 12.0
 """Upper limit of a sample's contribution: one outlier, which differs twice, is not yet noise."""
 
 
-class SigmaLimits(NamedTuple):
-    """Minimum and maximum standard deviation after a restart."""
-
-    least: float
-    greatest: float
-
-    def bound(self, sigma: float) -> float:
-        """Return a standard deviation clipped to the limits."""
-        return min(max(sigma, self.least), self.greatest)
-
-
-VELOCITY = SigmaLimits(0.3, 10.0)
-"""[m/s]"""
-ATTITUDE = SigmaLimits(0.1, 0.3)
-"""[rad]"""
-ACCEL_BIAS = SigmaLimits(0.5, 5.0)
-"""[m/s²]"""
-GYRO_BIAS = SigmaLimits(0.04, 0.2)
-"""2.3 to 11 °/s [rad/s]"""
-
-
 class Restart(NamedTuple):
     """Standard deviations of the filter's errors after a restart."""
 
@@ -303,6 +279,11 @@ class Restart(NamedTuple):
     attitude_rad: float
     accel_bias_m_s2: float
     gyro_bias_rad_s: float
+
+
+LEAST = Restart(0.3, 0.1, 0.5, 0.04)
+GREATEST = Restart(10.0, 0.3, 5.0, 0.2)
+"""Limits of the standard deviations; those of the gyro bias are 2.3 and 11 °/s."""
 
 
 def restart_for(velocity_m_s: float, seconds: float) -> Restart:
@@ -313,12 +294,9 @@ def restart_for(velocity_m_s: float, seconds: float) -> Restart:
     """
     acceleration = abs(velocity_m_s) / seconds
     tilt = acceleration / GRAVITY_M_S2
-    return Restart(
-        VELOCITY.bound(abs(velocity_m_s)),
-        ATTITUDE.bound(tilt),
-        ACCEL_BIAS.bound(acceleration),
-        GYRO_BIAS.bound(tilt / seconds),
-    )
+    sigmas = Restart(abs(velocity_m_s), tilt, acceleration, tilt / seconds)
+    bounded = zip(sigmas, LEAST, GREATEST, strict=True)
+    return Restart._make(min(max(sigma, least), greatest) for sigma, least, greatest in bounded)
 
 
 class InnovationCounter:
@@ -416,12 +394,8 @@ def _note_velocity(records: Any, deviations: Vector, acceleration: Vector) -> No
 class Consistency:
     """Monitor for the innovations of velocity and heading."""
 
-    def __init__(self, record: Any = None) -> None:
-        """Use the record of a flight controller; None = a new record."""
-        if record is None:
-            from firmware_sim.engine.record import new_controller
-
-            record = new_controller()
+    def __init__(self, record: Any) -> None:
+        """Use the record of a flight controller."""
         self._record = record
         self.restarts = 0
         """Number of filter restarts."""

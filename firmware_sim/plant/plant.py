@@ -94,7 +94,6 @@ class Blowing(Protocol):
 
     def step(self) -> Vector:
         """Advance one tick and return the wind (3,) NED [m/s]; read-only."""
-        ...
 
 
 class Collision(NamedTuple):
