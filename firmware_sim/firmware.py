@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from airl_mav.camera.frame import Frame
+from airl_mav.core.addons import entries, load
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
@@ -19,10 +20,10 @@ from airl_mav.profiles.projections import SLOW, Renderer
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
-from firmware_sim.faults.faulty_link import FailingEndpoint
-from firmware_sim.flight_log.flight_log import ULOG_SUFFIX, FlightLog, LogFolder
-from firmware_sim.interfaces import FlightController, TrueState
+from firmware_sim.fault_timeline import FailingLink
+from firmware_sim.interfaces import ULOG_SUFFIX, FlightController, TrueState
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.traffic import TlogWriter
@@ -46,20 +47,32 @@ class FrameServer(Protocol):
     @property
     def awaited(self) -> bool:
         """True if a client waits for the next frame, which must then be on time."""
-        ...
 
     @property
     def transport_us(self) -> int | None:
         """Time from exposure to a client that reads between ticks [µs]; None = read at any time."""
-        ...
 
     def publish(self, frame: Frame) -> None:
         """Offer a frame without blocking."""
-        ...
 
     def close(self) -> None:
         """Release the resources."""
-        ...
+
+
+class FlightLog(Protocol):
+    """Flight log of the vehicle, by an add-on (table FLIGHT_LOGS)."""
+
+    def after_ticks(self, flown: Record, truths: Record, state: AutopilotState) -> None:
+        """Log n ticks, from their logs and the final state of the autopilot."""
+
+    def text(self, message: OperatorText, time_us: int) -> None:
+        """Log an operator text."""
+
+    def close(self) -> None:
+        """Complete the log. Idempotent; further ticks and texts are ignored."""
+
+    def discard(self) -> None:
+        """Complete the log, and release all files."""
 
 
 class FlightStack(Protocol):
@@ -76,7 +89,6 @@ class FlightStack(Protocol):
             UsageError: The vehicle's parameters are invalid, or the firmware does not exist.
             FirmwareLostError: External firmware died while it booted.
         """
-        ...
 
     def connect(self, tick: Callable[[], int], truth: Callable[[], TrueState]) -> None:
         """Open MAVLink after the flight controller's first tick.
@@ -90,19 +102,15 @@ class FlightStack(Protocol):
             UsageError: External firmware is silent, or configured for another vehicle.
             FirmwareLostError: External firmware died.
         """
-        ...
 
     def filenos(self) -> Sequence[int]:
         """Return the descriptors that become readable when MAVLink arrives."""
-        ...
 
     def receive(self, now_us: int) -> int:
         """Handle messages received by simulated `now_us` [µs]; return how many took effect."""
-        ...
 
     def next_send_us(self) -> float:
         """Return the latest simulated time for the next call of `send` [µs]."""
-        ...
 
     def send(self, now_us: int, flown: Record) -> None:
         """Send the messages that are due.
@@ -111,15 +119,12 @@ class FlightStack(Protocol):
             now_us: Simulated time after the newest tick [µs].
             flown: (n,) logs of the ticks since the last call; empty for external firmware.
         """
-        ...
 
     def log_to(self, tlog: TlogWriter | None) -> None:
         """Start to log the onboard link to a tlog; None stops logging."""
-        ...
 
     def counters(self) -> dict[str, LinkCounters]:
         """Return traffic counters by link name."""
-        ...
 
     def strangers(self) -> Sequence[str]:
         """Return a line for each unidentified client that commanded the vehicle in this episode.
@@ -127,11 +132,9 @@ class FlightStack(Protocol):
         The heartbeat of such a client is neither a companion's nor a ground station's. Empty for
         external firmware, whose MAVLink is not inspected here.
         """
-        ...
 
     def close(self) -> None:
         """Release everything."""
-        ...
 
 
 class BuiltinFlightStack:
@@ -207,7 +210,7 @@ class Firmware:
         pacing: Pacing,
         *,
         recording: bool = True,
-        failing: FailingEndpoint | None = None,
+        failing: FailingLink | None = None,
     ) -> None:
         """Create the firmware without an episode.
 
@@ -237,9 +240,7 @@ class Firmware:
         self._sockets: Sequence[int] = ()
         self._tlog: TlogWriter | None = None
         self._flight_log: FlightLog | None = None
-        self._log_folder: LogFolder | None = None
-        self._stop_listening: Callable[[], None] = lambda: None
-        """Unsubscribe the flight log from parameter changes."""
+        """Flight log; None without the add-on `flight_log`."""
 
     @property
     def camera_endpoint(self) -> str:
@@ -318,11 +319,10 @@ class Firmware:
         internals = None if simulation is None else simulation.autopilot.internals
         if simulation is not None and internals is not None:
             now_us = simulation.time_us
-            self._flight_log = log = FlightLog(
-                path, internals.parameters, now_us, start_unix_us - now_us, self._lose_log
-            )
-            self._stop_listening = internals.parameters.on_change(log.parameters_changed)
-            internals.logs = self._log_folder = LogFolder(path.parent, log)
+            for place in entries("firmware_sim", "FLIGHT_LOGS").values():
+                self._flight_log = load(place)(
+                    path, internals, now_us, start_unix_us - now_us, self._lose_log
+                )
 
     def _lose_log(self, what: str) -> None:
         """Report a log that can no longer be written; the flight continues without it."""
@@ -402,9 +402,7 @@ class Firmware:
     def close_logs(self) -> None:
         """Complete the logs of the episode. Idempotent."""
         if self._flight_log is not None:
-            self._stop_listening()
             self._flight_log.close()
-            self._flight_log = None
         if self._tlog is not None:
             self.flight_stack.log_to(None)
             self._tlog.close()
@@ -413,9 +411,9 @@ class Firmware:
     def discard(self) -> None:
         """Close the episode without saving it."""
         self.close_logs()
-        if self._log_folder is not None:
-            self._log_folder.close()
-            self._log_folder = None
+        if self._flight_log is not None:
+            self._flight_log.discard()
+            self._flight_log = None
         if self.simulation is not None:
             if self.epoch_ns is not None:
                 gc.unfreeze()

@@ -45,9 +45,7 @@ from firmware_sim.engine.ticks import (
     log_flown_record,
     log_record,
 )
-from firmware_sim.faults.fault_timeline import ClientFaults, FaultTimeline
-from firmware_sim.faults.faulty_camera import FailingCamera
-from firmware_sim.faults.faulty_controller import FailingParts
+from firmware_sim.fault_timeline import ClientFaults, FaultTimeline, fault_effect
 from firmware_sim.interfaces import ActuatorControls, FlightController, SensorSample, TrueState
 from firmware_sim.pacing import Arrivals
 from firmware_sim.plant.body import FLOOR
@@ -201,8 +199,8 @@ class Simulation:
         Raises:
             UsageError: The vehicle's parameter overrides are invalid.
         """
-        asked, nominal = setup.aircraft, Airframe.from_profile(setup.vehicle)
-        wind = wind_of_episode(asked.wind, setup.seed)
+        aircraft, nominal = setup.aircraft, Airframe.from_profile(setup.vehicle)
+        wind = wind_of_episode(aircraft.wind, setup.seed)
         self.autopilot: FlightController = autopilot or builtin_autopilot(setup)
         self._internals = self.autopilot.internals
         self.plant = Plant(
@@ -210,8 +208,8 @@ class Simulation:
             setup.arena,
             np.random.default_rng(setup.seed),
             start_us=start_us,
-            aircraft=asked.model_copy(update={"wind": wind}),
-            airframe=draw_airframe(nominal, asked.spread, stream(setup.seed, Stream.AIRFRAME)),
+            aircraft=aircraft.model_copy(update={"wind": wind}),
+            airframe=draw_airframe(nominal, aircraft.spread, stream(setup.seed, Stream.AIRFRAME)),
             rate_hz=self.autopilot.rate_hz,
             computer_w=setup.computer_w,
         )
@@ -222,7 +220,7 @@ class Simulation:
         self._unaltered = self._fly
         """The flight controller's step, without faults."""
         self._setup = setup
-        if asked.faults:
+        if aircraft.faults:
             self._let_fail(start_us)
         if self.autopilot.internals is not None:
             self.autopilot.internals.failures = ClientFaults(self._faults_now)
@@ -231,11 +229,12 @@ class Simulation:
         if setup.arena is not None:
             vehicle = setup.vehicle
             self._camera = camera_by(
-                *(vehicle.camera, setup.arena, start_us, asked.sensors, setup.seed),
-                *(asked.renderer, vehicle.cameras),
+                *(vehicle.camera, setup.arena, start_us, aircraft.sensors, setup.seed),
+                *(aircraft.renderer, vehicle.cameras),
             )
             if self.faults is not None:
-                self._camera = FailingCamera(self._camera, self.faults, setup.seed)
+                failing_camera = fault_effect("camera")
+                self._camera = failing_camera(self._camera, self.faults, setup.seed)
         self.recorder: FlightRecorder | None = None
         """Flight recorder; None = no recording."""
         if recording:
@@ -273,7 +272,8 @@ class Simulation:
         """Insert the fault layer between plant and flight controller; return its timeline."""
         setup = self._setup
         self.faults = FaultTimeline(setup.aircraft.faults, setup.seed, start_us)
-        self._fly = FailingParts(self.autopilot, self.plant, setup.vehicle, self.faults).step
+        failing_parts = fault_effect("parts")
+        self._fly = failing_parts(self.autopilot, self.plant, setup.vehicle, self.faults).step
         return self.faults
 
     def _faults_now(self) -> FaultTimeline:
@@ -442,15 +442,15 @@ class CrashDetector:
     def __init__(self) -> None:
         self.hit: str | None = None
         """Name of the first body hit; None = no crash."""
-        self._seen = 0
+        self._checked = 0
 
     def look(self, simulation: Simulation) -> bool:
         """Check the contacts of this tick; return True if the first crash is among them."""
         hits = simulation.plant.collisions
-        if len(hits) == self._seen:
+        if len(hits) == self._checked:
             return False
-        new = hits[self._seen :]
-        self._seen = len(hits)
+        new = hits[self._checked :]
+        self._checked = len(hits)
         crashes = [hit.what for hit in new if is_crash(hit, simulation.autopilot.flight)]
         if self.hit is not None or not crashes:
             return False

@@ -27,8 +27,12 @@ In `firmware_sim.addons`:
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
     SENSORS: {name in `profiles.vehicle.Sensors`: its `sensor_table.Sensor`}
     MISSIONS: {name: subclass of `navigation.plan.Missions`}
-    SERVICES: {name: MAVLink service, a module with HANDLERS and `send_pending`}
+    SERVICES: {name: MAVLink service, a module as described in `firmware_sim.mavlink.services`}
+    STREAMS: {name: module with BUILDERS of streamed messages, as `firmware_sim.mavlink.streams`}
+    CAPABILITIES: {name: bit of MAV_PROTOCOL_CAPABILITY}
     EVENTS: {name: module with event `Definition`s}
+    FLIGHT_LOGS: {name: function that opens a `firmware_sim.firmware.FlightLog`}
+    FAULT_EFFECTS: {`parts`, `camera` or `link`: class that executes faults there}
 
 Values are text (`module` or `module:name`); `load` imports what they name, on first use.
 `after_import` runs a module of this package once another package is imported.

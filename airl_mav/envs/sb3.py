@@ -16,7 +16,7 @@ from airl_mav.envs.experts import Expert
 from airl_mav.envs.saved_state import Stateful
 from airl_mav.envs.spec import ExpertName
 from airl_mav.envs.vector import NavigationVectorEnv
-from airl_mav.policy.observation_spec import Encoded
+from airl_mav.policy.layouts import Encoded
 
 QUALITY = ("success", "outcome", "flight_time_s", "distance_m", "energy_j", "seed", "zone")
 """Keys of `info` in SB3's `episode` info, in addition to return, length and time."""

@@ -1,4 +1,4 @@
-"""Table of all faults: parts, kinds, amounts and possible outcomes.
+"""Table of all faults: parts, kinds and amounts.
 
 A fault is a part and a kind: `gps off`, `motor2 weak`. Each kind defines its amount's meaning, unit
 and range, and the fidelity levels that support the fault.
@@ -7,10 +7,9 @@ and range, and the fidelity levels that support the fault.
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Literal
 
 from airl_mav.core.constants import GRAVITY_M_S2
 
@@ -261,7 +260,6 @@ KINDS: Mapping[tuple[Part, str], Kind] = {
 }
 """All faults, by part and kind."""
 
-
 NOISE_SEED = 1 << 32
 """Multiplied by a camera noise fault's number, from 1, and added to the episode's seed, so that its
 noise differs from the healthy camera's."""
@@ -275,213 +273,3 @@ def kind_of(part: str, kind: str) -> Kind | None:
 def kinds_of(part: str) -> tuple[str, ...]:
     """Return the kinds of a part; empty for an unknown part."""
     return tuple(kind for known, kind in KINDS if known == part)
-
-
-# --- faults as text: `gps off at 8s for 5s`, `motor2 weak 60% at offboard+2s`
-#
-#     FAULT  = PART KIND [AMOUNT] [at WHEN] [for TIME]
-#     AMOUNT = NUMBER[,NUMBER,NUMBER][ ][UNIT]
-#     WHEN   = TIME | PHASE | PHASE+TIME
-#     TIME   = NUMBER s | NUMBER ms
-
-PARTS: tuple[str, ...] = get_args(Part)
-PHASES: tuple[str, ...] = get_args(Phase)
-
-KIND_WORDS = {
-    "lost": "off",
-    "loss": "off",
-    "frozen": "stuck",
-    "noisy": "noise",
-    "biased": "bias",
-    "jump": "bias",
-    "delayed": "delay",
-    "late": "delay",
-}
-"""Synonyms of kinds, used only if the part has no kind with this name."""
-
-_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_AMOUNT = re.compile(rf"({_NUMBER}(?:,{_NUMBER})*)(.*)")
-_TIME = re.compile(rf"({_NUMBER})(ms|s)")
-_MS_PER_S = 1000.0
-
-
-def read_fault(text: str) -> dict[str, Any]:
-    """Return the fields of a fault text. Raises ValueError with position and accepted words."""
-    words = text.split()
-    if len(words) > 1 and words[0] == "motor" and f"motor{words[1]}" in MOTORS:
-        words = [f"motor{words[1]}", *words[2:]]
-    if not words or words[0] not in PARTS:
-        raise ValueError(f"{text!r}: no such part; accepted: {', '.join(PARTS)}")
-    part = words[0]
-    known = kinds_of(part)
-    kind = words[1] if len(words) > 1 else ""
-    kind = kind if kind in known else KIND_WORDS.get(kind, kind)
-    about = kind_of(part, kind)
-    if about is None:
-        raise ValueError(f"{text!r}: no such fault of {part}; accepted: {', '.join(known)}")
-    rest = words[2:]
-    cut = next((i for i, word in enumerate(rest) if word in ("at", "for")), len(rest))
-    fields: dict[str, Any] = {"part": part, "kind": kind}
-    if cut:
-        if about.amount is None:
-            raise ValueError(f"{text!r}: {''.join(rest[:cut])!r}: {part} {kind} has no amount")
-        fields["value"] = _amount("".join(rest[:cut]), about.amount, text)
-    clauses = rest[cut:]
-    while clauses:
-        word, said, clauses = clauses[0], clauses[1:2], clauses[2:]
-        if word not in ("at", "for") or not said:
-            raise ValueError(f"{text!r}: {word!r}: accepted: at TIME, at PHASE+TIME, for TIME")
-        more = _when(said[0], text) if word == "at" else {"for_s": _time(said[0], text)}
-        if set(more) & set(fields):
-            raise ValueError(f"{text!r}: {word!r} stands twice")
-        fields |= more
-    return fields
-
-
-def fault_text(fields: Mapping[str, Any]) -> str:
-    """Return a fault as text that `read_fault` parses into the same fields."""
-    part, kind = fields["part"], fields["kind"]
-    words = [part, kind]
-    amount = KINDS[part, kind].amount
-    if fields["value"] and amount is not None:
-        words.append(_amount_text(fields["value"], amount))
-    begins = f"{_numbers([fields['at_s']])}s"
-    if fields["phase"] is not None:
-        words += ["at", fields["phase"] + (f"+{begins}" if fields["at_s"] else "")]
-    elif fields["at_s"]:
-        words += ["at", begins]
-    if fields["for_s"] is not None:
-        words += ["for", f"{_numbers([fields['for_s']])}s"]
-    return " ".join(words)
-
-
-def _amount_text(values: Sequence[float], amount: Amount) -> str:
-    """Return an amount in the stored unit, or in a unit in which six digits are exact."""
-    for unit, factor in [(amount.unit, 1.0), *amount.units.items()]:
-        text = ",".join(f"{v / factor:g}" for v in values) + unit
-        if _amount(text, amount, text) == list(values):
-            return text
-    return _numbers(values) + amount.unit
-
-
-def _numbers(values: Sequence[float]) -> str:
-    """Return numbers in their shortest exact form."""
-    return ",".join(f"{v:g}" if float(f"{v:g}") == v else repr(v) for v in values)
-
-
-def _amount(said: str, amount: Amount, text: str) -> list[float]:
-    found = _AMOUNT.fullmatch(said)
-    if found is None or found[2] not in amount.units:
-        accepted = ", ".join(unit or "no unit" for unit in amount.units)
-        raise ValueError(
-            f"{text!r}: {said!r}: accepted: {amount.accepted}, written with {accepted}"
-        )
-    factor = amount.units[found[2]]
-    numbers = [float(number) for number in found[1].split(",")]
-    if factor == 1.0:
-        return numbers
-    # Rounded to the written decimal: 95 * 0.01 is not 0.95.
-    return [float(f"{number * factor:.15g}") for number in numbers]
-
-
-def _when(said: str, text: str) -> dict[str, Any]:
-    phase, _, later = said.partition("+")
-    if phase in PHASES:
-        return {"phase": phase, "at_s": _time(later, text) if later else 0.0}
-    if _TIME.fullmatch(said) is None:
-        raise ValueError(
-            f"{text!r}: at {said!r}: accepted: a time as 8s or 500ms, or a phase"
-            f" ({', '.join(PHASES)}), also with a time as hold+2s"
-        )
-    return {"at_s": _time(said, text)}
-
-
-def _time(said: str, text: str) -> float:
-    found = _TIME.fullmatch(said)
-    if found is None or not math.isfinite(float(found[1])):
-        raise ValueError(f"{text!r}: {said!r}: accepted: a time as 8s or 500ms")
-    return float(found[1]) / (_MS_PER_S if found[2] == "ms" else 1.0)
-
-
-End = Literal["not armed", "landed", "crashed", "flying", "flown away", "broken"]
-"""Result of a flight.
-
-not armed: arming was rejected; landed: on the ground, motors off, touchdown below the maximum
-landing speed; crashed: faster, or upside down; flying: still in the air at the end; flown away:
-further from home, or higher, than the bound; broken: NaN or infinity, or an exception.
-"""
-
-MATRIX_PHASES: tuple[Phase, ...] = (*("ground", "climb", "hold", "offboard", "mission", "landing"),)
-
-SAFE: frozenset[End] = frozenset({"landed"})
-FALLS: frozenset[End] = frozenset({"landed", "crashed"})
-"""Results without control: the vehicle falls, within the bounds."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """Fault of the matrix."""
-
-    fault: str
-    """Fault specification as text, without a time."""
-    ends: frozenset[End] = SAFE
-    """Allowed results if the fault began in the air."""
-    on_ground: frozenset[End] = frozenset({"not armed", "landed"})
-    """Allowed results if the fault began on the ground."""
-
-    def allowed(self, phase: Phase) -> frozenset[End]:
-        """Return the allowed results for a phase."""
-        return self.on_ground | self.ends if phase == "ground" else self.ends
-
-
-CASES: tuple[Case, ...] = (
-    Case("accel off", FALLS),
-    Case("accel noise 10x"),
-    Case("accel bias 0.5,0.5,0.5m/s2"),
-    Case("gyro off", FALLS),
-    Case("gyro noise 10x"),
-    Case("gyro bias 2,2,2deg/s"),
-    Case("gyro delay 8ms"),
-    Case("mag off"),
-    Case("mag stuck"),
-    Case("mag bias 0.1,0.1,0gauss"),
-    Case("baro off"),
-    Case("baro stuck"),
-    Case("baro noise 10x"),
-    Case("baro bias 0.5hPa"),
-    Case("gps off"),
-    Case("gps off for 2s"),
-    Case("gps stuck"),
-    Case("gps noise 5x"),
-    Case("gps bias 20,0,0m"),
-    Case("gps drift 0.5,0,0m/s"),
-    Case("gps delay 200ms"),
-    Case("gps delay 1s", FALLS),
-    Case("motor1 off", FALLS),
-    Case("motor2 weak 75%"),
-    Case("motor2 mismatch 20%"),
-    Case("motor2 slow 4x"),
-    Case("battery drop 60%"),
-    Case("battery drop 92%"),
-    Case("battery sag 0.3V"),
-    Case("wind gust 6,0,0m/s for 4s"),
-    Case("wind step 5,0,0m/s"),
-)
-"""Faults that PX4 is expected to survive, and faults that no quadrotor survives. Covers the flight
-controller alone: camera and link faults belong to the companion."""
-
-STANDS: frozenset[End] = frozenset({"landed", "flying"})
-"""Results without a landing detection: safe, but the motors may keep running."""
-
-FITTED_CASES: tuple[Case, ...] = (
-    Case("rangefinder off"),
-    Case("rangefinder stuck", STANDS, frozenset({"not armed", "landed", "flying"})),
-    Case("rangefinder noise 5x"),
-    Case("rangefinder bias 0.5m"),
-    Case("flow off"),
-    Case("flow stuck"),
-    Case("flow noise 5x"),
-)
-"""Faults of optional sensors, flown only on request."""
-
-CASE_OF: Mapping[str, Case] = {case.fault: case for case in (*CASES, *FITTED_CASES)}

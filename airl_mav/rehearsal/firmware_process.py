@@ -37,8 +37,7 @@ from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.external.flight_stack import FirmwareRequest, real_firmware
 from firmware_sim.external.parameters import KeptParameters
 from firmware_sim.external.programs import how_to_start
-from firmware_sim.faults.fault_timeline import FaultTimeline
-from firmware_sim.faults.faulty_link import FailingEndpoint
+from firmware_sim.fault_timeline import FailingLink, FaultTimeline, failing_link
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack, fly
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, bind_device_links, bind_udp_links
@@ -90,11 +89,11 @@ def build_firmware(
     signing = None if aircraft.signing_key is None else StoredSigning(aircraft.signing_key)
     insecure = insecure or signing is not None
     flight_stack: FlightStack
-    failing: FailingEndpoint | None = None
+    failing: FailingLink | None = None
     if aircraft.firmware == "builtin":
         links = ends()
         if link_fails(aircraft.faults):
-            failing = FailingEndpoint(links.api, pacing.clock)
+            failing = failing_link(links.api, pacing.clock)
         try:
             devices = bind_devices()
         except UsageError:

@@ -28,7 +28,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.envs.experts import Expert
 from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import ExpertName
-from airl_mav.policy.observation_spec import Encoded
+from airl_mav.policy.layouts import Encoded
 
 
 class Demonstrations:

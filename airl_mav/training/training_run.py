@@ -31,7 +31,7 @@ from airl_mav.envs.spec import EnvironmentSpec, Randomisation
 from airl_mav.envs.stopping import bounded
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
-from airl_mav.policy.observation_spec import SHIPPED
+from airl_mav.policy.layouts import SHIPPED
 from airl_mav.rehearsal.live_view import ViewEnds, view_part
 from airl_mav.rehearsal.run_folder import locked
 from airl_mav.training.algorithms import make_model

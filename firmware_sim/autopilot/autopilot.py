@@ -58,13 +58,13 @@ from firmware_sim.engine.record import LANDING, LIFT_OFF, NOTHING
 from firmware_sim.engine.ticks import ALIGN, CLIMBED, REPEATED_BITS, control_record, detect_record
 from firmware_sim.interfaces import (
     ActuatorControls,
+    LogStore,
     SensorSample,
     TrueState,
 )
-from firmware_sim.storage import LogStore
 
 if TYPE_CHECKING:
-    from firmware_sim.faults.fault_timeline import ClientFaults
+    from firmware_sim.fault_timeline import ClientFaults
 
 # Bound once: looking up an enum member in every tick is slow.
 _GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
+from typing import Any
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
@@ -26,15 +27,18 @@ from firmware_sim.mavlink.endpoint import (
 )
 from firmware_sim.mavlink.link import Link, LinkCounters, Payloads
 from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, gcs_link, onboard_link
-from firmware_sim.mavlink.services import connection, handle, send_pending
-from firmware_sim.mavlink.services.context import Context, sender
-from firmware_sim.mavlink.services.transfers import RunningCalibration
-from firmware_sim.mavlink.streams import BUILDERS, VEHICLE_BUILDERS, Builder, Vehicle
+from firmware_sim.mavlink.services import Context, connection, handle, send_pending, sender, table
+from firmware_sim.mavlink.streams import (
+    BUILDERS,
+    VEHICLE_BUILDERS,
+    Builder,
+    Vehicle,
+    addon_builders,
+)
 from firmware_sim.mavlink.streams.sensors import Radio
 from firmware_sim.mavlink.telemetry import TickContext, flown_of
 from firmware_sim.mavlink.texts_and_events import REPLY_IDS, EventBuffer, EventSender, TextEncoder
 from firmware_sim.mavlink.traffic import Forwarder, Senders, TlogWriter, TrafficLog
-from firmware_sim.storage import Storage
 
 _DISCARD_CALLS = 16
 """Number of reads that empty a link: 16 times 256 datagrams exceed a socket's buffer."""
@@ -77,7 +81,6 @@ class MavlinkServer:
         boot_unix_us: int,
         clock: Clock | None = None,
         signing: StoredSigning | None = None,
-        storage: Storage | None = None,
     ) -> None:
         """Open the links. Each streams its default rates from the first `send`.
 
@@ -85,7 +88,6 @@ class MavlinkServer:
             links: Configurations of the links.
             port: Autopilot; None = attached later (`attach`).
             boot_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
-            storage: Vehicle files for MAVLink FTP; None = temporary files. Closed with the server.
             clock: Limits the time per tick for received messages and bulk transfers. None, or a
                 clock that stops during the tick: only their number is limited.
             signing: Stored key, required on all links; None = no key until a client sets one, which
@@ -99,8 +101,9 @@ class MavlinkServer:
         self._signing = (
             Signing(lambda: boot_unix_us + self._now_us) if signing is None else signing.signing
         )
-        self._storage = storage or Storage()
-        self._calibration = RunningCalibration()
+        self.vehicle_states: dict[type, Any] = {}
+        """States of services that all clients share, by class."""
+        table("HANDLERS")  # loads the services
         self._radio = Radio()
         self._now_us = 0
         self._forget_us = 0
@@ -120,6 +123,7 @@ class MavlinkServer:
         # All links share these builders, so each message is built once per tick.
         self._builders: dict[str, Builder | None] = {
             **BUILDERS,
+            **addon_builders(),
             **{name: partial(build, self._vehicle) for name, build in VEHICLE_BUILDERS.items()},
             **{name: each.build for name, each in sensor_table.streams().items()},
             "TIMESYNC": None,
@@ -152,7 +156,8 @@ class MavlinkServer:
         self._senders.forget()
         self._complaints.restart()
         self._announced.renew()
-        self._calibration = RunningCalibration()
+        for state in self.vehicle_states.values():
+            state.restart()
         # A new boot restarts the event numbers.
         self._events = EventBuffer()
         for clients in self._links:
@@ -239,14 +244,7 @@ class MavlinkServer:
         after_us: int,
         texts: Sequence[OperatorText],
     ) -> None:
-        """Send texts, events and due streams to clients.
-
-        Args:
-            due: Clients with anything to send, and their slow streams.
-            flown: (n,) logs of the newest ticks.
-            after_us: Time from the log of a tick to its end [µs].
-            texts: Texts for operators.
-        """
+        """Send texts, events and streams to clients that are due, each with its slow streams."""
         assert self._port is not None  # noqa: S101 (the caller has looked)
         now_us, state = self._now_us, self._port.state()
         origin, before, last = state.origin, self._context.row, len(flown) - 1
@@ -268,7 +266,7 @@ class MavlinkServer:
                     link.stream_fast(flown[last:], after_us, context, most)
                 else:
                     link.stream_fast(flown, after_us, context, most)
-            if texts or (client.events is not None and client.events.has_news(now_us)):
+            if texts or client.events.next_us <= now_us:
                 _stream_news(client, texts, now_us)
             # Streams beyond the share wait for the next tick, where they come first.
             if len(names) > share:
@@ -345,7 +343,8 @@ class MavlinkServer:
             self._stored.save()
         for clients in self._links:
             clients.close()
-        self._storage.close()
+        for state in self.vehicle_states.values():
+            state.close()
 
     def _open(self, config: LinkConfig, link_id: int) -> Clients:
         def welcome(peer: Peer, endpoint: Sender) -> Client:
@@ -363,7 +362,8 @@ class MavlinkServer:
             )
             texts = TextEncoder()
             reply_texts = TextEncoder(REPLY_IDS) if config.separate_replies else texts
-            client = Client(peer, link, texts, reply_texts, heard_us=self._now_us)
+            events = EventSender(self._events)
+            client = Client(peer, link, texts, reply_texts, events, heard_us=self._now_us)
             if self._port is not None:
                 self._connect(client, self._port)
                 # A client that connects in flight starts its streams now.
@@ -385,8 +385,7 @@ class MavlinkServer:
             self._events,
             self._signing,
             self._system_id,
-            storage=self._storage,
-            calibration=self._calibration,
+            vehicle_states=self.vehicle_states,
             radio=self._radio,
         )
         self._is_transferring = True
@@ -417,7 +416,7 @@ class MavlinkServer:
         context.now_us = self._now_us
         self._is_transferring = True  # cleared by `send` when idle
         client.hear(source)
-        self._traffic.heard(client, message)
+        self._traffic.record_first(client, message)
         kind = message.get_type()
         effective = handle(message, kind, context)
         if effective:
@@ -460,9 +459,8 @@ def _stream_news(client: Client, texts: Iterable[OperatorText], now_us: int) -> 
     for text in texts:
         for chunk in client.texts.encode(text):
             client.link.stream(chunk)
-    if client.events is not None:
-        for message in client.events.due(now_us):
-            client.link.stream(message)
+    for message in client.events.due(now_us):
+        client.link.stream(message)
 
 
 def _tell(clients: Iterable[Client], text: OperatorText) -> None:
@@ -471,11 +469,11 @@ def _tell(clients: Iterable[Client], text: OperatorText) -> None:
             client.link.send(chunk)
 
 
-def _share(asked: Sequence[int]) -> int:
+def _share(requests: Sequence[int]) -> int:
     """Return the maximum number of streamed messages per client and tick, given their requests."""
-    if sum(asked) <= STREAMS_PER_TICK // 2:
+    if sum(requests) <= STREAMS_PER_TICK // 2:
         return STREAMS_PER_TICK // 2
-    return max(1, STREAMS_PER_TICK // 2 // sum(1 for number in asked if number))
+    return max(1, STREAMS_PER_TICK // 2 // sum(1 for number in requests if number))
 
 
 def _system_id(port: BuiltinAutopilot) -> int:

@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from firmware_sim.autopilot.events.definition import FailsafeAction
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
     Conditions,
-    FailsafeAction,
     FailsafeSettings,
     FenceBreach,
     can_run,
@@ -32,7 +32,6 @@ from firmware_sim.autopilot.failsafes.failsafe_table import (
 )
 from firmware_sim.autopilot.failsafes.framework import (
     NO_INTERVENTION,
-    FailsafeInput,
     FailsafeResult,
     FailsafeState,
     Intervention,
@@ -70,8 +69,15 @@ class Machine:
         """Let time pass, change what is wrong, and update; return the outcome."""
         self.time_us += elapsed_us
         self.conditions = self.conditions._replace(**changes)
-        vehicle = FailsafeInput(self.armed, self.mode, self.mission_finished)
-        self.last = update(self.state, self.time_us, vehicle, self.conditions, self.options, asked)
+        now = Situation(
+            self.time_us,
+            self.conditions,
+            self.options,
+            self.mode,
+            self.mission_finished,
+            armed=self.armed,
+        )
+        self.last = update(self.state, now, asked)
         self.state, self.mode = self.last.state, self.last.intended
         if self.last.text is not None:
             self.texts.append(self.last.text.text)
@@ -96,16 +102,16 @@ def test_manual_control_lost_holds_then_returns() -> None:
     m = flying(Mode.POSITION, nav_rcl_act=2)
     assert m.step(manual_control_signal_lost=True).state.action is FailsafeAction.HOLD
     assert m.texts == ["Failsafe activated: entering Hold for 5 seconds"]
-    assert m.last.delayed is FailsafeAction.RETURN
+    assert m.last.delayed is FailsafeAction.RTL
     assert m.last.mode is Mode.HOLD
     m.step(4900 * MS)
     assert m.action() is FailsafeAction.HOLD
     m.step(200 * MS)
-    assert m.action() is FailsafeAction.RETURN
+    assert m.action() is FailsafeAction.RTL
     assert m.texts[-1] == "Failsafe activated"
     # The signal is back: the return continues until the user chooses a mode.
     m.step(manual_control_signal_lost=False)
-    assert m.action() is FailsafeAction.RETURN
+    assert m.action() is FailsafeAction.RTL
     m.mode = Mode.ALTITUDE
     assert m.step().mode is Mode.ALTITUDE
     assert m.action() is FailsafeAction.NONE
@@ -115,7 +121,7 @@ def test_the_worse_of_two_is_taken_and_the_other_after_it() -> None:
     m = flying(Mode.POSITION, nav_rcl_act=2, nav_dll_act=3)
     m.step(manual_control_signal_lost=True)
     m.step(6 * S)
-    assert m.action() is FailsafeAction.RETURN
+    assert m.action() is FailsafeAction.RTL
     m.step(gcs_connection_lost=True)
     assert m.action() is FailsafeAction.LAND, "no second wait: it is in a failsafe already"
     m.mode = Mode.HOLD
@@ -125,15 +131,15 @@ def test_the_worse_of_two_is_taken_and_the_other_after_it() -> None:
 
 def test_the_user_takes_over_with_the_sticks_only_after_the_wait() -> None:
     m = flying(Mode.MISSION)
-    m.step(mission_failure=True)
+    m.step(flight_time_limit_exceeded=True)
     assert m.action() is FailsafeAction.HOLD
     m.step(3 * S, Intervention(sticks_moved=True))
     assert m.action() is FailsafeAction.HOLD
     m.step(3 * S)
-    assert m.action() is FailsafeAction.RETURN
+    assert m.action() is FailsafeAction.RTL
     m.step(10 * MS, Intervention(sticks_moved=True))
     assert (m.action(), m.mode, m.state.taken_over) == (FailsafeAction.WARN, Mode.POSITION, True)
-    m.step()
+    m.step(flight_time_limit_exceeded=False)
     assert m.action() is FailsafeAction.NONE
     assert not m.state.taken_over
 
@@ -176,18 +182,18 @@ def test_a_condition_that_flaps_acts_in_the_end() -> None:
     """A wait that has begun runs on without its cause; the next is shorter than the first."""
     m = flying(Mode.MISSION)
     for _ in range(3):
-        m.step(mission_failure=True)
+        m.step(flight_time_limit_exceeded=True)
         m.step(1 * S)
         assert m.action() is FailsafeAction.HOLD
-        m.step(mission_failure=False)
+        m.step(flight_time_limit_exceeded=False)
         m.step(500 * MS)
         assert m.action() is FailsafeAction.HOLD
     m.step(1 * S)
     assert m.action() is FailsafeAction.NONE
-    m.step(mission_failure=True)
+    m.step(flight_time_limit_exceeded=True)
     assert m.texts[-1] == "Failsafe activated: entering Hold for 3 seconds"
     m.step(3500 * MS)
-    assert m.action() is FailsafeAction.RETURN
+    assert m.action() is FailsafeAction.RTL
 
 
 def test_the_battery_acts_only_when_worse_than_at_arming() -> None:
@@ -233,7 +239,7 @@ def test_attitude_failure(after_s: float, breaker: int, expected: FailsafeAction
 def test_an_orbit_that_a_failsafe_ended_is_not_resumed() -> None:
     m = flying(Mode.ORBIT, com_fail_act_t=0.0)
     m.step(flight_time_limit_exceeded=True)
-    assert m.action() is FailsafeAction.RETURN
+    assert m.action() is FailsafeAction.RTL
     m.step(flight_time_limit_exceeded=False)
     assert (m.action(), m.mode) == (FailsafeAction.NONE, Mode.HOLD)
 
@@ -241,7 +247,7 @@ def test_an_orbit_that_a_failsafe_ended_is_not_resumed() -> None:
 def test_offboard_lost_and_regained() -> None:
     m = flying(Mode.OFFBOARD, com_obl_rc_act=3)
     m.step(offboard_control_signal_lost=True)
-    assert (m.action(), m.last.mode, m.mode) == (FailsafeAction.RETURN, Mode.RETURN, Mode.OFFBOARD)
+    assert (m.action(), m.last.mode, m.mode) == (FailsafeAction.RTL, Mode.RETURN, Mode.OFFBOARD)
     assert m.texts == ["Failsafe activated"], "no wait in Hold for a mode that cannot fly on"
     m.step(offboard_control_signal_lost=False)
     assert (m.action(), m.last.mode) == (FailsafeAction.NONE, Mode.OFFBOARD)
@@ -321,14 +327,14 @@ def test_the_chain_of_fallbacks() -> None:
         conditions = FINE._replace(**lost)
         ends.append(
             (
-                possible(FailsafeAction.FALLBACK_POSITION, conditions),
+                possible(FailsafeAction.FALLBACK_POSCTRL, conditions),
                 possible(FailsafeAction.HOLD, conditions),
             )
         )
     assert ends == [
-        (FailsafeAction.FALLBACK_POSITION, FailsafeAction.LAND),
-        (FailsafeAction.FALLBACK_POSITION, FailsafeAction.LAND),
-        (FailsafeAction.FALLBACK_ALTITUDE, FailsafeAction.DESCEND),
+        (FailsafeAction.FALLBACK_POSCTRL, FailsafeAction.LAND),
+        (FailsafeAction.FALLBACK_POSCTRL, FailsafeAction.LAND),
+        (FailsafeAction.FALLBACK_ALTCTRL, FailsafeAction.DESCEND),
         (FailsafeAction.FALLBACK_STABILIZED, FailsafeAction.DESCEND),
         (FailsafeAction.TERMINATE, FailsafeAction.TERMINATE),
     ]
@@ -348,7 +354,7 @@ class Known(NamedTuple):
 _LINK = [
     FailsafeAction.NONE,
     FailsafeAction.HOLD,
-    FailsafeAction.RETURN,
+    FailsafeAction.RTL,
     FailsafeAction.LAND,
     None,
     FailsafeAction.TERMINATE,
@@ -358,7 +364,7 @@ _LIMIT = [
     FailsafeAction.NONE,
     FailsafeAction.WARN,
     FailsafeAction.HOLD,
-    FailsafeAction.RETURN,
+    FailsafeAction.RTL,
     FailsafeAction.TERMINATE,
     FailsafeAction.LAND,
 ]
@@ -385,7 +391,7 @@ def _low_battery(k: Known) -> FailsafeAction:
     if k.p.com_low_bat_act == 2:
         return FailsafeAction.LAND
     empty = k.c.battery_warning is BatteryWarning.EMERGENCY
-    return FailsafeAction.LAND if empty and k.p.com_low_bat_act == 3 else FailsafeAction.RETURN
+    return FailsafeAction.LAND if empty and k.p.com_low_bat_act == 3 else FailsafeAction.RTL
 
 
 def _unflyable(k: Known) -> FailsafeAction:
@@ -393,10 +399,10 @@ def _unflyable(k: Known) -> FailsafeAction:
     mode, action = k.mode, FailsafeAction.NONE
     if mode is Mode.OFFBOARD and k.c.offboard_control_signal_lost:
         losses = [
-            (FailsafeAction.FALLBACK_POSITION, Mode.POSITION),
-            (FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+            (FailsafeAction.FALLBACK_POSCTRL, Mode.POSITION),
+            (FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE),
             (FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
-            (FailsafeAction.RETURN, Mode.RETURN),
+            (FailsafeAction.RTL, Mode.RETURN),
             (FailsafeAction.LAND, Mode.LAND),
             (FailsafeAction.HOLD, Mode.HOLD),
             (FailsafeAction.TERMINATE, Mode.TERMINATION),
@@ -406,7 +412,7 @@ def _unflyable(k: Known) -> FailsafeAction:
         action, mode = losses[k.p.com_obl_rc_act]
     steps = {
         0: [
-            (Mode.POSITION, FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+            (Mode.POSITION, FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE),
             (Mode.ALTITUDE, FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
         ],
         1: [
@@ -418,7 +424,7 @@ def _unflyable(k: Known) -> FailsafeAction:
         for at, then, into in steps:
             if mode is at and not _flies(at, k.c):
                 action, mode = then, into
-    return action if _flies(mode, k.c) else FailsafeAction.RETURN
+    return action if _flies(mode, k.c) else FailsafeAction.RTL
 
 
 def _flies(mode: Mode, c: Conditions) -> bool:
@@ -458,25 +464,10 @@ RULES: list[Callable[[Known], FailsafeAction]] = [
         if k.c.gcs_connection_lost and k.mode not in (Mode.LAND, Mode.PRECISION_LAND)
         else FailsafeAction.NONE
     ),
-    lambda k: (
-        FailsafeAction.RETURN
-        if k.mode is Mode.MISSION and k.c.mission_failure
-        else FailsafeAction.NONE
-    ),
-    lambda k: (
-        _pick(list(_LIMIT), k.p.com_wind_max_act, FailsafeAction.WARN)
-        if k.c.wind_limit_exceeded
-        else FailsafeAction.NONE
-    ),
-    lambda k: FailsafeAction.RETURN if k.c.flight_time_limit_exceeded else FailsafeAction.NONE,
+    lambda k: FailsafeAction.RTL if k.c.flight_time_limit_exceeded else FailsafeAction.NONE,
     lambda k: (
         _pick(list(_LIMIT), k.p.com_pos_low_act, FailsafeAction.WARN)
         if k.c.local_position_accuracy_low and k.mode in (Mode.HOLD, Mode.MISSION)
-        else FailsafeAction.NONE
-    ),
-    lambda k: (
-        (FailsafeAction.LAND if k.mode in (Mode.TAKEOFF, Mode.RETURN) else FailsafeAction.HOLD)
-        if k.c.navigator_failure
         else FailsafeAction.NONE
     ),
     lambda k: (
@@ -485,13 +476,12 @@ RULES: list[Callable[[Known], FailsafeAction]] = [
         else FailsafeAction.NONE
     ),
     lambda k: (
-        {1: FailsafeAction.WARN, 3: FailsafeAction.RETURN}.get(
+        {1: FailsafeAction.WARN, 3: FailsafeAction.RTL}.get(
             k.p.com_fltt_low_act, FailsafeAction.NONE
         )
         if k.c.battery_low_remaining_time
         else FailsafeAction.NONE
     ),
-    lambda k: FailsafeAction.WARN if k.c.battery_unhealthy else FailsafeAction.NONE,
     _low_battery,
     lambda k: (
         (FailsafeAction.WARN if k.p.cbrk_flightterm == 121212 else FailsafeAction.TERMINATE)
@@ -499,17 +489,10 @@ RULES: list[Callable[[Known], FailsafeAction]] = [
         else FailsafeAction.NONE
     ),
     lambda k: (
-        {0: FailsafeAction.WARN, 1: FailsafeAction.RETURN, 2: FailsafeAction.LAND}.get(
-            k.p.com_imb_prop_act, FailsafeAction.NONE
-        )
-        if k.c.fd_imbalanced_prop
-        else FailsafeAction.NONE
-    ),
-    lambda k: (
         {
             1: FailsafeAction.HOLD,
             2: FailsafeAction.LAND,
-            3: FailsafeAction.RETURN,
+            3: FailsafeAction.RTL,
             4: FailsafeAction.TERMINATE,
         }.get(k.p.com_act_fail_act, FailsafeAction.WARN)
         if k.c.fd_motor_failure
@@ -519,11 +502,11 @@ RULES: list[Callable[[Known], FailsafeAction]] = [
 ]
 
 _CHAIN = [
-    (FailsafeAction.FALLBACK_POSITION, Mode.POSITION),
-    (FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+    (FailsafeAction.FALLBACK_POSCTRL, Mode.POSITION),
+    (FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE),
     (FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
     (FailsafeAction.HOLD, Mode.HOLD),
-    (FailsafeAction.RETURN, Mode.RETURN),
+    (FailsafeAction.RTL, Mode.RETURN),
     (FailsafeAction.LAND, Mode.LAND),
     (FailsafeAction.DESCEND, Mode.DESCEND),
 ]
@@ -536,13 +519,9 @@ def second_opinion(k: Known) -> FailsafeAction:
         worst = next(
             (a for a, mode in _CHAIN if a >= worst and _flies(mode, k.c)), FailsafeAction.TERMINATE
         )
-    if (
-        k.mode in (Mode.LAND, Mode.RETURN)
-        and worst is FailsafeAction.RETURN
-        and _flies(k.mode, k.c)
-    ):
+    if k.mode in (Mode.LAND, Mode.RETURN) and worst is FailsafeAction.RTL and _flies(k.mode, k.c):
         return FailsafeAction.WARN
-    needless = worst in (FailsafeAction.RETURN, FailsafeAction.LAND)
+    needless = worst in (FailsafeAction.RTL, FailsafeAction.LAND)
     if k.mode is Mode.PRECISION_LAND and needless and _flies(k.mode, k.c):
         return FailsafeAction.WARN
     return worst
@@ -562,14 +541,12 @@ OPTIONS = st.builds(
     FailsafeSettings,
     com_act_fail_act=st.integers(0, 4),
     com_fltt_low_act=st.integers(0, 3),
-    com_imb_prop_act=st.integers(-1, 2),
     com_low_bat_act=st.integers(0, 3),
     com_obl_rc_act=st.integers(0, 7),
     com_pos_low_act=st.integers(0, 5),
     com_posctl_navl=st.integers(0, 1),
     com_rc_in_mode=st.integers(0, 4),
     com_rcl_except=st.integers(0, 7),
-    com_wind_max_act=st.integers(0, 5),
     cbrk_flightterm=st.sampled_from([0, 121212]),
     gf_action=st.integers(0, 5),
     nav_dll_act=st.sampled_from([0, 1, 2, 3, 5, 6]),

@@ -11,12 +11,11 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
-from airl_mav.addons.fault_matrix.matrix import fly_fault
+from airl_mav.addons.fault_matrix.matrix import FITTED_CASES, Case, fly_fault
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import HOME, Vector
-from airl_mav.faults.kinds import FITTED_CASES, Case
 from airl_mav.profiles.vehicle import OpticalFlow as Profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from airl_mav.addons.fault_matrix.matrix import fly_fault
+from airl_mav.addons.fault_matrix.matrix import FITTED_CASES, STANDS, Case, fly_fault
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import HOME
-from airl_mav.faults.kinds import FITTED_CASES, STANDS, Case
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from firmware_sim.addons.auxiliary_estimation.range_finder import RangeFinder
 from firmware_sim.addons.auxiliary_estimation.sensors import distance_sensor
+from firmware_sim.addons.flight_log import topics
 from firmware_sim.autopilot.autopilot_state import Clearance, Result
 from firmware_sim.autopilot.error_state import V
 from firmware_sim.autopilot.flight_modes import Mode
@@ -31,7 +31,6 @@ from firmware_sim.autopilot.modes.sticks import Piloting, TerrainHold
 from firmware_sim.engine.record import LANDING, new_controller
 from firmware_sim.engine.ticks import detect_record
 from firmware_sim.external import hil_messages as hil
-from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import DOWNWARD, DistanceReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.mavlink.streams import sensors, status

@@ -31,7 +31,7 @@ from airl_mav.experiments import campaign, gym_flier
 from airl_mav.experiments.campaign import EpisodeSaver
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.policy.card import load_card
-from airl_mav.policy.observation_spec import Encoded
+from airl_mav.policy.layouts import Encoded
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profiles_dir
 from airl_mav.rehearsal import run_folder

@@ -15,8 +15,14 @@ from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.link import Link
 from firmware_sim.mavlink.px4_links import LinkConfig
-from firmware_sim.mavlink.services import commands, handle
-from firmware_sim.mavlink.services.context import Context, VehicleCommand, for_vehicle, sender
+from firmware_sim.mavlink.services import (
+    Context,
+    VehicleCommand,
+    for_vehicle,
+    handle,
+    sender,
+    table,
+)
 from firmware_sim.mavlink.streams import BUILDERS, Builder, status
 from firmware_sim.mavlink.telemetry import PARTS, TickContext, flown_of
 from firmware_sim.mavlink.texts_and_events import EventBuffer, TextEncoder
@@ -165,7 +171,7 @@ class Manners:
             dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
         ):
             a, b, c, d, e, f, g = params
-            result = commands.ACTIONS[number](
+            result = table("ACTIONS")[number](
                 VehicleCommand(number, (a, b, c, d, e, f, g)), context
             )
             assert result is not None

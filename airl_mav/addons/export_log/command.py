@@ -22,7 +22,7 @@ from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.run_arenas import trust_arenas
 from airl_mav.scenario.aircraft import GREATEST_PORT
-from firmware_sim.flight_log.flight_log import ULOG_SUFFIX
+from firmware_sim.interfaces import ULOG_SUFFIX
 
 Format = Literal["mcap", "ulog"]
 

@@ -8,9 +8,11 @@ import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -21,7 +23,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json, write_json
 from airl_mav.core.frames import local_to_geodetic
 from airl_mav.faults.fault import Fault
-from airl_mav.faults.kinds import CASE_OF, MATRIX_PHASES, Case, End, Phase
+from airl_mav.faults.kinds import Phase
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.addons.missions.items import NavCommand, PlanFrame
@@ -31,6 +33,90 @@ from firmware_sim.autopilot.commander import FlightPhase as Commander
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem
 from firmware_sim.simulation import TOUCHDOWN_M_S, EpisodeSetup, Simulation, builtin_autopilot
+
+End = Literal["not armed", "landed", "crashed", "flying", "flown away", "broken"]
+"""Result of a flight.
+
+not armed: arming was rejected; landed: on the ground, motors off, touchdown below the maximum
+landing speed; crashed: faster, or upside down; flying: still in the air at the end; flown away:
+further from home, or higher, than the bound; broken: NaN or infinity, or an exception.
+"""
+
+MATRIX_PHASES: tuple[Phase, ...] = (*("ground", "climb", "hold", "offboard", "mission", "landing"),)
+
+SAFE: frozenset[End] = frozenset({"landed"})
+
+FALLS: frozenset[End] = frozenset({"landed", "crashed"})
+"""Results without control: the vehicle falls, within the bounds."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """Fault of the matrix."""
+
+    fault: str
+    """Fault specification as text, without a time."""
+    ends: frozenset[End] = SAFE
+    """Allowed results if the fault began in the air."""
+    on_ground: frozenset[End] = frozenset({"not armed", "landed"})
+    """Allowed results if the fault began on the ground."""
+
+    def allowed(self, phase: Phase) -> frozenset[End]:
+        """Return the allowed results for a phase."""
+        return self.on_ground | self.ends if phase == "ground" else self.ends
+
+
+CASES: tuple[Case, ...] = (
+    Case("accel off", FALLS),
+    Case("accel noise 10x"),
+    Case("accel bias 0.5,0.5,0.5m/s2"),
+    Case("gyro off", FALLS),
+    Case("gyro noise 10x"),
+    Case("gyro bias 2,2,2deg/s"),
+    Case("gyro delay 8ms"),
+    Case("mag off"),
+    Case("mag stuck"),
+    Case("mag bias 0.1,0.1,0gauss"),
+    Case("baro off"),
+    Case("baro stuck"),
+    Case("baro noise 10x"),
+    Case("baro bias 0.5hPa"),
+    Case("gps off"),
+    Case("gps off for 2s"),
+    Case("gps stuck"),
+    Case("gps noise 5x"),
+    Case("gps bias 20,0,0m"),
+    Case("gps drift 0.5,0,0m/s"),
+    Case("gps delay 200ms"),
+    Case("gps delay 1s", FALLS),
+    Case("motor1 off", FALLS),
+    Case("motor2 weak 75%"),
+    Case("motor2 mismatch 20%"),
+    Case("motor2 slow 4x"),
+    Case("battery drop 60%"),
+    Case("battery drop 92%"),
+    Case("battery sag 0.3V"),
+    Case("wind gust 6,0,0m/s for 4s"),
+    Case("wind step 5,0,0m/s"),
+)
+"""Faults that PX4 is expected to survive, and faults that no quadrotor survives. Covers the flight
+controller alone: camera and link faults belong to the companion."""
+
+STANDS: frozenset[End] = frozenset({"landed", "flying"})
+"""Results without a landing detection: safe, but the motors may keep running."""
+
+FITTED_CASES: tuple[Case, ...] = (
+    Case("rangefinder off"),
+    Case("rangefinder stuck", STANDS, frozenset({"not armed", "landed", "flying"})),
+    Case("rangefinder noise 5x"),
+    Case("rangefinder bias 0.5m"),
+    Case("flow off"),
+    Case("flow stuck"),
+    Case("flow noise 5x"),
+)
+"""Faults of optional sensors, flown only on request."""
+
+CASE_OF: Mapping[str, Case] = {case.fault: case for case in (*CASES, *FITTED_CASES)}
 
 AFTER_S = 0.5
 """Time from the start of the phase to the fault [s]."""
@@ -84,71 +170,65 @@ def fly_fault(vehicle: VehicleProfile, fault: str, phase: Phase, seed: int) -> F
         simulation.close()
 
 
+@dataclass
 class _Flight:
     """Simulated pilot of one flight."""
 
-    def __init__(
-        self,
-        simulation: Simulation,
-        autopilot: BuiltinAutopilot,
-        fault: str,
-        phase: Phase,
-        seed: int,
-    ) -> None:
-        self._simulation, self._autopilot = simulation, autopilot
-        self._told = fault, phase, seed
-        self._said: list[str] = []
-        self._streams = False
-        self._farthest_m = 0.0
-        self._touchdowns: list[float] = []
-        self._ticks = 0
-        self._autopilot.on_message = lambda message: self._hear(message.text)
+    simulation: Simulation
+    autopilot: BuiltinAutopilot
+    fault: str
+    phase: Phase
+    seed: int
+    texts: list[str] = field(default_factory=list)
+    """Texts for the operator after the start of the fault."""
+    streams: bool = False
+    """True while the pilot sends offboard setpoints."""
+    farthest_m: float = 0.0
+    touchdowns: list[float] = field(default_factory=list)
+    ticks: int = 0
+
+    def __post_init__(self) -> None:
+        """Listen to the autopilot's texts."""
+        self.autopilot.on_message = lambda message: self._hear(message.text)
 
     def _hear(self, text: str) -> None:
-        faults = self._simulation.faults
-        if faults is not None and faults.acted(self._simulation.time_us):
-            self._said.append(text)
+        faults = self.simulation.faults
+        if faults is not None and faults.acted(self.simulation.time_us):
+            self.texts.append(text)
 
     def fly(self) -> FaultFlight:
-        simulation = self._simulation
+        simulation = self.simulation
         pilot, end = self._pilot(), None
         while end is None and simulation.time_us < LONGEST_S * US_PER_S:
             try:
                 end = next(pilot, None) or self._tick()
             except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as error:
-                self._said.append(f"{type(error).__name__}: {error}")
+                self.texts.append(f"{type(error).__name__}: {error}")
                 end = "broken"
-        fault, phase, seed = self._told
-        return FaultFlight(
-            fault,
-            phase,
-            seed,
-            end or "flying",
-            max(self._touchdowns, default=None),
-            round(self._farthest_m, 3),
-            self._autopilot.flight.mode.name,
-            tuple(dict.fromkeys(self._said)),
-        )
+        touchdown_m_s, farthest_m = max(self.touchdowns, default=None), round(self.farthest_m, 3)
+        mode, texts = self.autopilot.flight.mode.name, tuple(dict.fromkeys(self.texts))
+        result = end or "flying", touchdown_m_s, farthest_m, mode, texts
+        return FaultFlight(self.fault, self.phase, self.seed, *result)
 
     def _tick(self) -> End | None:
         """Fly a tick; return the end if the flight is over, otherwise None."""
-        simulation, flight = self._simulation, self._autopilot.flight
-        if self._streams and simulation.time_us % _REPEAT_US < TICK_US:
+        simulation, flight = self.simulation, self.autopilot.flight
+        if self.streams and simulation.time_us % _REPEAT_US < TICK_US:
             self._offer()
         flown = flight.phase is Commander.AIR
         simulation.tick()
-        self._ticks += 1
-        if self._ticks % _LOOK_TICKS == 0 and not (
+        self.ticks += 1
+        if self.ticks % _LOOK_TICKS == 0 and not (
             np.isfinite(simulation.plant.motion).all()
-            and np.isfinite(self._autopilot.estimator.state).all()
+            and np.isfinite(self.autopilot.estimator.state).all()
         ):
             return "broken"
         distance_m = math.dist((0.0, 0.0, 0.0), simulation.plant.position)
-        self._farthest_m = max(self._farthest_m, distance_m)
+        self.farthest_m = max(self.farthest_m, distance_m)
         if distance_m > FENCE_M:
             return "flown away"
         for hit in simulation.plant.collisions:  # collisions of this tick only: nothing is recorded
-            self._touchdowns.append(hit.speed_m_s)
+            self.touchdowns.append(hit.speed_m_s)
             if hit.speed_m_s >= TOUCHDOWN_M_S and flown:
                 return "crashed"
         return None
@@ -157,11 +237,11 @@ class _Flight:
         """Send an offboard setpoint to the north."""
         north = np.array([2.0, 0.0, 0.0])
         setpoint = Setpoint(np.full(3, math.nan), north, 0.0, math.nan)
-        self._autopilot.offer_setpoint(setpoint, self._simulation.time_us)
+        self.autopilot.offer_setpoint(setpoint, self.simulation.time_us)
 
     def _waypoint(self) -> PlanItem:
         """Return a mission item north of any position that is reached."""
-        origin = self._autopilot.estimator.origin
+        origin = self.autopilot.estimator.origin
         if origin is None:
             raise ValueError("a mission without a position")
         place = local_to_geodetic(np.array([FENCE_M, 0.0, 0.0]), origin)
@@ -176,9 +256,9 @@ class _Flight:
 
     def _pilot(self) -> Iterator[End | None]:
         """Act as the pilot, one tick per step; yield the end when it is known."""
-        autopilot = self._autopilot
+        autopilot = self.autopilot
         while autopilot.flight.phase is Commander.BOOT:
-            if self._simulation.time_us > 20 * US_PER_S:
+            if self.simulation.time_us > 20 * US_PER_S:
                 yield "not armed"
             yield None
         yield from self._wait(2.0)
@@ -191,17 +271,17 @@ class _Flight:
         autopilot.takeoff(ALTITUDE_M)
         yield from self._fly_as(Mode.TAKEOFF, 30.0, until=Mode.HOLD)
         yield from self._fly_as(Mode.HOLD, 2.0)
-        north = Mode.MISSION if self._told[1] == "mission" else Mode.OFFBOARD
+        north = Mode.MISSION if self.phase == "mission" else Mode.OFFBOARD
         if autopilot.flight.mode is Mode.HOLD:
             if north is Mode.MISSION:
                 autopilot.plans.store(MissionType.MISSION, (self._waypoint(),), 1, 0)
             else:
-                self._streams = True
+                self.streams = True
                 self._offer()
                 yield None
             autopilot.set_mode(north)
         yield from self._fly_as(north, 3.0)
-        self._streams = False
+        self.streams = False
         if autopilot.flight.mode is north:
             autopilot.set_mode(Mode.LAND)
         else:
@@ -213,9 +293,9 @@ class _Flight:
         self, mode: Mode, limit_s: float, until: Mode | None = None
     ) -> Iterator[End | None]:
         """Wait while a mode is active, at most `limit_s` [s]."""
-        end_us = self._simulation.time_us + limit_s * US_PER_S
-        flight = self._autopilot
-        while flight.flight.mode is mode and self._simulation.time_us < end_us:
+        end_us = self.simulation.time_us + limit_s * US_PER_S
+        flight = self.autopilot
+        while flight.flight.mode is mode and self.simulation.time_us < end_us:
             if flight.flight.phase < Commander.GROUND:
                 yield "landed"
             yield None
@@ -224,10 +304,10 @@ class _Flight:
 
     def _until_down(self, limit_s: float) -> Iterator[End | None]:
         """Wait until the motors are off, at most `limit_s` [s]."""
-        end_us = self._simulation.time_us + limit_s * US_PER_S
-        while self._simulation.time_us < end_us:
-            if self._autopilot.flight.phase < Commander.GROUND:
-                yield "landed" if self._simulation.plant.position[2] > -0.5 else "crashed"
+        end_us = self.simulation.time_us + limit_s * US_PER_S
+        while self.simulation.time_us < end_us:
+            if self.autopilot.flight.phase < Commander.GROUND:
+                yield "landed" if self.simulation.plant.position[2] > -0.5 else "crashed"
             yield None
 
     def _wait(self, seconds: float) -> Iterator[None]:
@@ -285,40 +365,22 @@ def fly_matrix(
         if [flight.seed for flight in cell.flights] == list(seeds)
     }
     jobs = [(fault, phase) for fault in faults for phase in phases]
+    missing = [job for job in jobs if job not in kept]
+    fly = partial(_fly_cell, vehicle, tuple(seeds))
     cells: list[MatrixCell] = []
-    for cell in _flown_cells(vehicle, jobs, tuple(seeds), kept, workers):
-        cells.append(cell)
-        flown(cell)
+    # Spawned processes: pybullet and compiled kernels do not survive a fork beside threads.
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, mp_context=context) if workers > 1 else None
+    with pool or nullcontext():
+        new = iter(map(fly, missing) if pool is None else pool.map(fly, missing))
+        for job in jobs:
+            cells.append(kept.get(job) or next(new))
+            flown(cells[-1])
     return cells
 
 
-def _flown_cells(
-    vehicle: VehicleProfile,
-    jobs: Sequence[tuple[str, Phase]],
-    seeds: Sequence[int],
-    kept: Mapping[tuple[str, Phase], MatrixCell],
-    workers: int,
-) -> Iterator[MatrixCell]:
-    """Yield the cells of the jobs, in the order of the jobs."""
-    if workers == 1:
-        for job in jobs:
-            yield kept.get(job) or _fly_cell(vehicle, *job, seeds)
-        return
-    # Spawned processes: pybullet and compiled kernels do not survive a fork beside threads.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        waiting = {
-            job: pool.submit(_fly_cell, vehicle, *job, seeds) for job in jobs if job not in kept
-        }
-        for job in jobs:
-            yield kept.get(job) or waiting[job].result()
-
-
-def _fly_cell(
-    vehicle: VehicleProfile, fault: str, phase: Phase, seeds: Sequence[int]
-) -> MatrixCell:
-    flights = tuple(fly_fault(vehicle, fault, phase, seed) for seed in seeds)
-    return MatrixCell(fault, phase, flights)
+def _fly_cell(vehicle: VehicleProfile, seeds: Sequence[int], job: tuple[str, Phase]) -> MatrixCell:
+    return MatrixCell(*job, tuple(fly_fault(vehicle, *job, seed) for seed in seeds))
 
 
 def markdown(cells: Sequence[MatrixCell]) -> str:

@@ -25,8 +25,7 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.actions import commands, discrete_actions
-from airl_mav.policy.layouts import newest_frame
-from airl_mav.policy.observation_spec import Encoded
+from airl_mav.policy.layouts import Encoded, newest_frame
 from airl_mav.rehearsal.live_view import ViewEnds
 from airl_mav.training.training_folder import Evaluation, TrainingProgress
 

@@ -40,44 +40,30 @@ _MODE_LOCATION = 3
 """MAV_ROI_LOCATION."""
 
 
-class _Look(Enum):
-    NOWHERE = auto()
-    PLACE = auto()
-    WAYPOINT = auto()
-
-
 class VehicleRoi:
-    """Region of interest."""
+    """Region of interest: a place, or the next waypoint with an offset of the heading."""
 
     def __init__(self) -> None:
-        self._look = _Look.NOWHERE
-        self._place = Geodetic(0.0, 0.0, 0.0)
-        self._offset = 0.0
+        self._at: Geodetic | float | None = None
+        """Place, or offset from the direction of the waypoint [rad]; None = nowhere."""
 
-    def reset(self) -> None:
-        """Clear the region of interest."""
-        self._look = _Look.NOWHERE
-
-    def look_at(self, place: Geodetic) -> None:
-        """Set the region of interest to a place (MAV_CMD_DO_SET_ROI_LOCATION)."""
-        self._look, self._place = _Look.PLACE, place
+    def look_at(self, place: Geodetic | None) -> None:
+        """Set the region of interest to a place (MAV_CMD_DO_SET_ROI_LOCATION); None = clear it."""
+        self._at = place
 
     def command(self, item: PlanItem) -> None:
         """Execute a mission item about the region of interest; others are ignored."""
+        place = Geodetic(item.x, item.y, item.z)
         if item.command == NavCommand.DO_SET_ROI_NONE:
-            self.reset()
+            self._at = None
         elif item.command == NavCommand.DO_SET_ROI_LOCATION:
-            self.look_at(Geodetic(item.x, item.y, item.z))
+            self._at = place
         elif item.command == NavCommand.DO_SET_ROI_WPNEXT_OFFSET:
             offset = math.radians(item.z)
-            self._look = _Look.WAYPOINT
-            self._offset = offset if math.isfinite(offset) else 0.0
+            self._at = offset if math.isfinite(offset) else 0.0
         elif item.command == NavCommand.DO_SET_ROI:
             located = item.frame != PlanFrame.MISSION and item.params[0] == _MODE_LOCATION
-            if located:
-                self.look_at(Geodetic(item.x, item.y, item.z))
-            else:
-                self.reset()
+            self._at = place if located else None
 
     def heading(
         self, position: Vec, target: Vec, local: Callable[[Geodetic], Vec], nearest_m: float
@@ -86,13 +72,16 @@ class VehicleRoi:
 
         `position` and the destination `target` are local NED [m]; `local` converts a place to it.
         """
-        if self._look is _Look.NOWHERE:
+        if self._at is None:
             return None
-        at = local(self._place) if self._look is _Look.PLACE else target
-        north, east = at[0] - position[0], at[1] - position[1]
+        offset, there = 0.0, target
+        if isinstance(self._at, Geodetic):
+            there = local(self._at)
+        else:
+            offset = self._at
+        north, east = there[0] - position[0], there[1] - position[1]
         if math.hypot(north, east) <= nearest_m:
             return None
-        offset = self._offset if self._look is _Look.WAYPOINT else 0.0
         return wrap_pi(math.atan2(east, north) + offset)
 
 
@@ -171,7 +160,7 @@ class MissionExecutor:
         self._disarmed_meanwhile = False
         self._activated_at = 0
         self._speed_to_restore = NAN
-        self._seen = (0, 0)
+        self._versions = (0, 0)
         self._home_altitude_m = NAN
         self._checked_for: object = None
 
@@ -181,13 +170,13 @@ class MissionExecutor:
         """Track changes of the plans while another mode flies."""
         if not armed:
             self._disarmed_meanwhile = True
-        self._look()
+        self._is_changed()
         self.review(situation)
 
     def activate(self, situation: NavigationState) -> None:
         """Start Mission mode."""
         plans = self._plans
-        self._look()
+        self._is_changed()
         self._validate(situation)
         over = len(plans.mission) > 0 and plans.current + 1 == len(plans.mission)
         if self._disarmed_meanwhile and self._began_before and over:
@@ -211,7 +200,7 @@ class MissionExecutor:
 
     def update(self, situation: NavigationState) -> None:
         """Advance the mission; call at 20 Hz in Mission mode."""
-        if self._look():
+        if self._is_changed():
             self.review(situation)
             self.triplet = STANDING
             self._begin(situation.landed)
@@ -225,20 +214,20 @@ class MissionExecutor:
             self._arrival.restart()
             if self._flown.autocontinue:
                 self._advance(situation)
-        self._look_at_roi(situation)
+        self._turn_to_roi(situation)
 
     # --- the mission as a whole
 
-    def _look(self) -> bool:
+    def _is_changed(self) -> bool:
         """Return whether a client has changed the mission or its current item."""
         plans = self._plans
         mission = plans.stored(MissionType.MISSION)
-        seen = (mission.revision, plans.set_current_count)
-        if seen == self._seen:
+        versions = (mission.revision, plans.set_current_count)
+        if versions == self._versions:
             return False
-        if mission.revision != self._seen[0]:
+        if mission.revision != self._versions[0]:
             self._began_before = False
-        self._seen = seen
+        self._versions = versions
         return True
 
     def review(self, situation: NavigationState) -> None:
@@ -261,15 +250,15 @@ class MissionExecutor:
 
     def _begin(self, landed: bool) -> None:
         """Start, or report the reason against it."""
-        self.roi.reset()
+        self.roi.look_at(None)
         self.finished = False
         if not self.valid:
             self._running = False
             refused = MISSION_REFUSED if landed else MISSION_LOITER
-            self._say(Severity.CRITICAL, refused.message, refused.event())
+            self._announce(Severity.CRITICAL, refused.message, refused.event())
             return
         if not self._running:
-            self._say(Severity.INFO, "Executing Mission", MISSION_EXECUTE.event())
+            self._announce(Severity.INFO, "Executing Mission", MISSION_EXECUTE.event())
         self._running = True
         self._work = _Work.ITEM
         self._plans.reached = -1
@@ -299,7 +288,7 @@ class MissionExecutor:
             if following is None:
                 landed = situation.landed
                 end = MISSION_FINISHED if landed else MISSION_FINISHED_LOITER
-                self._say(Severity.INFO, end.message, end.event())
+                self._announce(Severity.INFO, end.message, end.event())
                 if self._plans.current + 1 == len(self._plans.mission):
                     self._plans.jumps_done.clear()
                 self._end(situation)
@@ -364,7 +353,7 @@ class MissionExecutor:
         if not math.isnan(self._climb_down) and self._work is _Work.ITEM:
             above_m = -(self._climb_down - situation.local(situation.home)[2])
             text = f"Climb to {above_m:.1f} meters above home"
-            self._say(Severity.INFO, text, MISSION_CLIMB.event(above_m))
+            self._announce(Severity.INFO, text, MISSION_CLIMB.event(above_m))
             then = flown.place
             flown.command = _N.TAKEOFF if situation.landed else _N.LOITER_TO_ALT
             flown.place = north, east, self._climb_down
@@ -447,7 +436,7 @@ class MissionExecutor:
         else:
             self.roi.command(item)
 
-    def _look_at_roi(self, situation: NavigationState) -> None:
+    def _turn_to_roi(self, situation: NavigationState) -> None:
         """Point the nose to the region of interest, unless the mount does (MIS_MNT_YAW_CTL)."""
         turns = self.triplet.kind in (TripletKind.POSITION, TripletKind.LOITER)
         if not turns or self._value("MIS_MNT_YAW_CTL") > 0.0:
@@ -459,7 +448,7 @@ class MissionExecutor:
             self._flown.yaw = yaw
             self.triplet = self.triplet._replace(yaw=yaw)
 
-    def _say(self, severity: Severity, text: str, event: MavlinkEvent) -> None:
+    def _announce(self, severity: Severity, text: str, event: MavlinkEvent) -> None:
         self._crew.say(OperatorText(severity, text, event))
 
 

@@ -1,7 +1,8 @@
 """Table of failsafes: condition, parameter, action. One row per failsafe, pure.
 
 Source: PX4 1.16, commander/failsafe/failsafe.cpp (checkStateAndMode and its callees). Not
-applicable to this vehicle and omitted: VTOL transitions, ESC arming failure.
+applicable to this vehicle and omitted: VTOL transitions, ESC arming failure, imbalanced propellers,
+wind limits, and failures of battery, mission and navigator.
 """
 
 from __future__ import annotations
@@ -12,13 +13,12 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.events.definition import FailsafeAction, FailsafeCause
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     FLIGHT_TERMINATION_OFF,
     BatteryWarning,
     Clear,
     Conditions,
-    FailsafeAction,
-    FailsafeReason,
     FailsafeSettings,
     Options,
     Takeover,
@@ -27,11 +27,11 @@ from firmware_sim.autopilot.failsafes.failsafe_conditions import (
 from firmware_sim.autopilot.flight_modes import Mode, Need
 
 MODE_OF_ACTION = {
-    FailsafeAction.FALLBACK_POSITION: Mode.POSITION,
-    FailsafeAction.FALLBACK_ALTITUDE: Mode.ALTITUDE,
+    FailsafeAction.FALLBACK_POSCTRL: Mode.POSITION,
+    FailsafeAction.FALLBACK_ALTCTRL: Mode.ALTITUDE,
     FailsafeAction.FALLBACK_STABILIZED: Mode.STABILIZED,
     FailsafeAction.HOLD: Mode.HOLD,
-    FailsafeAction.RETURN: Mode.RETURN,
+    FailsafeAction.RTL: Mode.RETURN,
     FailsafeAction.LAND: Mode.LAND,
     FailsafeAction.DESCEND: Mode.DESCEND,
     FailsafeAction.TERMINATE: Mode.TERMINATION,
@@ -39,17 +39,17 @@ MODE_OF_ACTION = {
 """Mode of each action; other actions keep the intended mode. In ascending order: if a mode cannot
 run, the next action replaces it."""
 
-OFFBOARD_LOSS: dict[int, tuple[FailsafeAction, Mode | None]] = {
-    0: (FailsafeAction.FALLBACK_POSITION, Mode.POSITION),
-    1: (FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE),
-    2: (FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
-    3: (FailsafeAction.RETURN, Mode.RETURN),
-    4: (FailsafeAction.LAND, Mode.LAND),
-    5: (FailsafeAction.HOLD, Mode.HOLD),
-    6: (FailsafeAction.TERMINATE, Mode.TERMINATION),
-    7: (FailsafeAction.DISARM, None),
+OFFBOARD_LOSS = {
+    0: FailsafeAction.FALLBACK_POSCTRL,
+    1: FailsafeAction.FALLBACK_ALTCTRL,
+    2: FailsafeAction.FALLBACK_STABILIZED,
+    3: FailsafeAction.RTL,
+    4: FailsafeAction.LAND,
+    5: FailsafeAction.HOLD,
+    6: FailsafeAction.TERMINATE,
+    7: FailsafeAction.DISARM,
 }
-"""COM_OBL_RC_ACT: action, and the mode whose requirements apply from there on."""
+"""Actions of COM_OBL_RC_ACT."""
 
 
 def mode_of(action: FailsafeAction, intended: Mode) -> Mode:
@@ -75,13 +75,14 @@ def mode_fallback(
     action, mode = FailsafeAction.NONE, intended
     # Replacements in sequence: offboard loss first, then modes that cannot run.
     if conditions.offboard_control_signal_lost and mode.spec.needs & Need.OFFBOARD_SIGNAL:
-        action, next_mode = OFFBOARD_LOSS.get(settings.com_obl_rc_act, OFFBOARD_LOSS[0])
-        if next_mode is None:
+        action = OFFBOARD_LOSS.get(settings.com_obl_rc_act, OFFBOARD_LOSS[0])
+        if action is FailsafeAction.DISARM:
             return action
-        mode = next_mode
+        # From here on, the requirements of the action's mode apply.
+        mode = MODE_OF_ACTION[action]
     if settings.com_posctl_navl == 0:
         if mode is Mode.POSITION and not can_run(mode, conditions):
-            action, mode = FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE
+            action, mode = FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE
         # The replacement itself may be impossible: continue to the next one.
         if mode is Mode.ALTITUDE and not can_run(mode, conditions):
             action, mode = FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED
@@ -89,14 +90,14 @@ def mode_fallback(
         action, mode = FailsafeAction.LAND, Mode.LAND
         if not can_run(mode, conditions):
             action, mode = FailsafeAction.DESCEND, Mode.DESCEND
-    return action if can_run(mode, conditions) else FailsafeAction.RETURN
+    return action if can_run(mode, conditions) else FailsafeAction.RTL
 
 
 NOTHING = Options(FailsafeAction.NONE)
 
 
 class Situation(NamedTuple):
-    """Input of a table row."""
+    """Current state of the vehicle: input of the failsafes."""
 
     time_us: int
     conditions: Conditions
@@ -109,6 +110,7 @@ class Situation(NamedTuple):
     manual_control_lost_at_arming: bool = False
     """Manual control was lost at arming and has not returned: it is optional."""
     battery_at_arming: BatteryWarning = BatteryWarning.NONE
+    armed: bool = False
 
 
 class Trigger(Enum):
@@ -116,20 +118,15 @@ class Trigger(Enum):
 
     MANUAL_CONTROL = auto()
     GCS = auto()
-    MISSION = auto()
     MISSION_WITHOUT_LINKS = auto()
-    WIND = auto()
     FLIGHT_TIME = auto()
     POSITION_ACCURACY = auto()
-    NAVIGATOR = auto()
     GEOFENCE = auto()
     REMAINING_TIME = auto()
-    BATTERY_UNHEALTHY = auto()
     BATTERY_LOW = auto()
     BATTERY_CRITICAL = auto()
     BATTERY_EMERGENCY = auto()
     ATTITUDE = auto()
-    PROPELLER = auto()
     MOTOR = auto()
     MODE_FALLBACK = auto()
 
@@ -170,14 +167,14 @@ _EXCEPT_MISSION, _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 1, 2, 4
 """Bits of COM_RCL_EXCEPT."""
 
 _NONE, _WARN, _HOLD = NOTHING, Options(FailsafeAction.WARN), Options(FailsafeAction.HOLD)
-_RETURN = Options(FailsafeAction.RETURN, Clear.ON_MODE_CHANGE)
+_RETURN = Options(FailsafeAction.RTL, Clear.ON_MODE_CHANGE)
 _LAND = Options(FailsafeAction.LAND, Clear.ON_MODE_CHANGE)
 _LASTING_HOLD = Options(FailsafeAction.HOLD, Clear.ON_MODE_CHANGE)
 _TERMINATE = Options(FailsafeAction.TERMINATE, Clear.NEVER, Takeover.NEVER)
 _DISARM = Options(FailsafeAction.DISARM, takeover=Takeover.NEVER)
 
 
-def _caused(answers: Mapping[int, Options], cause: FailsafeReason) -> dict[int, Options]:
+def _caused(answers: Mapping[int, Options], cause: FailsafeCause) -> dict[int, Options]:
     return {value: options._replace(cause=cause) for value, options in answers.items()}
 
 
@@ -187,7 +184,7 @@ _LINK_LOSS = {0: _NONE, 1: _HOLD, 2: _RETURN, 3: _LAND, 5: _TERMINATE, 6: _DISAR
 
 _ESCAPABLE_HOLD = _LASTING_HOLD._replace(takeover=Takeover.MODE_SWITCH)
 _LIMITS = {0: _NONE, 1: _WARN, 2: _ESCAPABLE_HOLD, 3: _RETURN, 4: _TERMINATE, 5: _LAND}
-"""Responses of GF_ACTION and COM_WIND_MAX_ACT."""
+"""Responses of GF_ACTION."""
 
 _POSITION_LOW = {
     value: Options(action, takeover=Takeover.MODE_SWITCH)
@@ -196,7 +193,7 @@ _POSITION_LOW = {
             FailsafeAction.NONE,
             FailsafeAction.WARN,
             FailsafeAction.HOLD,
-            FailsafeAction.RETURN,
+            FailsafeAction.RTL,
             FailsafeAction.TERMINATE,
             FailsafeAction.LAND,
         )
@@ -243,16 +240,10 @@ def _links_lost_after_mission(s: Situation) -> bool:
     )
 
 
-def _in_first(s: Situation, seconds: float) -> bool:
-    return s.armed_us is not None and s.time_us < s.armed_us + seconds * US_PER_S
-
-
-def _spooling(s: Situation) -> bool:
-    return _in_first(s, s.settings.com_spoolup_time)
-
-
 def _taking_off(s: Situation) -> bool:
-    return _in_first(s, s.settings.com_lkdown_tko + s.settings.com_spoolup_time)
+    """Return whether COM_SPOOLUP_TIME + COM_LKDOWN_TKO after arming are not over."""
+    limit_s = s.settings.com_lkdown_tko + s.settings.com_spoolup_time
+    return s.armed_us is not None and s.time_us < s.armed_us + limit_s * US_PER_S
 
 
 def _terminates(s: Situation) -> bool:
@@ -270,7 +261,7 @@ def _battery_row(
     trigger: Trigger,
     level: BatteryWarning,
     title: str,
-    cause: FailsafeReason,
+    cause: FailsafeCause,
     actions: tuple[FailsafeAction, ...],
 ) -> Row:
     threshold = ("", "BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")[level]
@@ -287,7 +278,7 @@ def _battery_row(
     )
 
 
-_W, _R, _L = FailsafeAction.WARN, FailsafeAction.RETURN, FailsafeAction.LAND
+_W, _R, _L = FailsafeAction.WARN, FailsafeAction.RTL, FailsafeAction.LAND
 
 TABLE: tuple[Row, ...] = (
     Row(
@@ -295,7 +286,7 @@ TABLE: tuple[Row, ...] = (
         "Manual control lost",
         "no pilot's input for so long, unless there was none at arming",
         _manual_control,
-        _caused(_LINK_LOSS, FailsafeReason.MANUAL_CONTROL_LOSS),
+        _caused(_LINK_LOSS, FailsafeCause.MANUAL_CONTROL_LOSS),
         "NAV_RCL_ACT",
         related=("COM_RC_LOSS_T", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
     ),
@@ -304,41 +295,24 @@ TABLE: tuple[Row, ...] = (
         "Ground station lost",
         "no ground station's HEARTBEAT for so long; not in Land or Precision Landing",
         lambda s: s.conditions.gcs_connection_lost and s.intended not in _LANDING,
-        _caused(_LINK_LOSS, FailsafeReason.GCS_LOSS),
+        _caused(_LINK_LOSS, FailsafeCause.GCS_CONNECTION_LOSS),
         "NAV_DLL_ACT",
         related=("COM_DL_LOSS_T",),
-    ),
-    Row(
-        Trigger.MISSION,
-        "Mission cannot be completed",
-        "the mission has become infeasible, in Mission",
-        lambda s: s.intended is Mode.MISSION and s.conditions.mission_failure,
-        {0: Options(FailsafeAction.RETURN)},
     ),
     Row(
         Trigger.MISSION_WITHOUT_LINKS,
         "No link after the mission",
         "the mission is finished, the ground station lost and NAV_DLL_ACT 0, manual control unused",
         _links_lost_after_mission,
-        {0: Options(FailsafeAction.RETURN)},
+        {0: Options(FailsafeAction.RTL)},
         related=("NAV_DLL_ACT", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
-    ),
-    Row(
-        Trigger.WIND,
-        "Wind above its limit",
-        "the estimated wind exceeds its limit",
-        lambda s: s.conditions.wind_limit_exceeded,
-        _LIMITS,
-        "COM_WIND_MAX_ACT",
-        Options(FailsafeAction.WARN),
-        related=("COM_WIND_MAX",),
     ),
     Row(
         Trigger.FLIGHT_TIME,
         "Flight time over",
         "so long since take-off",
         lambda s: s.conditions.flight_time_limit_exceeded,
-        {0: Options(FailsafeAction.RETURN)},
+        {0: Options(FailsafeAction.RTL)},
         related=("COM_FLT_TIME_MAX",),
     ),
     Row(
@@ -352,20 +326,6 @@ TABLE: tuple[Row, ...] = (
         "COM_POS_LOW_ACT",
         Options(FailsafeAction.WARN, takeover=Takeover.MODE_SWITCH),
         related=("COM_POS_LOW_EPH",),
-    ),
-    Row(
-        Trigger.NAVIGATOR,
-        "Mode failed in Takeoff or Return",
-        "what the mode flies to cannot be reached",
-        lambda s: s.conditions.navigator_failure and s.intended in (Mode.TAKEOFF, Mode.RETURN),
-        {0: _LAND},
-    ),
-    Row(
-        Trigger.NAVIGATOR,
-        "Mode failed otherwise",
-        "what the mode flies to cannot be reached",
-        lambda s: s.conditions.navigator_failure and s.intended not in (Mode.TAKEOFF, Mode.RETURN),
-        {0: _LASTING_HOLD},
     ),
     Row(
         Trigger.GEOFENCE,
@@ -382,43 +342,29 @@ TABLE: tuple[Row, ...] = (
         "Remaining flight time low",
         "the battery lasts no longer than a return takes",
         lambda s: s.conditions.battery_low_remaining_time,
-        _caused({0: _NONE, 1: _WARN, 3: _RETURN}, FailsafeReason.FLIGHT_TIME_LOW),
+        _caused({0: _NONE, 1: _WARN, 3: _RETURN}, FailsafeCause.LOW_REMAINING_FLIGHT_TIME),
         "COM_FLTT_LOW_ACT",
         related=("BAT1_CAPACITY", "RTL_TIME_FACTOR", "RTL_TIME_MARGIN"),
-    ),
-    Row(
-        Trigger.BATTERY_UNHEALTHY,
-        "Battery unhealthy at arming",
-        "the battery reports nothing, within COM_SPOOLUP_TIME of arming",
-        lambda s: s.conditions.battery_unhealthy and _spooling(s),
-        {0: Options(FailsafeAction.DISARM)},
-    ),
-    Row(
-        Trigger.BATTERY_UNHEALTHY,
-        "Battery unhealthy",
-        "the battery reports nothing for 5 s",
-        lambda s: s.conditions.battery_unhealthy and not _spooling(s),
-        {0: _WARN},
     ),
     _battery_row(
         Trigger.BATTERY_LOW,
         BatteryWarning.LOW,
         "Battery low",
-        FailsafeReason.BATTERY_LOW,
+        FailsafeCause.LOW_BATTERY_LEVEL,
         (_W, _W, _W, _W),
     ),
     _battery_row(
         Trigger.BATTERY_CRITICAL,
         BatteryWarning.CRITICAL,
         "Battery critical",
-        FailsafeReason.BATTERY_CRITICAL,
+        FailsafeCause.CRITICAL_BATTERY_LEVEL,
         (_W, _R, _L, _R),
     ),
     _battery_row(
         Trigger.BATTERY_EMERGENCY,
         BatteryWarning.EMERGENCY,
         "Battery empty",
-        FailsafeReason.BATTERY_EMERGENCY,
+        FailsafeCause.EMERGENCY_BATTERY_LEVEL,
         (_W, _R, _L, _L),
     ),
     Row(
@@ -444,15 +390,6 @@ TABLE: tuple[Row, ...] = (
         lambda s: s.conditions.fd_critical_failure and not _taking_off(s) and not _terminates(s),
         {0: _WARN},
         related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "CBRK_FLIGHTTERM"),
-    ),
-    Row(
-        Trigger.PROPELLER,
-        "Imbalanced propeller",
-        "the vibration exceeds its limit",
-        lambda s: s.conditions.fd_imbalanced_prop,
-        {-1: _NONE, 0: _WARN, 1: _RETURN, 2: _LAND},
-        "COM_IMB_PROP_ACT",
-        related=("FD_IMB_PROP_THR",),
     ),
     Row(
         Trigger.MOTOR,

@@ -19,11 +19,12 @@ from firmware_sim.autopilot.failsafes.watch import Reports
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.guidance import Home
 from firmware_sim.autopilot.inputs import ModeRequest, PositionYaw, Reposition
-from firmware_sim.autopilot.modes.interface import FlightContext, here, triple
+from firmware_sim.autopilot.modes.interface import FlightContext, here
 from firmware_sim.autopilot.modes.return_to_launch import return_time_s
 from firmware_sim.autopilot.navigation.fence import FenceMonitor
 from firmware_sim.autopilot.navigation.plan import Crew, Missions, NavigationState, Plans
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
+from firmware_sim.autopilot.smooth_trajectory import triple
 
 PERIOD_US = 50_000
 """Period in Mission and Return: 20 Hz [µs]."""
@@ -68,11 +69,11 @@ class Navigator:
 
         As in PX4, any place is allowed unless GF_ACTION is stronger than a warning.
         """
-        kept = round(self._value("GF_ACTION")) > _WARN
-        if now is None or not kept or not isinstance(request, Reposition):
+        enforced = round(self._value("GF_ACTION")) > _WARN
+        if now is None or not enforced or not isinstance(request, Reposition):
             return request
-        wanted = zip(request.place.position, now.position, strict=True)
-        there = [here if math.isnan(axis) else axis for axis, here in wanted]
+        axes = zip(request.place.position, now.position, strict=True)
+        there = [here if math.isnan(axis) else axis for axis, here in axes]
         if self.fence.inside(local_to_geodetic(np.array(there), now.origin), now.home):
             return request
         why = events.ALTITUDE_OUTSIDE if request.altitude_alone else events.REPOSITION_OUTSIDE

@@ -1,95 +1,208 @@
-"""MAVLink microservices: a table of message names with their addressee check and handler."""
+"""MAVLink microservices: tables of their handlers, and the state that the handlers share.
+
+A service is a module with any of these tables and functions:
+
+    HANDLERS: {message: (check of the addressee, handler)}
+    ACTIONS: {MAV_CMD: action}
+    REQUESTS: {id of a message that is no stream: action of REQUEST_MESSAGE}
+    send_pending(context): sends the next part of a client's transfers, once per tick
+
+A new service is a module and a line in `SERVICES`, or in the table SERVICES of an add-on.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cache
-from types import MappingProxyType
-from typing import Any
+from itertools import chain
+from typing import Any, TypeVar
 
 from airl_mav.core.addons import entries, load
-from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
-from firmware_sim.mavlink.codec import WireMessage
-from firmware_sim.mavlink.services import (
-    calibration,
-    commands,
-    connection,
-    ftp,
-    logs,
-    measurements,
-    params,
-    setpoints,
-    shell,
-)
-from firmware_sim.mavlink.services.context import Context, for_vehicle, for_vehicle_or_all
+from airl_mav.core.signing import Signing
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
+from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
+from firmware_sim.mavlink.link import Link
+from firmware_sim.mavlink.streams.sensors import Radio
+from firmware_sim.mavlink.texts_and_events import EventBuffer
 
-Handler = Callable[[WireMessage, Context], bool]
+State = TypeVar("State", bound="ServiceState")
+
+Handler = Callable[[WireMessage, "Context"], bool]
 """Handles one message for this vehicle; returns False if it had no effect."""
 
+Addressee = Callable[[WireMessage, "Context"], bool]
+"""Returns True if a message is addressed to this vehicle."""
 
-def _for_anyone(_message: WireMessage, _context: Context) -> bool:
+Handlers = dict[str, tuple[Addressee, Handler]]
+"""Check of the addressee and handler, by message name."""
+
+ANY = 0
+"""System or component id of a broadcast."""
+
+
+class ServiceState:
+    """State of a service: of one client, or of the vehicle and common to all its clients."""
+
+    @property
+    def is_running(self) -> bool:
+        """True if `send_pending` has something to send, now or later."""
+        return False
+
+    @property
+    def forbids_arming(self) -> bool:
+        """True if PX4 rejects arming meanwhile."""
+        return False
+
+    def restart(self) -> None:
+        """Reset a state of the vehicle, because the autopilot changes."""
+
+    def close(self) -> None:
+        """Release the resources when the client leaves or the server closes."""
+
+
+@dataclass(slots=True)
+class Context:
+    """State of one client for its handlers. The server updates `now_us` for every message.
+
+    All clients of a vehicle share events, signing, radio and `vehicle_states`.
+    """
+
+    link: Link
+    """Replies and streams of this client."""
+    port: BuiltinAutopilot
+    now_us: int
+    """Simulated time [µs]."""
+    announce: Callable[[OperatorText], None]
+    """Sends a text, with its event if available, to all clients of all links. Events are part of
+    the telemetry. In lockstep, replies must not change the telemetry, so only the text is sent."""
+    broadcast: Callable[[str, bytes], None]
+    """Sends a message, given by name and payload, to all clients of all links."""
+    events: EventBuffer
+    signing: Signing
+    """Signing key of all links, if set."""
+    system_id: int = SYSTEM_ID
+    next_parameter: int | None = None
+    """Next index of a running parameter list; -1 = the hash; None = no list is running."""
+    states: dict[type, Any] = field(default_factory=dict)
+    """States of services for this client, by class."""
+    vehicle_states: dict[type, Any] = field(default_factory=dict)
+    """States of services that all clients share, by class."""
+    radio: Radio = field(default_factory=Radio)
+    """Newest RC channels."""
+    refusals: set[str] = field(default_factory=set)
+    """Rejections of setpoints reported since the last accepted setpoint."""
+
+    @property
+    def is_busy(self) -> bool:
+        """True if any transfer or repetition is in progress."""
+        return self.next_parameter is not None or any(
+            state.is_running for state in chain(self.states.values(), self.vehicle_states.values())
+        )
+
+    def state(self, kind: type[State]) -> State:
+        """Return the state of a service for this client; new at the first call."""
+        if kind not in self.states:
+            self.states[kind] = kind()
+        found: State = self.states[kind]
+        return found
+
+    def vehicle_state(self, kind: type[State]) -> State:
+        """Return the state of a service that all clients share; new at the first call."""
+        if kind not in self.vehicle_states:
+            self.vehicle_states[kind] = kind()
+        found: State = self.vehicle_states[kind]
+        return found
+
+    def announce_once(self, refusal: OperatorText) -> None:
+        """Announce a rejection unless it was announced before."""
+        if refusal.text not in self.refusals:
+            self.refusals.add(refusal.text)
+            self.announce(refusal)
+
+    def close(self) -> None:
+        """Release the client's resources when the client leaves or the autopilot changes."""
+        for state in self.states.values():
+            state.close()
+
+
+def for_anyone(_message: WireMessage, _context: Context) -> bool:
+    """Return True for every message."""
     return True
 
 
-Addressee = Callable[[WireMessage, Context], bool]
-"""Returns True if a message is addressed to this vehicle."""
+def for_vehicle(message: WireMessage, context: Context) -> bool:
+    """Return True if a message is addressed to this vehicle's autopilot or all its components."""
+    system: int = message.target_system
+    return system == context.system_id and message.target_component in (COMPONENT_ID, ANY)
 
-HANDLERS: Mapping[str, tuple[Addressee, Handler]] = MappingProxyType(
-    {
-        "COMMAND_LONG": (commands.is_addressed, commands.handle_command_long),
-        "COMMAND_INT": (commands.is_addressed, commands.handle_command_int),
-        "SET_MODE": (_for_anyone, commands.handle_set_mode),
-        "REQUEST_DATA_STREAM": (for_vehicle_or_all, connection.handle_data_stream),
-        "PARAM_REQUEST_LIST": (for_vehicle, params.handle_list),
-        "PARAM_REQUEST_READ": (for_vehicle, params.handle_read),
-        "PARAM_SET": (for_vehicle, params.handle_set),
-        "SET_POSITION_TARGET_LOCAL_NED": (for_vehicle_or_all, setpoints.handle_local),
-        "SET_POSITION_TARGET_GLOBAL_INT": (for_vehicle_or_all, setpoints.handle_global),
-        "SET_ATTITUDE_TARGET": (for_vehicle_or_all, setpoints.handle_attitude),
-        "MANUAL_CONTROL": (setpoints.is_for_pilot, setpoints.handle_manual_control),
-        "RC_CHANNELS_OVERRIDE": (setpoints.is_for_radio, setpoints.handle_channels),
-        "FOLLOW_TARGET": (_for_anyone, setpoints.handle_follow_target),
-        "LANDING_TARGET": (_for_anyone, measurements.handle_landing_target),
-        "DISTANCE_SENSOR": (_for_anyone, measurements.handle_distance),
-        "OPTICAL_FLOW_RAD": (_for_anyone, measurements.handle_optical_flow),
-        "OBSTACLE_DISTANCE": (_for_anyone, measurements.handle_obstacle_distance),
-        "ODOMETRY": (_for_anyone, measurements.handle_odometry),
-        "VISION_POSITION_ESTIMATE": (_for_anyone, measurements.handle_vision_position),
-        "HEARTBEAT": (_for_anyone, connection.handle_heartbeat),
-        "SET_GPS_GLOBAL_ORIGIN": (_for_anyone, commands.handle_set_origin),
-        "SETUP_SIGNING": (for_vehicle_or_all, connection.handle_setup),
-        "REQUEST_EVENT": (for_vehicle, connection.handle_event),
-        "PING": (_for_anyone, connection.handle_ping),
-        "TIMESYNC": (_for_anyone, connection.handle_timesync),
-        "SERIAL_CONTROL": (_for_anyone, shell.handle_input),
-        "FILE_TRANSFER_PROTOCOL": (for_vehicle_or_all, ftp.handle_request),
-        "LOG_REQUEST_LIST": (for_vehicle_or_all, logs.handle_list),
-        "LOG_REQUEST_DATA": (for_vehicle_or_all, logs.handle_data),
-        "LOG_REQUEST_END": (for_vehicle_or_all, logs.handle_end),
-        "LOG_ERASE": (for_vehicle_or_all, logs.handle_erase),
-        "LOGGING_ACK": (for_vehicle_or_all, logs.handle_ack),
-    }
-)
+
+def for_vehicle_or_all(message: WireMessage, context: Context) -> bool:
+    """Return True for messages to this vehicle, as `for_vehicle`, and for broadcasts."""
+    system: int = message.target_system
+    component: int = message.target_component
+    return system in (context.system_id, ANY) and component in (COMPONENT_ID, ANY)
+
+
+def sender(message: WireMessage) -> tuple[int, int]:
+    """Return the system and component id of a message's sender."""
+    return message.get_srcSystem(), message.get_srcComponent()
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleCommand:
+    """A COMMAND_LONG or COMMAND_INT."""
+
+    number: int
+    params: tuple[float, float, float, float, float, float, float]
+    """Parameters 1 to 7 of COMMAND_LONG; NaN = not set."""
+    sender: tuple[int, int] = (0, 0)
+    frame: int | None = None
+    """MAV_FRAME of a COMMAND_INT; None for a COMMAND_LONG."""
+
+    def integer(self, number: int) -> int | None:
+        """Return parameter 1 to 7, rounded; None if not finite."""
+        value = self.params[number - 1]
+        return round(value) if math.isfinite(value) else None
+
+
+Action = Callable[[VehicleCommand, Context], "Result | None"]
+"""Executes a command and returns its result; None = no acknowledgement, as in PX4."""
+
+SERVICES = {
+    "params": "firmware_sim.mavlink.services.params",
+    "commands": "firmware_sim.mavlink.services.commands",
+    "connection": "firmware_sim.mavlink.services.connection",
+    "setpoints": "firmware_sim.mavlink.services.setpoints",
+}
+"""Services of the core, as those of add-ons: loaded by the first server."""
 
 
 @cache
-def added() -> tuple[Any, ...]:
-    """Return the services of add-ons: modules with HANDLERS and `send_pending`."""
-    return tuple(load(place) for place in entries("firmware_sim", "SERVICES").values())
+def services() -> tuple[Any, ...]:
+    """Return the modules of all services, in the order of their messages within a tick."""
+    return tuple(map(load, [*SERVICES.values(), *entries("firmware_sim", "SERVICES").values()]))
 
 
 @cache
-def handlers() -> Mapping[str, tuple[Addressee, Handler]]:
-    """Return all handlers by message: of the core, and of add-ons."""
-    found = dict(HANDLERS)
-    for service in added():
-        found |= service.HANDLERS
+def table(name: str) -> dict[Any, Any]:
+    """Return a table of all services: HANDLERS, ACTIONS or REQUESTS."""
+    found: dict[Any, Any] = {}
+    for service in services():
+        found |= getattr(service, name, {})
     return found
+
+
+@cache
+def _senders() -> tuple[Callable[[Context], None], ...]:
+    return tuple(each.send_pending for each in services() if hasattr(each, "send_pending"))
 
 
 def handle(message: WireMessage, kind: str, context: Context) -> bool:
     """Handle a message of a type; return True if it was for this vehicle and had an effect."""
-    is_addressed, handler = handlers().get(kind, (None, None))
+    is_addressed, handler = table("HANDLERS").get(kind, (None, None))
     if handler is None and kind in _MISSION_STARTS and message.target_system == context.system_id:
         context.announce_once(OperatorText(Severity.ERROR, "No missions without add-on missions"))
     return bool(
@@ -101,26 +214,7 @@ _MISSION_STARTS = ("MISSION_REQUEST_LIST", "MISSION_COUNT")
 """First messages of a download and an upload."""
 
 
-def _send_added(context: Context) -> None:
-    for service in added():
-        service.send_pending(context)
-
-
-PENDING: tuple[Callable[[Context], None], ...] = (
-    params.send_pending,
-    _send_added,
-    ftp.send_pending,
-    calibration.send_pending,
-    shell.send_pending,
-    logs.send_pending,
-)
-"""Functions that send the next part of a client's transfers, once per tick and client."""
-
-
 def send_pending(context: Context) -> None:
     """Send the next part of all transfers of a client."""
-    if not context.is_getting:  # Usual case: only mission progress may be due.
-        _send_added(context)
-        return
-    for send in PENDING:
+    for send in _senders():
         send(context)

@@ -8,9 +8,15 @@ import struct
 
 from firmware_sim.autopilot.autopilot_state import Arming, Result
 from firmware_sim.autopilot.parameter_store import Parameters, ParameterValue
-from firmware_sim.mavlink.codec import WireMessage, dialect, param_value, payload
-from firmware_sim.mavlink.services.context import Action, Context, VehicleCommand, sender
-from firmware_sim.mavlink.services.transfers import crc32part
+from firmware_sim.mavlink.codec import WireMessage, crc32part, dialect, param_value, payload
+from firmware_sim.mavlink.services import (
+    Action,
+    Context,
+    Handlers,
+    VehicleCommand,
+    for_vehicle,
+    sender,
+)
 
 HASH_NAME = "_HASH_CHECK"
 """Name of a pseudo parameter: checksum with which ground stations validate cached values."""
@@ -147,17 +153,23 @@ def _store(command: VehicleCommand, context: Context) -> Result | None:
     if context.port.state().status.arming is Arming.ARMED:
         return Result.TEMPORARILY_REJECTED
     parameters = context.port.parameters
-    asked = command.integer(1)
+    action = command.integer(1)
     # Both resets restore the defaults.
-    if asked in (_RESET, _FACTORY_RESET):
+    if action in (_RESET, _FACTORY_RESET):
         parameters.reset()
-    elif asked == _LOAD:
+    elif action == _LOAD:
         return Result.ACCEPTED if parameters.load() else Result.FAILED
-    elif asked == _SAVE:
+    elif action == _SAVE:
         return Result.ACCEPTED if parameters.save() else Result.FAILED
-    elif asked != _RESET_SENSORS:  # sensors have no calibration to reset
+    elif action != _RESET_SENSORS:  # sensors have no calibration to reset
         return None
     return Result.ACCEPTED
 
 
 ACTIONS: dict[int, Action] = {dialect.MAV_CMD_PREFLIGHT_STORAGE: _store}
+
+HANDLERS: Handlers = {
+    "PARAM_REQUEST_LIST": (for_vehicle, handle_list),
+    "PARAM_REQUEST_READ": (for_vehicle, handle_read),
+    "PARAM_SET": (for_vehicle, handle_set),
+}

@@ -1,6 +1,7 @@
 """Streamed messages: tables of message names with their builder functions.
 
-A new message is a builder function and a line in `BUILDERS` or `VEHICLE_BUILDERS`.
+A new message is a builder function and a line in `BUILDERS` or `VEHICLE_BUILDERS`, or in a module
+of an add-on's table STREAMS.
 
 Sources of fields, units and "unknown" values: MAVLink common.xml and PX4
 src/modules/mavlink/streams/*.hpp.
@@ -9,8 +10,10 @@ src/modules/mavlink/streams/*.hpp.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from types import MappingProxyType
 
+from airl_mav.core.addons import entries, load
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import TrueState
@@ -22,28 +25,10 @@ Builder = Callable[[AutopilotState], "Values | None"]
 """Returns one message's fields, in order of definition, from a snapshot; None = no content yet.
 Plain values: creating message objects takes longer than all the rest."""
 
-_SILENT = (
-    *("GPS_STATUS", "NAV_CONTROLLER_OUTPUT", "COMMAND_LONG"),
-    *("CAMERA_TRIGGER", "SCALED_IMU2", "SCALED_IMU3", "GPS2_RAW"),
-    *("SCALED_PRESSURE3", "LANDING_TARGET", "EFI_STATUS", "WIND_COV"),
-    *("GPS_RTCM_DATA", "ADSB_VEHICLE", "DEBUG_VECT", "NAMED_VALUE_FLOAT"),
-    *("STATUSTEXT", "DEBUG", "CAMERA_IMAGE_CAPTURED", "MOUNT_ORIENTATION"),
-    *("GIMBAL_MANAGER_INFORMATION", "GIMBAL_MANAGER_STATUS", "GIMBAL_DEVICE_INFORMATION"),
-    *("GIMBAL_DEVICE_SET_ATTITUDE", "GIMBAL_DEVICE_ATTITUDE_STATUS"),
-    *("OBSTACLE_DISTANCE", "RAW_RPM", "DEBUG_FLOAT_ARRAY", "FIGURE_EIGHT_EXECUTION_STATUS"),
-    *("OPEN_DRONE_ID_BASIC_ID", "OPEN_DRONE_ID_LOCATION", "OPEN_DRONE_ID_SYSTEM"),
-)
-"""Streams of PX4 without content here, because the vehicle lacks the device.
 
-A real PX4 accepts a rate for these streams and sends nothing, as does this simulator. Source: the
-ids accepted by SET_MESSAGE_INTERVAL on a running PX4 1.16."""
-
-
-def _nothing(state: AutopilotState) -> None:
+def no_content(state: AutopilotState) -> None:
     """Return None: the stream has no content."""
 
-
-SILENT: Mapping[str, Builder] = MappingProxyType(dict.fromkeys(_SILENT, _nothing))
 
 _PACKED = (
     *("ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "ODOMETRY"),
@@ -54,17 +39,13 @@ _PACKED = (
 
 BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
     {
-        **SILENT,
         "HEARTBEAT": status.heartbeat,
         **dict.fromkeys(_PACKED),
         "EXTENDED_SYS_STATE": status.extended_sys_state,
         "SYS_STATUS": None,
         "ESTIMATOR_STATUS": status.estimator_status,
         "SCALED_PRESSURE": sensors.scaled_pressure,
-        # PX4's simulator sends one measurement to two barometers.
-        "SCALED_PRESSURE2": sensors.scaled_pressure,
         "MISSION_CURRENT": status.mission_current,
-        "FENCE_STATUS": status.fence_status,
         "HOME_POSITION": status.home_position,
         "GPS_GLOBAL_ORIGIN": status.gps_global_origin,
         "AUTOPILOT_VERSION": status.autopilot_version,
@@ -73,18 +54,18 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "CURRENT_MODE": status.current_mode,
         "ESC_INFO": None,
         "ESC_STATUS": None,
-        "ACTUATOR_OUTPUT_STATUS": sensors.actuator_output_status,
-        "HIL_ACTUATOR_CONTROLS": sensors.hil_actuator_controls,
-        "SCALED_IMU": sensors.scaled_imu,
-        "FLIGHT_INFORMATION": status.flight_information,
-        "PROTOCOL_VERSION": status.protocol_version,
-        "HIGH_LATENCY2": status.high_latency2,
-        # Last, because start times of streams depend on their order.
-        **dict.fromkeys(("DISTANCE_SENSOR", "OPTICAL_FLOW_RAD"), _nothing),
+        **dict.fromkeys(("DISTANCE_SENSOR", "OPTICAL_FLOW_RAD"), no_content),
     }
 )
 """Streams that need only the snapshot. None = packed by compiled code (`telemetry`). The server
 adds the streams of further sensors (`sensor_table`)."""
+
+
+@cache
+def addon_builders() -> dict[str, Builder]:
+    """Return the streams of add-ons (table STREAMS: modules with BUILDERS)."""
+    modules = map(load, entries("firmware_sim", "STREAMS").values())
+    return {name: build for module in modules for name, build in module.BUILDERS.items()}
 
 
 class Vehicle:

@@ -10,13 +10,12 @@ import numpy as np
 
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.kernels import kernel
-from firmware_sim.autopilot.autopilot_state import Arming, Vector
+from firmware_sim.autopilot.autopilot_state import Vector
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.streams import units
-from firmware_sim.mavlink.streams.status import base_mode
 from firmware_sim.mavlink.streams.units import UINT16_MAX, boot_ms, percent
 
 if TYPE_CHECKING:
@@ -34,22 +33,6 @@ _CHARGE_WARNINGS = (
     ("BAT_EMERGEN_THR", dialect.MAV_BATTERY_CHARGE_STATE_EMERGENCY),
 )
 """Threshold parameters, from the highest to the lowest."""
-
-
-def scaled_imu(state: AutopilotState) -> Values:
-    """Return the newest IMU sample without biases [mG, mrad/s], and magnetic field [mGauss]."""
-    estimate = state.estimate
-    return (
-        units.boot_ms(state.time_us),
-        *(
-            # m/s² to milli-g, rad/s to mrad/s, gauss to milligauss.
-            units.int16(a * 1e3 / GRAVITY_M_S2)
-            for a in (state.accel - estimate.accel_bias).tolist()
-        ),
-        *(units.int16(w * 1e3) for w in (state.gyro - estimate.gyro_bias).tolist()),
-        *(units.int16(m * 1e3) for m in state.mag.tolist()),
-        units.int16(state.temperature_c * 100.0),
-    )
 
 
 def scaled_pressure(state: AutopilotState) -> Values:
@@ -114,47 +97,6 @@ def _charge_state(remaining: float, parameters: Parameters) -> int:
 
 
 # --- outputs
-
-_PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900, 1_000, 1_000
-"""Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
-
-_OUTPUTS = 16
-"""Number of outputs in PX4's simulation. Outputs without a motor stay at the disarmed pulse."""
-
-_OUTPUT_FIELDS = 32
-"""Number of slots in ACTUATOR_OUTPUT_STATUS."""
-
-
-def actuator_output_status(state: AutopilotState) -> Values:
-    """Return the pulse widths [µs] as an array with 16 active outputs."""
-    return state.time_us, _OUTPUTS, *_outputs(state), *(0,) * (_OUTPUT_FIELDS - _OUTPUTS)
-
-
-def hil_actuator_controls(state: AutopilotState) -> Values:
-    """Return motor commands 0..1, zero while disarmed; 16 controls."""
-    commands, flags = _commands(state), 0
-    unused = (0.0,) * (_OUTPUTS - len(commands))
-    return state.time_us, *commands, *unused, base_mode(state.status), flags
-
-
-def _outputs(state: AutopilotState) -> Values:
-    """Return the pulse widths of all outputs [µs]."""
-    pulses = _pulses(state)
-    return *pulses, *(_PWM_DISARMED,) * (_OUTPUTS - len(pulses))
-
-
-def _armed(state: AutopilotState) -> bool:
-    return state.status.arming is Arming.ARMED
-
-
-def _commands(state: AutopilotState) -> tuple[float, ...]:
-    return state.motors if _armed(state) else (0.0,) * len(state.motors)
-
-
-def _pulses(state: AutopilotState) -> list[int]:
-    if not _armed(state):
-        return [_PWM_DISARMED] * len(state.motors)
-    return [_PWM_MIN + units.saturate(_PWM_SPAN * u, 0, _PWM_SPAN, 0) for u in state.motors]
 
 
 # --- vibration
@@ -237,10 +179,8 @@ def clearance(state: AutopilotState, down: float) -> tuple[float, float]:
 
 CHANNELS = 18
 
-
 _ZERO_SAYS_NOTHING = 8
 """First channel for which 0 means unused. UINT16_MAX means unused for all channels."""
-
 
 _FULL_SIGNAL = 100
 
@@ -249,19 +189,19 @@ class Radio:
     """Channel values of the newest RC_CHANNELS_OVERRIDE, common to all clients."""
 
     def __init__(self) -> None:
-        self._said: tuple[int, ...] = ()
+        self._channels: tuple[int, ...] = ()
         self._time_us = 0
         self._count = 0
         """Number of RC_CHANNELS_OVERRIDE messages received."""
 
-    def hear(self, message: WireMessage, now_us: int) -> None:
+    def receive(self, message: WireMessage, now_us: int) -> None:
         """Store an RC_CHANNELS_OVERRIDE received at simulated `now_us` [µs]."""
-        said = [getattr(message, f"chan{number}_raw") for number in range(1, CHANNELS + 1)]
+        channels = [getattr(message, f"chan{number}_raw") for number in range(1, CHANNELS + 1)]
         # Trailing unused channels do not count: PX4 reports the number of channels up to the last
         # used one.
-        while said and _says_nothing(said[-1], len(said) - 1):
-            said.pop()
-        self._said, self._time_us = tuple(said), now_us
+        while channels and _says_nothing(channels[-1], len(channels) - 1):
+            channels.pop()
+        self._channels, self._time_us = tuple(channels), now_us
         self._count += 1
 
     def updates(self) -> Builder:
@@ -274,11 +214,11 @@ class Radio:
             if sent == self._count:
                 return None
             sent = self._count
-            said = self._said
+            channels = self._channels
             # RC_CHANNELS always has 18 values; UINT16_MAX marks the missing ones.
-            unused = (UINT16_MAX,) * (CHANNELS - len(said))
-            signal = _FULL_SIGNAL if said else 0
-            return boot_ms(self._time_us), len(said), *said, *unused, signal
+            unused = (UINT16_MAX,) * (CHANNELS - len(channels))
+            signal = _FULL_SIGNAL if channels else 0
+            return boot_ms(self._time_us), len(channels), *channels, *unused, signal
 
         return build
 

@@ -15,9 +15,9 @@ from airl_mav.core.constants import TICK_US, US_PER_MS
 from airl_mav.core.frames import local_to_geodetic, quat_yaw
 from airl_mav.vehicle import atmosphere
 from firmware_sim import sensor_table
+from firmware_sim.addons.flight_log.ulog_writer import Topic, Values
 from firmware_sim.autopilot.autopilot_state import Arming, Landed
 from firmware_sim.autopilot.snapshot import AutopilotState
-from firmware_sim.flight_log.ulog_writer import Topic, Values
 from firmware_sim.interfaces import TrueState
 
 ON_CHANGE_US = 500 * US_PER_MS

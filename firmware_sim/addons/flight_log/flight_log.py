@@ -1,7 +1,5 @@
 """ULog flight log of one vehicle, and the folder of its logs."""
 
-# ruff: noqa: D102 (`AutopilotState` documents the properties of `FlownState`)
-
 from __future__ import annotations
 
 from collections import OrderedDict
@@ -11,16 +9,25 @@ from typing import Any, BinaryIO, cast
 
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector
+from firmware_sim.addons.flight_log.topics import SENSOR_COMBINED, TOPICS, Moment, sensor_combined
+from firmware_sim.addons.flight_log.ulog_writer import UlogWriter, Values
 from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import OperatorText, Setpoint, StateEstimate
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.snapshot import AutopilotState, setpoint_of
 from firmware_sim.engine.dynamics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.engine.record import Record
-from firmware_sim.flight_log.topics import SENSOR_COMBINED, TOPICS, Moment, sensor_combined
-from firmware_sim.flight_log.ulog_writer import UlogWriter, Values
-from firmware_sim.interfaces import BatterySample, TrueState
-from firmware_sim.storage import LogEntry, LogStore, OpenLog
+from firmware_sim.interfaces import (
+    ULOG_SUFFIX,
+    BatterySample,
+    LogEntry,
+    LogStore,
+    OpenLog,
+    TrueState,
+)
+
+# ruff: noqa: D102 (`AutopilotState` documents the properties of `FlownState`)
 
 
 def truth_of(tick: Any) -> TrueState:
@@ -130,6 +137,10 @@ class FlightLog:
         """True state after the newest tick (`engine.record.TRUE_TICK`)."""
         self._parameters = parameters
         self._known = dict(_values(parameters))
+        self.folder = LogFolder(path.parent, self)
+        """All logs in the log's folder."""
+        self.stop_listening: Callable[[], None] = lambda: None
+        """Unsubscribe from parameter changes."""
         self.writer = UlogWriter(
             path,
             start_us,
@@ -141,7 +152,7 @@ class FlightLog:
 
     def after_ticks(self, flown: Record, truths: Record, state: AutopilotState) -> None:
         """Log the due topics of n ticks, from their logs and the final autopilot state."""
-        if self.writer.lost:
+        if self.writer.lost or self.writer.closed:
             return
         rows = (flown[name].tolist() for name in ("time_us", "gyro", "accel"))
         for k, (time_us, gyro, accel) in enumerate(zip(*rows, strict=True)):
@@ -155,7 +166,8 @@ class FlightLog:
 
     def text(self, message: OperatorText, time_us: int) -> None:
         """Log an operator text."""
-        self.writer.text(time_us, message.severity, message.text)
+        if not self.writer.closed:
+            self.writer.text(time_us, message.severity, message.text)
 
     def parameters_changed(self) -> None:
         """Log the parameters with changed values."""
@@ -166,7 +178,14 @@ class FlightLog:
 
     def close(self) -> None:
         """Complete the log and rename it to the final name. Idempotent."""
+        self.stop_listening()
+        self.stop_listening = lambda: None
         self.writer.close()
+
+    def discard(self) -> None:
+        """Complete the log, and close all files open for downloads."""
+        self.close()
+        self.folder.close()
 
     def _log(self, moment: Moment, now_us: int) -> None:
         due_us, last = self._due_us, self._last
@@ -189,8 +208,6 @@ def _values(parameters: Parameters) -> Iterable[tuple[str, int | float]]:
             yield parameter.name, parameter.value
 
 
-ULOG_SUFFIX = ".ulg"
-
 OPEN_FILES = 8
 """Maximum number of log files kept open for downloads, which read a few bytes per tick."""
 
@@ -203,7 +220,7 @@ class LogFolder(LogStore):
         self._folder = folder
         self._current = current
         self._complete: Sequence[Path] = ()
-        self._seen: tuple[int, bool] | None = None
+        self._scanned: tuple[int, bool] | None = None
         """Folder change time [ns] and closed flag of the log when `_complete` was scanned."""
         self._files: OrderedDict[Path, BinaryIO] = OrderedDict()
         """Open files; the most recently read file is last."""
@@ -247,10 +264,10 @@ class LogFolder(LogStore):
             self._files.popitem()[1].close()
 
     def _completed(self) -> Sequence[Path]:
-        seen = self._folder.stat().st_mtime_ns, self._current.writer.closed
-        if seen != self._seen:
+        state = self._folder.stat().st_mtime_ns, self._current.writer.closed
+        if state != self._scanned:
             self.close()
-            self._seen = seen
+            self._scanned = state
             self._complete = sorted(self._folder.glob(f"*{ULOG_SUFFIX}"))
         return self._complete
 
@@ -270,3 +287,17 @@ def _entry(path: Path) -> LogEntry:
     except OSError:
         return LogEntry(0, 0)  # removed by another program
     return LogEntry(int(stat.st_mtime), stat.st_size)
+
+
+def open_flight_log(
+    path: Path,
+    autopilot: BuiltinAutopilot,
+    start_us: int,
+    boot_unix_us: int,
+    on_lost: Callable[[str], None],
+) -> FlightLog:
+    """Open the flight log of an autopilot, which offers it to clients; see `FlightLog`."""
+    log = FlightLog(path, autopilot.parameters, start_us, boot_unix_us, on_lost)
+    log.stop_listening = autopilot.parameters.on_change(log.parameters_changed)
+    autopilot.logs = log.folder
+    return log

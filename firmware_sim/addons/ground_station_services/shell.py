@@ -8,6 +8,7 @@ from __future__ import annotations
 import fnmatch
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
@@ -15,7 +16,7 @@ from firmware_sim.autopilot.autopilot_state import Arming
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services import Context, Handlers, ServiceState, for_anyone
 
 PROMPT = "pxh> "
 
@@ -35,6 +36,19 @@ _LONGEST_OUTPUT = 1 << 17
 """Unsent output above which new commands are dropped [bytes]."""
 
 
+@dataclass(slots=True)
+class Shell(ServiceState):
+    """Shell state of one client."""
+
+    line: bytearray = field(default_factory=bytearray)
+    output: bytearray = field(default_factory=bytearray)
+
+    @property
+    def is_running(self) -> bool:
+        """True if output remains to be sent."""
+        return bool(self.output)
+
+
 def handle_input(message: WireMessage, context: Context) -> bool:
     """Read input and run each complete line."""
     if (
@@ -42,7 +56,7 @@ def handle_input(message: WireMessage, context: Context) -> bool:
         or message.flags & dialect.SERIAL_CONTROL_FLAG_REPLY
     ):
         return False
-    shell = context.shell
+    shell = context.state(Shell)
     # The client may send a line in several messages, or several lines in one.
     for byte in bytes(message.data[: message.count]):
         if byte not in b"\r\n":
@@ -60,7 +74,10 @@ def handle_input(message: WireMessage, context: Context) -> bool:
 
 def send_pending(context: Context) -> None:
     """Send the next part of the output; call once per tick."""
-    output = context.shell.output
+    shell = context.states.get(Shell)
+    if shell is None:
+        return
+    output = shell.output
     for _ in range(MESSAGES_PER_TICK):
         if not output:
             return
@@ -113,8 +130,8 @@ def _parameters(words: Sequence[str], port: BuiltinAutopilot, _now_us: int) -> s
         if found is not None and fnmatch.fnmatchcase(found.name, pattern):
             value = found.value
             # PX4 prints floats with four decimals.
-            shown = f"{value}" if isinstance(value, int) else f"{value:.4f}"
-            lines.append(f"x   {found.name} [{index},{index}] : {shown}")
+            text = f"{value}" if isinstance(value, int) else f"{value:.4f}"
+            lines.append(f"x   {found.name} [{index},{index}] : {text}")
     return "\n".join([*lines, "", f" {len(store)}/{len(store)} parameters used.", ""])
 
 
@@ -123,13 +140,13 @@ def _commander(words: Sequence[str], port: BuiltinAutopilot, _now_us: int) -> st
         return "usage: commander status\n"
     status = port.state().status
     armed = "Armed" if status.arming is Arming.ARMED else "Disarmed"
-    said = (
+    lines = (
         armed,
         f"navigation mode: {_title(status.mode)}",
         f"user intended navigation mode: {_title(status.intended_mode)}",
         f"in failsafe: {'yes' if status.failsafe else 'no'}",
     )
-    return "".join(f"INFO  [commander] {line}\n" for line in said)
+    return "".join(f"INFO  [commander] {line}\n" for line in lines)
 
 
 def _title(mode: Mode) -> str:
@@ -185,11 +202,11 @@ def _listener(words: Sequence[str], port: BuiltinAutopilot, now_us: int) -> str:
     state = port.state()
     age_s = (now_us - state.time_us) / US_PER_S
     lines = [f"    timestamp: {state.time_us} ({age_s:.6f} seconds ago)"]
-    lines += [f"    {name}: {_shown(value)}" for name, value in fields(state).items()]
+    lines += [f"    {name}: {_formatted(value)}" for name, value in fields(state).items()]
     return "\n".join(["", f"TOPIC: {topic}", f" {topic}", *lines, "", ""])
 
 
-def _shown(value: float) -> str:
+def _formatted(value: float) -> str:
     return f"{value:.4f}" if isinstance(value, float) else f"{value}"
 
 
@@ -201,3 +218,5 @@ COMMANDS: Mapping[str, Shown] = {
     "uptime": _uptime,
     "ver": _version,
 }
+
+HANDLERS: Handlers = {"SERIAL_CONTROL": (for_anyone, handle_input)}

@@ -1,17 +1,24 @@
-"""Timeline of the faults of an episode, to which clients can add faults."""
+"""Timeline of the faults of an episode, to which clients can add faults.
+
+An add-on executes the faults: table FAULT_EFFECTS.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from airl_mav.core.addons import entries, load
+from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
 from airl_mav.core.streams import Stream, stream
 from airl_mav.faults.fault import FOREVER_US, Fault, active, next_change_us
 from airl_mav.faults.kinds import Part
 from firmware_sim.autopilot.commander import CommanderState, FlightPhase
+from firmware_sim.mavlink.endpoint import SharedEndpoint
 
 
 class Acting(NamedTuple):
@@ -163,3 +170,27 @@ class ClientFaults:
         """End all active faults of a part."""
         if self._injected:
             self._timeline().clear(part)
+
+
+class FailingLink(SharedEndpoint, Protocol):
+    """Endpoint behind a failing link."""
+
+    def begin(self, timeline: FaultTimeline | None) -> None:
+        """Begin an episode with these faults, once per episode. Frames in transit are lost."""
+
+
+def fault_effect(place: str) -> Any:
+    """Return what executes the faults at a place: `parts`, `camera` or `link`.
+
+    Raises UsageError without the add-on.
+    """
+    effects = entries("firmware_sim", "FAULT_EFFECTS")
+    if place not in effects:
+        raise UsageError("faults: require the add-on firmware_sim.addons.fault_injection")
+    return load(effects[place])
+
+
+def failing_link(endpoint: SharedEndpoint, clock: Clock, *, conducted: bool = False) -> FailingLink:
+    """Return an endpoint whose link can fail; `conducted`: the companion runs in lockstep."""
+    link: FailingLink = fault_effect("link")(endpoint, clock, conducted=conducted)
+    return link

@@ -12,14 +12,16 @@ import functools
 import json
 import lzma
 import math
+import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 from airl_mav.core.addons import entries, load
 from airl_mav.profiles.parameters import SPECS, ParameterSpec
+from firmware_sim.addons.ground_station_services.files import Storage
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.autopilot.events import check_events, flight_events
-from firmware_sim.autopilot.events.check_events import CheckEvent
+from firmware_sim.autopilot.events import flight_events, health_report
 from firmware_sim.autopilot.events.definition import (
     ENUMERATIONS,
     Definition,
@@ -29,12 +31,12 @@ from firmware_sim.autopilot.events.definition import (
     words,
 )
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.context import Context, VehicleCommand
-from firmware_sim.mavlink.services.transfers import crc32part
+from firmware_sim.autopilot.prearm import CHECKS
+from firmware_sim.mavlink.codec import crc32part, dialect
+from firmware_sim.mavlink.services import Action, Context, VehicleCommand
 from firmware_sim.mavlink.streams.units import boot_ms
-from firmware_sim.storage import Storage
 
+_MIB = 1024.0 * 1024.0
 _FOLDER = "etc/extras"
 _GENERAL, _PARAMETERS = "component_general.json.xz", "parameters.json.xz"
 _EVENTS = "all_events.json.xz"
@@ -88,6 +90,24 @@ def request_information(_command: VehicleCommand, context: Context) -> Result:
     return Result.ACCEPTED
 
 
+def _request_storage(command: VehicleCommand, context: Context) -> Result:
+    """Handle parameter 2: storage number; 0 = all. The only storage has number 1."""
+    number, count, empty = 1, 1, b""
+    if command.integer(2) not in (None, 0, number):
+        return Result.DENIED
+    disk = shutil.disk_usage(context.vehicle_state(Storage).folder)
+    # STORAGE_INFORMATION has mebibytes.
+    sizes = (size / _MIB for size in (disk.total, disk.used, disk.free))
+    no_speed = 0.0
+    context.link.send(
+        dialect.MAVLink_storage_information_message(
+            *(boot_ms(context.now_us), number, count, dialect.STORAGE_STATUS_READY),
+            *(*sizes, no_speed, no_speed, dialect.STORAGE_TYPE_UNKNOWN, empty),
+        )
+    )
+    return Result.ACCEPTED
+
+
 def _uri() -> bytes:
     return f"mftp://{_FOLDER}/{_GENERAL}".encode("ascii")
 
@@ -126,12 +146,12 @@ def _parameter_described(spec: ParameterSpec) -> dict[str, Any]:
 def definitions() -> Iterator[Definition]:
     """Yield all events that this vehicle can send."""
     added = map(load, entries("firmware_sim", "EVENTS").values())
-    for module in (flight_events, check_events, *added):
+    for module in (flight_events, health_report, *added):
         for value in vars(module).values():
             if isinstance(value, Definition):
                 yield value
-            elif isinstance(value, CheckEvent):
-                yield value.definition
+    for check in CHECKS:
+        yield check.event
 
 
 def _event_document() -> dict[str, Any]:
@@ -185,3 +205,21 @@ def _modes_of_groups() -> dict[str, list[int]]:
         for mode, bit in lowest.items()
         if bit in groups
     }
+
+
+def _first_as_second(command: VehicleCommand) -> VehicleCommand:
+    first = command.params[0]
+    return replace(command, params=(first, first, *command.params[2:]))
+
+
+REQUESTS: dict[int, Action] = {
+    dialect.MAVLINK_MSG_ID_COMPONENT_METADATA: request_metadata,
+    dialect.MAVLINK_MSG_ID_COMPONENT_INFORMATION: request_information,
+    dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION: _request_storage,
+}
+
+ACTIONS: dict[int, Action] = {
+    dialect.MAV_CMD_REQUEST_STORAGE_INFORMATION: (
+        lambda command, context: _request_storage(_first_as_second(command), context)
+    ),
+}

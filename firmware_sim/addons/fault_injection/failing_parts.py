@@ -1,4 +1,4 @@
-"""Sensor, motor, battery and wind faults, inserted only in episodes with faults.
+"""Sensor, motor, battery, wind and camera faults, inserted only in episodes with faults.
 
 A sensor that is off has None in the sample. Accelerometer and gyro are never None: flight
 controllers count time by their samples. If one is off, it repeats its last sample like a stuck
@@ -10,19 +10,25 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from airl_mav.camera.frame import Frame
+from airl_mav.camera.noise import DepthNoise, noisy_frame
+from airl_mav.camera.render import Motion
 from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic
 from airl_mav.faults.fault import Fault, gust_share
-from airl_mav.faults.kinds import MOTORS, SENSORS
+from airl_mav.faults.kinds import MOTORS, NOISE_SEED, SENSORS
+from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import Battery, Sensors, VehicleProfile
 from airl_mav.vehicle.airframe import Airframe, command_for, steady_speed
 from firmware_sim.engine.dynamics import Speeds
 from firmware_sim.engine.ticks import PA_PER_HPA
-from firmware_sim.faults.fault_timeline import Acting, FaultTimeline
+from firmware_sim.fault_timeline import Acting, FaultTimeline
 from firmware_sim.interfaces import (
     ActuatorControls,
     BatterySample,
@@ -33,6 +39,7 @@ from firmware_sim.interfaces import (
     Odometry,
     SensorSample,
 )
+from firmware_sim.plant.camera import OnboardCamera
 from firmware_sim.plant.plant import Blowing, Plant
 
 
@@ -95,8 +102,8 @@ def slowed(
     """
     motors = list(controls.motors)
     for index, factor in slow.items():
-        now, asked = speeds[index], steady_speed(motors[index], thrust_curve)
-        reached = now + (asked - now) * (1.0 - lag ** (1.0 / factor)) / (1.0 - lag)
+        now, target = speeds[index], steady_speed(motors[index], thrust_curve)
+        reached = now + (target - now) * (1.0 - lag ** (1.0 / factor)) / (1.0 - lag)
         motors[index] = command_for(reached * reached, thrust_curve)
     first, second, third, fourth = motors
     return controls._replace(motors=(first, second, third, fourth))
@@ -128,7 +135,6 @@ FIELDS = {
 
 INERTIAL = ("accel", "gyro")
 
-
 Effect = Callable[[Any, int], Any]
 """Effect of a fault on one sensor: maps value and time [µs] to the measured value; None = no sample
 in this tick. May be stateful."""
@@ -138,18 +144,18 @@ def _off(value: Any, time_us: int) -> None:
     """Return no sample."""
 
 
+@dataclass
 class Stuck:
     """Stuck sensor: repeats the first sample of the fault at the sensor's rate."""
 
-    def __init__(self) -> None:
-        self._held: Any = None
+    sample: Any = None
 
     def __call__(self, value: Any, time_us: int) -> Any:
         """Return the held sample, or None without a sample in this tick."""
         del time_us
-        if self._held is None:
-            self._held = value
-        return None if value is None else self._held
+        if self.sample is None:
+            self.sample = value
+        return None if value is None else self.sample
 
 
 class Late:
@@ -174,43 +180,36 @@ class Late:
         return self._newest if self._always else arrived
 
 
+@dataclass
 class Biased:
-    """Constant error."""
+    """Error that is constant, or grows at a constant velocity."""
 
-    def __init__(self, offset: Vector) -> None:
-        self._offset = offset
+    offset: Vector
+    velocity: Vector | None = None
+    since_us: int = 0
 
     def __call__(self, value: Any, time_us: int) -> Any:
         """Return the value with the error."""
-        del time_us
-        return None if value is None else shifted(value, self._offset)
-
-
-class Drifting:
-    """Position error that grows at a constant velocity."""
-
-    def __init__(self, velocity: Vector, since_us: int) -> None:
-        self._velocity, self._since_us = velocity, since_us
-
-    def __call__(self, value: Any, time_us: int) -> Any:
-        """Return the fix with the error."""
         if value is None:
             return None
-        return shifted(value, self._velocity * ((time_us - self._since_us) / US_PER_S))
+        if self.velocity is None:
+            return shifted(value, self.offset)
+        return shifted(value, self.velocity * ((time_us - self.since_us) / US_PER_S))
 
 
+@dataclass
 class Noisy:
     """White noise in addition to the sensor's noise."""
 
-    def __init__(self, sd: Vector, rng: np.random.Generator) -> None:
-        self._sd, self._rng = sd, rng
+    sd: Vector
+    rng: np.random.Generator
 
     def __call__(self, value: Any, time_us: int) -> Any:
         """Return the value with additional noise."""
         del time_us
         if value is None:
             return None
-        error = self._sd * self._rng.standard_normal(len(self._sd))
+        error = self.sd * self.rng.standard_normal(len(self.sd))
         moved = shifted(value, error[:3])
         if isinstance(moved, GpsFix):
             return moved._replace(velocity_ned=moved.velocity_ned + error[3:])
@@ -235,13 +234,13 @@ def shifted(value: Any, offset: Vector) -> Any:
     return value + offset
 
 
-def farther(told: DistanceReading, error_m: float) -> DistanceReading:
+def farther(reading: DistanceReading, error_m: float) -> DistanceReading:
     """Return a range with an error, with quality 0 if it is outside the sensor's limits."""
-    if told.quality == 0:
-        return told
-    distance_m = max(0.0, told.distance_m + error_m)
-    within = told.least_m <= distance_m <= told.greatest_m
-    return told._replace(distance_m=distance_m, quality=told.quality if within else 0)
+    if reading.quality == 0:
+        return reading
+    distance_m = max(0.0, reading.distance_m + error_m)
+    within = reading.least_m <= distance_m <= reading.greatest_m
+    return reading._replace(distance_m=distance_m, quality=reading.quality if within else 0)
 
 
 def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
@@ -250,7 +249,9 @@ def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
     gps = profile.gps
     horizontal, speed = gps.horizontal_noise_m, gps.velocity_noise_m_s
     vision = profile.vision
-    seen = (0.0, 0.0) if vision is None else (vision.position_noise_m, vision.velocity_noise_m_s)
+    vision_sd = (0.0, 0.0)
+    if vision is not None:
+        vision_sd = vision.position_noise_m, vision.velocity_noise_m_s
     ranges, flow = profile.rangefinder, profile.optical_flow
     known: dict[str, list[float]] = {
         "accel": [profile.imu.accel_noise_m_s2 * white] * 3,
@@ -258,7 +259,7 @@ def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
         "mag": [profile.magnetometer.noise_gauss] * 3,
         "baro": [profile.barometer.noise_pa / PA_PER_HPA],
         "gps": [horizontal, horizontal, gps.vertical_noise_m, speed, speed, speed],
-        "vision": [seen[0]] * 3 + [seen[1]] * 3,
+        "vision": [vision_sd[0]] * 3 + [vision_sd[1]] * 3,
         "rangefinder": [0.0 if ranges is None else ranges.noise_m],
         "flow": [0.0 if flow is None else flow.noise_rad_s] * 2,
     }
@@ -278,7 +279,8 @@ def effect_of(acting: Acting, profile: Sensors, tick_s: float, rng: np.random.Ge
     if kind == "bias":
         return Biased(np.array(fault.value))
     if kind == "drift":
-        return Drifting(np.array(fault.value), acting.since_us)
+        velocity = np.array(fault.value)
+        return Biased(np.zeros(3), velocity, acting.since_us)
     # `amount` is the ratio of total noise to the sensor's noise; their variances add.
     more = math.sqrt(max(0.0, fault.amount**2 - 1.0))
     return Noisy(more * noise_sd(part, profile, tick_s), rng)
@@ -408,3 +410,73 @@ class FailingParts:
     def _effect_of(self, acting: Acting) -> Effect:
         rng = self._timeline.generator(acting.number)
         return effect_of(acting, self._vehicle.sensors, self._tick_s, rng)
+
+
+class FailingCamera:
+    """Camera with faults, inserted only in episodes with faults."""
+
+    def __init__(self, camera: OnboardCamera, timeline: FaultTimeline, seed: int) -> None:
+        """Wrap a healthy camera, with the faults and the seed of the episode."""
+        self._camera = camera
+        self._timeline = timeline
+        self._seed = seed
+        self._acting: list[Acting] = []
+        self._frozen: Frame | None = None
+        self._late: deque[tuple[int, Frame]] = deque()
+        timeline.on_change(self._rearrange)
+
+    @property
+    def next_us(self) -> int:
+        """Simulated time of the next exposure or delayed frame [µs]."""
+        next_us = self._camera.next_us
+        return min(next_us, self._late[0][0]) if self._late else next_us
+
+    def restart(self, time_us: int) -> None:
+        """Begin an episode at `time_us` [µs]."""
+        self._late.clear()
+        self._camera.restart(time_us)
+
+    def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
+        """Pass due frames to `publish`; see `OnboardCamera.offer`."""
+        if time_us >= self._camera.next_us:
+            self._camera.offer(time_us, motion, lambda frame: self._take(frame, publish))
+        while self._late and self._late[0][0] <= time_us:
+            publish(self._late.popleft()[1])
+
+    def skip_unread(self, read_us: int) -> None:
+        """Skip nothing: a delayed or frozen frame may be read later."""
+
+    def _take(self, frame: Frame, publish: Callable[[Frame], None]) -> None:
+        delay_us = 0
+        for each in self._acting:
+            kind = each.fault.kind
+            if kind == "off":
+                return
+            if kind == "delay":
+                delay_us += round(each.fault.amount * US_PER_S)
+            elif kind == "noise":
+                noise = DepthNoise(None, SensorNoise(depth_noise=each.fault.amount))
+                seed = NOISE_SEED * (each.number + 1) + self._seed
+                depth = noisy_frame(frame.depth_mm, noise, seed, frame.sequence)
+                frame = _showing(frame, depth, frame.jpeg)
+            else:  # stuck
+                if self._frozen is None:
+                    self._frozen = frame
+                frame = _showing(frame, self._frozen.image, self._frozen.jpeg)
+        if delay_us or self._late:
+            # A camera's frames arrive in order: a later frame must not overtake.
+            due_us = frame.capture_time_us + delay_us
+            self._late.append((max(due_us, self._late[-1][0]) if self._late else due_us, frame))
+        else:
+            publish(frame)
+
+    def _rearrange(self) -> None:
+        self._acting = self._timeline.acting("camera")
+        if all(each.fault.kind != "stuck" for each in self._acting):
+            self._frozen = None
+
+
+def _showing(frame: Frame, image: NDArray[Any], jpeg: bytes | None) -> Frame:
+    """Return a copy of a frame with another image of the main camera."""
+    picture = image, frame.intrinsics, jpeg, frame.further
+    return Frame(frame.sequence, frame.capture_time_us, *picture)
