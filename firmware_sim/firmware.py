@@ -113,11 +113,9 @@ class FlightStack(Protocol):
         """Return the latest simulated time for the next call of `send` [µs]."""
 
     def send(self, now_us: int, flown: Record) -> None:
-        """Send the messages that are due.
+        """Send the messages due at simulated `now_us` [µs], after the newest tick.
 
-        Args:
-            now_us: Simulated time after the newest tick [µs].
-            flown: (n,) logs of the ticks since the last call; empty for external firmware.
+        `flown` is (n,) logs of the ticks since the last call; empty for external firmware.
         """
 
     def log_to(self, tlog: TlogWriter | None) -> None:

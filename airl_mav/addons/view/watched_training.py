@@ -291,14 +291,13 @@ class EpisodeReplay:
         if episode.hover_after_s is not None:
             held_s = episode.hold_s + episode.hover_after_s
             expires_us = began_us + sent + round(held_s * US_PER_S)
-        forward, right, down, turn = record["setpoint"][-1].astype(float).tolist()
         message = view_messages.Decided(
             captured_us=began_us + stamp["capture_us"],
             began_us=began_us + began,
             ready_us=began_us + ready,
             sent_us=began_us + sent,
             expires_us=expires_us,
-            setpoint=(forward, right, down, turn),
+            setpoint=tuple(record["setpoint"][-1].astype(float).tolist()),
             compensated=self._environment.compensate,
             shape=view_messages.shape_of(image),
         )

@@ -105,16 +105,7 @@ def run(words: Sequence[str], port: BuiltinAutopilot, now_us: int) -> str:
     return command(words[1:], port, now_us)
 
 
-def _help(_words: Sequence[str], _port: BuiltinAutopilot, _now_us: int) -> str:
-    return "".join(f"  {name}\n" for name in sorted(COMMANDS))
-
-
-def _version(_words: Sequence[str], _port: BuiltinAutopilot, _now_us: int) -> str:
-    return "HW arch: AIRL_SITL\nPX4 version: 1.16.0 (emulated by airl-mav)\n"
-
-
-def _uptime(_words: Sequence[str], _port: BuiltinAutopilot, now_us: int) -> str:
-    return f"Uptime: {now_us / US_PER_S:.3f} s of simulated time\n"
+_VERSION = "HW arch: AIRL_SITL\nPX4 version: 1.16.0 (emulated by airl-mav)\n"
 
 
 def _parameters(words: Sequence[str], port: BuiltinAutopilot, _now_us: int) -> str:
@@ -212,11 +203,13 @@ def _formatted(value: float) -> str:
 
 COMMANDS: Mapping[str, Shown] = {
     "commander": _commander,
-    "help": _help,
+    "help": lambda *_: "".join(f"  {name}\n" for name in sorted(COMMANDS)),
     "listener": _listener,
     "param": _parameters,
-    "uptime": _uptime,
-    "ver": _version,
+    "uptime": lambda _words, _port, now_us: (
+        f"Uptime: {now_us / US_PER_S:.3f} s of simulated time\n"
+    ),
+    "ver": lambda *_: _VERSION,
 }
 
 HANDLERS: Handlers = {"SERIAL_CONTROL": (for_anyone, handle_input)}
