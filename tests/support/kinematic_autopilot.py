@@ -13,7 +13,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from firmware_sim.fault_timeline import ClientFaults
 
 from airl_mav.control.demand import AttitudeDemand, RateDemand
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US, US_PER_S
@@ -50,6 +49,7 @@ from firmware_sim.autopilot.inputs import (
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.parameter_store import ParameterValue
 from firmware_sim.autopilot.snapshot import progress
+from firmware_sim.fault_timeline import ClientFaults
 from firmware_sim.interfaces import BatterySample, GpsFix, LogStore, Received, SensorSample
 
 if TYPE_CHECKING:
