@@ -1,4 +1,4 @@
-"""A sensor added as docs/architecture.md says: a model of its profile and an add-on of two files."""
+"""A sensor added as docs/architecture.md says: a model of a profile, an add-on of two files."""
 
 from __future__ import annotations
 

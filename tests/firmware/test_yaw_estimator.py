@@ -274,7 +274,7 @@ class Told(YawEstimator):
     """Estimator with a fixed heading error, uncertainty, and explained share of the motion."""
 
     def __init__(self, off_deg: float, sigma_deg: float, explained: float) -> None:
-        super().__init__()
+        super().__init__(new_controller())
         self._shared[5:7] = math.radians(off_deg), math.radians(sigma_deg) ** 2
         self._explained = explained
 
