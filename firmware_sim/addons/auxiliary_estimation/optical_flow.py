@@ -22,7 +22,7 @@ from firmware_sim.addons.auxiliary_estimation.sensors import (
     GREATEST_RAD_S,
     LEAST_HEIGHT_M,
 )
-from firmware_sim.addons.auxiliary_estimation.terrain_filter import GROUND
+from firmware_sim.addons.auxiliary_estimation.terrain_filter import GROUND, reset_variances
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.error_state import FusionHorizon, Measurement, selecting
 from firmware_sim.interfaces import FlowReading
@@ -344,16 +344,13 @@ class OpticalFlowFusion:
 
     def _put_velocity(self, variance: float, now_us: int) -> None:
         """Reset the horizontal velocity to the flow velocity."""
-        state, p = self._state, self._terrain.covariance.copy()
+        state = self._state
         # Rotate the smoothed body velocity to NED, without its vertical component.
         level = self._rotation[:2, :2] @ self._smoothed_velocity
         state[es.V : es.V + 2] = level
-        for i in (es.VEL, es.VEL + 1):
-            # Correlations of the old velocity do not hold for the new one.
-            p[i, :] = p[:, i] = 0.0
-            # A flow error of s [rad/s] is a velocity error of s times range.
-            p[i, i] = self._range_m**2 * variance
-        self._terrain.restart(p)
+        # A flow error of s [rad/s] is a velocity error of s times range.
+        spread = self._range_m**2 * variance
+        reset_variances(self._terrain, {es.VEL: spread, es.VEL + 1: spread})
         self._agree(now_us)
 
     def _put_ground(self, now_us: int) -> None:

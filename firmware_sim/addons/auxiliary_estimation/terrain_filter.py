@@ -10,6 +10,8 @@ PX4 1.16, EKF/covariance.cpp, terrain_control.cpp and range_height_fusion.cpp.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from airl_mav.core.constants import TICK_S
@@ -31,6 +33,15 @@ _OF_RANGE = np.zeros(es.N_STATES + 1)
 _OF_RANGE[es.POS + 2], _OF_RANGE[GROUND] = -1.0, 1.0
 _OF_RANGE.setflags(write=False)
 """Jacobian of the height above ground by the errors: terrain z minus vehicle z."""
+
+
+def reset_variances(carried: ErrorFilter, variances: Mapping[int, float]) -> None:
+    """Set variances of errors by their indices, and clear the correlations of these errors."""
+    covariance = carried.covariance.copy()
+    for index, variance in variances.items():
+        covariance[index, :] = covariance[:, index] = 0.0
+        covariance[index, index] = variance
+    carried.restart(covariance)
 
 
 class TerrainFilter:
