@@ -56,10 +56,19 @@ from airl_mav.scenario.model import Workers
 from airl_mav.training.training_folder import TrainingFolder
 
 
-class SweepRequest(Workers):
-    """Request of an architecture search and its execution. The methods raise UsageError."""
+class SweepOptions(Workers):
+    """Search for the best network: train many networks, evaluate all, draw heat maps.
 
-    sweep: str = Field(
+    The search space is Air Learning's template: layers x filters, with several training seeds per
+    cell. The same --out resumes after any interruption.
+
+    Examples:
+        airl sweep quick
+        airl sweep full --executor ray --ray-address 192.168.1.10:6379
+        airl sweep quick --dry-run
+    """
+
+    sweep: Annotated[str, POSITIONAL] = Field(
         default="quick",
         description="quick (two cores, an hour), full (the paper's grid), paper (the same on the"
         " paper's image, for GPUs), tiny (seconds, shows nothing), or a path to a .toml",
@@ -267,23 +276,6 @@ class _TrialBars:
                 self._bars[trial].update(completed=last.steps, postfix=success)
         ended = self._total - len(self._left)
         self._bar.update(completed=done, postfix=f"{ended}/{self._total} trials")
-
-
-class SweepOptions(SweepRequest):
-    """Search for the best network: train many networks, evaluate all, draw heat maps.
-
-    The search space is Air Learning's template: layers x filters, with several training seeds per
-    cell. The same --out resumes after any interruption.
-
-    Examples:
-        airl sweep quick
-        airl sweep full --executor ray --ray-address 192.168.1.10:6379
-        airl sweep quick --dry-run
-    """
-
-    sweep: Annotated[str, POSITIONAL] = Field(
-        default="quick", description=SweepRequest.model_fields["sweep"].description
-    )
 
 
 OPTIONS = SweepOptions
