@@ -5,6 +5,7 @@ The `__init__` of an add-on is light and may define tables, which the core reads
 
     COMMANDS: {command of `airl`: (purpose, module with OPTIONS and run)}
     EXECUTORS: {value of `--executor`: module with `connected`}
+    ALGORITHMS: {name in training files: `Algorithm` of `training.algorithm_table`}
     LIGHT: the commands can be imported without the simulator
 
 In `firmware_sim.addons`:
@@ -54,3 +55,8 @@ def addon_commands() -> dict[str, tuple[str, str]]:
 def addon_executors() -> dict[str, str]:
     """Return the executors of add-ons: modules by name."""
     return entries("airl_mav", "EXECUTORS")
+
+
+def addon_algorithms() -> dict[str, str]:
+    """Return the learning algorithms of add-ons: rows of the algorithm table by name."""
+    return entries("airl_mav", "ALGORITHMS")

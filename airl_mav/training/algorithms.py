@@ -24,8 +24,8 @@ from airl_mav.core.plugins import NETWORKS, load_part
 from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, image_key
 from airl_mav.policy.runtime import first_line
 from airl_mav.training import config
-from airl_mav.training.algorithm_table import ALGORITHMS, Algorithm
-from airl_mav.training.config import NetworkSpec
+from airl_mav.training.algorithm_table import Algorithm
+from airl_mav.training.config import ALGORITHMS, NetworkSpec
 
 BATCH = ALGORITHMS["dqn"].batch
 

@@ -24,70 +24,39 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
 from torch.nn import functional
 
+from airl_mav.addons.imitation.experts import Expert
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.experts import Expert
 from airl_mav.envs.sb3 import NavigationVecEnv
-from airl_mav.envs.spec import ExpertName
 from airl_mav.policy.observation_spec import Encoded
+from airl_mav.training.config import ExpertName
+from airl_mav.training.dqn import Ring, Shapes, shapes_of
 
 
-class Demonstrations:
-    """Observations and the expert's actions; arguments as in `dqn.NStepReplay`."""
+class Demonstrations(Ring):
+    """Observations and the expert's actions."""
 
     def __init__(
-        self,
-        steps: int,
-        vehicles: int,
-        shapes: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]],
-        actions: spaces.Space[Any],
+        self, steps: int, vehicles: int, shapes: Shapes, actions: spaces.Space[Any]
     ) -> None:
-        size = max(steps // vehicles, 1), vehicles
-        discrete = isinstance(actions, spaces.Discrete)
-        self.head = 0
-        self.filled = 0
-        self._observations = {k: np.zeros((*size, *s), t) for k, (s, t) in shapes.items()}
-        self._actions = np.zeros(
-            size if discrete else (*size, *(actions.shape or ())),
-            np.int64 if discrete else np.float32,
-        )
+        shape = () if isinstance(actions, spaces.Discrete) else actions.shape or ()
+        kind = np.int64 if isinstance(actions, spaces.Discrete) else np.float32
+        rows = max(steps // vehicles, 1)
+        super().__init__(shapes, np.zeros((rows, vehicles, *shape), kind))
 
     def __len__(self) -> int:
         """Return the number of stored decisions."""
-        return self.filled * self._actions.shape[1]
+        return self.filled * self.vehicles
 
     def add(self, observations: Mapping[str, NDArray[Any]], actions: NDArray[Any]) -> None:
         """Store the observations of all vehicles, and the expert's actions."""
-        for key, array in self._observations.items():
-            array[self.head] = observations[key]
-        self._actions[self.head] = actions
-        rows = len(self._actions)
-        self.head = (self.head + 1) % rows
-        self.filled = min(self.filled + 1, rows)
+        self._store(observations, actions)
 
     def sample(self, batch: int, generator: np.random.Generator) -> tuple[Encoded, NDArray[Any]]:
         """Draw observations and their actions uniformly, with replacement."""
         rows = generator.integers(self.filled, size=batch)
-        vehicles = generator.integers(self._actions.shape[1], size=batch)
+        vehicles = generator.integers(self.vehicles, size=batch)
         seen = {key: array[rows, vehicles] for key, array in self._observations.items()}
         return seen, self._actions[rows, vehicles]
-
-    def get_state(self) -> dict[str, NDArray[Any]]:
-        """Return the complete memory by name; views, not copies."""
-        named = {name: array[: self.filled] for name, array in self._named().items()}
-        return named | {"head": np.array(self.head)}
-
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Restore the state from `get_state`; ValueError for other shapes."""
-        for name, array in self._named().items():
-            saved = state[name]
-            if saved.shape[1:] != array.shape[1:] or len(saved) > len(array):
-                raise ValueError(f"replay {name}: {saved.shape} does not fit {array.shape}")
-            array[: len(saved)] = saved
-        self.filled, self.head = len(state["actions"]), int(state["head"])
-
-    def _named(self) -> dict[str, NDArray[Any]]:
-        seen = {f"observations/{key}": array for key, array in self._observations.items()}
-        return {"actions": self._actions} | seen
 
 
 class Imitation(BaseAlgorithm):
@@ -149,10 +118,9 @@ class Imitation(BaseAlgorithm):
         self.policy = cast("ActorCriticPolicy", policy.to(self.device))
         if not isinstance(self.env, NavigationVecEnv):
             raise UsageError(f"algorithm.expert: none for a {type(self.env).__name__}")
-        self._expert: Expert = self.env.teach(self.expert_name)
-        assert isinstance(self.observation_space, spaces.Dict)  # noqa: S101 (MultiInputPolicy's)
-        boxes = {k: cast("spaces.Box", v) for k, v in self.observation_space.spaces.items()}
-        shapes = {k: (box.shape, box.dtype) for k, box in boxes.items()}
+        self._expert = Expert(self.expert_name, self.env.env.navigation)
+        self.env.teach(self._expert)
+        shapes = shapes_of(self.observation_space)
         self.replay = Demonstrations(self.buffer_size, self.n_envs, shapes, self.action_space)
         self.generator = np.random.default_rng(self.seed)
 

@@ -15,17 +15,18 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.addons.imitation.planner import Planner
 from airl_mav.arena.gates import Openings, openings_of
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import ned_to_heading, quats_to_euler
+from airl_mav.envs import sb3
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.planner import Planner
-from airl_mav.envs.saved_state import State, Stateful
-from airl_mav.envs.spec import ExpertName
+from airl_mav.envs.saved_state import State
 from airl_mav.policy.action_sets import VELOCITIES, VERTICAL, ActionSpec, commands, discrete_actions
 from airl_mav.policy.actions import fastest_climb
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
+from airl_mav.training.config import ExpertName
 
 AHEAD_S = 0.4
 """Prediction time of the position [s]: about the dead time plus half the response time."""
@@ -201,7 +202,7 @@ class GreedyPilots:
         return nearest
 
 
-class Expert(Stateful):
+class Expert(sb3.Expert):
     """Expert and its memory, with checkpoint support."""
 
     def __init__(self, name: ExpertName, navigation: Navigation) -> None:
