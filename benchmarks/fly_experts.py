@@ -11,7 +11,7 @@ from typing import get_args
 
 import numpy as np
 
-from airl_mav.addons.imitation.experts import Expert
+from airl_mav.addons.imitation.imitation import Expert
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec

@@ -29,7 +29,7 @@ from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
 from airl_mav.policy.learned import LearnedPolicy
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction import Compensator
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.scenario.piloting import action_generator
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario

@@ -20,7 +20,7 @@ from airl_mav.latency.injection import FixedSampler, Injection, LatencySampler, 
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import PolicyInfo
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction import Compensator
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.loading import profile_digest

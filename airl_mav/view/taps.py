@@ -13,7 +13,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.latency.injection import LatencySampler
 from airl_mav.policy.observation import Kinematics
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction import Compensator
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view import view_messages as messages
 from airl_mav.view.ends import ViewEnds

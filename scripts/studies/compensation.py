@@ -34,7 +34,7 @@ from airl_mav.envs.fleet import FlightStatus
 from airl_mav.experiments.gym_flier import navigation_of, pilots_of
 from airl_mav.flight.paired import relative_difference
 from airl_mav.flight.statistics import wilson
-from airl_mav.prediction.compensator import RECENT, Compensator, ExpectedLatency
+from airl_mav.prediction import RECENT, Compensator, ExpectedLatency
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.report.measures import rate_with_interval, with_interval
 from airl_mav.report.table import NONE, Column, TableView, markdown_table, print_table, write_table

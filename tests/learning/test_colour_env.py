@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.preprocessing import is_image_space
 
-from airl_mav.addons.imitation.experts import Expert
+from airl_mav.addons.imitation.imitation import Expert
 from airl_mav.camera.exposure import expose
 from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.core.errors import FieldError, UsageError

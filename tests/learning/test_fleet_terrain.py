@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from airl_mav.addons.imitation.experts import Expert
+from airl_mav.addons.imitation.imitation import Expert
 from airl_mav.addons.imitation.planner import OVER_M, PlannerBody, map_of
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
-from airl_mav.addons.imitation.experts import Expert, choices
+from airl_mav.addons.imitation.imitation import Expert, choices
 from airl_mav.addons.imitation.planner import PlannerBody, map_of
 from airl_mav.envs.evaluation import (
     EpisodeResult,

@@ -38,7 +38,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
 from airl_mav.core.fields import optional, quantity, switch, validated
 from airl_mav.core.progress import Bar, Progress, RichProgress
-from airl_mav.experiments.campaign_store import open_campaign
+from airl_mav.experiments.campaign import open_campaign
 from airl_mav.experiments.executors import (
     Executor,
     ExecutorSettings,
@@ -194,11 +194,11 @@ def run_sweep(
     something else.
     """
     say = partial(progress.note, style="yellow")
-    with open_campaign(path, declaration(config), command=command, say=say) as store:
-        folder = SweepFolder(store.path, config)
+    with open_campaign(path, declaration(config), command=command, say=say) as campaign:
+        folder = SweepFolder(path.absolute(), config)
 
         def summary() -> Sweep:
-            sweep = summarize(folder, store.campaign.made, computer)
+            sweep = summarize(folder, campaign.made, computer)
             write_sweep(sweep)
             return sweep
 
