@@ -21,22 +21,10 @@ from airl_mav.core.fields import ProfileModel, validated
 from airl_mav.core.files import read_json, write_json
 from airl_mav.core.kernels import cache_folder
 from airl_mav.envs.arena_batch import ArenaBatch, empty_batch
-from airl_mav.envs.fleet import (
-    Fleet,
-    FleetConstants,
-    Rules,
-    hover,
-    new_fleet,
-    vehicle_of,
-)
+from airl_mav.envs.fleet import Fleet, FleetConstants, Rules, hover, new_fleet, vehicle_of
 from airl_mav.envs.fleet_step import advance
 from airl_mav.envs.spec import Delay, EnvironmentSpec
-from airl_mav.latency.injection import (
-    Injection,
-    choose_injection,
-    longest_ms,
-    parse_latency,
-)
+from airl_mav.latency.injection import Injection, choose_injection, longest_ms, parse_latency
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.conditions import Payload, equipped
 from airl_mav.profiles.loading import profile_digest

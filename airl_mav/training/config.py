@@ -10,20 +10,10 @@ from pydantic import Field, field_validator, model_validator
 
 from airl_mav.core.addons import addon_algorithms, load
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import (
-    ProfileModel,
-    optional,
-    quantity,
-    switch,
-    validated,
-)
+from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
 from airl_mav.core.plugins import NETWORKS, part_name
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.policy.action_sets import (
-    SHIPPED,
-    ActionSpec,
-    discrete_actions,
-)
+from airl_mav.policy.action_sets import SHIPPED, ActionSpec, discrete_actions
 from airl_mav.profiles.computer import load_computer
 from airl_mav.training.algorithm_table import CORE_ALGORITHMS, ActionKind, Algorithm
 

@@ -64,7 +64,8 @@ class Ring:
 
     def __init__(self, shapes: Shapes, actions: NDArray[Any]) -> None:
         """Use zero-filled `actions` (rows, vehicles, ...), with observations of these shapes."""
-        size = self.rows, self.vehicles = actions.shape[:2]
+        self.rows, self.vehicles = int(actions.shape[0]), int(actions.shape[1])
+        size = self.rows, self.vehicles
         self.head = 0
         self.filled = 0
         self._actions = actions
@@ -183,8 +184,8 @@ class NStepReplay(Ring):
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Return the complete memory by name; views, not copies."""
-        last = {f"last/{key}": array for key, array in self._last.items()}
-        return super().get_state() | last | {"free": np.array(self._free, np.int32)}
+        state = super().get_state() | {"free": np.array(self._free, np.int32)}
+        return state | {f"last/{key}": array for key, array in self._last.items()}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Restore the state from `get_state`; ValueError for other shapes."""

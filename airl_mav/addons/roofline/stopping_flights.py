@@ -11,10 +11,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Shape
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.envs.arena_batch import ArenaBatch
-from airl_mav.envs.fleet import (
-    Fleet,
-    FlightStatus,
-)
+from airl_mav.envs.fleet import Fleet, FlightStatus
 from airl_mav.envs.fleet_step import advance
 from airl_mav.envs.stopping import (
     ALTITUDE_M,
@@ -28,12 +25,7 @@ from airl_mav.envs.stopping import (
     stop,
     twin_of,
 )
-from airl_mav.latency.injection import (
-    FixedSampler,
-    Injection,
-    LatencySampler,
-    latency_generator,
-)
+from airl_mav.latency.injection import FixedSampler, Injection, LatencySampler, latency_generator
 
 WALL_HALF_M = (0.5, 20.0, 5.0)
 """Half extents of the obstacle: too wide to fly around [m]."""
