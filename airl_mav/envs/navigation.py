@@ -68,6 +68,24 @@ EVERYONE = slice(None)
 """Rows of all n vehicles."""
 
 
+class Commands(NamedTuple):
+    """Kind of commands."""
+
+    least: int
+    """Minimum number of columns of commands."""
+    setpoint: tuple[int, ...]
+    """Columns of `Fleet.setpoint` with these numbers."""
+    expire: bool
+    """True if a command that is not replaced in time ends in a stop."""
+
+
+COMMANDS: dict[CommandKind, Commands] = {
+    "velocity": Commands(3, (0, 1, 3), expire=False),
+    "body_rates": Commands(4, (0, 1, 2, 3), expire=True),
+}
+"""Kinds of commands of the vectorized simulator."""
+
+
 class WholeTruth(NamedTuple):
     """True state, hidden from policies, for experts in imitation learning."""
 
@@ -122,8 +140,8 @@ class Navigation(Stateful):
         """
         self.spec = spec
         self.n = n
-        self.by_rates: bool = (commands or spec.action_spec.commands) == "body_rates"
-        """True for body rate and thrust commands, False for velocities."""
+        self.commands = COMMANDS[commands or spec.action_spec.commands]
+        """Kind of the commands of `fly`."""
         if vehicle is None:
             vehicle, computer = equipped(spec.vehicle, spec.delay.computer, Payload())
             computer_w = computer.onboard_watts
@@ -222,7 +240,7 @@ class Navigation(Stateful):
             )
         # Negative: velocity setpoints do not time out.
         timeout_us = -TICK_US
-        if self.by_rates:
+        if self.commands.expire:
             held_s = 0.0 if pipelined else rules.hold_s
             timeout_us = round((rules.decision_timeout_s or held_s + UPRIGHT_S) * US_PER_S)
         return Timing(
@@ -359,14 +377,14 @@ class Navigation(Stateful):
 
         Args:
             commands: (n, 3) forward, right [m/s], yaw rate [rad/s] with altitude hold; or (n, 4)
-                with an additional downward speed [m/s], NaN = altitude hold. With `by_rates`, (n,
-                4) body rates FRD [rad/s] and thrust 0..1.
+                with an additional downward speed [m/s], NaN = altitude hold. Of the kind body_rates
+                (n, 4) body rates FRD [rad/s] and thrust 0..1.
             encode: True if `observe` is called next.
 
         Raises:
             ValueError: Wrong number or width of commands.
         """
-        least = 4 if self.by_rates else 3
+        least = self.commands.least
         if commands.ndim != 2 or len(commands) != self.n or not least <= commands.shape[1] <= 4:
             accepted = " or ".join(f"({self.n}, {width})" for width in range(least, 5))
             raise ValueError(f"commands of shape {commands.shape}: accepted: {accepted}")
@@ -489,7 +507,7 @@ class Navigation(Stateful):
 
     def _held(self) -> Mapping[str, Any]:
         # Keeps velocity checkpoints compatible with versions before body rates.
-        unsaved = ("room",) if self.by_rates else ("room", "by_rates")
+        unsaved = ("room",) if self.commands.expire else ("room", "by_rates")
         held: dict[str, Any] = {
             "navigation": {
                 "seeds": self.seeds,
@@ -511,7 +529,7 @@ class Navigation(Stateful):
         timing: dict[str, Any] = {}
         if self._decision.timing.pipelined:
             timing = {"left": decision.left, "in_flight": decision.in_flight}
-        if self.by_rates:
+        if self.commands.expire:
             rates = (decision.newest, decision.wanted, decision.sent_us)
             timing["rates"] = dict(zip(("newest", "wanted", "sent_us"), rates, strict=True))
         if timing:

@@ -184,8 +184,9 @@ class NStepReplay(Ring):
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Return the complete memory by name; views, not copies."""
-        state = super().get_state() | {"free": np.array(self._free, np.int32)}
-        return state | {f"last/{key}": array for key, array in self._last.items()}
+        state = super().get_state() | {f"last/{key}": each for key, each in self._last.items()}
+        state["free"] = np.array(self._free, np.int32)
+        return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Restore the state from `get_state`; ValueError for other shapes."""
