@@ -13,7 +13,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from airl_mav.core.after_import import after_import as _after_import
+from airl_mav.core.addons import after_import as _after_import
 
 __version__ = "0.2.0"
 

@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.core.constants import TICK_S
-from airl_mav.lockstep.lockstep_link import lockstep_link
+from airl_mav.lockstep.vehicle import lockstep_link
 from airl_mav.profiles.vehicle import load_vehicle
 
 ROOT = Path(__file__).parents[1]

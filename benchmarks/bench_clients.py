@@ -33,7 +33,7 @@ from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
-from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.pacing import WallPacing
 from firmware_sim.simulation import EpisodeSetup

@@ -17,11 +17,10 @@ from rich.table import Table
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import Meshes
-from airl_mav.camera.colour import Work, render_colour
-from airl_mav.camera.gloss import Gloss
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import ColourArrays
+from airl_mav.camera.picture import ColourArrays, Work, render_colour
 from airl_mav.camera.projection import Bent
+from airl_mav.camera.shading import Gloss
 from airl_mav.camera.textures import atlas
 from airl_mav.core.kernels import kernel
 

@@ -21,11 +21,11 @@ from rich.table import Table
 
 from airl_mav.experiments.quantisation import export_int8, quantised
 from airl_mav.policy.card import ONNX_FILE, PolicyFacts, load_card, read_card
+from airl_mav.policy.card_writing import write_template
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.observation_spec import Encoded, ObservationSpec
 from airl_mav.policy.registry import find_policy
 from airl_mav.policy.runtime import OnnxRuntime
-from airl_mav.policy.template import write_template
 
 DEFAULT = ("static-obstacles", "5x32")
 LONGEST_S = 10.0

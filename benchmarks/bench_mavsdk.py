@@ -37,8 +37,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from airl_mav.core.constants import LOOPBACK
-from airl_mav.core.provenance import provenance, usable_cores
-from airl_mav.latency.percentiles import summarize
+from airl_mav.core.machine import provenance, usable_cores
+from airl_mav.latency.stages import summarize
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.table import (
     DURATION_COLUMNS,
@@ -51,7 +51,7 @@ from airl_mav.report.table import (
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import Address, Peer, UdpEndpoint, UdpPeer
-from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.pacing import WallPacing
 from firmware_sim.simulation import EpisodeSetup

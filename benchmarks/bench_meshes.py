@@ -34,9 +34,8 @@ from rich.table import Table
 from airl_mav.arena.geometry import Arena, PlacedMesh
 from airl_mav.arena.triangles import Triangles, encoded, triangles_of
 from airl_mav.camera.bvh import meshes_of
-from airl_mav.camera.colour import Work
 from airl_mav.camera.intrinsics import Intrinsics, rays_of
-from airl_mav.camera.picture import ColourArrays
+from airl_mav.camera.picture import ColourArrays, Work
 from airl_mav.camera.projection import bent_of
 from airl_mav.camera.render import render
 from airl_mav.camera.textures import atlas

@@ -27,15 +27,15 @@ from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.commander import CommanderState
-from firmware_sim.external.process import FirmwareProcess, StartCommand
-from firmware_sim.external.px4.px4_program import (
+from firmware_sim.external.launcher import FirmwareProcess, StartCommand
+from firmware_sim.external.programs import (
     API_LOCAL_PORT,
     API_PORT,
     SIMULATOR_PORT,
     environment,
     find_px4,
 )
-from firmware_sim.external.px4.px4_sitl import Px4Bridge, TcpPort
+from firmware_sim.external.px4_sitl import Px4Bridge, TcpPort
 from firmware_sim.mavlink.codec import Decoder, Encoder, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.pacing import Pacing, Unpaced, WallPacing

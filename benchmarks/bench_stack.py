@@ -25,19 +25,18 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_S, TICK_US, US_PER_S
 from airl_mav.lockstep.digest import FlightDigest
 from airl_mav.lockstep.lockstep_flight import fly
-from airl_mav.lockstep.lockstep_link import lockstep_link
-from airl_mav.lockstep.threaded import ThreadPartner
+from airl_mav.lockstep.stage import ThreadPartner
+from airl_mav.lockstep.vehicle import lockstep_link
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario, resolve
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import LinkConfig, gcs_link
+from firmware_sim.mavlink.px4_links import LinkConfig, gcs_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.plant.plant import Plant
 from firmware_sim.plant.sensors import SensorSuite

@@ -28,8 +28,8 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.addons.profiling import hil
+from airl_mav.addons.profiling.measurement import ProfileRequest
 from airl_mav.addons.profiling.policy_under_test import BareLoop, PolicyUnderTest, open_policy
-from airl_mav.addons.profiling.request import ProfileRequest
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.frames import Goal

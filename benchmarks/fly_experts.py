@@ -16,7 +16,7 @@ from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.statistics import wilson
-from airl_mav.policy.action_sets import commands
+from airl_mav.policy.actions import commands
 from airl_mav.training.config import ExpertName
 
 VEHICLES = 50

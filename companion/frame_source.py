@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
@@ -11,6 +12,8 @@ from typing import Protocol
 import zmq
 
 from airl_mav.camera.frame import MOST_BYTES, Frame, FrameError
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.addons import load_entry
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
@@ -171,3 +174,38 @@ def open_camera(endpoint: str, clock: Clock) -> ZmqFrameSource:
     if endpoint.startswith("tcp:") and not (port.isdecimal() and 1 <= int(port) <= GREATEST_PORT):
         raise FieldError("camera", endpoint, f"tcp://HOST:PORT, port 1..{GREATEST_PORT}")
     return ZmqFrameSource(endpoint, clock)
+
+
+class OpenCamera(FrameSource, Protocol):
+    """Frame source that can be closed and reports failures."""
+
+    @property
+    def failure(self) -> str | None:
+        """Return the reason for missing frames; None = no failure, or unknown."""
+
+    @property
+    def dropped(self) -> int:
+        """Return the number of lost camera images; 0 if unknown."""
+
+    def close(self) -> None:
+        """Release the camera."""
+
+
+def open_named_camera(
+    name: str,
+    clock: Clock,
+    wanted: Intrinsics,
+    whose: str,
+    further: Mapping[str, Intrinsics] | None = None,
+) -> OpenCamera:
+    """Open a camera by name; FieldError if it is missing, sees too little or has no depth.
+
+    A name is tcp://HOST:PORT or ipc://PATH, whose images are used unchanged, or that of a driver.
+    Its images are converted to the `wanted` camera of `whose`, such as "vehicle quad".
+    """
+    # An address has a scheme; the publisher defines its own camera, so nothing is converted.
+    if "://" in name:
+        return open_camera(name, clock)
+    open_driver = load_entry("companion", "CAMERAS", "driver", ("camera", name), "cameras")
+    camera: OpenCamera = open_driver(name, clock, wanted, whose, further)
+    return camera

@@ -17,7 +17,7 @@ from airl_mav.camera.frame import Frame
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Goal, goal_height_m
 from airl_mav.policy.observation import Kinematics
-from airl_mav.profiles.distortion import sees_to, undistorted
+from airl_mav.profiles.projections import sees_to, undistorted
 from airl_mav.scenario.model import LimitSettings, PilotSettings
 from companion.frame_source import ReceivedFrame
 from companion.link_interface import FRAMES_LATE, TELEMETRY_FROZEN, VehicleStatus

@@ -23,8 +23,16 @@ from airl_mav.core.clock import Clock, WallClock
 from airl_mav.policy.actions import Attitude
 from airl_mav.policy.observation import Kinematics
 from companion import link_interface
-from companion.dialects import POSITION, PX4, Dialect, dialect_of
-from companion.mavsdk_connection import exchange_raw, first_autopilot, open_connection, set_timeout
+from companion.mavsdk_connection import (
+    POSITION,
+    PX4,
+    Dialect,
+    dialect_of,
+    exchange_raw,
+    first_autopilot,
+    open_connection,
+    set_timeout,
+)
 
 POLL_S = 0.1
 """Interval of checks while waiting for a condition [s]."""

@@ -19,10 +19,10 @@ from airl_mav.policy.actions import CameraBound, Policy, RigBound
 from airl_mav.prediction import Compensator
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.stand_alone import Start as PilotedStart
-from companion.dialects import ARDUPILOT
 from companion.frame_source import FrameSource
 from companion.limits import NOT_OURS, Limits
 from companion.link_interface import CAMERA_SILENT, LINK_LOST, STOP, TELEMETRY_FROZEN, LinkError
+from companion.mavsdk_connection import ARDUPILOT
 from companion.mavsdk_link import MavsdkLink
 from companion.pilot import FRAME_WAIT_S, WAITING, Pilot, SentDecision
 from companion.watchdog import Guard, Watchdog

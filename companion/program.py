@@ -1,45 +1,56 @@
-"""Stand-alone companion program: connects, flies one mission and reports the result."""
+"""Stand-alone companion program: one mission with a real flight controller, or a ground check.
+
+The ground check looks at camera, flight controller and policy for a few seconds, without arming.
+"""
 
 from __future__ import annotations
 
 import math
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pydantic import TypeAdapter
+import numpy as np
 
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.addons import load_entry
 from airl_mav.core.clock import Clock, WallClock
-from airl_mav.core.cpu_quota import held_to
-from airl_mav.core.errors import FieldError
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import Goal
-from airl_mav.core.provenance import describe_machine
+from airl_mav.core.machine import describe_machine
+from airl_mav.core.scheduling import held_to
 from airl_mav.flight.episode_record import Part, Setup
 from airl_mav.latency.injection import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.policy.observation import InFlight, Kinematics, observe, views_of
 from airl_mav.policy.registry import camera_refused, find_policy
 from airl_mav.prediction import Compensator
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from airl_mav.scenario import piloting
+from airl_mav.scenario import checks
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
-from companion.cameras.by_name import OpenCamera, open_named_camera
-from companion.frame_source import FrameSource, SharedFrames
+from companion.frame_source import (
+    FrameSource,
+    OpenCamera,
+    ReceivedFrame,
+    SharedFrames,
+    open_named_camera,
+)
+from companion.link_interface import LinkError
+from companion.mavsdk_connection import RATE_HZ, signed
 from companion.mavsdk_link import MavsdkLink
-from companion.offboard_mission import MissionResult, check_camera, fly_mission
-from companion.presence import obstacles_told, present
-from companion.signing_proxy import signed
+from companion.offboard_mission import FRAME_TIMEOUT_S, MissionResult, check_camera, fly_mission
+from companion.pilot import age_of
+from companion.status_reports import obstacles_told, present
 from companion.watchdog import ThreadGuard
 
 if TYPE_CHECKING:
-    from companion.black_box import BlackBoxRecorder
-
-_SETUP = TypeAdapter(Setup)
+    from companion.addons.black_box.recorder import BlackBoxRecorder
 
 FLIGHT_S = 600.0
 """Default time limit of navigation [s]."""
@@ -77,12 +88,14 @@ class MissionSetup:
 def prepare(asked: StandAloneCompanion) -> MissionSetup:
     """Check the input and load the policy before any connection, or raise UsageError."""
     check_companion(asked)
+    if asked.black_box is not None:
+        _recording(asked)
     policy = find_policy(asked.policy, trust=asked.trust)
-    pilot, watchdog = piloting.decide_piloting(asked, policy, PilotSettings.goal_radius_m)
+    pilot, watchdog = checks.decide_piloting(asked, policy, PilotSettings.goal_radius_m)
     # Computing time of this computer counts, except in lockstep.
-    injection = piloting.select_latency(asked, policy, on_this_computer=not asked.lockstep)
-    piloting.check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
-    loaded = piloting.load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
+    injection = checks.select_latency(asked, policy, on_this_computer=not asked.lockstep)
+    checks.check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
+    loaded = checks.load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
     sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
     # Obstacle messages need depth along the heading; other cameras are rejected before the flight.
     vehicle, compensator = load_vehicle(asked.vehicle), None
@@ -100,11 +113,11 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
         raise FieldError(
             "policy", asked.policy, problem=f"does not fit vehicle {asked.vehicle}: {reason}"
         )
-    piloting.check_goal_height(
+    checks.check_goal_height(
         policy, asked.goal, "goal", " ".join(f"{metres:g}" for metres in asked.goal)
     )
     # Checked before the compensator is created.
-    piloting.check_compensated(pilot, policy, vehicle)
+    checks.check_compensated(pilot, policy, vehicle)
     if pilot.compensate:
         compensator = Compensator(1, vehicle, Intrinsics.of(vehicle.camera))
     limits = asked.limits
@@ -125,7 +138,7 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
         computer_watts=0.0,
         injection=injection,
         speed=asked.speed,
-        between_commands=piloting.between_commands(pilot, watchdog.hover_after_s),
+        between_commands=checks.between_commands(pilot, watchdog.hover_after_s),
         firmware="not known",
     )
     return MissionSetup(
@@ -171,28 +184,22 @@ def obstacles_reported(
         yield frames
 
 
-@contextmanager
 def recorded(
     asked: StandAloneCompanion, mission: MissionSetup, link: MavsdkLink, clock: Clock
-) -> Iterator[BlackBoxRecorder | None]:
+) -> AbstractContextManager[BlackBoxRecorder | None]:
     """Record a mission if requested. Raises FieldError if no file can be written."""
     if asked.black_box is None:
-        yield None
-        return
-    # Imported here, as MCAP is an optional extra.
-    from companion.black_box import open_recorder, recording
-
-    run = run_of(asked, mission)
-    with recording(open_recorder(asked.black_box, run, link, clock, mission.goal)) as recorder:
-        link.hear_texts(recorder.heard)
-        yield recorder
+        return nullcontext()
+    recorder: AbstractContextManager[BlackBoxRecorder] = _recording(asked)(
+        asked, mission, link, clock
+    )
+    return recorder
 
 
-def run_of(asked: StandAloneCompanion, mission: MissionSetup) -> dict[str, Any]:
-    """Return the setup and configuration in the format of `run.json`."""
-    config = asked.model_dump(mode="json")
-    config |= {"pilot": asdict(mission.pilot), "limits": mission.limits.model_dump(mode="json")}
-    return {"setup": _SETUP.dump_python(mission.setup, mode="json"), "config": config}
+def _recording(asked: StandAloneCompanion) -> Any:
+    """Return the function that records a mission. Raises FieldError without the add-on."""
+    option = "black_box", f"{asked.black_box}"
+    return load_entry("companion", "RECORDERS", "black_box", option, "black_box")
 
 
 def fly_alone(
@@ -257,3 +264,164 @@ def fly_alone(
                 if box.failure is not None:
                     result = replace(result, notes=(*result.notes, box.failure))
             return result
+
+
+LOOK_S = 3.0
+"""Duration of the checks of the camera and of the telemetry [wall s]."""
+
+POLL_S = 0.002
+"""Interval of telemetry reads [s]."""
+
+DECISIONS = 30
+"""Number of timed decisions, without the first one."""
+
+LEAST_SHARE = 0.5
+"""Minimum share of the requested telemetry rate."""
+
+
+class CheckResult(NamedTuple):
+    """Result of one check."""
+
+    what: str
+    good: bool
+    told: str
+
+
+def check_on_ground(
+    asked: StandAloneCompanion, mission: MissionSetup, stop: threading.Event
+) -> Iterator[CheckResult]:
+    """Check a flight's requirements one by one, skipping absent parts, until `stop` is set."""
+    clock = WallClock(asked.speed)
+    yield CheckResult("policy", True, f"{asked.policy}, holds an action {mission.pilot.hold_s:g} s")
+    # CPU quota as in flight, so that the timed decisions are representative.
+    with held_to(asked.cpu_quota):
+        try:
+            camera = mission_camera(asked, mission, clock)
+        except UsageError as error:
+            yield CheckResult("camera", False, str(error))
+            return
+        with closing(camera):
+            yield from look_at_camera(mission, camera, clock, stop)
+            # The newest frame serves as input for the timed decisions.
+            seen = camera.latest()
+            try:
+                with (
+                    signed(asked.connect, asked.signing_key) as url,
+                    closing(MavsdkLink(url, clock, stop)) as link,
+                ):
+                    link.connect(asked.connect_timeout, stop)
+                    yield from look_at_vehicle(link, mission, stop)
+                    if seen is not None and not stop.is_set():
+                        yield time_decisions(mission, seen, link.kinematics())
+            except (LinkError, UsageError) as error:
+                yield CheckResult("flight controller", False, str(error))
+
+
+def look_at_camera(
+    mission: MissionSetup, camera: FrameSource, clock: Clock, stop: threading.Event
+) -> Iterator[CheckResult]:
+    """Check rate, age and changes of frames, and if they fit the policy."""
+    first = camera.wait(-1, FRAME_TIMEOUT_S)
+    if first is None:
+        yield CheckResult("camera", False, f"no frame for {FRAME_TIMEOUT_S:g} s")
+        return
+    try:
+        check_camera(mission.policy, camera, stop, mission.compensator)
+    except UsageError as error:
+        yield CheckResult("camera", False, str(error))
+        return
+    # Frames are not stored: a driver may send thousands of large frames.
+    watch, last, frozen, ages_us = WallClock(), first, True, []
+    # The loop counts changes of frames in wall time: rates of real devices.
+    while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
+        newer = camera.wait(last.frame.sequence, 0.5)
+        if newer is not None:
+            # Equality with the first frame throughout means a frozen image.
+            frozen = frozen and np.array_equal(first.frame.image, newer.frame.image)
+            last = newer
+            ages_us.append(age_of(newer, clock.time_us()))
+    lens, rate_hz = first.frame.intrinsics, len(ages_us) / LOOK_S
+    if not ages_us:
+        yield CheckResult("camera", False, f"one frame in {LOOK_S:g} s")
+        return
+    kind = "" if lens.kind == "depth" else f"{lens.kind}, "
+    told = f"{kind}{lens.width}x{lens.height} px, {rate_hz:.1f} frames/s"
+    for name, other in first.frame.lenses.items():
+        told += f"; {name}: {other.kind}, {other.width}x{other.height} px"
+    if frozen:
+        # Not a fault: a simulator's images of a vehicle at rest may be without noise.
+        told += "; every image is the same (a real camera has noise)"
+    age_us = float(np.median(ages_us))
+    yield CheckResult(
+        "camera", True, f"{told}; {age_us / US_PER_MS:.0f} ms old where it is decided on"
+    )
+
+
+def look_at_vehicle(
+    link: MavsdkLink, mission: MissionSetup, stop: threading.Event
+) -> Iterator[CheckResult]:
+    """Check the telemetry rate, then the reported state."""
+    watch, changes, last = WallClock(), 0, link.kinematics()
+    while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
+        watch.sleep_until(watch.time_us() + int(POLL_S * US_PER_S))
+        now = link.kinematics()
+        # A changed position is the sign of new telemetry.
+        changes += not np.array_equal(now.position, last.position)
+        last = now
+    rate_hz = changes / LOOK_S
+    status = link.status()
+    yield CheckResult(
+        "flight controller",
+        link.connected,
+        f"{link.dialect.name}, {'armed' if status.armed else 'disarmed'}, mode {status.mode}",
+    )
+    asked = f"position {rate_hz:.0f} times a second, {RATE_HZ:.0f} were asked for"
+    # At least half of the requested rate must arrive.
+    yield CheckResult("telemetry", rate_hz >= LEAST_SHARE * RATE_HZ, asked)
+    # With an external origin, GPS health is not required.
+    missing = link.missing_health(by_gps=mission.pilot.origin is None)
+    charge, least = status.battery, mission.limits.battery
+    yield CheckResult(
+        "battery",
+        least is None or (charge is not None and charge >= least),
+        ("not told" if charge is None else f"{100.0 * charge:.0f} %")
+        + ("" if least is None else f"; the limit is {100.0 * least:g} %"),
+    )
+    yield CheckResult(
+        "health",
+        not missing,
+        f"not yet: {', '.join(missing)}"
+        if missing
+        else "calibrated, knows where it is, may be armed",
+    )
+
+
+def time_decisions(mission: MissionSetup, seen: ReceivedFrame, state: Kinematics) -> CheckResult:
+    """Measure the policy's inference time (t2) on a received frame."""
+    frame, watch, took_us = seen.frame, WallClock(), []
+    # The same observation each time: only the duration matters.
+    observation = observe(
+        *(frame.image, frame.intrinsics, state, np.asarray(mission.goal, np.float64)),
+        InFlight.of_first_decisions(1).rows(0),
+        further=views_of(frame),
+    )
+    try:
+        # One extra call: the first is dropped below.
+        for _ in range(DECISIONS + 1):
+            begun_us = watch.time_us()
+            mission.policy.act(observation)
+            took_us.append(watch.time_us() - begun_us)
+    except Exception as error:
+        # A policy may raise any exception.
+        what = " ".join(f"{type(error).__name__}: {error}".split())
+        return CheckResult("decision", False, f"the policy failed: {what}")
+    del took_us[0]
+    median_us = float(np.median(took_us))
+    longest_s = max(took_us) / US_PER_S
+    bound_s = mission.watchdog.timeout_s()
+    return CheckResult(
+        "decision",
+        longest_s < bound_s,
+        f"t2 {median_us / US_PER_MS:.2f} ms, the median of {DECISIONS}; longest"
+        f" {1e3 * longest_s:.2f} ms, the watchdog's bound is {bound_s:g} s",
+    )

@@ -12,8 +12,8 @@ import os
 import zmq
 
 from airl_mav.camera.frame import Frame
-from companion.cameras.driver import DepthImage
-from companion.cameras.fitting import Lens
+from companion.addons.cameras.drivers import DepthImage
+from companion.addons.cameras.fitting import Lens
 
 
 class SimulatorCamera:

@@ -15,7 +15,7 @@ from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
-from airl_mav.profiles.camera_kind import SLOW, Renderer
+from airl_mav.profiles.projections import SLOW, Renderer
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
@@ -25,7 +25,7 @@ from firmware_sim.flight_log.flight_log import ULOG_SUFFIX, FlightLog, LogFolder
 from firmware_sim.interfaces import FlightController, TrueState
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
-from firmware_sim.mavlink.tlog import TlogWriter
+from firmware_sim.mavlink.traffic import TlogWriter
 from firmware_sim.pacing import Pacing
 from firmware_sim.plant.camera import CameraMaker, CameraProcess, SimulatedCamera
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot

@@ -1,10 +1,13 @@
-"""Simulation of one vehicle in one arena."""
+"""Simulation of one vehicle in one arena, detection of its crashes, and snapshots of it."""
 
 from __future__ import annotations
 
+import io
 import math
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from types import FunctionType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -28,7 +31,7 @@ from airl_mav.vehicle.airframe import Airframe, draw_airframe
 from airl_mav.vehicle.atmosphere import wind_of_episode
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim.autopilot.commander import CommanderState, FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.parameter_store import Keeper, Parameters
 from firmware_sim.engine.dynamics import POSITION, QUATERNION, RATES, VELOCITY
@@ -47,13 +50,10 @@ from firmware_sim.faults.faulty_camera import FailingCamera
 from firmware_sim.faults.faulty_controller import FailingParts
 from firmware_sim.interfaces import ActuatorControls, FlightController, SensorSample, TrueState
 from firmware_sim.pacing import Arrivals
+from firmware_sim.plant.body import FLOOR
 from firmware_sim.plant.camera import CameraMaker, OnboardCamera, SimulatedCamera
-from firmware_sim.plant.plant import Plant
+from firmware_sim.plant.plant import Collision, Plant
 from firmware_sim.recording import FlightRecorder, fault_arrays
-from firmware_sim.simulation_snapshot import SimulationSnapshot
-
-if TYPE_CHECKING:
-    from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 
 GROUND_LIMIT_S = 30.0
 """Maximum time for boot, arming, spin-up and the approach of the altitude [s]."""
@@ -418,3 +418,124 @@ class Simulation:
         """Release the physics server and the autopilot."""
         self.plant.close()
         self.autopilot.close()
+
+
+TOUCHDOWN_M_S = 2.0
+"""Maximum speed of a landing on the floor [m/s]; PX4 lands at 0.7 to 1.5 m/s."""
+
+
+def is_crash(hit: Collision, flight: CommanderState) -> bool:
+    """Return True if a contact ends a flight.
+
+    Contacts with the floor do not end a flight while the vehicle is on the ground, or if they are
+    gentle and the mode is neither Offboard nor Hold.
+    """
+    if hit.what != FLOOR:
+        return True
+    gentle = flight.mode not in (Mode.OFFBOARD, Mode.HOLD) and hit.speed_m_s < TOUCHDOWN_M_S
+    return flight.phase is FlightPhase.AIR and not gentle
+
+
+class CrashDetector:
+    """Detector of the first body hit in flight; call `look` once per tick."""
+
+    def __init__(self) -> None:
+        self.hit: str | None = None
+        """Name of the first body hit; None = no crash."""
+        self._seen = 0
+
+    def look(self, simulation: Simulation) -> bool:
+        """Check the contacts of this tick; return True if the first crash is among them."""
+        hits = simulation.plant.collisions
+        if len(hits) == self._seen:
+            return False
+        new = hits[self._seen :]
+        self._seen = len(hits)
+        crashes = [hit.what for hit in new if is_crash(hit, simulation.autopilot.flight)]
+        if self.hit is not None or not crashes:
+            return False
+        self.hit = crashes[0]
+        return True
+
+
+if TYPE_CHECKING:
+    pass
+
+
+class SimulationSnapshot:
+    """State of a simulation: plant, built-in autopilot, camera, faults and record.
+
+    The simulation is pickled in memory. Constant objects (setup, arena, functions without a
+    closure) and the clock are shared. Array views remain views: a copy would no longer follow its
+    base array.
+    """
+
+    def __init__(self, simulation: Simulation, *shared: object) -> None:
+        """Copy the state except for `shared` objects; see `Simulation.snapshot`."""
+        internals = simulation.autopilot.internals
+        if internals is None:
+            raise ValueError("a snapshot needs the built-in autopilot")
+        self._shared = list(shared)
+        state = io.BytesIO()
+        on_message, internals.on_message = internals.on_message, None
+        try:
+            _Pickler(state, self._shared).dump(simulation)
+        except (TypeError, AttributeError, pickle.PicklingError) as error:
+            raise ValueError(f"a snapshot needs a flight without links and logs: {error}") from None
+        finally:
+            internals.on_message = on_message
+        self._state = state.getvalue()
+
+    def restore(self) -> Simulation:
+        """Return a new simulation in this state, which shares only the clock with others.
+
+        Callbacks for texts of the autopilot are not restored. Close the simulation after use.
+        """
+        simulation: Simulation = _Unpickler(io.BytesIO(self._state), self._shared).load()
+        return simulation
+
+
+class _Pickler(pickle.Pickler):
+    def __init__(self, file: io.BytesIO, shared: list[object]) -> None:
+        super().__init__(file, pickle.HIGHEST_PROTOCOL)
+        self._shared = shared
+        self._numbers = {id(each): number for number, each in enumerate(shared)}
+
+    def persistent_id(self, obj: object) -> int | None:
+        """Return the number of a shared object; None = the object is copied."""
+        number = self._numbers.get(id(obj))
+        if number is None and isinstance(obj, FunctionType) and obj.__closure__ is None:
+            number = self._numbers[id(obj)] = len(self._shared)
+            self._shared.append(obj)
+        return number
+
+    def reducer_override(self, obj: Any) -> Any:
+        """Pickle an array view as a view of its base array."""
+        if not isinstance(obj, np.ndarray) or not isinstance(obj.base, np.ndarray):
+            return NotImplemented
+        address, base = obj.__array_interface__["data"][0], obj.base
+        offset = address - base.__array_interface__["data"][0]
+        return _view, (base, obj.dtype, obj.shape, offset, obj.strides, obj.flags.writeable)
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, shared: list[object]) -> None:
+        super().__init__(file)
+        self._shared = shared
+
+    def persistent_load(self, number: int) -> object:
+        """Return a shared object."""
+        return self._shared[number]
+
+
+def _view(
+    base: NDArray[Any],
+    dtype: np.dtype[Any],
+    shape: tuple[int, ...],
+    offset: int,
+    strides: tuple[int, ...],
+    writeable: bool,
+) -> NDArray[Any]:
+    view: NDArray[Any] = np.ndarray(shape, dtype, base, offset, strides)
+    view.flags.writeable = writeable
+    return view

@@ -30,7 +30,7 @@ from firmware_sim.engine.record import FLOWN_TICK, RISING
 from firmware_sim.engine.ticks import detect_record
 from firmware_sim.interfaces import DistanceReading
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.telemetry import Packer, TickContext
 from firmware_sim.plant.camera import SimulatedCamera

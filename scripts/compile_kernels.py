@@ -11,7 +11,7 @@ import numpy as np
 
 from airl_mav.envs.evaluation import fly_episodes
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.profiles.camera_kind import KINDS
+from airl_mav.profiles.projections import KINDS
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import HAS_PYBULLET, PlantName
 from firmware_sim.warm_up import warm_up

@@ -157,7 +157,7 @@ def help_text(command: str) -> str:
     """Return the output of a command's `--help` as a text block."""
     program, *rest = command.split()
     entry: Callable[[], Any] = getattr(
-        importlib.import_module("airl_mav.cli.entry"), program.removeprefix("airl-")
+        importlib.import_module("airl_mav.cli.main"), program.removeprefix("airl-")
     )
     printed = io.StringIO()
     plain = {"COLUMNS": HELP_COLUMNS, "NO_COLOR": "1", "TERM": "dumb"}

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel, TypeAdapter
 
 from airl_mav.addons.conformance.result import SCHEMA, Reference, StoredStep
-from airl_mav.addons.conformance.steps import StepName
+from airl_mav.addons.conformance.telemetry import StepName
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.files import read_typed

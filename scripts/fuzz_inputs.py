@@ -39,10 +39,10 @@ from airl_mav.core.constants import LOOPBACK, TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.signing import read_key
 from airl_mav.policy.actions import limited
-from airl_mav.policy.greedy import GreedyPolicy
 from airl_mav.policy.observation import Kinematics, encode
+from airl_mav.policy.registry import GreedyPolicy
 from airl_mav.profiles.loading import load_profile, profiles_dir
-from airl_mav.rehearsal.stand_alone_vehicle import aircraft_of, episode_of
+from airl_mav.rehearsal.firmware_process import aircraft_of, episode_of
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from airl_mav.training.config import TrainingConfig
@@ -51,8 +51,8 @@ from companion.pilot import OLDEST_FRAME_US, age_of
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.external.launcher import no_process
-from firmware_sim.external.parameter_file import KeptParameters, qgroundcontrol_file
-from firmware_sim.external.px4.px4_sitl import EPOCH_US, Px4Bridge
+from firmware_sim.external.parameters import KeptParameters, qgroundcontrol_file
+from firmware_sim.external.px4_sitl import EPOCH_US, Px4Bridge
 from firmware_sim.interfaces import (
     BatterySample,
     FirmwareLostError,

@@ -32,9 +32,9 @@ from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.codec import Encoder, WireLayout, dialect, message_id
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
-from firmware_sim.mavlink.services import HANDLERS
+from firmware_sim.mavlink.services import handlers
 from firmware_sim.mavlink.services.commands import ACTIONS
 from firmware_sim.pacing import Unpaced
 from firmware_sim.simulation import EpisodeSetup
@@ -124,7 +124,7 @@ class Fuzzer:
     def __init__(self, rng: np.random.Generator, *, steering: bool = False) -> None:
         self._dice = dice = Dice(rng)
         # A signing key would reject all later frames.
-        names = STEERING if steering else [name for name in HANDLERS if name != "SETUP_SIGNING"]
+        names = STEERING if steering else [name for name in handlers() if name != "SETUP_SIGNING"]
         known = {**KNOWN, "command": STEERING_COMMANDS} if steering else KNOWN
         self._kinds = [_Kind(dialect.mavlink_map[message_id(name)], dice, known) for name in names]
         self._encoders = [Encoder(245, 190), Encoder(1, 191), Encoder(0, 0), Encoder(255, 255)]

@@ -24,9 +24,9 @@ import tyro
 from flown_lines import FlownLines
 from plants_compared import PAIRS
 
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_USAGE, UsageError
-from airl_mav.core.provenance import provenance
+from airl_mav.core.machine import provenance
+from airl_mav.core.progress import new_console
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import wilson

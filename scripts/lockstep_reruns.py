@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from airl_mav.core.console import new_console
+from airl_mav.core.progress import new_console
 
 BEGINS = "begins"
 

@@ -21,8 +21,8 @@ from flown_lines import FlownLines
 from numpy.typing import NDArray
 from rich.table import Table
 
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_USAGE, UsageError
+from airl_mav.core.progress import new_console
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.rehearsal.run_folder import FlownEpisode

@@ -22,10 +22,10 @@ import tyro
 from rich.table import Table
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles
-from airl_mav.core.console import new_console
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import EXIT_USAGE, UsageError
-from airl_mav.lockstep.lockstep_link import builtin_vehicle, real_vehicle
+from airl_mav.core.progress import new_console
+from airl_mav.lockstep.vehicle import builtin_vehicle, real_vehicle
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.firmware import Firmware

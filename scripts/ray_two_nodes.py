@@ -31,8 +31,7 @@ from rich.console import Console
 
 from airl_mav.addons.sweep.command import run_sweep
 from airl_mav.addons.sweep.config import load_sweep
-from airl_mav.core.console import new_console
-from airl_mav.core.progress import RichProgress
+from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.experiments.campaign import Cell, run_cell
 from airl_mav.experiments.executors import ExecutorSettings, open_executor
 from airl_mav.policy.card import read_card

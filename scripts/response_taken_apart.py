@@ -23,9 +23,9 @@ import tyro
 from numpy.typing import NDArray
 
 from airl_mav.core.clock import SimClock
-from airl_mav.core.console import new_console
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
-from airl_mav.core.provenance import provenance
+from airl_mav.core.machine import provenance
+from airl_mav.core.progress import new_console
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.table import NONE, Column, TableView, print_table, write_table
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot

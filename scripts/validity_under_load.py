@@ -22,8 +22,8 @@ from lockstep_reruns import busy
 from rich.table import Table
 
 from airl_mav import load_run
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INVALID
+from airl_mav.core.progress import new_console
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import Estimate

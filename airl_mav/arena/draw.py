@@ -21,10 +21,9 @@ from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
-from airl_mav.arena.gates import over_openings
 from airl_mav.arena.geometry import Arena, Shape, Tour
 from airl_mav.arena.ground import Ground
-from airl_mav.arena.room_plan import over_doors
+from airl_mav.arena.walls import over_doors, over_openings
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.files import replace_file
 

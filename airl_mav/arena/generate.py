@@ -9,38 +9,44 @@ from functools import cached_property
 import numpy as np
 
 from airl_mav.arena.finishes import Statics
-from airl_mav.arena.gates import (
-    Openings,
-    behind,
-    closed_from_above,
-    draw_openings,
-    frames,
-    with_gates,
-    with_walls,
-)
 from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
 from airl_mav.arena.ground import Ground
-from airl_mav.arena.passage import Hills, free_share, least_gap_m, passage_exists
 from airl_mav.arena.placed_assets import AssetBodies, Things, draw_bodies, draw_things, generate_own
 from airl_mav.arena.placement import (
     TRIES,
     Boxes,
     Floats,
+    Hills,
     NoRoomError,
     bounding_boxes,
     draw_goal,
     footprint_areas,
+    free_share,
     join,
+    least_gap_m,
+    passage_exists,
     place_all,
     zone_radius_m,
 )
 from airl_mav.arena.relief import draw_ground, stand_on
-from airl_mav.arena.room_plan import Plan, draw_plan, room_walls, standing_on_the_floor
 from airl_mav.arena.tours import draw_tours
+from airl_mav.arena.walls import (
+    Openings,
+    Plan,
+    behind,
+    closed_from_above,
+    draw_openings,
+    draw_plan,
+    frames,
+    room_walls,
+    standing_on_the_floor,
+    with_gates,
+    with_walls,
+)
 from airl_mav.core.errors import UsageError
 from airl_mav.core.seeding import seeded
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
-from airl_mav.profiles.rooms import HEADROOM_M
+from airl_mav.profiles.walls import HEADROOM_M
 
 LAYOUTS = 20
 """Layouts drawn before generation fails."""

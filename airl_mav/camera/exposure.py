@@ -13,7 +13,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import grey, render_picture
 from airl_mav.camera.render import render
 from airl_mav.core.streams import words_of
-from airl_mav.profiles.camera_kind import Renderer
+from airl_mav.profiles.projections import Renderer
 from airl_mav.vehicle.rotation import Quat, Vec
 
 PATHS = 16

@@ -14,8 +14,14 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.camera_kind import CameraKind, Projection, shape_of
-from airl_mav.profiles.distortion import MOST_COEFFICIENT, UNDISTORTED, Distortion
+from airl_mav.profiles.projections import (
+    MOST_COEFFICIENT,
+    UNDISTORTED,
+    CameraKind,
+    Distortion,
+    Projection,
+    shape_of,
+)
 
 _MODES: Final = {1: "L", 3: "RGB"}
 

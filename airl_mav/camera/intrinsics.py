@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.profiles.camera_kind import CameraKind, Projection, shape_of
-from airl_mav.profiles.distortion import UNDISTORTED, Distortion, distorted, sees_to, undistorted
+from airl_mav.profiles.projections import (
+    UNDISTORTED,
+    CameraKind,
+    Distortion,
+    Projection,
+    distorted,
+    sees_to,
+    shape_of,
+    undistorted,
+)
 
 if TYPE_CHECKING:
     from airl_mav.profiles.camera import Camera

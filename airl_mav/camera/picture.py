@@ -1,24 +1,61 @@
-"""Rendering of a colour camera's view: colour, depth and segmentation from one pass."""
+"""Rendering of a colour camera's view: colour, depth and segmentation from one pass.
+
+Each pixel is sampled by one ray. As with depth, the image is drawn obstacle by obstacle: the bodies
+of `raycast`, then shadows, then each obstacle shades its visible pixels within its rectangles.
+Depth, light and colour are stored as planes of 32 bits, so that every loop along a line vectorizes.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.finishes import FLOOR as FLOOR_ROW
+from airl_mav.arena.finishes import OBSTACLE as OBSTACLE_ROW
+from airl_mav.arena.finishes import WALLS as WALLS_ROW
 from airl_mav.arena.finishes import Drawn, linear_of, srgb_of
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.bvh import meshes_of
-from airl_mav.camera.colour import Work, render_colour
-from airl_mav.camera.gloss import Gloss
+from airl_mav.camera import surfaces
+from airl_mav.camera.bvh import Meshes, count_of, is_owned, meshes_of, raised
 from airl_mav.camera.intrinsics import Intrinsics, finer
-from airl_mav.camera.projection import bent_of
+from airl_mav.camera.meshes import Faces
+from airl_mav.camera.primitives import FLOOR, GROUND, OBSTACLE, SKY, Ids, Rectangles
+from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Optics, Scene, bent_of
+from airl_mav.camera.raycast import (
+    aim,
+    blank,
+    body_of,
+    draw_bodies,
+    invert,
+    write_transposed,
+)
+from airl_mav.camera.reflections import draw_reflections
 from airl_mav.camera.render import pose_of
+from airl_mav.camera.shading import (
+    F32,
+    ZERO,
+    Canvas,
+    Gloss,
+    Lit,
+    Packed,
+    PixelRays,
+    Plane,
+    Points,
+    SceneLook,
+    let_through,
+)
+from airl_mav.camera.shadows import (
+    CORNERS,
+    Shaded,
+    shade_by_meshes,
+    shade_by_obstacle,
+    shade_by_walls,
+)
 from airl_mav.camera.textures import atlas, mean_of, periods
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import borrowing_kernel, kernel, large_kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
 LUMA = (19595, 38470, 7471)
@@ -152,3 +189,251 @@ def antialiased(
     mean = light.reshape(k.height, side, k.width, side, 3).mean(axis=(1, 3))
     rgb: NDArray[np.uint8] = np.rint(255.0 * srgb_of(mean)).astype(np.uint8)
     return rgb
+
+
+U32 = np.uint32
+
+RANGE_M: Final = 10_000.0
+"""Range of a colour camera [m]; exceeds every arena."""
+
+
+class Work(NamedTuple):
+    """Work buffers for images of n lines of m pixels; valid during one call only."""
+
+    lines: NDArray[np.float64]  # (n, 2)
+    xs: NDArray[np.float64]  # (m,)
+    far: Plane  # (n, m)
+    ids: Ids  # (n, m)
+    lit: Plane  # (n, m)
+    clear: Plane  # (n, m)
+    out: Packed  # (n m,)
+    rays: PixelRays
+    points: Points
+    corners: NDArray[np.float64]  # (CORNERS, 3)
+
+    @classmethod
+    def of(cls, width: int, height: int, cylindrical: bool) -> Work:
+        """Return buffers for an image size; lines are rows, or columns of a cylinder."""
+        n, m = (width, height) if cylindrical else (height, width)
+        # A block has at least one whole line.
+        block = max(surfaces.BLOCK, m)
+
+        def floats(*shape: int) -> Plane:
+            return np.zeros(shape, np.float32)
+
+        return cls(
+            np.zeros((n, 2)),
+            np.zeros(m),
+            floats(n, m),
+            np.zeros((n, m), np.int32),
+            floats(n, m),
+            floats(n, m),
+            np.zeros(n * m, np.int32),
+            PixelRays(floats(n * m), floats(n * m), floats(n * m)),
+            Points(np.zeros(block, np.int32), *(floats(block) for _ in range(5))),
+            np.zeros((CORNERS, 3)),
+        )
+
+
+@large_kernel
+def render_colour(
+    rgb: NDArray[np.uint8],
+    depth: Plane,
+    seen: Ids,
+    work: Work,
+    position: Vec | NDArray[np.float64],
+    quaternion: Quat | NDArray[np.float64],
+    focal: float,
+    cx: float,
+    cy: float,
+    cylindrical: bool,
+    bounds: NDArray[np.float64],
+    shape: NDArray[np.int8],
+    center: NDArray[np.float64],
+    half_size: NDArray[np.float64],
+    yaw: NDArray[np.float64],
+    meshes: Meshes | None,
+    texture: NDArray[np.int8],
+    per_m: NDArray[np.float32],
+    offset: NDArray[np.float32],
+    albedo: NDArray[np.float32],
+    gloss: Gloss | None,
+    lights: NDArray[np.float32],
+    atlas: Plane,
+    bent: Bent | None,
+) -> None:
+    """Render the colour image of an arena; arguments not listed as in `render_depth`.
+
+    The outputs are `rgb` (height, width, 3) sRGB, `depth` (height, width) unlimited [m], 0 = no
+    surface, and `seen`. Inside an obstacle the image is black. `seen` is CEILING, SKY, ... of
+    `primitives`, FLOOR also for hills, or OBSTACLE + the number of an obstacle or of a mesh's
+    first. `texture` (2 + n,), `offset` (2 + n, 2) and `albedo` (2 + n, 2, 3) are fields of
+    `Finish`, `per_m` (2 + n,) is the number of pattern periods per metre, `atlas` is
+    `textures.atlas()`. `gloss` describes surfaces that are not matt; None has no cost. `lights` (7,
+    3): direction of the sun, irradiance of sun and sky, the floor's mean radiosity, zenith,
+    horizon, and the fog's extinction [1/m] in the first column.
+    """
+    camera = raised(meshes, position)
+    lines, xs = work.lines, work.xs
+    view, axes = aim(lines, xs, quaternion, focal, cx, cy, cylindrical, RANGE_M)
+    # A cylinder is drawn by columns into work buffers, and transposed at the end.
+    far, ids = (work.far, work.ids) if cylindrical else (depth, seen)
+    rectangles = np.zeros((len(shape) + count_of(meshes), 3, 4), np.int32)
+    faces = None if meshes is None else np.empty(far.shape, np.int32)
+    optics = Optics(lines, xs, bent, view, axes, camera)
+    scene = Scene(bounds, shape, center, half_size, yaw)
+    inside = draw_bodies(far, ids, rectangles, optics, scene, meshes, faces)
+    if inside >= 0:
+        _show_inside(rgb, depth, seen, inside, bent)
+        return
+    invert(far)
+    pixel2 = F32(1.0 / (view.focal * view.focal))
+    light = _lit(lights)
+    look = SceneLook(texture, per_m, offset, albedo, gloss, light, atlas, pixel2)  # type: ignore[arg-type]
+    _show(rgb, far, ids, rectangles, faces, work, optics, scene, meshes, look, gloss)
+    if cylindrical:
+        write_transposed(depth, far)
+        write_transposed(seen, ids)
+
+
+@borrowing_kernel
+def _show_inside(
+    rgb: NDArray[np.uint8], depth: Plane, seen: Ids, inside: int, bent: Bent | None
+) -> None:
+    """Write the image of a camera inside an obstacle."""
+    rgb[:, :, :] = 0
+    depth[:, :] = MIN_DEPTH_M
+    seen[:, :] = OBSTACLE + inside
+    if bent is not None:
+        blank(depth, bent)
+        for v in range(depth.shape[0]):
+            for u in range(depth.shape[1]):
+                seen[v, u] = seen[v, u] if depth[v, u] > ZERO else SKY
+
+
+@borrowing_kernel
+def _show(
+    rgb: NDArray[np.uint8],
+    far: Plane,
+    ids: Ids,
+    rectangles: Rectangles,
+    faces: Faces | None,
+    work: Work,
+    optics: Optics,
+    scene: Scene,
+    meshes: Meshes | None,
+    look: SceneLook,
+    gloss: Gloss | None,
+) -> None:
+    """Write the colours of the bodies drawn by `draw_bodies`.
+
+    `far` (n, m) is depth [m], `ids` the body of each pixel (hills become floor), `rectangles`
+    (obstacles + meshes, 3, 4) the bodies' bounds, `faces` (n, m) the meshes' triangles. `gloss` is
+    `look.gloss`.
+    """
+    camera, view, light, count = optics.camera, optics.lens, look.light, ids.size
+    lit, out, rays = work.lit, work.out, work.rays
+    canvas = Canvas(
+        out, ids.reshape(count), far.reshape(count), lit.reshape(count),
+        work.clear.reshape(count), rays, work.points,
+    )  # fmt: skip
+    surfaces.write_rays(rays, optics)
+    to_sun = (float(light.to_sun[0]), float(light.to_sun[1]), float(light.to_sun[2]))
+    shade_by_walls(
+        canvas, camera, scene.bounds, to_sun, float(light.extinction), let_through(gloss, WALLS_ROW)
+    )
+    shadows = Shaded(lit, far, ids, work.corners)
+    # Without sunlight `lit` has no effect, so bodies need no shadows.
+    sunny = max(max(light.sun[0], light.sun[1]), light.sun[2]) > ZERO
+    for i in range(len(scene.shape)):
+        if sunny:
+            if is_owned(meshes, i):
+                continue
+            body = body_of(scene, optics.axes, camera, i)
+            shade_by_obstacle(shadows, optics, body, to_sun, let_through(gloss, OBSTACLE_ROW + i))
+    if meshes is not None and faces is not None and sunny:
+        shade_by_meshes(shadows, optics, meshes, faces, to_sun, gloss)
+    surfaces.draw_sky(canvas, camera, light)
+    surfaces.shade_floor(canvas, look, camera)
+    surfaces.shade_walls(canvas, look, camera)
+    if meshes is not None and faces is not None:
+        surfaces.shade_meshes(canvas, look, optics, rectangles, meshes, faces.reshape(count))
+    for i in range(len(scene.shape)):
+        if is_owned(meshes, i):
+            continue
+        body = body_of(scene, optics.axes, camera, i)
+        # A cylinder may show a body at three turns, as in `raycast._draw_obstacle`.
+        for k in range(3 if view.cylindrical else 1):
+            surfaces.shade_obstacle(canvas, look, optics, body, rectangles[i, k])
+    # Reflections replace the pixels of surfaces that are not matt.
+    if gloss is not None:
+        draw_reflections(out, canvas.ids, rays, camera, scene, meshes, look)
+    _blacken(out, optics.bent)
+    unpack(rgb, out, view.cylindrical)
+    _tell_ground(canvas.ids, meshes)
+
+
+@borrowing_kernel
+def _tell_ground(ids: Ids, meshes: Meshes | None) -> None:
+    """Write the floor's number (n,) where hills are seen."""
+    if meshes is None:
+        return
+    for at in range(len(ids)):
+        ids[at] = FLOOR if ids[at] == GROUND else ids[at]
+
+
+@borrowing_kernel
+def _blacken(out: Packed, bent: Bent | None) -> None:
+    """Write black into fisheye pixels outside the field of view."""
+    if bent is None:
+        return
+    n, m = bent.forward.shape
+    for v in range(n):
+        for u in range(m):
+            i, j, k = bent.forward[v, u], bent.across[v, u], bent.along[v, u]
+            if i == 0.0 and j == 0.0 and k == 0.0:
+                out[v * m + u] = np.int32(0)
+
+
+@borrowing_kernel
+def _lit(lights: NDArray[np.float32]) -> Lit:
+    """Return the light from its array."""
+    return Lit(
+        (lights[0, 0], lights[0, 1], lights[0, 2]),
+        (lights[1, 0], lights[1, 1], lights[1, 2]),
+        (lights[2, 0], lights[2, 1], lights[2, 2]),
+        (lights[3, 0], lights[3, 1], lights[3, 2]),
+        (lights[4, 0], lights[4, 1], lights[4, 2]),
+        (lights[5, 0], lights[5, 1], lights[5, 2]),
+        lights[6, 0],
+    )
+
+
+@borrowing_kernel
+def unpack(rgb: NDArray[np.uint8], out: Packed, cylindrical: bool) -> None:
+    """Write the image from its packed pixels, line by line."""
+    height, width, _ = rgb.shape
+    if cylindrical:
+        for v in range(height):
+            for u in range(width):
+                colour = out[u * height + v]
+                rgb[v, u, 0] = colour & 255
+                rgb[v, u, 1] = (colour >> 8) & 255
+                rgb[v, u, 2] = (colour >> 16) & 255
+        return
+    count = height * width
+    if count % 4 == 0:
+        # Four pixels are three words: three stores in place of twelve.
+        words, four = rgb.reshape(3 * count).view(np.uint32), out.view(np.uint32)
+        for k in range(count // 4):
+            p, q, r, s = four[4 * k], four[4 * k + 1], four[4 * k + 2], four[4 * k + 3]
+            words[3 * k] = p | U32(q << U32(24))
+            words[3 * k + 1] = U32(q >> U32(8)) | U32(r << U32(16))
+            words[3 * k + 2] = U32(r >> U32(16)) | U32(s << U32(8))
+        return
+    pixels = rgb.reshape(count, 3)
+    for u in range(count):
+        colour = out[u]
+        pixels[u, 0] = colour & 255
+        pixels[u, 1] = (colour >> 8) & 255
+        pixels[u, 2] = (colour >> 16) & 255

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics, fisheye_rays
 from airl_mav.core.kernels import borrowing_kernel, kernel
-from airl_mav.profiles.distortion import Distortion, distorted, sees_to
+from airl_mav.profiles.projections import Distortion, distorted, sees_to
 from airl_mav.vehicle.rotation import Vec
 
 MIN_DEPTH_M: Final = 0.001

@@ -26,8 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.bvh import Meshes, is_owned, raised
-from airl_mav.camera.mesh_triangles import Faces
-from airl_mav.camera.meshes import draw_meshes
+from airl_mav.camera.meshes import Faces, draw_meshes
 from airl_mav.camera.primitives import (
     BOX,
     CYLINDER,

@@ -2,9 +2,12 @@
 
 Pixels of varnish, metal or glass are rendered again. A tree of rays starts at the camera: varnish,
 metal and glass mirror them, glass also transmits them, until all hits are matt or contribute too
-little. A rough surface directly visible to the camera mirrors `gloss.SAMPLES` directions. Rough
+little. A rough surface directly visible to the camera mirrors `shading.SAMPLES` directions. Rough
 surfaces in reflections count as smooth, except for the sun's highlight, which has a closed form.
 Matt surfaces are shaded as in `shading.paint`, with a shadow ray to the sun.
+
+Images are drawn body by body (`raycast`, `shadows`), all rays of the camera at once; these few rays
+have other origins. Computes in float64; a ray is a unit vector.
 """
 
 from __future__ import annotations
@@ -18,8 +21,9 @@ from numpy.typing import NDArray
 from airl_mav.arena.finishes import FLOOR as FLOOR_ROW
 from airl_mav.arena.finishes import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.finishes import WALLS as WALLS_ROW
-from airl_mav.camera import gloss, shading
-from airl_mav.camera.bvh import STACK, Meshes
+from airl_mav.camera import shading
+from airl_mav.camera.bvh import STACK, Meshes, is_owned, material_row
+from airl_mav.camera.meshes import distance_to, inverse_of, stopped_by
 from airl_mav.camera.primitives import (
     BOX,
     CEILING,
@@ -28,20 +32,12 @@ from airl_mav.camera.primitives import (
     GROUND,
     OBSTACLE,
     SKY,
+    WALL_EAST_WEST,
     WALL_NORTH_SOUTH,
     Ids,
+    turn_axes,
 )
 from airl_mav.camera.projection import Scene, dot
-from airl_mav.camera.scene_rays import (
-    Bodies,
-    Met,
-    SurfacePoint,
-    advanced,
-    bodies_of,
-    meet,
-    place_of,
-    sunlight,
-)
 from airl_mav.camera.shadows import ABOVE_M
 from airl_mav.camera.surfaces import FOG_LAYER_M
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel, large_kernel
@@ -103,7 +99,7 @@ def draw_reflections(
     for u in range(len(out)):
         seen = ids[u]
         # Sky and ceiling have no material.
-        if seen in (SKY, CEILING) or look.gloss.surface[row_of(seen)] == gloss.MATT:
+        if seen in (SKY, CEILING) or look.gloss.surface[row_of(seen)] == shading.MATT:
             continue
         n, e, d = float(rays.north[u]), float(rays.east[u]), float(rays.down[u])
         per = 1.0 / math.sqrt(n * n + e * e + d * d)
@@ -204,7 +200,7 @@ def _follow(
             ray, share, way, depth, advanced(origin, ray, met.distance), place.normal, albedo,
             min(max(-dot(place.normal, ray), 0.0), 1.0), float(look.gloss.alpha[row]), blur,
         )  # fmt: skip
-        if kind == gloss.GLASS:
+        if kind == shading.GLASS:
             tops = _pass(tree, tops, seen)
             continue
         arrives = 0.0
@@ -213,9 +209,9 @@ def _follow(
             # bodies.
             begin = advanced(seen.at, seen.normal, ABOVE_M) if met.mesh >= 0 else seen.at
             arrives = sunlight(bodies, meshes, look.gloss.lets, met.seen, begin, _sun(light), nodes)
-        if kind != gloss.METAL:
+        if kind != shading.METAL:
             _scatter(colour, seen, kind, light, arrives)
-        if kind != gloss.MATT:
+        if kind != shading.MATT:
             _shine(colour, seen, kind, light, arrives)
             tops = _mirror(tree, tops, seen, kind)
 
@@ -235,8 +231,8 @@ def _shines(light: shading.Lit) -> bool:
 @large_borrowing_kernel
 def _pass(tree: NDArray[np.float64], tops: int, seen: RayHit) -> int:
     """Push the transmitted and the reflected ray of a pane; return the number of pending rays."""
-    back = gloss.pane_reflects(seen.cosine)
-    away = gloss.mirrored(seen.ray, seen.normal)
+    back = shading.pane_reflects(seen.cosine)
+    away = shading.mirrored(seen.ray, seen.normal)
     tops = _grown(tree, tops, seen, away, _scaled(seen.share, back), 0.0)
     onwards = _times(_scaled(seen.share, 1.0 - back), seen.albedo)
     return _grown(tree, tops, seen, seen.ray, onwards, 0.0)
@@ -248,12 +244,12 @@ def _scatter(
 ) -> None:
     """Add the matt scattering of a bare or varnished surface; `arrives` = share of sunlight."""
     facing, enters, sun_enters = max(dot(seen.normal, _sun(light)), 0.0), 1.0, 1.0
-    if kind == gloss.GLOSSY:
+    if kind == shading.GLOSSY:
         # Internal reflections return all scattered light, so diffuse light is as bright as without
         # varnish. Sunlight is therefore relative to the mean over all directions, and the
         # transmission towards the eye equals the transmission from there.
-        enters = 1.0 - gloss.fresnel(seen.cosine)
-        sun_enters = (1.0 - gloss.fresnel(min(facing, 1.0))) / gloss.VARNISH_ADMITS
+        enters = 1.0 - shading.fresnel(seen.cosine)
+        sun_enters = (1.0 - shading.fresnel(min(facing, 1.0))) / shading.VARNISH_ADMITS
     direct, rise = shading.F32(arrives * facing * sun_enters), shading.F32(-seen.normal[2])
     for k in range(3):
         bright = shading.irradiance(light, k, direct, rise)
@@ -269,14 +265,14 @@ def _shine(
     The mirror's roughness widens a reflected highlight, because eight rays would show it eight
     times (Kaplanyan and Dachsbacher, Path space regularization, 2013).
     """
-    if arrives == 0.0 or gloss.is_smooth(seen.alpha):
+    if arrives == 0.0 or shading.is_smooth(seen.alpha):
         return
     alpha = max(seen.alpha, seen.blur)
-    value, cosine = gloss.highlight(alpha, seen.normal, seen.ray, _sun(light))
-    if kind == gloss.METAL:
+    value, cosine = shading.highlight(alpha, seen.normal, seen.ray, _sun(light))
+    if kind == shading.METAL:
         _add(colour, _times(seen.share, seen.albedo), light.sun, arrives * value)
     else:
-        back = gloss.fresnel(min(max(cosine, 0.0), 1.0))
+        back = shading.fresnel(min(max(cosine, 0.0), 1.0))
         _add(colour, seen.share, light.sun, arrives * value * back)
 
 
@@ -284,17 +280,17 @@ def _shine(
 def _mirror(tree: NDArray[np.float64], tops: int, seen: RayHit, kind: int) -> int:
     """Push the mirrored rays of metal or varnish; return the number of pending rays."""
     # Only the first hit is sampled, because the rays multiply at each further hit.
-    many = 1 if seen.depth > 0 or gloss.is_smooth(seen.alpha) else gloss.SAMPLES
+    many = 1 if seen.depth > 0 or shading.is_smooth(seen.alpha) else shading.SAMPLES
     for number in range(many):
-        u, v = gloss.spread(number)
-        shine = seen.normal if many == 1 else gloss.facet(seen.alpha, seen.normal, seen.ray, u, v)
-        away = gloss.mirrored(seen.ray, shine)
-        gives = 1.0 if many == 1 else gloss.facet_gives(seen.alpha, seen.normal, away) / many
+        u, v = shading.spread(number)
+        shine = seen.normal if many == 1 else shading.facet(seen.alpha, seen.normal, seen.ray, u, v)
+        away = shading.mirrored(seen.ray, shine)
+        gives = 1.0 if many == 1 else shading.facet_gives(seen.alpha, seen.normal, away) / many
         share = _scaled(seen.share, gives)
-        if kind == gloss.METAL:
+        if kind == shading.METAL:
             share = _times(share, seen.albedo)
         else:
-            share = _scaled(share, gloss.fresnel(min(max(-dot(shine, seen.ray), 0.0), 1.0)))
+            share = _scaled(share, shading.fresnel(min(max(-dot(shine, seen.ray), 0.0), 1.0)))
         tops = _grown(tree, tops, seen, away, share, 0.0 if many == 1 else seen.alpha)
     return tops
 
@@ -383,3 +379,281 @@ def sky_at(light: shading.Lit, ray: Vec, down: float) -> Vec:
         horizon[1] + share * (float(end[1]) - horizon[1]),
         horizon[2] + share * (float(end[2]) - horizon[2]),
     )
+
+
+LEAST_M: Final = 1e-4
+"""Minimum hit distance [m]; excludes the surface at the ray's origin."""
+
+
+class Bodies(NamedTuple):
+    """Obstacles and room of an arena, as arguments of `render_depth`; see `bodies_of`."""
+
+    bounds: NDArray[np.float64]  # (6,)
+    shape: NDArray[np.int8]  # (n,)
+    center: NDArray[np.float64]  # (n, 3)
+    half_size: NDArray[np.float64]  # (n, 3)
+    turn: NDArray[np.float64]  # (n, 2) cosine and sine of the heading of its axes
+    reach: NDArray[np.float64]  # (n,) square of the radius of a sphere around each [m²]
+
+
+class Met(NamedTuple):
+    """First hit of a ray."""
+
+    distance: float
+    """Distance along the ray [m]; infinite without a hit."""
+    seen: int
+    """SKY, FLOOR, ... of `primitives`; for a mesh the number of its first obstacle, or GROUND."""
+    mesh: int
+    """Index of the mesh; -1 = not a mesh."""
+    face: int
+    """Index of the mesh's triangle."""
+
+
+class SurfacePoint(NamedTuple):
+    """Point on a body in the body's axes."""
+
+    at: Vec
+    """Position from the body's centre or the mesh's origin [m]; on room and floor NED."""
+    normal: Vec
+    """Unit vector NED on the ray's side."""
+    side: int
+    """Face perpendicular to the body's first, second or vertical axis: 0, 1, 2; 3 = curved side."""
+
+
+@kernel
+def bodies_of(scene: Scene) -> Bodies:
+    """Return the bodies of an arena, with values precomputed for all rays."""
+    bounds, shape, center, half_size, yaw = scene
+    n = len(shape)
+    turn, reach = np.empty((n, 2)), np.empty(n)
+    for i in range(n):
+        turn[i, 0], turn[i, 1] = 1.0, 0.0
+        a, b, c = half_size[i, 0], half_size[i, 1], half_size[i, 2]
+        if shape[i] == BOX:
+            turn[i, 0], turn[i, 1] = math.cos(yaw[i]), math.sin(yaw[i])
+            reach[i] = a * a + b * b + c * c
+        else:
+            reach[i] = a * a + c * c if shape[i] == CYLINDER else a * a
+    return Bodies(bounds, shape, center, half_size, turn, reach)
+
+
+@kernel
+def advanced(origin: Vec, ray: Vec, distance: float) -> Vec:
+    """Return the point at a distance along a ray."""
+    return (
+        origin[0] + distance * ray[0],
+        origin[1] + distance * ray[1],
+        origin[2] + distance * ray[2],
+    )
+
+
+@large_borrowing_kernel
+def _span(bodies: Bodies, i: int, origin: Vec, ray: Vec) -> tuple[float, float]:
+    """Return a ray's entry and exit distance through an obstacle; exit < entry is a miss."""
+    center, half = bodies.center[i], bodies.half_size[i]
+    away = (origin[0] - center[0], origin[1] - center[1], origin[2] - center[2])
+    # Early exit: most rays miss the bounding sphere.
+    apart, ahead = dot(away, away) - bodies.reach[i], dot(away, ray)
+    if apart > 0.0 and (ahead > 0.0 or ahead * ahead < apart):
+        return math.inf, -math.inf
+    cos, sin = bodies.turn[i, 0], bodies.turn[i, 1]
+    o, d = turn_axes(away, cos, sin), turn_axes(ray, cos, sin)
+    if bodies.shape[i] == BOX:
+        i0, i1, i2 = inverse_of(d[0]), inverse_of(d[1]), inverse_of(d[2])
+        a, b, c = -o[0] * i0, -o[1] * i1, -o[2] * i2
+        w0, w1, w2 = half[0] * abs(i0), half[1] * abs(i1), half[2] * abs(i2)
+        return max(max(a - w0, b - w1), c - w2), min(min(a + w0, b + w1), c + w2)
+    if bodies.shape[i] == CYLINDER:
+        level = max(d[0] * d[0] + d[1] * d[1], 1e-18)
+        toward = -(o[0] * d[0] + o[1] * d[1])
+        rest = level * (half[0] * half[0] - o[0] * o[0] - o[1] * o[1]) + toward * toward
+        if rest <= 0.0:
+            return math.inf, -math.inf
+        root, i2 = math.sqrt(rest), inverse_of(d[2])
+        c, w2 = -o[2] * i2, half[2] * abs(i2)
+        return max((toward - root) / level, c - w2), min((toward + root) / level, c + w2)
+    toward = -dot(o, d)
+    rest = half[0] * half[0] - dot(o, o) + toward * toward
+    if rest <= 0.0:
+        return math.inf, -math.inf
+    root = math.sqrt(rest)
+    return toward - root, toward + root
+
+
+@borrowing_kernel
+def _room(bounds: NDArray[np.float64], origin: Vec, ray: Vec) -> tuple[float, int]:
+    """Return a ray's first hit of floor, walls and ceiling: distance and number."""
+    best, seen = math.inf, SKY
+    for side in range(4):
+        axis = side // 2
+        t = (bounds[side] - origin[axis]) * inverse_of(ray[axis])
+        if t <= LEAST_M or t >= best:
+            continue
+        p = advanced(origin, ray, t)
+        other = 1 - axis
+        inside = bounds[2 * other] <= p[other] <= bounds[2 * other + 1]
+        if inside and -bounds[4] <= p[2] <= 0.0:
+            best, seen = t, WALL_NORTH_SOUTH if axis == 0 else WALL_EAST_WEST
+    for lid in range(2 if bounds[5] > 0.0 else 1):
+        t = ((-bounds[4] if lid else 0.0) - origin[2]) * inverse_of(ray[2])
+        if t <= LEAST_M or t >= best:
+            continue
+        p = advanced(origin, ray, t)
+        if bounds[0] <= p[0] <= bounds[1] and bounds[2] <= p[1] <= bounds[3]:
+            best, seen = t, CEILING if lid else FLOOR
+    return best, seen
+
+
+@borrowing_kernel
+def _from_mesh(meshes: Meshes, k: int, origin: Vec, ray: Vec) -> tuple[Vec, Vec]:
+    """Return a ray relative to mesh k's origin, in its axes and units; directions have length 1."""
+    cos, sin, per = meshes.pose[k, 2], meshes.pose[k, 3], 1.0 / meshes.pose[k, 4]
+    offset = (
+        per * (origin[0] - meshes.pose[k, 0]),
+        per * (origin[1] - meshes.pose[k, 1]),
+        per * (origin[2] - meshes.pose[k, 5]),
+    )
+    return turn_axes(offset, cos, sin), turn_axes(ray, cos, sin)
+
+
+@large_borrowing_kernel
+def meet(
+    bodies: Bodies, meshes: Meshes | None, origin: Vec, ray: Vec, waiting: NDArray[np.int32]
+) -> Met:
+    """Return the first hit of a ray from `origin` NED [m]; `waiting` (STACK,) is a buffer."""
+    best, seen = _room(bodies.bounds, origin, ray)
+    mesh, face = -1, -1
+    for i in range(len(bodies.shape)):
+        if is_owned(meshes, i):
+            continue
+        enter, leave = _span(bodies, i, origin, ray)
+        if leave < enter:
+            continue
+        # A ray that starts inside a body, as in glass, hits the far side.
+        t = enter if enter > LEAST_M else leave
+        if LEAST_M < t < best:
+            best, seen = t, OBSTACLE + i
+    if meshes is not None:
+        for k in range(len(meshes.root)):
+            scale = meshes.pose[k, 4]
+            at, way = _from_mesh(meshes, k, origin, ray)
+            t, which = distance_to(
+                meshes.bvh, meshes.root[k], at, way, LEAST_M / scale, best / scale, waiting
+            )
+            if which >= 0:
+                best, seen, mesh, face = t * scale, OBSTACLE + meshes.first[k], k, which
+    return Met(best, seen, mesh, face)
+
+
+@large_borrowing_kernel
+def place_of(
+    bodies: Bodies, meshes: Meshes | None, met: Met, origin: Vec, ray: Vec
+) -> SurfacePoint:
+    """Return the point where a ray hits a body; any body except ceiling and sky."""
+    p = advanced(origin, ray, met.distance)
+    if meshes is not None and met.mesh >= 0:
+        return _on_mesh(meshes, met, p, ray)
+    if met.seen >= OBSTACLE:
+        return _on_obstacle(bodies, met.seen - OBSTACLE, p, ray)
+    axis = 2 if met.seen == FLOOR else (0 if met.seen == WALL_NORTH_SOUTH else 1)
+    sign = -1.0 if ray[axis] > 0.0 else 1.0
+    return SurfacePoint(p, _scaled_axis(axis, sign), axis)
+
+
+@kernel
+def _scaled_axis(axis: int, by: float) -> Vec:
+    """Return the unit vector of an axis, times a factor."""
+    return (
+        by if axis == 0 else 0.0,
+        by if axis == 1 else 0.0,
+        by if axis == 2 else 0.0,
+    )
+
+
+@kernel
+def _towards(normal: Vec, ray: Vec) -> Vec:
+    """Return a normal, flipped to the ray's side."""
+    sign = -1.0 if dot(normal, ray) > 0.0 else 1.0
+    return (sign * normal[0], sign * normal[1], sign * normal[2])
+
+
+@borrowing_kernel
+def _on_mesh(meshes: Meshes, met: Met, p: Vec, ray: Vec) -> SurfacePoint:
+    """Return the point p on a mesh, with its normal."""
+    k, n = met.mesh, meshes.bvh.normals[met.face]
+    scale, cos, sin = meshes.pose[k, 4], meshes.pose[k, 2], meshes.pose[k, 3]
+    at, _ = _from_mesh(meshes, k, p, ray)
+    normal = turn_axes((float(n[0]), float(n[1]), float(n[2])), cos, -sin)
+    return SurfacePoint((scale * at[0], scale * at[1], scale * at[2]), _towards(normal, ray), 3)
+
+
+@borrowing_kernel
+def _on_obstacle(bodies: Bodies, i: int, p: Vec, ray: Vec) -> SurfacePoint:
+    """Return the point p on obstacle i, with its normal."""
+    center, half = bodies.center[i], bodies.half_size[i]
+    cos, sin = bodies.turn[i, 0], bodies.turn[i, 1]
+    a, b, c = turn_axes((p[0] - center[0], p[1] - center[1], p[2] - center[2]), cos, sin)
+    side = 3
+    if bodies.shape[i] == BOX:
+        # The face has the largest coordinate relative to the half size.
+        qa, qb, qc = abs(a) / half[0], abs(b) / half[1], abs(c) / half[2]
+        side = 2 if qc >= max(qa, qb) else (0 if qa >= qb else 1)
+        outward = c if side == 2 else (a if side == 0 else b)
+        normal = _scaled_axis(side, math.copysign(1.0, outward))
+    elif bodies.shape[i] == CYLINDER and abs(c) / half[2] * half[0] >= math.hypot(a, b):
+        side = 2
+        normal = _scaled_axis(side, math.copysign(1.0, c))
+    else:
+        height = 0.0 if bodies.shape[i] == CYLINDER else c
+        per = 1.0 / max(math.sqrt(a * a + b * b + height * height), 1e-9)
+        normal = (per * a, per * b, per * height)
+    # Inside glass the far side is visible from within.
+    return SurfacePoint((a, b, c), _towards(turn_axes(normal, cos, -sin), ray), side)
+
+
+@large_borrowing_kernel
+def sunlight(
+    bodies: Bodies,
+    meshes: Meshes | None,
+    lets: NDArray[np.float32],
+    own: int,
+    at: Vec,
+    to_sun: Vec,
+    waiting: NDArray[np.int32],
+) -> float:
+    """Return the share of the sun's light that reaches a point slightly off its surface.
+
+    `lets` (2 + n,) is `Gloss.lets`, `own` the point's surface, as `Met.seen`: a convex body shades
+    itself; `waiting` (STACK,) is a buffer.
+    """
+    share = 1.0
+    bounds = bodies.bounds
+    for side in range(4):
+        axis = side // 2
+        t = (bounds[side] - at[axis]) * inverse_of(to_sun[axis])
+        # Excludes the wall that holds the point; the same distance as `shadows._STEP_M`.
+        if t <= 1e-3:
+            continue
+        p = advanced(at, to_sun, t)
+        other = 1 - axis
+        if bounds[2 * other] <= p[other] <= bounds[2 * other + 1] and -bounds[4] <= p[2] <= 0.0:
+            share *= lets[WALLS_ROW]
+    for i in range(len(bodies.shape)):
+        # An opaque body ends the search.
+        if share == 0.0:
+            return 0.0
+        if is_owned(meshes, i) or own == OBSTACLE + i:
+            continue
+        enter, leave = _span(bodies, i, at, to_sun)
+        if leave >= max(enter, 0.0):
+            share *= lets[OBSTACLE_ROW + i]
+    if meshes is not None:
+        for k in range(len(meshes.root)):
+            if share == 0.0:
+                return 0.0
+            place, way = _from_mesh(meshes, k, at, to_sun)
+            least = LEAST_M / meshes.pose[k, 4]
+            inverse = (inverse_of(way[0]), inverse_of(way[1]), inverse_of(way[2]))
+            if stopped_by(meshes.bvh, meshes.root[k], place, way, inverse, least, -1, waiting) >= 0:
+                share *= lets[material_row(meshes, k)]
+    return share

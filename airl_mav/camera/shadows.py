@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.bvh import STACK, Meshes, material_row
-from airl_mav.camera.gloss import Gloss, let_through
-from airl_mav.camera.mesh_triangles import Faces
-from airl_mav.camera.meshes import inverse_of, seen_from, stopped_by
+from airl_mav.camera.meshes import Faces, inverse_of, seen_from, stopped_by
 from airl_mav.camera.primitives import BOX, CYLINDER, OBSTACLE, SKY, Ids, turned
 from airl_mav.camera.projection import (
     Bent,
@@ -30,7 +28,7 @@ from airl_mav.camera.projection import (
     is_pinhole,
     ray_of,
 )
-from airl_mav.camera.shading import F32, ONE, ZERO, Canvas, Plane, Vec32
+from airl_mav.camera.shading import F32, ONE, ZERO, Canvas, Gloss, Plane, Vec32, let_through
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
 

@@ -17,7 +17,7 @@ from airl_mav.arena.finishes import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.finishes import WALLS as WALLS_ROW
 from airl_mav.camera import primitives, shading
 from airl_mav.camera.bvh import Meshes, material_row
-from airl_mav.camera.mesh_triangles import Faces
+from airl_mav.camera.meshes import Faces
 from airl_mav.camera.projection import MIN_DEPTH_M, Optics, Pose, ProjectedBody
 from airl_mav.camera.shading import (
     F32,

@@ -12,16 +12,16 @@ from pydantic import Field
 from rich.console import Console
 from rich.table import Table
 
-from airl_mav.arena.gates import openings_of
 from airl_mav.arena.generate import free_area_fraction, generate
 from airl_mav.arena.geometry import Arena, Shape, Tour
 from airl_mav.arena.ground import STEEPEST
 from airl_mav.arena.placement import Floats, zone_of
+from airl_mav.arena.walls import openings_of
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.core.console import new_console
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.progress import new_console
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile

@@ -12,10 +12,10 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import replace_file
+from airl_mav.core.progress import new_console
 from airl_mav.profiles.arena import ASSET_NAME, SHAPES, ArenaSpec
 from airl_mav.profiles.assets import MOST_PARTS, MOST_TRIANGLES, MeshFile
 from airl_mav.profiles.loading import load_profile

@@ -8,15 +8,14 @@ import threading
 from rich.console import Console
 
 from airl_mav.cli.options import run_command
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED
 from airl_mav.core.files import save_arrays
+from airl_mav.core.progress import new_console
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.conducted import Abandoned
-from companion.ground_check import check_on_ground
 from companion.link_interface import LinkError
-from companion.program import MissionSetup, fly_alone, prepare
-from companion.systemd import service
+from companion.lockstep_turns import Abandoned
+from companion.program import MissionSetup, check_on_ground, fly_alone, prepare
+from companion.status_reports import service
 
 
 class CompanionOptions(StandAloneCompanion):

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.core.console import new_console
 from airl_mav.core.fields import ProfileModel
+from airl_mav.core.progress import new_console
 from airl_mav.profiles.computer import LatencyDistribution, Workload, load_computer
 from airl_mav.profiles.loading import list_profiles
 

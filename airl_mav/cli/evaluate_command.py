@@ -11,8 +11,7 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.options import POSITIONAL, scenario_of
-from airl_mav.cli.shared_options import Gate, Viewing, leave, requirements_of, view_of
-from airl_mav.cli.telling import Voice
+from airl_mav.cli.shared_options import Gate, Viewing, Voice, leave, requirements_of, view_of
 from airl_mav.core.errors import FieldError
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.shared_options import Gate, leave, requirements_of
-from airl_mav.cli.telling import Telling, Voice
+from airl_mav.cli.shared_options import Gate, Telling, Voice, leave, requirements_of
 from airl_mav.core.fields import quantity
 from airl_mav.scenario import model
 from airl_mav.scenario.aircraft import Aircraft

@@ -12,8 +12,8 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
+from airl_mav.core.progress import new_console
 from airl_mav.experiments.quantisation import export_int8
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard
 from airl_mav.policy.card_writing import copy_policy

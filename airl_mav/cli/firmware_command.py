@@ -8,17 +8,16 @@ import threading
 from rich.console import Console
 
 from airl_mav.cli.options import run_command
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN
 from airl_mav.core.first_start import compile_shown
 from airl_mav.core.frames import Goal
+from airl_mav.core.progress import new_console
 from airl_mav.lockstep.remote import fly_vehicle_in_lockstep
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from airl_mav.rehearsal.stand_alone_vehicle import Listener, aircraft_of, fly_vehicle
-from airl_mav.scenario.resolve import flight_plan
-from airl_mav.scenario.resolved import FIRMWARE_TITLES
+from airl_mav.rehearsal.firmware_process import Listener, aircraft_of, fly_vehicle
+from airl_mav.scenario.resolve import FIRMWARE_TITLES, flight_plan
 from airl_mav.scenario.stand_alone import StandAloneVehicle
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.interfaces import FirmwareLostError

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.core.console import new_console
 from airl_mav.core.plugins import POLICIES, announced
+from airl_mav.core.progress import new_console
 from airl_mav.policy.registry import find_policy, policy_names
 from airl_mav.profiles.loading import Kind, describe_profile, list_profiles
 

@@ -1,4 +1,4 @@
-"""`airl`: all subcommands, one module per subcommand."""
+"""`airl` and its subcommands, one module each. Light: `airl --help` loads no option models."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from rich.table import Table
 
 from airl_mav import __version__
 from airl_mav.core.addons import addon_commands
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_USAGE
+from airl_mav.core.progress import new_console
 
 SUBCOMMANDS: dict[str, str] = {
     # To add one: write cli/<name>_command.py with OPTIONS and run(), and a line here. Add-ons have
@@ -30,7 +30,6 @@ SUBCOMMANDS: dict[str, str] = {
     "train": "train a policy on the batch twin",
     "export": "turn a stable-baselines3 model into a policy folder",
     "view": "replay the flights of a run in a browser",
-    "video": "what the camera sees, in QGroundControl and other players of RTP",
     "report": "a run's tables and page again, or a comparison of several runs",
     "arena": "look at an arena, or at what its profile draws",
     "asset": "an arena whose obstacles are a mesh of yours (STL, OBJ, GLB)",
@@ -68,10 +67,7 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
             f"error: airl {name}: no such command; {hint}", style="red"
         )
         sys.exit(EXIT_USAGE)
-    # Imported here: the list of commands does not need the option models.
-    from airl_mav.cli.options import run_command
-
-    run_command(f"airl {name}", known[name][1], rest)
+    _run(f"airl {name}", known[name][1], rest)
 
 
 def _print_help(console: Console) -> None:
@@ -89,6 +85,36 @@ def _print_help(console: Console) -> None:
         "\nairl COMMAND --help shows its options and examples; airl --version the version.",
         highlight=False,
     )
+
+
+# --- entry points of the console scripts
+
+
+def sitl() -> None:
+    """Run `airl-sitl`."""
+    _run("airl-sitl", "airl_mav.cli.sitl_command", sys.argv[1:])
+
+
+def firmware() -> None:
+    """Run `airl-firmware`."""
+    _run("airl-firmware", "airl_mav.cli.firmware_command", sys.argv[1:])
+
+
+def companion() -> None:
+    """Run `airl-companion`, which needs only the light installation."""
+    _run("airl-companion", "airl_mav.cli.companion_command", sys.argv[1:])
+
+
+def airl() -> None:
+    """Run `airl` with its subcommands."""
+    main(sys.argv[1:])
+
+
+def _run(prog: str, module: str, words: Sequence[str]) -> NoReturn:
+    # Imported here: the list of commands does not need the option models.
+    from airl_mav.cli.options import run_command
+
+    run_command(prog, module, words)
 
 
 if __name__ == "__main__":

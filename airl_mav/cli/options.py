@@ -23,7 +23,6 @@ import tyro
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import (
     EXIT_BROKEN,
     EXIT_INTERRUPTED,
@@ -34,7 +33,7 @@ from airl_mav.core.errors import (
 )
 from airl_mav.core.fields import range_of, validated
 from airl_mav.core.first_start import shown_by
-from airl_mav.core.progress import RichProgress
+from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.faults.fault import Fault
 from airl_mav.scenario.aircraft import IN_WORDS
 from airl_mav.scenario.model import Scenario
@@ -303,7 +302,7 @@ EXTRAS = {
 }
 """Packages of the extras, by their names in pyproject.toml."""
 
-LIGHT = ("companion", "computers", "export", "list", "train", "video")
+LIGHT = ("companion", "computers", "export", "list", "train")
 """Commands that can be imported without the simulator; light add-ons define `LIGHT` themselves."""
 
 

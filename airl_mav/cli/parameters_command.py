@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,26 +12,9 @@ from airl_mav.cli.options import POSITIONAL
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
 from airl_mav.core.files import replace_file
-from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, VehicleName
-from firmware_sim.external.airframe_check import (
-    HITL_OUTPUT,
-    SITL_OUTPUT,
-    RequiredAirframe,
-    ardupilot_airframe,
-    px4_airframe,
-)
-from firmware_sim.external.parameter_client import Value
-from firmware_sim.external.parameter_file import ardupilot_file, qgroundcontrol_file
-
-Kind = tuple[Callable[[VehicleProfile], RequiredAirframe], Callable[[Mapping[str, Value]], str]]
-
-KINDS: dict[str, Kind] = {
-    "px4": (lambda vehicle: px4_airframe(vehicle, SITL_OUTPUT), qgroundcontrol_file),
-    "px4-hitl": (lambda vehicle: px4_airframe(vehicle, HITL_OUTPUT), qgroundcontrol_file),
-    "ardupilot": (ardupilot_airframe, ardupilot_file),
-}
-"""Functions that compute and format the parameters, by kind of firmware."""
+from firmware_sim.external.programs import firmware_kind
 
 
 class ParametersOptions(ProfileModel):
@@ -58,9 +40,9 @@ OPTIONS = ParametersOptions
 
 def run(options: ParametersOptions) -> int:
     """Write or print the parameters; return 0."""
-    airframe_of, file_of = KINDS[options.firmware]
-    airframe = airframe_of(load_vehicle(options.vehicle))
-    text = file_of({**airframe.frame, **airframe.settings})
+    kind = firmware_kind(options.firmware)
+    airframe = kind.airframe(load_vehicle(options.vehicle))
+    text = kind.parameter_file({**airframe.frame, **airframe.settings})
     if options.out is None:
         sys.stdout.write(text)
         return 0

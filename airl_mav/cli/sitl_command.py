@@ -12,15 +12,21 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import check_installed, run_command, scenario_of
-from airl_mav.cli.shared_options import Gate, Viewing, leave, requirements_of, view_of
-from airl_mav.cli.telling import Telling, Voice
-from airl_mav.cli.video_command import video_shown, video_words, watcher_of
+from airl_mav.cli.shared_options import (
+    Gate,
+    Telling,
+    Viewing,
+    Voice,
+    leave,
+    requirements_of,
+    view_of,
+)
+from airl_mav.core.addons import load_entry
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
-from airl_mav.profiles.camera_kind import SLOW
+from airl_mav.profiles.projections import SLOW
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario, resolve
 from firmware_sim.external.programs import how_to_start
 
 if TYPE_CHECKING:
@@ -82,9 +88,10 @@ def video_of(
     """Return a context that shows the camera's video, if requested."""
     if options.video is None:
         return nullcontext()
+    show = load_entry("airl_mav", "SITL_OPTIONS", "video", ("video", options.video), "video")
     check_installed("film")
-    watcher_of(options.video, "video")
-    return video_shown(video_words(asked, options.video), say)
+    shown: AbstractContextManager[None] = show(asked, options.video, say)
+    return shown
 
 
 def conclude(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voice: Voice) -> int:

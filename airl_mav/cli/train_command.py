@@ -14,8 +14,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.cli.shared_options import Viewing, view_of
-from airl_mav.cli.telling import Telling, Voice
+from airl_mav.cli.shared_options import Telling, Viewing, Voice, view_of
 from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.first_start import compile_shown

@@ -10,8 +10,7 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import OnboardOptions, episodes
 from airl_mav.cli.options import POSITIONAL, REPEATED, scenario_of
-from airl_mav.cli.shared_options import Gate, leave, requirements_of
-from airl_mav.cli.telling import Voice
+from airl_mav.cli.shared_options import Gate, Voice, leave, requirements_of
 from airl_mav.experiments.gap import seek_verdict
 from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.flight.sequential import LOOKS

@@ -12,10 +12,10 @@ from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
 from airl_mav.cli.shared_options import TrustArenas, folder_of
-from airl_mav.core.console import new_console
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.progress import new_console
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.replay.replayed_flight import ReplayedRuns, run_folders
 from airl_mav.report.run_arenas import trust_arenas

@@ -7,20 +7,39 @@ The `__init__` of an add-on is light and may define tables, which the core reads
     EXECUTORS: {value of `--executor`: module with `connected`}
     ALGORITHMS: {name in training files: `Algorithm` of `training.algorithm_table`}
     LIGHT: the commands can be imported without the simulator
+    SITL_OPTIONS: {option of `airl sitl`: function to a context manager around the flights}
+
+In `companion.addons`:
+
+    CAMERAS: {"driver": function that opens a camera by the name of a driver}
+    RECORDERS: {"black_box": context manager that records a mission}
+
+In `firmware_sim.addons`:
+
+    FIRMWARE: {value of `--firmware`: `firmware_sim.external.programs.FirmwareKind`}
 
 In `firmware_sim.addons`:
 
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
+    MISSIONS: {name: subclass of `navigation.plan.Missions`}
+    SERVICES: {name: MAVLink service, a module with HANDLERS and `send_pending`}
+    EVENTS: {name: module with event `Definition`s}
 
 Values are text (`module` or `module:name`); `load` imports what they name, on first use.
+`after_import` runs a module of this package once another package is imported.
 """
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+import sys
 from functools import cache
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 from typing import Any
+
+from airl_mav.core.errors import FieldError
 
 PACKAGES = ("airl_mav", "companion", "firmware_sim")
 
@@ -47,6 +66,25 @@ def load(place: str) -> Any:
     return getattr(loaded, name) if name else loaded
 
 
+def load_entry(package: str, table: str, name: str, option: tuple[str, object], addon: str) -> Any:
+    """Import what an entry of a table names.
+
+    Args:
+        package: Package of the add-ons.
+        table: Table of the entry.
+        name: Name of the entry.
+        option: Option that needs the entry, and its value.
+        addon: Add-on that has the entry.
+
+    Raises:
+        FieldError: The add-on is missing.
+    """
+    place = entries(package, table).get(name)
+    if place is None:
+        raise FieldError(*option, problem=f"needs the add-on {package}/addons/{addon}")
+    return load(place)
+
+
 def addon_commands() -> dict[str, tuple[str, str]]:
     """Return the subcommands of add-ons: purpose and module by name."""
     return entries("airl_mav", "COMMANDS")
@@ -60,3 +98,47 @@ def addon_executors() -> dict[str, str]:
 def addon_algorithms() -> dict[str, str]:
     """Return the learning algorithms of add-ons: rows of the algorithm table by name."""
     return entries("airl_mav", "ALGORITHMS")
+
+
+def after_import(package: str, ours: str) -> None:
+    """Import module `ours` after `package` is fully imported; `package` may be missing."""
+    if package in sys.modules:
+        importlib.import_module(ours)
+    else:
+        sys.meta_path.insert(0, _Watcher(package, ours))
+
+
+class _Watcher:
+    """Import finder that detects the import of a package and delegates it to other finders."""
+
+    def __init__(self, package: str, ours: str) -> None:
+        self._package = package
+        self._ours = ours
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        """Return the spec of the next finders, extended by the import of our module."""
+        if name != self._package:
+            return None
+        for finder in sys.meta_path:
+            if isinstance(finder, _Watcher) or not hasattr(finder, "find_spec"):
+                continue
+            if (spec := finder.find_spec(name, path, target)) is not None:
+                self._watch(spec)
+                return spec
+        return None
+
+    def _watch(self, spec: ModuleSpec) -> None:
+        """Let the package's loader import our module at its end."""
+        loader: Any = spec.loader
+        execute = getattr(loader, "exec_module", None)
+        if execute is None:
+            return
+
+        def then(module: ModuleType) -> None:
+            execute(module)
+            if self in sys.meta_path:
+                sys.meta_path.remove(self)
+            importlib.import_module(self._ours)
+
+        # Patch only this loader object: the package's spec and loader interface are unchanged.
+        loader.exec_module = then

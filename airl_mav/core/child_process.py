@@ -1,4 +1,4 @@
-"""Child processes with a log, supervision, and termination, even if the parent is killed.
+"""Child processes with a log, supervision, suspension, and an end with their parent.
 
 A child's standard input is a pipe held by its parent. The child must exit when the pipe closes,
 because the parent stopped the child or ended unexpectedly. Programs of this package read the pipe.
@@ -17,8 +17,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-
-from airl_mav.core.suspension import Suspension
 
 GRACE_S = 5.0
 """Timeout for a child to exit after its pipe is closed, and again after SIGTERM [wall s]."""
@@ -51,6 +49,41 @@ class Exited:
             with suppress(ValueError):
                 return signal.Signals(-self.code).name
         return f"exit status {self.code}"
+
+
+RESUME = "--resume"
+"""First argument of the guard of a suspended process."""
+
+
+class Suspension:
+    """Suspension of a process, from construction to `end`.
+
+    A stopped process cannot notice that the pipe from its parent has closed, and would never exit.
+    A guard reads a pipe on its behalf, and resumes it if this program is killed.
+    """
+
+    def __init__(self, pid: int) -> None:
+        """Suspend a child process (SIGSTOP)."""
+        self._pid = pid
+        os.kill(pid, signal.SIGSTOP)
+        self._guard = subprocess.Popen(  # noqa: S603 - a list of arguments, no shell
+            [sys.executable, "-m", "airl_mav.core.child_process", RESUME, str(pid)],
+            stdin=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+            start_new_session=True,
+        )
+
+    def end(self) -> None:
+        """Resume the process; no effect if it has ended or is already resumed."""
+        _resume(self._pid)
+        if self._guard.stdin is not None:
+            self._guard.stdin.close()
+        self._guard.wait()
+
+
+def _resume(pid: int) -> None:
+    with suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGCONT)
 
 
 class ChildProcess:
@@ -154,7 +187,14 @@ class ChildProcess:
 
 
 def main() -> None:
-    """Run the command line's program until it or standard input ends; exit with its status."""
+    """Run the command line's program until it or standard input ends; exit with its status.
+
+    With `RESUME` and a process id, resume that process when standard input ends.
+    """
+    if sys.argv[1] == RESUME:
+        _read_to_end()
+        _resume(int(sys.argv[2]))
+        return
     # A new session: signals to the parent do not reach the program, and it can be ended together
     # with all of its children.
     program = subprocess.Popen(  # noqa: S603 - a list of arguments, no shell
@@ -168,13 +208,17 @@ def main() -> None:
 
 
 def _end_with_stdin(program: subprocess.Popen[bytes]) -> None:
-    while os.read(0, 4096):
-        pass
+    _read_to_end()
     _signal_group(program.pid, signal.SIGTERM)
     try:
         program.wait(GUARDED_GRACE_S)
     except subprocess.TimeoutExpired:
         _signal_group(program.pid, signal.SIGKILL)
+
+
+def _read_to_end() -> None:
+    while os.read(0, 4096):
+        pass
 
 
 def _signal_group(group: int, number: int) -> None:

@@ -8,6 +8,7 @@ resumes where it ended. A record of the source files marks a plan as done.
 from __future__ import annotations
 
 import fcntl
+import importlib
 import json
 import os
 import queue
@@ -25,8 +26,8 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.compiling import writable_folder
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.files import replace_file
+from airl_mav.core.machine import usable_cores
 from airl_mav.core.progress import Bar, Progress
-from airl_mav.core.provenance import usable_cores
 
 LABEL = "compiling kernels (first start only)"
 
@@ -257,7 +258,7 @@ class _Step:
 
     def _start(self, job: CompileJob) -> None:
         process = ChildProcess(
-            [sys.executable, "-m", "airl_mav.core.compile_process"],
+            [sys.executable, "-m", "airl_mav.core.first_start"],
             self._scratch / "log.txt",
             capture_stdout=True,
         )
@@ -317,3 +318,56 @@ def _clear(running: _Running) -> None:
     running.process.stop()
     if running.reader is not None and running.reader.ident is not None:
         running.reader.join()
+
+
+# --- the process of a job
+
+
+def main() -> None:
+    """Run the `CompileJob` in standard input; end with it.
+
+    Writes a line of JSON for each compiled kernel, without numba's own functions, and at the end
+    the source files of all kernels, including dependencies.
+    """
+    import numba
+    from numba.core import event
+
+    from airl_mav.core import kernels
+
+    class Compiler(event.Listener):  # type: ignore[misc]
+        def on_start(self, event: event.Event) -> None:  # noqa: ARG002 (any is one)
+            _write({"compiling": True})  # A kernel is missing in the cache.
+
+        def on_end(self, event: event.Event) -> None:
+            function = event.data["dispatcher"].py_func
+            if function.__code__.co_filename in kernels.kernel_files:
+                _write({"compiled": function.__qualname__})
+
+    # Not `sys.stdin`, whose lock the thread would hold at exit.
+    request = b""
+    while not request.endswith(b"\n"):
+        if not (part := os.read(0, 65536)):
+            return
+        request += part
+    threading.Thread(target=_end_with_stdin, daemon=True).start()
+    job = json.loads(request)
+    event.register("numba:compile", Compiler())
+    module, _, name = job["function"].partition(":")
+    getattr(importlib.import_module(module), name)(**job["arguments"])
+    version = Path(numba.__file__).with_name("_version.py")
+    _write({"files": [str(each) for each in (version, *kernels.sources())]})
+
+
+def _write(line: Mapping[str, Any]) -> None:
+    sys.stdout.write(json.dumps(line) + "\n")
+    sys.stdout.flush()
+
+
+def _end_with_stdin() -> None:
+    while os.read(0, 4096):
+        pass
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,7 +1,8 @@
 """Progress of long tasks: bars and lines on a terminal, or nothing for callers of the Python API.
 
 Tasks report to a `Progress`: a `Bar` for countable work, the current status, notes for people, and
-events for programs. `RichProgress` draws; `JsonProgress` writes for programs.
+events for programs. `RichProgress` draws; `JsonProgress` writes for programs. `new_console`
+returns the console of a command, without rich's markup in paths and messages.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from types import TracebackType
 from typing import IO, Any, ClassVar
 
@@ -37,6 +39,10 @@ WIDE = 110
 
 PACE_S = 600.0
 """The remaining time is estimated from the pace over this interval [wall s]."""
+
+
+new_console = partial(Console, markup=False, emoji=False)
+"""Factory of consoles that print square brackets and `:name:` as they are."""
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.finishes import OBSTACLE
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.colour import Work, render_colour
-from airl_mav.camera.gloss import MATT, Gloss
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import ColourArrays, write_grey
+from airl_mav.camera.picture import ColourArrays, Work, render_colour, write_grey
 from airl_mav.camera.projection import Bent, bent_of
 from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.camera.shading import MATT, Gloss
 from airl_mav.camera.textures import atlas
 from airl_mav.core.errors import UsageError
 from airl_mav.core.kernels import kernel

@@ -23,8 +23,7 @@ from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
 from airl_mav.latency.stamps import NO_STAMP, SETPOINTS
-from airl_mav.policy.action_sets import command_numbers, commands
-from airl_mav.policy.actions import Action, Policy, flyable
+from airl_mav.policy.actions import Action, Policy, command_numbers, commands, flyable
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation

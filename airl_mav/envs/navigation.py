@@ -54,10 +54,10 @@ from airl_mav.policy.observation_spec import Encoded, ObservationSpec
 from airl_mav.prediction import Compensator
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.conditions import Payload, check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import flown_values
+from airl_mav.profiles.projections import CameraKind
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import draw_airframe, spreads
 

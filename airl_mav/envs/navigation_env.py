@@ -20,7 +20,7 @@ from airl_mav.envs.rewards import Step, costs, reward_of
 from airl_mav.envs.spec import SHIPPED_REWARDS, Costs, EnvironmentSpec, gymnasium_spec
 from airl_mav.envs.stopping import bounded
 from airl_mav.envs.world import GOES_ON, TERMINATED, TRUNCATED
-from airl_mav.policy.action_sets import ActionSpec, commands, continuous_numbers, discrete_actions
+from airl_mav.policy.actions import ActionSpec, commands, continuous_numbers, discrete_actions
 from airl_mav.policy.layouts import boxes, newest_frame
 from airl_mav.policy.observation_spec import Encoded, ObservationSpec
 

@@ -14,14 +14,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MM_PER_M
-from airl_mav.camera.imaging_checks import check_noise, check_twin_imaging
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.fleet import Fleet
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.faults.fault import Fault
-from airl_mav.policy.images import Bytes, Shrink
+from airl_mav.policy.images import (
+    BAND_M,
+    NEAREST_M,
+    WIDEST_RAD,
+    Bytes,
+    Floats,
+    Moved,
+    Scanning,
+    ScanRays,
+    Shrink,
+    Tilt,
+    goes_round,
+)
 from airl_mav.policy.layouts import DISTANCE_SCALE_M, LEAST_DISTANCE_M, SPEED_SCALE_M_S
 from airl_mav.policy.observation_spec import (
     ObservationSpec,
@@ -29,18 +40,7 @@ from airl_mav.policy.observation_spec import (
     camera_mismatch,
     further_mismatch,
 )
-from airl_mav.policy.scans import (
-    BAND_M,
-    NEAREST_M,
-    WIDEST_RAD,
-    Floats,
-    Moved,
-    Scanning,
-    ScanRays,
-    Tilt,
-    goes_round,
-)
-from airl_mav.profiles.camera import Camera
+from airl_mav.profiles.camera import Camera, check_noise, check_twin_imaging
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.rotation import Quat, Vec, multiply, yaw_of
 

@@ -24,7 +24,7 @@ from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.fleet import FlightArrays, FlightStatus
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.projections import CameraKind
 
 WIDTH_PX, HEIGHT_PX = 960, 540
 DPI = 100

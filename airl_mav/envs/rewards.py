@@ -24,8 +24,7 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.fleet import FlightArrays, FlightStatus
 from airl_mav.envs.spec import SHIPPED_REWARDS, Costs
-from airl_mav.policy.action_sets import PAPER_SPEED_M_S
-from airl_mav.policy.actions import BodyRates
+from airl_mav.policy.actions import PAPER_SPEED_M_S, BodyRates
 
 PROGRESS_1_M = 0.02
 """`shaped`: reward per metre of progress towards the goal; 50 m equal the goal's reward."""

@@ -11,15 +11,16 @@ from airl_mav.core.errors import FieldError, UnexpectedArgumentError, UsageError
 from airl_mav.core.fields import Each, ProfileModel, later_field, quantity, validated
 from airl_mav.core.plugins import REWARDS, part_name
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
-from airl_mav.policy.action_sets import (
+from airl_mav.policy.actions import (
     BODY_RATES,
     MAX_RATE_DEG_S,
     PAPER_SPEED_M_S,
+    UPRIGHT_S,
     ActionSetName,
     ActionSpec,
+    DecisionTiming,
     MaxRate,
 )
-from airl_mav.policy.actions import UPRIGHT_S, DecisionTiming
 from airl_mav.policy.observation_spec import (
     LEAST_ROWS,
     STRIP_ROWS,
@@ -30,9 +31,14 @@ from airl_mav.policy.observation_spec import (
     Told,
 )
 from airl_mav.profiles.camera import Camera, check_matched, check_rows
-from airl_mav.profiles.camera_kind import CYLINDER_MOST_DEG, CameraKind, Projection, check_fov
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
-from airl_mav.profiles.distortion import check_distortion
+from airl_mav.profiles.projections import (
+    CYLINDER_MOST_DEG,
+    CameraKind,
+    Projection,
+    check_distortion,
+    check_fov,
+)
 from airl_mav.profiles.vehicle import load_vehicle
 
 SHIPPED_REWARDS = ("shaped", "timed", "progress", "paced", "paper-scaled", "paper")

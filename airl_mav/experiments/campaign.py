@@ -25,12 +25,13 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_typed, write_json
 from airl_mav.core.first_start import compile_first
+from airl_mav.core.machine import provenance
 from airl_mav.core.progress import Progress
-from airl_mav.core.provenance import provenance
 from airl_mav.experiments.executors import Executor, Flier, FlyEpisodes, Stop, WorkerError, never
 from airl_mav.experiments.live import Ended
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.rehearsal import run_folder
+from airl_mav.rehearsal.observer import Tally
 from airl_mav.rehearsal.run_folder import (
     CAMPAIGN_FILE,
     FlownEpisode,
@@ -39,7 +40,6 @@ from airl_mav.rehearsal.run_folder import (
     check_folder,
     locked,
 )
-from airl_mav.rehearsal.tally import Tally
 from airl_mav.scenario.resolve import plan_of
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
 

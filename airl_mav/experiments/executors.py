@@ -28,11 +28,11 @@ from airl_mav.core.compiling import Heard, heard_compiling
 from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import quantity
-from airl_mav.core.provenance import usable_cores
+from airl_mav.core.machine import usable_cores
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.scenario.aircraft import GREATEST_INSTANCE, Aircraft
 from airl_mav.scenario.model import GREATEST_WORKERS, Workers
-from airl_mav.scenario.resolved import PlannedEpisode
+from airl_mav.scenario.resolve import PlannedEpisode
 
 J = TypeVar("J")
 R = TypeVar("R")

@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from airl_mav.core.clock import utc_now
-from airl_mav.core.console import new_console
 from airl_mav.core.files import Arrays
-from airl_mav.core.progress import Progress, RichProgress
+from airl_mav.core.progress import Progress, RichProgress, new_console
 from airl_mav.experiments.campaign import (
     CampaignRun,
     Cell,
@@ -41,8 +40,7 @@ from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.comparison_model import Comparison, Kind, RunEntry
 from airl_mav.report.table import count_outcomes
 from airl_mav.scenario.model import Scenario, free_fields
-from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario, resolve
 
 
 @dataclass(frozen=True)

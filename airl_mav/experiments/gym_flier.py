@@ -32,8 +32,8 @@ from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation_spec import ObservationSpec, SeenCamera
 from airl_mav.prediction import Compensator
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
-from airl_mav.scenario.piloting import action_generator
-from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
+from airl_mav.scenario.checks import action_generator
+from airl_mav.scenario.resolve import PlannedEpisode, ResolvedScenario
 
 BLOCK_SLOTS = 4
 """Episodes per job and slot: in shorter jobs most slots would wait for the longest flights."""

@@ -9,18 +9,17 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from airl_mav.core.cpu_quota import remove_left
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.first_start import compile_first
 from airl_mav.core.progress import Progress
+from airl_mav.core.scheduling import remove_left
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.rehearsal.observer import LiveObserver, Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RUN_FILE, locked, open_folder
 from airl_mav.rehearsal.signals import terminated_as_interrupted
-from airl_mav.scenario.resolve import plan_of
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario, plan_of
 from airl_mav.view.ends import ViewEnds, ViewRequest
 from firmware_sim.external.programs import check_program
 
@@ -60,7 +59,7 @@ def fly_live(
     asked = scenario.scenario
     if asked.level == "gym":
         raise FieldError("level", asked.level, "lockstep or sitl; airl evaluate flies the twin")
-    check_program(asked.real)
+    check_program(asked)
     say = partial(progress.note, style="yellow")
     known = out is not None and (out / RUN_FILE).exists()
     with ExitStack() as held, terminated_as_interrupted():

@@ -19,7 +19,7 @@ from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.evaluation import LearnedPilots, fly_seeds
 from airl_mav.experiments.gap import training_environment
 from airl_mav.experiments.gym_flier import navigation_of
-from airl_mav.policy.action_sets import discrete_actions
+from airl_mav.policy.actions import discrete_actions
 from airl_mav.policy.card import (
     ONNX_FILE,
     TORCH_FILE,
@@ -36,8 +36,8 @@ from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import Encoded
 from airl_mav.policy.runtime import OnnxRuntime, first_line
+from airl_mav.scenario.checks import action_generator
 from airl_mav.scenario.model import DEFAULT_ARENA, Scenario
-from airl_mav.scenario.piloting import action_generator
 from airl_mav.scenario.resolve import resolve
 
 METHOD = (

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 from airl_mav.core.constants import US_PER_S, Level
 from airl_mav.core.files import typed
 from airl_mav.core.frames import Goal
-from airl_mav.core.process_use import ProcessUse
+from airl_mav.core.resource_use import ProcessUse
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
 from airl_mav.latency.injection import Injection

@@ -11,9 +11,8 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Referee, TruthSample, Verdict
 from airl_mav.lockstep.digest import FlightDigest
 from airl_mav.rehearsal.episode import EpisodeSupervisor, Order
-from firmware_sim.crash_detector import CrashDetector
 from firmware_sim.engine.record import Record
-from firmware_sim.simulation import Simulation
+from firmware_sim.simulation import CrashDetector, Simulation
 
 
 class Judge:

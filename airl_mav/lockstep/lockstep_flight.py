@@ -8,10 +8,11 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from airl_mav.arena.geometry import Arena
+from airl_mav.camera.frame import Frame
 from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.flight.judge import Outcome, Referee, Verdict
@@ -20,10 +21,9 @@ from airl_mav.flight.validity import BY_HAND
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.lockstep.digest import FlightDigest, Unwitnessed, WitnessedPolicy
 from airl_mav.lockstep.judging import Judge
-from airl_mav.lockstep.lockstep_link import real_vehicle
-from airl_mav.lockstep.stage import LockstepStage
-from airl_mav.lockstep.threaded import PATIENCE_S
+from airl_mav.lockstep.stage import PATIENCE_S, LockstepStage
 from airl_mav.lockstep.turns import LockstepError
+from airl_mav.lockstep.vehicle import real_vehicle
 from airl_mav.policy.actions import Policy
 from airl_mav.rehearsal.channel import Text
 from airl_mav.rehearsal.episode import (
@@ -37,17 +37,15 @@ from airl_mav.rehearsal.episode import (
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
 from airl_mav.rehearsal.observer import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
-from airl_mav.scenario.piloting import TRANSPORT_US
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.checks import TRANSPORT_US
+from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.view.ends import ViewEnds
 from companion.offboard_mission import MissionResult, Start, check_camera, fly_mission
+from companion.pilot import SentDecision
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.simulation import Simulation
 from firmware_sim.warm_up import warm_up
-
-if TYPE_CHECKING:  # Not loaded without a viewer.
-    from airl_mav.lockstep.watched_flight import Watched
 
 LOADING = "loading"
 """Status text before the first flight."""
@@ -221,10 +219,7 @@ class LockstepFlight:
         asked = resolved.scenario
         vehicle = real_vehicle(asked, resolved.vehicle, log)
         with ExitStack() as held:
-            # Imported on demand: a flight without viewer needs no web server.
             if self._view is not None:
-                from airl_mav.lockstep.watched_flight import Watched
-
                 self._watched = held.enter_context(closing(Watched(self._view, resolved)))
             self._stage = held.enter_context(
                 LockstepStage(
@@ -379,3 +374,44 @@ class LockstepFlight:
         if not self._witnessed:
             return None
         return {"flight": self._digest.hexdigest(), **self._digest.lanes()}
+
+
+class Watched:
+    """Connection of one flight to a viewer, until it is closed.
+
+    Call the companion's methods on its thread, all others on the waiting conductor's thread.
+    """
+
+    def __init__(self, ends: ViewEnds, scenario: ResolvedScenario) -> None:
+        """Connect to a viewer; the pace is real time until a spectator changes it."""
+        # Imported on demand: a flight without viewer needs no web server.
+        from airl_mav.view.taps import CompanionTap, SimulationTap
+        from airl_mav.view.viewer import REAL_TIME, Pace
+
+        self._open = ExitStack()
+        self._simulation = self._open.enter_context(closing(SimulationTap(ends, scenario)))
+        self.companion = self._open.enter_context(closing(CompanionTap(ends, scenario)))
+        """Companion's part of the connection."""
+        self._pace = self._open.enter_context(closing(Pace(ends, scenario.speed or REAL_TIME)))
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._open.close()
+
+    def begin(self, seed: int, arena: Arena, started_us: int) -> None:
+        """Show the start of an episode, at a simulated time [µs]."""
+        self._simulation.begin(seed, arena, started_us)
+
+    def frame(self, frame: Frame) -> None:
+        """Show a camera frame."""
+        self._simulation.frame(frame)
+
+    def tick(self, simulation: Simulation, collision: str | None) -> None:
+        """Show the newest ticks, and wait as the pace requires."""
+        self._simulation.tick(simulation, collision, self._pace.tick)
+        self._pace.tick(simulation.time_us)
+
+    def decided(self, decision: SentDecision) -> None:
+        """Show an executed decision."""
+        self.companion.decided(decision)
+        self._pace.decided()

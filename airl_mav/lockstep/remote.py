@@ -18,13 +18,11 @@ from airl_mav.flight.judge import Referee, Task, Verdict
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.digest import SEEN, FlightDigest
 from airl_mav.lockstep.judging import Judge
-from airl_mav.lockstep.lockstep_camera import TokenCamera
-from airl_mav.lockstep.lockstep_link import BOOT_UNIX_US, builtin_vehicle
-from airl_mav.lockstep.token_partner import TokenPartner
+from airl_mav.lockstep.token_partner import TokenPartner, Wire
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
-from airl_mav.lockstep.wire import Wire
+from airl_mav.lockstep.vehicle import BOOT_UNIX_US, TokenCamera, builtin_vehicle
 from airl_mav.rehearsal.episode import EpisodeSupervisor
-from airl_mav.rehearsal.stand_alone_vehicle import Listener, aircraft_of, episode_of
+from airl_mav.rehearsal.firmware_process import Listener, aircraft_of, episode_of
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.firmware import Firmware, FrameServer, LoadedEpisode
 from firmware_sim.mavlink.endpoint import UdpEndpoint

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
 from airl_mav.core.constants import US_PER_S
-from companion.conducted import Poll
+from companion.lockstep_turns import Poll
 
 COMPANION_STARTS_US = US_PER_S // 10
 """Delay from the boot of the flight controller to the start of the companion [µs]."""

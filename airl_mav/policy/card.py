@@ -18,9 +18,8 @@ from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
 from airl_mav.core.files import read_json
-from airl_mav.policy.action_sets import CONTINUOUS, ActionSpec
-from airl_mav.policy.action_sets import SHIPPED as SHIPPED_ACTION_SETS
-from airl_mav.policy.actions import DecisionTiming
+from airl_mav.policy.actions import CONTINUOUS, ActionSpec, DecisionTiming
+from airl_mav.policy.actions import SHIPPED as SHIPPED_ACTION_SETS
 from airl_mav.policy.observation_spec import SHIPPED as SHIPPED_LAYOUTS
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch, further_mismatch
 from airl_mav.policy.runtime import OnnxRuntime

@@ -25,7 +25,15 @@ from numpy.typing import NDArray
 from airl_mav.core import plugins
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import down_in_body, heading_to_ned
-from airl_mav.policy.images import NUMPY, Bytes, Shrink, body_bytes, paper_bytes
+from airl_mav.policy.images import (
+    NUMPY,
+    Bytes,
+    Shrink,
+    body_bytes,
+    paper_bytes,
+    scan_bytes,
+    scans_of,
+)
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import (
     SHIPPED,
@@ -37,8 +45,7 @@ from airl_mav.policy.observation_spec import (
     SeenCamera,
     Told,
 )
-from airl_mav.policy.scans import scan_bytes, scans_of
-from airl_mav.profiles.camera_kind import CHANNELS, KINDS
+from airl_mav.profiles.projections import CHANNELS, KINDS
 
 VELOCITY, GOAL = "velocity", "goal"
 """Keys of the shipped layouts besides the image's key, which is the camera's kind."""

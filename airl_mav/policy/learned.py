@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.errors import UsageError
-from airl_mav.policy.action_sets import ActionSpec, command, discrete_actions
-from airl_mav.policy.actions import Action, BodyRates
+from airl_mav.policy.actions import Action, ActionSpec, BodyRates, command, discrete_actions
 from airl_mav.policy.card import (
     TORCH_FILE,
     PolicyCard,

@@ -13,16 +13,19 @@ from pydantic import AfterValidator, Field, model_validator
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core import plugins
 from airl_mav.core.fields import ProfileModel, later_field, quantity
-from airl_mav.policy.scans import goes_round
+from airl_mav.policy.images import goes_round
 from airl_mav.profiles.camera import Coefficients, camera_named
-from airl_mav.profiles.camera_kind import (
+from airl_mav.profiles.projections import (
     CHANNELS,
     CYLINDER_MOST_DEG,
+    UNDISTORTED,
     CameraKind,
     Projection,
+    check_distortion,
     check_fov,
+    distorted,
+    undistorted,
 )
-from airl_mav.profiles.distortion import UNDISTORTED, check_distortion, distorted, undistorted
 
 SHIPPED = ("body", "paper", "scan")
 LayoutName = Annotated[str, plugins.part_name(plugins.LAYOUTS, SHIPPED)]

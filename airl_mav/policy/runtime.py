@@ -16,7 +16,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.policy.action_sets import ActionSpec, continuous_numbers, discrete_actions
+from airl_mav.policy.actions import ActionSpec, continuous_numbers, discrete_actions
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 

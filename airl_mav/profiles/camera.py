@@ -1,10 +1,11 @@
-"""Camera of a vehicle profile: image, mount, depth matching and image formation."""
+"""Camera of a vehicle profile: image, mount, depth matching, image formation; their checks."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from typing import Annotated, Any, Final
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import (
     BeforeValidator,
@@ -17,8 +18,22 @@ from pydantic import (
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import Each, ProfileModel, later_field, optional, quantity, switch
-from airl_mav.profiles.camera_kind import CYLINDER_MOST_DEG, CameraKind, Projection, check_fov
-from airl_mav.profiles.distortion import MOST_COEFFICIENT, UNDISTORTED, Distortion, check_distortion
+from airl_mav.profiles.projections import (
+    CYLINDER_MOST_DEG,
+    MOST_COEFFICIENT,
+    UNDISTORTED,
+    CameraKind,
+    Distortion,
+    Projection,
+    Renderer,
+    check_distortion,
+    check_fov,
+)
+
+if TYPE_CHECKING:
+    from airl_mav.faults.fault import Fault
+    from airl_mav.profiles.arena import ArenaSpec
+    from airl_mav.profiles.conditions import SensorNoise
 
 
 class AutoExposure(ProfileModel):
@@ -382,3 +397,61 @@ def check_rates(main: Camera, further: Mapping[str, Camera]) -> None:
                 camera.rate_hz,
                 f"{main.rate_hz:g} Hz, the main camera's, or left out: all are triggered together",
             )
+
+
+# --- checks against a scenario's other settings
+
+
+def check_noise(
+    camera: Camera,
+    asked: SensorNoise,
+    faults: Sequence[Fault],
+    table: str = "sensors",
+    further: Iterable[Camera] = (),
+) -> None:
+    """Raise FieldError for depth noise or faults without any depth camera."""
+    if camera.kind == "depth":
+        return
+    measured = any(each.kind == "depth" for each in further)
+    for name in ("depth_noise", "depth_dropout"):
+        if (value := getattr(asked, name)) and not measured:
+            raise FieldError(f"{table}.{name}", value, f"0 with a camera of kind {camera.kind!r}")
+    for fault in faults:
+        if (fault.part, fault.kind) == ("camera", "noise"):
+            accepted = f"a depth camera; the vehicle's is of kind {camera.kind!r}"
+            raise FieldError("faults", str(fault), accepted)
+
+
+def check_renderer(
+    camera: Camera, renderer: Renderer, arena: ArenaSpec, further: Iterable[Camera] = ()
+) -> None:
+    """Raise FieldError for cameras or arenas that a renderer does not support."""
+    if renderer == "raycast":
+        return
+    for each in (camera, *further):
+        _check_drawn(each, renderer, arena)
+
+
+def _check_drawn(camera: Camera, renderer: Renderer, arena: ArenaSpec) -> None:
+    accepted = None
+    if camera.kind == "depth":
+        accepted = "raycast with a depth camera; mitsuba draws colour"
+    elif camera.imaging is not None:
+        accepted = "raycast with a camera that has a table imaging"
+    elif arena.appearance.fog.drawn:
+        accepted = "raycast in an arena with fog"
+    elif find_spec("mitsuba") is None:
+        accepted = "raycast: mitsuba is not installed (pip install 'airl-mav[render]')"
+    if accepted is not None:
+        raise FieldError("renderer", renderer, accepted)
+
+
+def check_twin_imaging(camera: Camera, name: str = "") -> None:
+    """Raise FieldError for auto-exposure lag, unsupported where only decisions take frames."""
+    auto = None if camera.imaging is None else camera.imaging.auto_exposure
+    if auto is not None and auto.time_constant_s > 0.0:
+        raise FieldError(
+            f"{f'cameras.{name}' if name else 'camera'}.imaging.auto_exposure.time_constant_s",
+            auto.time_constant_s,
+            "0 in the batch twin, which takes the frames of decisions alone; any in lockstep",
+        )

@@ -19,8 +19,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError
 from airl_mav.core.fields import field_error
 from airl_mav.core.frames import Goal
-from airl_mav.core.process_use import ProcessUse
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.core.resource_use import ProcessUse
+from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.view.ends import ViewEnds
 
 

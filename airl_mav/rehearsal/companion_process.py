@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK
-from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import EXIT_BROKEN
 from airl_mav.core.files import save_arrays
-from airl_mav.core.process_use import UseMeter
+from airl_mav.core.resource_use import UseMeter
+from airl_mav.core.scheduling import held_to
 from airl_mav.rehearsal import channel
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from companion.frame_source import open_camera
 from companion.link_interface import LinkError
+from companion.mavsdk_connection import signed
 from companion.mavsdk_link import MavsdkLink
 from companion.offboard_mission import check_camera, fly_mission
-from companion.signing_proxy import signed
 from companion.watchdog import ThreadGuard
 
 if TYPE_CHECKING:  # Loaded only for a view.

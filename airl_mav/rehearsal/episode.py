@@ -23,11 +23,11 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.flight.validity import BY_HAND, host_faults, host_figures
 from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, STAMPS, setpoint_column
-from airl_mav.profiles.camera_kind import SLOW
+from airl_mav.profiles.projections import SLOW
 from airl_mav.rehearsal.channel import Ended, Loaded, State
 from airl_mav.rehearsal.process_pair import ProcessFaults
 from airl_mav.rehearsal.run_folder import TICK_LATENESS, FlownEpisode
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from companion.link_interface import CAMERA_SILENT, FRAMES_LATE, LINK_LOST, TELEMETRY_FROZEN
 
 TAKEOFF_LIMIT_S = 90.0

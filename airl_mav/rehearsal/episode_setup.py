@@ -7,7 +7,7 @@ import numpy as np
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.frames import Geodetic, quat_yaw
 from airl_mav.rehearsal.channel import State
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.simulation import EpisodeSetup, HoverStart, Simulation
 

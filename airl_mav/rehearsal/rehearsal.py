@@ -36,7 +36,7 @@ from airl_mav.rehearsal.process_pair import (
     ProcessPair,
 )
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.view.ends import ViewEnds
 from firmware_sim.external.programs import load_timeout_s
 

@@ -22,8 +22,8 @@ from airl_mav.core import files
 from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.log_file import PARTIAL_SUFFIX
-from airl_mav.core.provenance import describe_machine, git_state, package_versions
+from airl_mav.core.files import PARTIAL_SUFFIX
+from airl_mav.core.machine import describe_machine, git_state, package_versions
 from airl_mav.flight.episode_record import SCHEMA as LINE_SCHEMA
 from airl_mav.flight.episode_record import EpisodeRecord, Setup
 from airl_mav.flight.trajectory import Trajectory
@@ -31,7 +31,7 @@ from airl_mav.scenario.model import free_fields
 from airl_mav.scenario.scenario_file import SCENARIO_FILE, save_scenario
 
 if TYPE_CHECKING:
-    from airl_mav.scenario.resolved import ResolvedScenario
+    from airl_mav.scenario.resolve import ResolvedScenario
 
 SCHEMA = 1
 """Version of the folder's layout and of `run.json`."""

@@ -17,8 +17,7 @@ from airl_mav.latency.stamps import SETPOINTS, commanded
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.report.recorded_flight import episode_of, path_of, stamps_of
 from airl_mav.report.tracking import MOTOR_OUTPUTS, MOTOR_TIMES
-from airl_mav.vehicle_log.clock_alignment import ClockAlignment, align
-from airl_mav.vehicle_log.ulog_reader import VehicleLog
+from airl_mav.vehicle_log import ClockAlignment, VehicleLog, align
 
 
 def logged_episode_of(box: BlackBox, log: VehicleLog) -> FlownEpisode:

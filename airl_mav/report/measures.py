@@ -14,16 +14,18 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import Change, PairedComparison
 from airl_mav.flight.quality import BANDWIDTH_HZ, command_steps
 from airl_mav.flight.statistics import Aggregate, Estimate, known, successful
-from airl_mav.latency.percentiles import Summary, percentile, summarize
 from airl_mav.latency.stages import (
     ALL_STAGES,
     SETPOINT_TO_MOTOR,
     SHOWN_STAGES,
     Samples,
     Stage,
+    Summary,
     deadline_miss_ratio,
+    percentile,
     pool,
     stage_samples,
+    summarize,
 )
 from airl_mav.policy.registry import find_policy
 from airl_mav.rehearsal.run_folder import LoadedRun

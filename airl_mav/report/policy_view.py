@@ -25,7 +25,7 @@ from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, setpoint_column
 from airl_mav.policy import observation
-from airl_mav.policy.action_sets import commands, discrete_actions
+from airl_mav.policy.actions import commands, discrete_actions
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation_spec import MOST_FRAMES

@@ -14,7 +14,7 @@ from airl_mav.black_box.messages import Decision, End, Phase, Resources, Status,
 from airl_mav.core.constants import UNMEASURED_A, US_PER_S, CommandKind
 from airl_mav.core.files import typed
 from airl_mav.core.frames import Goal, goal_distance_m
-from airl_mav.core.process_use import ProcessUse
+from airl_mav.core.resource_use import ProcessUse
 from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality

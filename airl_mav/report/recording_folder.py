@@ -23,7 +23,7 @@ def take_in(path: Path, ulg: Path | None = None) -> Path:
     if ulg is not None:
         # Imported here: pyulog is an extra.
         from airl_mav.report.logged_episode import logged_episode_of
-        from airl_mav.vehicle_log.ulog_reader import read_vehicle_log
+        from airl_mav.vehicle_log import read_vehicle_log
 
         log = read_vehicle_log(ulg)
         digest = hashlib.sha256(f"{digest} {sha256_of(ulg)}".encode()).hexdigest()

@@ -22,8 +22,7 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.latency.percentiles import Summary
-from airl_mav.latency.stages import Samples, Stage
+from airl_mav.latency.stages import Samples, Stage, Summary
 from airl_mav.report import theme
 from airl_mav.report.table import OUTCOME_LABELS, ms
 

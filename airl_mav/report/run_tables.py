@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.process_use import ProcessUse
 from airl_mav.core.progress import DRAWING, Progress
+from airl_mav.core.resource_use import ProcessUse
 from airl_mav.flight.episode_record import EpisodeRecord, Part, Setup, run_sha256
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import NO_ESTIMATE, Estimate
-from airl_mav.latency.percentiles import CommandAges, Summary, command_ages, summarize
+from airl_mav.latency.stages import CommandAges, Summary, command_ages, summarize
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, TICK_LATENESS, LoadedRun
 from airl_mav.report import table

@@ -17,7 +17,7 @@ from rich.text import Text
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.files import read_typed, write_json
 from airl_mav.flight.judge import Outcome
-from airl_mav.latency.percentiles import MIN_SAMPLES, Summary
+from airl_mav.latency.stages import MIN_SAMPLES, Summary
 
 NONE = "–"
 """Cell text for a missing value."""

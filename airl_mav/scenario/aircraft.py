@@ -10,8 +10,8 @@ from pydantic import Field
 
 from airl_mav.core.fields import ProfileModel, optional, quantity, switch
 from airl_mav.faults.fault import Fault
-from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import Payload, SensorNoise, Spread, WindSettings
+from airl_mav.profiles.projections import Renderer
 
 VehicleName = Annotated[
     str, Field(description="vehicle profile: a shipped name, or a path to a .toml")

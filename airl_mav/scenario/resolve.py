@@ -1,39 +1,63 @@
-"""Resolution of a scenario. Reads every profile and the policy exactly once."""
+"""Resolution of a scenario, with all content loaded: reads profiles and policy exactly once."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
-from airl_mav.camera.imaging_checks import check_noise, check_renderer
+from pydantic import BaseModel
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.constants import Level
 from airl_mav.core.errors import FieldError
 from airl_mav.core.first_start import CompileJob, CompilePlan, compile_shown
-from airl_mav.flight.judge import GOAL_RADIUS_M
-from airl_mav.latency.injection import Injection, select_injection, without_timing
+from airl_mav.core.frames import Goal
+from airl_mav.flight.episode_record import BUILT_IN, EpisodeRecord, Part, Setup
+from airl_mav.flight.judge import GOAL_RADIUS_M, Task
+from airl_mav.latency.injection import (
+    FixedSampler,
+    Injection,
+    LatencySampler,
+    latency_generator,
+    select_injection,
+    without_timing,
+)
+from airl_mav.policy.actions import Policy
+from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import PolicyInfo, camera_refused, find_policy
+from airl_mav.prediction import Compensator
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.camera import check_noise, check_renderer
+from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.conditions import check_spread, equipped
-from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.loading import load_profile, profile_digest
+from airl_mav.profiles.parameters import flown_values
+from airl_mav.profiles.projections import CameraKind
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.scenario.aircraft import PlantName
+from airl_mav.scenario.aircraft import Aircraft, FirmwareName, PlantName
 from airl_mav.scenario.checks import (
+    NATIVE_T2_US,
+    action_generator,
+    between_commands,
+    check_commands,
+    check_compensated,
     check_firmware,
     check_fitted,
+    check_goal_height,
     check_level,
     check_plant,
     check_ports,
-    check_start,
-)
-from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.piloting import (
-    NATIVE_T2_US,
-    check_commands,
-    check_compensated,
-    check_goal_height,
     check_quota,
+    check_start,
     decide_piloting,
+    load_asked_policy,
 )
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.model import PilotSettings, Scenario, WatchdogSettings
+from airl_mav.scenario.scenario_file import anchored
 
 _FLIGHT = "firmware_sim.warm_up"
 _VECTORIZED = "airl_mav.envs.navigation"
@@ -140,3 +164,248 @@ def _labelled(injection: Injection, scenario: Scenario) -> Injection:
     if scenario.level == "sitl":
         return injection
     return without_timing(injection, NATIVE_T2_US / 1e3, scenario.level)
+
+
+HOVER_START_S = 0.3
+"""Time from the start in a hover to navigation: connection and switch to offboard [s]."""
+
+BEFORE_CLIMB_S = 9.2
+"""Take-off time of the built-in autopilot without the climb [s]: booting, arming, spinning up,
+slowing down. 150 take-offs to 2.5 m took 10.6 to 11.2 s, 10.88 s on average."""
+
+ARRIVAL_SHARE = 0.8
+"""Share of the goal radius to which the companion flies: it uses the estimated position, the
+referee the true one."""
+
+FIRMWARE_TITLES: dict[FirmwareName, str] = {
+    "builtin": BUILT_IN,
+    "px4": "PX4 SITL",
+    "ardupilot": "ArduPilot SITL",
+    "px4-hitl": "PX4 on a board",
+}
+
+
+@dataclass(frozen=True)
+class PlannedEpisode:
+    """Episode to be flown."""
+
+    index: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class ResolvedScenario:
+    """Validated scenario, and the content of every referenced profile."""
+
+    scenario: Scenario
+    vehicle: VehicleProfile
+    """Vehicle with its computer and payload."""
+    arena: ArenaSpec
+    computer: ComputerProfile
+    policy: PolicyInfo
+    injection: Injection
+    """Source of t2."""
+    pilot: PilotSettings
+    """Flight settings of the policy; the goal radius is the referee's."""
+    watchdog: WatchdogSettings
+    """Watchdog bounds, with the policy card's hover setting."""
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Seed of each episode, by index."""
+        return self.scenario.seeds
+
+    def left(self, done: Iterable[EpisodeRecord] = ()) -> list[PlannedEpisode]:
+        """Return the episodes that are not in `done`."""
+        there = {record.index for record in done}
+        return [PlannedEpisode(i, seed) for i, seed in enumerate(self.seeds) if i not in there]
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Recorded settings of a run, as plain values.
+
+        The scenario with absolute paths and resolved defaults, so that a default equals the same
+        explicit value; and the content of profiles and policy, because a name does not reveal
+        changes.
+        """
+        pilot = asdict(self.pilot)
+        if pilot["commands"] == "velocity":
+            # Compatible with versions before other command kinds.
+            del pilot["commands"]
+        profiles: dict[str, BaseModel] = {
+            "vehicle": self.vehicle,
+            "arena": self.arena,
+            "computer": self.computer,
+        }
+        if self.injection.latency is not None:
+            profiles["latency"] = self.injection.latency
+        return {
+            **anchored(self.scenario).model_dump(mode="json", exclude=set(pilot)),
+            "speed": self.speed,
+            "pilot": pilot,
+            "watchdog": self.watchdog.model_dump(mode="json"),
+            # The body includes the load, which the profile lacks.
+            "vehicle_body": self.vehicle.body.model_dump(),
+            "policy_sha256": self.policy.sha256,
+            "profiles_sha256": {
+                kind: profile_digest(profile) for kind, profile in profiles.items()
+            },
+        }
+
+    @property
+    def level(self) -> Level:
+        """Fidelity level in reports."""
+        real = self.scenario.firmware != "builtin"
+        return "firmware" if real else self.scenario.level
+
+    @property
+    def speed(self) -> float | None:
+        """Simulated seconds per wall second; None without pacing."""
+        scenario = self.scenario
+        if scenario.level == "sitl":
+            return 1.0 if scenario.speed is None else scenario.speed
+        return scenario.speed if scenario.level == "lockstep" else None
+
+    @property
+    def companion_pilot(self) -> PilotSettings:
+        """Flight settings of the companion, with a smaller goal radius than the referee's.
+
+        For a vehicle without GPS, they include the known origin.
+        """
+        origin = self.pilot.origin
+        if origin is None and (told := self.vehicle.told_origin) is not None:
+            origin = told.latitude_deg, told.longitude_deg, told.altitude_m
+        return replace(
+            self.pilot,
+            goal_radius_m=ARRIVAL_SHARE * self.pilot.goal_radius_m,
+            origin=origin,
+        )
+
+    @property
+    def takeoff_s(self) -> float:
+        """Approximate duration of a take-off [s]; 0 at level gym, which has none."""
+        if self.scenario.level == "gym":
+            return 0.0
+        if self.scenario.start == "hover":
+            return HOVER_START_S
+        parameters = flown_values(self.vehicle.autopilot_parameters())
+        return BEFORE_CLIMB_S + self.pilot.altitude_m / parameters["MPC_TKO_SPEED"]
+
+    def arena_of(self, seed: int) -> Arena:
+        """Return the arena of the episode of a seed. Raises UsageError if generation fails.
+
+        Moving obstacles start the seed's tours when navigation begins, to the precision known
+        beforehand. The same seed gives the same scene at every level.
+        """
+        # Late import of scipy, which a companion does not need.
+        from airl_mav.arena.generate import generate
+        from airl_mav.arena.tours import set_out_later
+
+        arena = generate(
+            self.arena,
+            self.scenario.arena_seed_of(seed),
+            name=self.scenario.arena,
+            vehicle_width_m=self.vehicle.body.width_m,
+            zone=self.scenario.zone,
+        )
+        return set_out_later(arena, self.takeoff_s)
+
+    def task(self, goal: Goal) -> Task:
+        """Return the referee's task for a flight to a goal."""
+        return Task(goal, self.pilot.goal_radius_m, self.scenario.time_limit_s)
+
+    @property
+    def rules(self) -> str:
+        """Rules of an episode, as text for reports."""
+        pilot = self.pilot
+        return (
+            f"goal radius {pilot.goal_radius_m:g} m, hold {pilot.hold_s:g} s, "
+            f"height {pilot.altitude_m:g} m, time limit {self.scenario.time_limit_s:g} s"
+        )
+
+    @property
+    def setup(self) -> Setup:
+        """Setup for the head of every report."""
+        scenario, hover_s = self.scenario, self.watchdog.hover_after_s
+        without = f" (its input {scenario.ablate!r} made zero)" if scenario.ablate else ""
+        return Setup(
+            level=self.level,
+            firmware=FIRMWARE_TITLES[scenario.firmware],
+            vehicle=Part(scenario.vehicle, self.vehicle.description),
+            arena=Part(scenario.arena, self.arena.description),
+            policy=Part(self.policy.name, f"{self.policy.description}{without}"),
+            computer=Part(scenario.computer, self.computer.description),
+            computer_watts=self.computer.onboard_watts,
+            computer_on_ground=self.computer.ground_equipment,
+            injection=self.injection,
+            speed=self.speed,
+            between_commands=between_commands(self.pilot, hover_s),
+            conditions=", ".join([*_conditions(scenario), *self._plant(), *self._zone()]),
+        )
+
+    def _plant(self) -> Iterator[str]:
+        """Yield a non-default plant; level gym has none."""
+        if self.level != "gym" and self.scenario.plant != "pybullet":
+            yield f"plant {self.scenario.plant}"
+
+    def _zone(self) -> Iterator[str]:
+        """Yield the requested curriculum zone of the goals."""
+        if (zone := self.scenario.zone) is not None:
+            yield f"zone {zone} (goals within {self.arena.zones_m[zone]:g} m)"
+
+    @property
+    def pack_j(self) -> float:
+        """Initial energy of the battery [J]."""
+        return self.vehicle.battery.energy_j(self.scenario.battery_charge)
+
+    @property
+    def arena_name(self) -> str:
+        """Name of the arena without its path."""
+        return Path(self.scenario.arena).stem
+
+    def latency_sampler(self, seed: int, *, native: bool) -> LatencySampler | None:
+        """Return the source of t2 for a seed's episode.
+
+        With native timing (`native`), None means no injection. Otherwise the default t2 is a
+        desktop computer's.
+        """
+        sampler = self.injection.sampler(latency_generator(seed, self.scenario.latency_seed))
+        return sampler if native else sampler or FixedSampler(NATIVE_T2_US)
+
+    def compensator(self) -> Compensator | None:
+        """Return the compensator of a companion, or None. Raises FieldError."""
+        if not self.pilot.compensate:
+            return None
+        return Compensator(1, self.vehicle, Intrinsics.of(self.vehicle.camera))
+
+    def fresh_policy(self, seed: int) -> Policy:
+        """Return the policy at the start of a seed's flight. Raises UsageError."""
+        loaded = self._loaded_policy
+        if isinstance(loaded, LearnedPolicy):
+            return loaded.with_generator(action_generator(seed))
+        return self._load_policy()
+
+    @cached_property
+    def _loaded_policy(self) -> Policy:
+        """Policy, with its network loaded once."""
+        return self._load_policy()
+
+    def _load_policy(self) -> Policy:
+        scenario = self.scenario
+        return load_asked_policy(scenario, self.policy, self.pilot.hold_s, scenario.seed)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Exclude the loaded network: each process opens a new one."""
+        return {key: value for key, value in self.__dict__.items() if key != "_loaded_policy"}
+
+
+def _conditions(scenario: Aircraft) -> Iterator[str]:
+    """Yield each non-default condition of an aircraft: field and value."""
+    for table in ("payload", "wind", "spread", "sensors"):
+        for name, value in getattr(scenario, table).model_dump(exclude_defaults=True).items():
+            yield f"{table}.{name} {value:g}"
+    if scenario.renderer != "raycast":
+        yield f"renderer {scenario.renderer}"
+    if scenario.battery_charge < 1.0:
+        yield f"battery_charge {scenario.battery_charge:g}"
+    yield from (f"fault: {fault}" for fault in scenario.faults)

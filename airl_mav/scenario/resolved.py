@@ -27,13 +27,13 @@ from airl_mav.profiles.loading import profile_digest
 from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, FirmwareName
-from airl_mav.scenario.model import PilotSettings, Scenario, WatchdogSettings
-from airl_mav.scenario.piloting import (
+from airl_mav.scenario.checks import (
     NATIVE_T2_US,
     action_generator,
     between_commands,
     load_asked_policy,
 )
+from airl_mav.scenario.model import PilotSettings, Scenario, WatchdogSettings
 from airl_mav.scenario.scenario_file import anchored
 
 HOVER_START_S = 0.3

@@ -16,6 +16,7 @@ from airl_mav.faults.kinds import PROCESSES
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.checks import (
+    TRANSPORT_US,
     check_drawing,
     check_faults,
     check_firmware,
@@ -32,7 +33,6 @@ from airl_mav.scenario.model import (
     LevelName,
     PolicyName,
 )
-from airl_mav.scenario.piloting import TRANSPORT_US
 
 SPEEDS = 0.0, 100.0
 """Limits of the speed; time beyond the host's capacity is skipped and reported."""

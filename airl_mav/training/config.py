@@ -13,7 +13,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
 from airl_mav.core.plugins import NETWORKS, part_name
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.policy.action_sets import SHIPPED, ActionSpec, discrete_actions
+from airl_mav.policy.actions import SHIPPED, ActionSpec, discrete_actions
 from airl_mav.profiles.computer import load_computer
 from airl_mav.training.algorithm_table import CORE_ALGORITHMS, ActionKind, Algorithm
 

@@ -20,12 +20,17 @@ from torch import nn
 
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.plugins import MODELS, load_part
-from airl_mav.policy import action_sets
+from airl_mav.policy.actions import (
+    BODY_RATES,
+    ActionSpec,
+    continuous_numbers,
+    discrete_actions,
+)
 from airl_mav.policy.card import PolicyCard, PolicyFacts
 from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import first_line
-from airl_mav.profiles.camera_kind import CHANNELS, KINDS
+from airl_mav.profiles.projections import CHANNELS, KINDS
 from airl_mav.training import export_request, onnx_export
 from airl_mav.training.onnx_export import RecurrentNetwork, RecurrentOfAny
 
@@ -192,7 +197,7 @@ def _further_keys(seen: spaces.Space[Any]) -> tuple[str, ...]:
 def check_spaces(
     model: BaseAlgorithm,
     spec: ObservationSpec,
-    actions: action_sets.ActionSpec,
+    actions: ActionSpec,
     normalised: Collection[str] = (),
 ) -> None:
     """Raise UsageError unless a model's spaces match a layout and an action set."""
@@ -218,7 +223,7 @@ def check_spaces(
         if not spec.in_flight and IN_FLIGHT in parts:
             told += f". What {IN_FLIGHT} tells is told by --like CONFIGURATION"
         raise UsageError(told)
-    space, count = model.action_space, action_sets.discrete_actions(actions)
+    space, count = model.action_space, discrete_actions(actions)
     if count is not None:
         if not (isinstance(space, spaces.Discrete) and space.n == count and space.start == 0):
             raise UsageError(
@@ -226,13 +231,13 @@ def check_spaces(
             )
     elif not (
         isinstance(space, spaces.Box)
-        and space.shape == (action_sets.continuous_numbers(actions),)
+        and space.shape == (continuous_numbers(actions),)
         and (space.low == -1.0).all()
         and (space.high == 1.0).all()
     ):
         raise UsageError(
             f"action space {space}; accepted with {actions.set!r}: "
-            f"Box(-1.0, 1.0, ({action_sets.continuous_numbers(actions)},), float32)"
+            f"Box(-1.0, 1.0, ({continuous_numbers(actions)},), float32)"
         )
 
 
@@ -275,7 +280,7 @@ def taken_by(model: BaseAlgorithm) -> export_request.ModelProperties:
     shape = None if kind is None else images[kind].shape
     actions: str | None = None
     if isinstance(space, spaces.Box):
-        actions = {3: "velocity3d", 4: action_sets.BODY_RATES}.get(len(space.low), "velocity")
+        actions = {3: "velocity3d", 4: BODY_RATES}.get(len(space.low), "velocity")
     goal = images.get(GOAL)
     tells_height = goal is not None and goal.shape == (4,)
     if kind is None or shape is None or len(shape) != 3:
@@ -406,7 +411,7 @@ def _check_decisions(
         found = network(*(torch.from_numpy(array).to(device) for array in arrays))
         outputs = (found[0] if memory else found).cpu().numpy()
     slack = onnx_export.TOLERANCE * max(1.0, float(np.abs(outputs).max()))
-    if action_sets.discrete_actions(facts.actions) is None:
+    if discrete_actions(facts.actions) is None:
         same = np.abs(outputs - decided).max() <= slack
     else:
         # Either of two equally good actions may win.

@@ -16,19 +16,23 @@ from torch import nn
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import optional, switch, validated
+from airl_mav.core.machine import package_versions
 from airl_mav.core.plugins import names_code
-from airl_mav.core.provenance import package_versions
 from airl_mav.envs.observations import LENS, further_seen
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import GOAL_RADIUS_M
-from airl_mav.policy.action_sets import MAX_RATE_DEG_S, PAPER_SPEED_M_S, ActionSetName, ActionSpec
-from airl_mav.policy.actions import DecisionTiming
+from airl_mav.policy.actions import (
+    MAX_RATE_DEG_S,
+    PAPER_SPEED_M_S,
+    ActionSetName,
+    ActionSpec,
+    DecisionTiming,
+)
 from airl_mav.policy.card import PolicyFacts, Training
 from airl_mav.policy.observation_spec import LayoutName, ObservationSpec
 from airl_mav.policy.runtime import first_line
-from airl_mav.profiles.camera_kind import CameraKind, Projection
-from airl_mav.profiles.distortion import UNDISTORTED
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import UNDISTORTED, CameraKind, Projection
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import PilotSettings
 

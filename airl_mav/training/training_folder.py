@@ -11,8 +11,8 @@ from pydantic import BaseModel, Field, TypeAdapter
 from airl_mav.core import files
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import optional, switch
+from airl_mav.core.machine import provenance
 from airl_mav.core.progress import Event, Progress
-from airl_mav.core.provenance import provenance
 from airl_mav.profiles.loading import load_profile
 from airl_mav.training.config import TrainingConfig, check_fields, configured
 

@@ -21,7 +21,7 @@ from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.files import replace_file
-from airl_mav.core.provenance import package_versions
+from airl_mav.core.machine import package_versions
 from airl_mav.envs.evaluation import EpisodeResult, fly_episodes, mean_of_successes, success_rate
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation

@@ -22,7 +22,7 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP, SETPOINTS
-from airl_mav.policy.action_sets import commands, discrete_actions
+from airl_mav.policy.actions import commands, discrete_actions
 from airl_mav.policy.layouts import newest_frame
 from airl_mav.policy.observation_spec import Encoded
 from airl_mav.training.training_folder import Evaluation, TrainingProgress

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.frames import Goal
-from airl_mav.profiles.camera_kind import Projection
+from airl_mav.profiles.projections import Projection
 from airl_mav.profiles.vehicle import Momentum, VehicleProfile
 
 Vector3 = tuple[float, float, float]

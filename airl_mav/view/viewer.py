@@ -14,7 +14,7 @@ from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.view.ends import ViewAnswer, ViewEnds, ViewSettings
 from airl_mav.view.feed import Asked
 from airl_mav.view.view_messages import Steering

@@ -48,9 +48,8 @@ from firmware_sim.autopilot.inputs import (
     Sticks,
 )
 from firmware_sim.autopilot.land_detector import LandDetector
-from firmware_sim.autopilot.navigation.flown_item import ExecutorState
 from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator, Whereabouts
-from firmware_sim.autopilot.navigation.plan import Plans
+from firmware_sim.autopilot.navigation.plan import NavigationState, Plans
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
@@ -94,6 +93,7 @@ class BuiltinAutopilot:
         self._guidance = Guidance(value, self._say, record)
         self._navigator = Navigator(self.plans, value, self)
         self._guidance.context.return_place = self._return_place
+        self._guidance.context.missions = self._navigator.missions
         self._manual_control = ManualControl(value)
         self._events: list[Told] = []
         self.supervisor = Supervisor(value, self.estimator, self._events.append)
@@ -389,7 +389,7 @@ class BuiltinAutopilot:
         home = PositionYaw(context.home, context.home_yaw)
         return home if now is None else self._navigator.return_place(now, home)
 
-    def _situation(self) -> ExecutorState | None:
+    def _situation(self) -> NavigationState | None:
         return self._whereabouts.situation(landed=self._commander.flight.phase is not _AIR)
 
     def _handle_detected(self) -> None:
@@ -555,7 +555,7 @@ class BuiltinAutopilot:
             self.plans.set_current(index)
         return Result.ACCEPTED
 
-    # --- towards the mission (navigation.executor.Crew)
+    # --- towards the mission (navigation.plan.Crew)
 
     def say(self, message: OperatorText) -> None:
         """Send a text to the operator."""
@@ -583,11 +583,7 @@ class BuiltinAutopilot:
 
     def look_at(self, place: Geodetic | None) -> None:
         """Turn the nose to a place during a mission; None = cancel."""
-        roi = self._navigator.mission.roi
-        if place is None:
-            roi.reset()
-        else:
-            roi.look_at(place)
+        self._navigator.missions.look_at(place)
 
     def return_to_launch(self) -> None:
         """Abort the mission and return."""

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import select
 import shutil
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from airl_mav.core.log_file import PARTIAL_SUFFIX
-from firmware_sim.external.airframe_check import RequiredAirframe
-from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
-from firmware_sim.flight_log.flight_log import ULOG_SUFFIX
+import psutil
+
+from airl_mav.core.child_process import ChildProcess
+from airl_mav.core.clock import Patience
+from airl_mav.core.files import PARTIAL_SUFFIX
+from firmware_sim.external.parameters import RequiredAirframe
 from firmware_sim.interfaces import (
     ActuatorControls,
     FirmwareLostError,
@@ -141,7 +148,9 @@ class Launcher:
 
     def _keep_flight_log(self) -> None:
         path, self.flight_log = self.flight_log, None
-        written = None if self._folders is None else self._folders.newest(ULOG_SUFFIX)
+        written = (
+            None if self._folders is None or path is None else self._folders.newest(path.suffix)
+        )
         if path is None or written is None:
             return
         partial = path.with_name(path.name + PARTIAL_SUFFIX)
@@ -157,3 +166,177 @@ class Launcher:
         self.stop()
         if self._folders is not None:
             self._folders.close()
+
+
+REST_LIMIT_S = 1.0
+"""Timeout until all threads sleep [wall s]; a thread that never sleeps must not stop a flight."""
+
+LOOKS = 2
+"""Consecutive samples with all threads asleep before the program counts as idle: a thread may wake
+another between the reads of their states."""
+
+PAUSE_S = 1e-4
+"""Pause between samples while a thread is busy [wall s]; the thread may need this core."""
+
+_STATE_BYTES = 80
+"""Bytes read of a thread's `stat`, enough for number, name and state."""
+
+
+class RunningProgram:
+    """Running process, with a check for idle threads."""
+
+    def __init__(self, pid: int, watched: Collection[bytes]) -> None:
+        """Set the process id, and the names of the threads that `settle` waits for."""
+        self.pid = pid
+        self._watched = frozenset(watched)
+        self._threads: list[int] | None = None
+        """Descriptor of the `stat` of each watched thread; None = threads not searched yet."""
+
+    @property
+    def stopped(self) -> bool:
+        """True if stopped by a signal: SIGSTOP, SIGTSTP."""
+        try:
+            return bool(psutil.Process(self.pid).status() == psutil.STATUS_STOPPED)
+        except psutil.Error:
+            return False
+
+    def settle(self) -> bool:
+        """Wait until the threads found at the first call sleep; False if unknown or timed out."""
+        patience, looks = Patience(), 0
+        while looks < LOOKS:
+            asleep = self._all_asleep()
+            if asleep is None:
+                return False
+            if asleep:
+                looks += 1
+                continue
+            looks = 0
+            if patience.so_far_s() > REST_LIMIT_S:
+                return False
+            select.select([], [], [], PAUSE_S)
+        return True
+
+    def close(self) -> None:
+        """Close the descriptors. Idempotent."""
+        for descriptor in self._threads or ():
+            os.close(descriptor)
+        self._threads = []
+
+    def _all_asleep(self) -> bool | None:
+        """Return True if all watched threads are asleep; None = unknown."""
+        try:
+            if self._threads is None:
+                self._threads = self._found()
+            for descriptor in self._threads:
+                if _state(os.pread(descriptor, _STATE_BYTES, 0)) != b"S":
+                    return False
+        except OSError:  # no /proc, or the program has ended
+            return None
+        return True
+
+    def _found(self) -> list[int]:
+        """Return the descriptors of the `stat` files of the watched threads."""
+        found = []
+        for thread in Path(f"/proc/{self.pid}/task").iterdir():
+            descriptor = os.open(thread / "stat", os.O_RDONLY | os.O_CLOEXEC)
+            if _name(os.pread(descriptor, _STATE_BYTES, 0)) in self._watched:
+                found.append(descriptor)
+            else:
+                os.close(descriptor)
+        return found
+
+
+def program_at(host: str, port: int, to_port: int) -> int | None:
+    """Return the process id of a TCP connection's client; None if unknown or of another user.
+
+    `to_port` is the server's port: the client's port may also be connected elsewhere.
+    """
+    with suppress(psutil.Error, OSError):
+        for connection in psutil.net_connections("tcp4"):
+            own, other = connection.laddr, connection.raddr
+            if own and other and tuple(own) == (host, port) and other.port == to_port:
+                return None if connection.pid in (None, os.getpid()) else int(connection.pid)
+    return None
+
+
+def _state(stat: bytes) -> bytes:
+    """Return the state of a thread. Source: proc_pid_stat(5), field 3."""
+    end = stat.rindex(b")")
+    return stat[end + 2 : end + 3]
+
+
+def _name(stat: bytes) -> bytes:
+    return stat[stat.index(b"(") + 1 : stat.rindex(b")")]
+
+
+@dataclass(frozen=True)
+class StartCommand:
+    """Command that starts a program in a working folder."""
+
+    argv: Sequence[str]
+    environment: Mapping[str, str]
+    """Variables added to the environment of this process."""
+
+
+class FirmwareProcess(ChildProcess):
+    """Process of external firmware. It ends with this process, even if killed."""
+
+    def __init__(self, name: str, command: StartCommand, cwd: Path, log: Path) -> None:
+        """Start a program in a folder, appending output to `log`, or raise FirmwareMissingError."""
+        self.name = name
+        program = Path(command.argv[0])
+        if not os.access(program, os.X_OK) or not program.is_file():
+            raise FirmwareMissingError(f"{name}: {program}: not an executable program")
+        super().__init__(command.argv, log, guarded=True, cwd=cwd, environment=command.environment)
+
+    def check(self) -> None:
+        """Raise FirmwareLostError when the process has ended."""
+        exited = self.poll()
+        if exited is not None:
+            tail = self.log_tail()
+            raise FirmwareLostError(
+                f"{self.name} ended ({exited}); log: {self.log}" + (f"\n{tail}" if tail else "")
+            )
+
+
+class WorkingFolders:
+    """Working folders, one per flight, for the firmware's parameters and flight logs."""
+
+    def __init__(self, name: str, kept: Path | None, log: Path | None) -> None:
+        """Choose the folders of a firmware, such as px4.
+
+        `kept` is the parent of kept working folders, None = one temporary folder at a time; `log`
+        receives the firmware's output, None = a file beside the working folders.
+        """
+        self._name = name
+        self._flights = 0
+        self._temporary = kept is None
+        root = Path(tempfile.mkdtemp(prefix=f"airl-{name}-")) if kept is None else kept
+        root.mkdir(parents=True, exist_ok=True)
+        self._root = root.absolute()
+        self.log = (log or root / f"{name}.log").absolute()
+
+    def fresh(self) -> Path:
+        """Return a new, empty working folder, without files of an earlier flight."""
+        if self._temporary:
+            shutil.rmtree(self._path, ignore_errors=True)
+        while True:
+            self._flights += 1
+            # Parallel processes may use the same parent folder.
+            with suppress(FileExistsError):
+                self._path.mkdir()
+                return self._path
+
+    def newest(self, suffix: str) -> Path | None:
+        """Return the most recently written file with a suffix in the present folder, if any."""
+        found = self._path.rglob(f"*{suffix}")
+        return max(found, key=lambda path: path.stat().st_mtime_ns, default=None)
+
+    def close(self) -> None:
+        """Remove temporary folders. Idempotent."""
+        if self._temporary:
+            shutil.rmtree(self._root, ignore_errors=True)
+
+    @property
+    def _path(self) -> Path:
+        return self._root / f"{self._name}-{self._flights:03d}"

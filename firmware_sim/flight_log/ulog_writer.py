@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from airl_mav.core.log_file import LogFile
+from airl_mav.core.files import LogFile
 
 Values = tuple[float | int | bool, ...]
 

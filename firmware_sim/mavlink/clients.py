@@ -1,34 +1,169 @@
-"""Clients of a link, each with separate streams and answers; forwarding and commanders.
+"""Clients of a link, each with separate streams and answers, and the limits on their data.
 
 PX4 SITL has a preset remote on each link (14540, 14550), which receives data before it sends any.
 Every other sender of a valid frame becomes a client. A client starts with the link's default
 streams and receives separate answers and parameter lists. Requests of one client do not affect the
 others.
+
+Too much MAVLink processing delays a tick, so frames per client and time per tick are limited. The
+idle time before the next tick delays nothing, so the limit there is higher.
 """
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.clock import Clock
+from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Geodetic
 from airl_mav.core.signing import Signing
-from firmware_sim.autopilot.autopilot_state import OperatorText
-from firmware_sim.mavlink.codec import (
-    COMPONENT_ID,
-    Decoder,
-    TextEncoder,
-    WireMessage,
-    dialect,
-    is_signed,
-)
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
+from firmware_sim.mavlink.codec import Decoder, WireMessage, is_signed
 from firmware_sim.mavlink.endpoint import Peer, Sender, SharedEndpoint
-from firmware_sim.mavlink.event_buffer import EventSender
 from firmware_sim.mavlink.link import Link, LinkCounters
-from firmware_sim.mavlink.rate_limits import Allowance, ListeningTime, TickTime
-from firmware_sim.mavlink.services.context import ANY, Context, sender
+from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.texts_and_events import EventSender, TextEncoder
+
+FRAMES_PER_S = 2_000
+"""Sustained frame rate of one client [1/s]: eight times the rate of a setpoint per tick."""
+
+BURST_FRAMES = 500
+"""Maximum burst of one client [frames]: a ground station requests up to 500 parameters at once."""
+
+
+class Allowance:
+    """Generic cell rate algorithm (ITU-T I.371) in integer microseconds of simulated time.
+
+    Counts frames and reads no clock: the result depends only on frames and their simulated times.
+    """
+
+    def __init__(self, per_s: int = FRAMES_PER_S, burst: int = BURST_FRAMES) -> None:
+        """Allow a sustained rate of `per_s` frames per second, and bursts of `burst` frames."""
+        self._each_us = US_PER_S // per_s
+        self._ahead_us = self._each_us * burst
+        self._until_us = 0
+        """Simulated time at which the counted frames no longer limit the rate [µs]."""
+
+    def left(self, now_us: int) -> bool:
+        """Return True if another frame is allowed at simulated `now_us` [µs]."""
+        return self._until_us - now_us < self._ahead_us
+
+    def take(self, frames: int, now_us: int) -> None:
+        """Count frames received at simulated `now_us` [µs]."""
+        self._until_us = max(self._until_us, now_us) + self._each_us * frames
+
+    def renew(self) -> None:
+        """Reset the counted frames, because simulated time may restart."""
+        self._until_us = 0
+
+
+LISTEN_US = TICK_US // 8
+"""Maximum time per tick for received data of one link [µs of the pacing clock]. The rest waits for
+the next tick."""
+
+IDLE_LISTEN_US = TICK_US // 4
+"""Maximum additional time for received data of all links while the simulator is idle before the
+next tick [µs of the pacing clock]. During a flood the companion, on the same host, needs part of
+the processor."""
+
+BULK_RESERVE_US = TICK_US // 8
+"""Time before the next tick at which bulk transfers stop, to read received data [µs of the pacing
+clock]."""
+
+
+class TickTime:
+    """Time before the next tick, common to all links."""
+
+    def __init__(self, clock: Clock | None) -> None:
+        """Store the pacing clock; None = no pacing, so time is unlimited."""
+        self.clock = clock
+        self.next_us = 0
+        """Simulated time at which the next tick starts [µs]."""
+        self.idle_us = IDLE_LISTEN_US
+        """Remaining idle time for received data before the next tick [µs]."""
+
+    def renew(self, next_us: int) -> None:
+        """Start the time budget that ends with the tick at simulated `next_us` [µs]."""
+        self.next_us = next_us
+        self.idle_us = IDLE_LISTEN_US
+
+    def is_short(self) -> bool:
+        """Return True if bulk transfers must wait because the next tick is near."""
+        return self.clock is not None and self.clock.time_us() > self.next_us - BULK_RESERVE_US
+
+
+class ListeningTime:
+    """Time budget per tick for the received data of one link."""
+
+    def __init__(self, tick: TickTime) -> None:
+        self._tick = tick
+        self._tick_us = tick.next_us
+        self._left_us = LISTEN_US
+        self._looked_us = 0
+
+    def renew(self) -> None:
+        """Reset the budget for a new tick."""
+        self._left_us = LISTEN_US
+
+    def begin(self) -> bool:
+        """Start reading, with a new budget in a new tick; return True if time is limited."""
+        tick = self._tick
+        # Without a clock only the number of messages is limited.
+        if tick.clock is None:
+            return False
+        # `begin` runs several times per tick; the budget renews once per tick.
+        if self._tick_us != tick.next_us:
+            self._tick_us, self._left_us = tick.next_us, LISTEN_US
+        self._looked_us = tick.clock.time_us()
+        return True
+
+    def left(self) -> bool:
+        """Charge the time since the last call; return True if time remains."""
+        tick = self._tick
+        if tick.clock is None:
+            return True
+        now_us = tick.clock.time_us()
+        spent_us, self._looked_us = now_us - self._looked_us, now_us
+        # Idle time is charged first: it delays no tick.
+        idle = now_us < tick.next_us
+        if idle and tick.idle_us > 0:
+            tick.idle_us -= spent_us
+        else:
+            self._left_us -= spent_us
+        return self._left_us > 0 or (idle and tick.idle_us > 0)
+
+
+EVERY_US = 10 * US_PER_S
+"""Minimum interval between two warnings of one type [µs]."""
+
+
+class Complaints:
+    """Operator warnings about rejected and dropped data, at a limited rate."""
+
+    def __init__(self) -> None:
+        self._told: dict[tuple[str, str], tuple[int, int]] = {}
+        """Last warning by link and type: time [µs], counter value."""
+
+    def restart(self) -> None:
+        """Restart the intervals, because simulated time may restart. Keeps reported counts."""
+        self._told = {key: (-EVERY_US, count) for key, (_, count) in self._told.items()}
+
+    def due(self, name: str, refused: int, dropped: int, now_us: int) -> list[OperatorText]:
+        """Return the warnings due on a link at `now_us` [µs] about rejected and dropped data."""
+        texts: list[OperatorText] = []
+        for kind, count, problem in (
+            ("refused", refused, "frames refused: bad signature"),
+            ("dropped", dropped, "datagrams dropped: flood or full"),
+        ):
+            # The first warning is due at once.
+            told_us, told = self._told.get((name, kind), (-EVERY_US, 0))
+            if count > told and now_us - told_us >= EVERY_US:
+                self._told[name, kind] = now_us, count
+                texts.append(OperatorText(Severity.WARNING, f"{name}: {count - told} {problem}"))
+        return texts
+
 
 MAX_CLIENTS = 32
 """Maximum number of clients of a link, without the preset remote."""
@@ -285,132 +420,3 @@ class Clients:
             return False
         self.forget_silent(now_us, silent_us)
         return True
-
-
-COMMANDS = frozenset(
-    (
-        "COMMAND_LONG",
-        "COMMAND_INT",
-        "SET_MODE",
-        "SET_POSITION_TARGET_LOCAL_NED",
-        "SET_POSITION_TARGET_GLOBAL_INT",
-        "SET_ATTITUDE_TARGET",
-        "MANUAL_CONTROL",
-        "RC_CHANNELS_OVERRIDE",
-        "MISSION_COUNT",
-        "MISSION_CLEAR_ALL",
-        "MISSION_SET_CURRENT",
-        "PARAM_SET",
-        "SETUP_SIGNING",
-    )
-)
-"""Messages that change the vehicle's behaviour."""
-
-ANNOUNCED = (dialect.MAV_TYPE_GCS, dialect.MAV_TYPE_ONBOARD_CONTROLLER)
-"""MAV_TYPE values in the heartbeat of a ground station and of a companion computer."""
-
-
-class Senders:
-    """Record of the systems that send commands and of those announced by a heartbeat."""
-
-    def __init__(self) -> None:
-        self._announced: set[tuple[int, int]] = set()
-        """Announced system and component ids, kept while the links are open."""
-        self._commands: Counter[tuple[int, int, str]] = Counter()
-
-    def note(self, message: WireMessage, kind: str, source: tuple[int, int]) -> None:
-        """Count a message from a sender if the message had an effect on this vehicle."""
-        if kind in COMMANDS:
-            self._commands[(*source, kind)] += 1
-        elif kind == "HEARTBEAT" and message.type in ANNOUNCED:
-            self._announced.add(source)
-
-    def strangers(self) -> tuple[str, ...]:
-        """Return a line per unannounced sender and message type since the last `forget`.
-
-        A heartbeat after a command also announces its sender: MAVSDK starts with commands.
-        """
-        return tuple(
-            f"system {system} component {component}, {kind} ({count} times)"
-            for (system, component, kind), count in sorted(self._commands.items())
-            if (system, component) not in self._announced
-        )
-
-    def forget(self) -> None:
-        """Reset the counts for a new episode."""
-        self._commands.clear()
-
-
-REMEMBERED_FRAMES = 128
-"""Number of recent frames per sender that are not forwarded again. Below 256, the number of
-sequence numbers: a sender of heartbeats alone repeats its frames after that."""
-
-REMEMBERED_SENDERS = 256
-
-NEVER = frozenset((dialect.MAVLINK_MSG_ID_SETUP_SIGNING,))
-"""Messages that are never forwarded. A signing key is for its recipient only."""
-
-
-class Forwarder:
-    """Message forwarder. Sends each frame once: programs that join two links cause no loop."""
-
-    def __init__(self, everybody: Callable[[], Iterable[Client]]) -> None:
-        """Store the callable that returns all clients of all links."""
-        self._everybody = everybody
-        self._seen: OrderedDict[tuple[int, int], deque[bytes]] = OrderedDict()
-
-    def forward(self, message: WireMessage, origin: Client, system_id: int, now_us: int) -> bool:
-        """Forward a message to the clients concerned; return True if any received it.
-
-        Args:
-            message: Received message.
-            origin: Client that sent the message.
-            system_id: System id of this vehicle.
-            now_us: Simulated time [µs].
-        """
-        # Messages without target fields are broadcasts.
-        target = getattr(message, "target_system", ANY), getattr(message, "target_component", ANY)
-        if target == (system_id, COMPONENT_ID) or message.get_msgId() in NEVER:
-            return False
-        if not origin.forwards.left(now_us):
-            return False
-        # A frame never returns to the client that sent it.
-        receivers = [
-            client
-            for client in self._everybody()
-            if client is not origin and _concerns(target, client)
-        ]
-        if not receivers:
-            return False
-        # Only frames with a receiver enter the memory of recent frames.
-        frame = bytes(message.get_msgbuf())
-        if not self._is_new(sender(message), frame):
-            return False
-        origin.forwards.take(1, now_us)
-        for client in receivers:
-            client.link.pass_on(frame)
-        return True
-
-    def _is_new(self, source: tuple[int, int], frame: bytes) -> bool:
-        frames = self._seen.get(source)
-        if frames is None:
-            # The sender that was silent longest is removed (`move_to_end` below keeps this order).
-            if len(self._seen) >= REMEMBERED_SENDERS:
-                self._seen.popitem(last=False)
-            frames = self._seen[source] = deque(maxlen=REMEMBERED_FRAMES)
-        if frame in frames:
-            return False
-        frames.append(frame)
-        self._seen.move_to_end(source)
-        return True
-
-
-def _concerns(target: tuple[int, int], client: Client) -> bool:
-    system, component = target
-    # A target that no client has announced is unknown: the frame is dropped, as in MAVLink
-    # routing.
-    if system == ANY:
-        return bool(client.components)
-    if component == ANY:
-        return any(heard[0] == system for heard in client.components)
-    return target in client.components

@@ -1,54 +1,160 @@
-"""MAVLink 2 codec. Only this module and `dialect` import pymavlink.
+"""MAVLink 2 codec and its dialect. Only this module imports pymavlink.
 
 pymavlink provides only the generated dialect (`dialect`): message classes, constants and the
-decoder of one whole frame. Framing is implemented here. On reception, pymavlink's parser waits for
+decoder of one whole frame. Its `development` set includes all of `common`, but lacks the newest
+messages of PX4: EVENT, COMPONENT_METADATA, TIME_ESTIMATE_TO_TARGET and others.
+`newer_messages.xml` defines these messages. The first import after an install generates a module
+from both (a fraction of a second) and caches it beside the compiled kernels.
+
+ Framing is implemented here. On reception, pymavlink's parser waits for
 the full payload that a damaged header announces, and discards it. For streams, creating and packing
 a message object takes several times as long as `WireLayout` and `Encoder.frame`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import hashlib
+import importlib.util
 import inspect
+import io
 import re
 import struct
+import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from itertools import accumulate
 from operator import itemgetter
+from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, TypeAlias
+from xml.etree import ElementTree as Xml
 
+import pymavlink
 from pymavlink.generator import mavcrc
 
-from firmware_sim.autopilot.autopilot_state import OperatorText
-from firmware_sim.mavlink.dialect import load
+from airl_mav.core.compiling import writable_folder
+
+NEWER = Path(__file__).with_name("newer_messages.xml")
+"""Messages missing from pymavlink's definitions."""
+
+DEFINITIONS = Path(pymavlink.__file__).parent / "dialects" / "v20"
+INCLUDED = ("minimal", "standard", "common", "development")
+"""pymavlink's definitions included in `development`, each including the one before."""
+
+_NAME = "airl_mavlink_dialect"
+
+
+def load_dialect() -> ModuleType:
+    """Return the dialect module, the counterpart of `pymavlink.dialects.v20.common`.
+
+    Raises:
+        ImportError: pymavlink is installed without its message definitions.
+    """
+    present = sys.modules.get(_NAME)
+    if present is not None:
+        return present
+    # Without a writable folder, each process generates its own module.
+    folder = writable_folder(f"mavlink-{_digest()}")
+    if folder is not None:
+        return _imported(generated(folder))
+    with tempfile.TemporaryDirectory() as temporary:
+        return _imported(generated(Path(temporary)))
+
+
+def _digest() -> str:
+    """Return a digest of the module's source definitions."""
+    digest = hashlib.sha256(NEWER.read_bytes())
+    for name in INCLUDED:
+        # Size and time reveal an upgrade of pymavlink without reading half a megabyte of text.
+        try:
+            seen = (DEFINITIONS / f"{name}.xml").stat()
+        except OSError as error:
+            raise ImportError(f"pymavlink lacks its message definitions: {error}") from error
+        digest.update(f"{name} {seen.st_size} {seen.st_mtime_ns}".encode())
+    return digest.hexdigest()[:16]
+
+
+def generated(folder: Path) -> Path:
+    """Return the path of the module in a folder. Generates a missing module."""
+    path = folder / f"{_NAME}.py"
+    # A temporary folder hides the half-written module from other processes.
+    if not path.is_file():
+        with tempfile.TemporaryDirectory(dir=folder) as temporary:
+            made = Path(temporary) / path.name
+            generate(NEWER, DEFINITIONS, INCLUDED, made)
+            made.replace(path)  # atomic, for several processes at once
+    return path
+
+
+def _imported(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(_NAME, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path}: cannot be imported")
+    module = importlib.util.module_from_spec(spec)
+    # Registered before execution, as in importlib's documentation.
+    sys.modules[_NAME] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[_NAME]
+        raise
+    return module
+
+
+def generate(newer: Path, definitions: Path, included: tuple[str, ...], module: Path) -> None:
+    """Write the Python module of a dialect.
+
+    Args:
+        newer: Additional definitions; they replace messages with the same number.
+        definitions: Folder of pymavlink's definitions.
+        included: Definitions of the dialect, each including the one before.
+        module: File to write, in an empty folder. Definitions are written there, too.
+
+    Raises:
+        ImportError: The generator rejects the definitions.
+    """
+    # Imported here because loading an existing module does not need the generator.
+    from pymavlink.generator import mavgen
+
+    folder = module.parent
+    root = Xml.parse(newer).getroot()  # noqa: S314 (our own file)
+    # A newer definition replaces pymavlink's message with the same number.
+    numbers = {message.get("id") for message in root.iter("message")}
+    for name in included:
+        tree = Xml.parse(definitions / f"{name}.xml")  # noqa: S314 (pymavlink's own file)
+        for messages in tree.getroot().iter("messages"):
+            for message in [m for m in messages if m.get("id") in numbers]:
+                messages.remove(message)
+        tree.write(folder / f"{name}.xml")
+    # Include and version come first, as in pymavlink's own files.
+    include, version = Xml.Element("include"), Xml.Element("version")
+    include.text = f"{included[-1]}.xml"
+    version.text = "3"  # HEARTBEAT's mavlink_version, as in minimal.xml
+    root[:0] = [include, version]
+    source = module.with_suffix(".xml")
+    Xml.ElementTree(root).write(source)
+    options = mavgen.Opts(
+        str(module.with_suffix("")), wire_protocol="2.0", language="Python3", validate=False
+    )
+    said = io.StringIO()
+    # In a rehearsal, a process's standard output is its channel to the harness.
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        made = mavgen.mavgen(options, [str(source)])
+    if not made:
+        raise ImportError(f"pymavlink's generator failed: {said.getvalue()}")
+
 
 if TYPE_CHECKING:
-    from pymavlink.dialects.v20 import development as dialect
+    from pymavlink.dialects.v20 import development
+
+    dialect = development
+    WireMessage: TypeAlias = development.MAVLink_message
 else:
-    dialect = load()
-
-__all__ = [
-    "COMPONENT_ID",
-    "SYSTEM_ID",
-    "Decoder",
-    "Encoder",
-    "Reader",
-    "TextEncoder",
-    "Values",
-    "WireLayout",
-    "WireMessage",
-    "dialect",
-    "is_signed",
-    "layout",
-    "message_id",
-    "message_name",
-    "param_value",
-    "payload",
-    "trimmed",
-]
-
-WireMessage: TypeAlias = dialect.MAVLink_message
-"""Received message, or a message to pack."""
+    dialect = load_dialect()
+    WireMessage = dialect.MAVLink_message
+    """Received message, or a message to pack."""
 
 Values: TypeAlias = Sequence[float]
 """Fields of a message in order of definition, with int values for integer fields. Arrays are
@@ -349,45 +455,3 @@ def _frame_end(buffer: bytes, start: int) -> int | None:
 
 
 # --- texts
-
-CHUNK_BYTES = 50
-_LAST_ID = 65_535
-
-SAID_BY_EVENT = b"\t"
-"""Suffix of a text that is also sent as an event, as in PX4. Ground stations with event support
-skip such texts."""
-
-REPLY_IDS = 32_768
-"""First id of replies if they are numbered separately from the autopilot's texts. The ids of two
-consecutive long texts must differ."""
-
-
-class TextEncoder:
-    """Encoder of texts as STATUSTEXT messages, with the ids that link the chunks."""
-
-    def __init__(self, last_id: int = 0) -> None:
-        """Number long texts from the id after `last_id`."""
-        self._id = last_id
-
-    def encode(self, message: OperatorText) -> list[WireMessage]:
-        """Return the messages of one text, in order.
-
-        A text of up to 50 characters is one message with id 0. A longer text is split into chunks
-        with a common id. A chunk with a NUL is the last, so an empty chunk follows a full last
-        chunk.
-        """
-        # STATUSTEXT is ASCII in PX4; other characters become question marks.
-        text = message.text.encode("ascii", errors="replace")
-        if message.event is not None:
-            text += SAID_BY_EVENT
-        if len(text) <= CHUNK_BYTES:
-            return [dialect.MAVLink_statustext_message(message.severity, text)]
-        # Id 0 means a single chunk, so ids run from 1 to 65535.
-        self._id = self._id % _LAST_ID + 1
-        starts = range(0, len(text) + 1, CHUNK_BYTES)
-        return [
-            dialect.MAVLink_statustext_message(
-                message.severity, text[start : start + CHUNK_BYTES], self._id, chunk
-            )
-            for chunk, start in enumerate(starts)
-        ]

@@ -6,6 +6,7 @@ import math
 import select
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 
 from airl_mav.core.clock import Clock
@@ -15,20 +16,23 @@ from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.engine.record import Record
 from firmware_sim.interfaces import TrueState
-from firmware_sim.mavlink.clients import Client, Clients, Forwarder, Senders
-from firmware_sim.mavlink.codec import COMPONENT_ID, REPLY_IDS, SYSTEM_ID, TextEncoder, WireMessage
-from firmware_sim.mavlink.endpoint import Peer, Sender
-from firmware_sim.mavlink.event_buffer import EventBuffer, EventSender
-from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
-from firmware_sim.mavlink.own_streams import OwnStreams, Radio
-from firmware_sim.mavlink.rate_limits import Allowance, Complaints, TickTime
-from firmware_sim.mavlink.services import handle, peers, send_pending
+from firmware_sim.mavlink.clients import Allowance, Client, Clients, Complaints, TickTime
+from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
+from firmware_sim.mavlink.endpoint import (
+    Peer,
+    Sender,
+    SharedEndpoint,
+)
+from firmware_sim.mavlink.link import Link, LinkCounters, Payloads
+from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, gcs_link, onboard_link
+from firmware_sim.mavlink.services import connection, handle, send_pending
 from firmware_sim.mavlink.services.context import Context, sender
 from firmware_sim.mavlink.services.transfers import RunningCalibration
-from firmware_sim.mavlink.streams import BUILDERS, Builder
-from firmware_sim.mavlink.streams.status import system_time
+from firmware_sim.mavlink.streams import BUILDERS, VEHICLE_BUILDERS, Builder, Vehicle
+from firmware_sim.mavlink.streams.sensors import Radio
 from firmware_sim.mavlink.telemetry import TickContext, flown_of
-from firmware_sim.mavlink.tlog import TlogWriter, TrafficLog
+from firmware_sim.mavlink.texts_and_events import REPLY_IDS, EventBuffer, EventSender, TextEncoder
+from firmware_sim.mavlink.traffic import Forwarder, Senders, TlogWriter, TrafficLog
 from firmware_sim.storage import Storage
 
 _DISCARD_CALLS = 16
@@ -100,7 +104,7 @@ class MavlinkServer:
         self._now_us = 0
         self._forget_us = 0
         self._system_id = SYSTEM_ID
-        self._streams, self._context = OwnStreams(), TickContext()
+        self._vehicle, self._context = Vehicle(boot_unix_us), TickContext()
         self._texts: list[OperatorText] = []
         self._announced = Allowance(TEXTS_PER_S, TEXTS_BURST)
         self._answers_apart = any(config.separate_replies for config in links)
@@ -115,8 +119,7 @@ class MavlinkServer:
         # All links share these builders, so each message is built once per tick.
         self._builders: dict[str, Builder | None] = {
             **BUILDERS,
-            "SYSTEM_TIME": system_time(boot_unix_us),
-            **self._streams.builders,
+            **{name: partial(build, self._vehicle) for name, build in VEHICLE_BUILDERS.items()},
             "TIMESYNC": None,
         }
         self._forwarder = Forwarder(self._all)
@@ -143,7 +146,7 @@ class MavlinkServer:
         self._port, self._has_sample = port, False
         self._forget_us = 0
         self._system_id = _system_id(port)
-        self._streams.attach(port, truth, self._system_id)
+        self._vehicle.attach(port, truth, self._system_id)
         self._senders.forget()
         self._complaints.restart()
         self._announced.renew()
@@ -205,7 +208,7 @@ class MavlinkServer:
         if flown is None:
             flown = flown_of(port.state())
             after_us = now_us - flown["time_us"].item(0)
-        self._streams.vibration.update(flown)
+        self._vehicle.vibration.update(flown)
         texts: list[OperatorText] = port.take_messages()
         if texts:
             texts = list(dict.fromkeys(texts))  # once per tick, like `_announce`
@@ -400,7 +403,7 @@ class MavlinkServer:
     def _link_builders(self) -> dict[str, Builder | None]:
         return {
             **self._builders,
-            "PING": peers.ping_requests(),
+            "PING": connection.ping_requests(),
             "RC_CHANNELS": self._radio.updates(),
         }
 
@@ -477,3 +480,20 @@ def _system_id(port: AutopilotPort) -> int:
     """Return MAV_SYS_ID, which PX4 reads at boot."""
     stored = port.parameters.by_name("MAV_SYS_ID")
     return SYSTEM_ID if stored is None else int(stored.value)
+
+
+def udp_server(
+    ends: UdpLinks,
+    boot_unix_us: int,
+    clock: Clock,
+    signing: StoredSigning | None = None,
+    *,
+    onboard: SharedEndpoint | None = None,
+    devices: Sequence[LinkConfig] = (),
+) -> MavlinkServer:
+    """Return the server of all links, without an autopilot; see `MavlinkServer`.
+
+    `onboard` wraps and replaces the endpoint of the onboard link; None = use it directly.
+    """
+    links = [onboard_link(onboard or ends.api), gcs_link(ends.gcs), *devices]
+    return MavlinkServer(links, boot_unix_us=boot_unix_us, clock=clock, signing=signing)

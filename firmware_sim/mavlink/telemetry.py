@@ -30,7 +30,7 @@ from firmware_sim.autopilot.failsafes import detectors
 from firmware_sim.engine.record import FLOWN_TICK, POSITION, TRAJECTORY, Fields, Record
 from firmware_sim.mavlink.codec import COMPONENT_ID, dialect, message_id
 from firmware_sim.mavlink.streams import units
-from firmware_sim.mavlink.streams.sensor_streams import clearance
+from firmware_sim.mavlink.streams.sensors import clearance
 from firmware_sim.mavlink.streams.status import sensor_bits
 
 register_jitable(detectors.current_a)

@@ -37,8 +37,8 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
 from airl_mav.core.scheduling import give_way
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import SensorNoise
+from airl_mav.profiles.projections import Renderer
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.plant.sensors import Rate
 

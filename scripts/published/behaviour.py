@@ -32,8 +32,7 @@ from airl_mav.experiments.gym_flier import GymFlier
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.scenario.model import LevelName, Scenario
-from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import PlannedEpisode
+from airl_mav.scenario.resolve import PlannedEpisode, resolve
 
 SCHEMA = 1
 """Version of the samples file."""

@@ -25,10 +25,10 @@ from rich.progress import track
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.options import run_command, scenario_of
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.files import replace_file
-from airl_mav.core.provenance import provenance
+from airl_mav.core.machine import provenance
+from airl_mav.core.progress import new_console
 from airl_mav.envs.evaluation import EpisodeResult, fly_seeds
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.experiments.gym_flier import navigation_of, pilots_of

@@ -16,7 +16,7 @@ from pydantic import Field, create_model
 from rich.console import Console
 
 from airl_mav.cli.options import run_command, scenario_of
-from airl_mav.core.console import new_console
+from airl_mav.core.progress import new_console
 from airl_mav.experiments.evaluate import LATENCIES, declare_degradation
 from airl_mav.experiments.experiment import Experiment
 from airl_mav.scenario.model import Scenario

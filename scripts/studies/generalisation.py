@@ -17,7 +17,7 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import fly_and_show
 from airl_mav.cli.options import run_command, scenario_of
-from airl_mav.core.console import new_console
+from airl_mav.core.progress import new_console
 from airl_mav.experiments.evaluate import matrix
 from airl_mav.experiments.experiment import ExperimentRun, entry_of
 from airl_mav.flight.paired import compare_pairs

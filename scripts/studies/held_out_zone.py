@@ -20,9 +20,9 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import fly_and_show
 from airl_mav.cli.options import run_command, scenario_of
-from airl_mav.core.console import new_console
 from airl_mav.core.fields import quantity
 from airl_mav.core.files import replace_file
+from airl_mav.core.progress import new_console
 from airl_mav.experiments.experiment import Experiment, make_cell
 from airl_mav.flight.statistics import aggregate
 from airl_mav.profiles.arena import ArenaSpec

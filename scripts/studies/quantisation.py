@@ -17,8 +17,8 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import fly_and_show
 from airl_mav.cli.options import run_command, scenario_of
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import UsageError
+from airl_mav.core.progress import new_console
 from airl_mav.experiments.evaluate import training_arena
 from airl_mav.experiments.experiment import Experiment, make_cell
 from airl_mav.experiments.quantisation import export_int8

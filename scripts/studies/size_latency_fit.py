@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.policy.template import NetworkSize
+from airl_mav.policy.card_writing import NetworkSize
 
 Array = NDArray[np.float64]
 

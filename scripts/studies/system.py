@@ -18,9 +18,9 @@ from pydantic import Field, create_model
 from rich.console import Console
 
 from airl_mav.cli.options import run_command, scenario_of
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
+from airl_mav.core.progress import new_console
 from airl_mav.experiments.experiment import Experiment
 from airl_mav.experiments.gap import NOT_MITIGATED, declare_gap
 from airl_mav.scenario.model import REFERENCE_COMPUTER, Scenario

@@ -22,8 +22,8 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import Renderer
 from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.plant.camera import CameraProcess, SimulatedCamera, SlowCamera

@@ -25,8 +25,7 @@ from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK, Record
 from firmware_sim.mavlink.codec import message_id
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import onboard_link
-from firmware_sim.mavlink.scheduler import ONBOARD_HZ
+from firmware_sim.mavlink.px4_links import ONBOARD_HZ, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.telemetry import FIELDS, NUMBERS
 from firmware_sim.plant.plant import Plant

@@ -42,9 +42,9 @@ from firmware_sim.autopilot.inputs import Source, Sticks
 from firmware_sim.autopilot.prearm import ArmingSettings, Readiness, can_arm
 from firmware_sim.autopilot.sensor_monitor import ACCEL, BARO, GPS, GYRO, MAG, SensorWatch
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.event_buffer import FIRST_SEQUENCE, KEPT
 from firmware_sim.mavlink.services import component_metadata
 from firmware_sim.mavlink.services.component_metadata import definitions
+from firmware_sim.mavlink.texts_and_events import FIRST_SEQUENCE, KEPT
 from tests.support import flight_rig
 from tests.support.flown_by_mavsdk import Flown, flown
 from tests.support.mavlink_clients import RawClient, Rig, wait_for

@@ -20,14 +20,14 @@ from hypothesis import strategies as st
 
 from airl_mav.core.errors import UsageError
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.external.ardupilot.ardupilot_sitl import (
+from firmware_sim.addons.ardupilot.bridge import (
     MAX_GARBAGE,
     ArdupilotBridge,
     ServoPacketError,
     parse_servos,
     state_line,
 )
+from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.interfaces import (
     ActuatorControls,
     BatterySample,

@@ -18,18 +18,22 @@ import pytest
 
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
-from airl_mav.lockstep.vehicle_end import acknowledged, command_of
+from airl_mav.lockstep.vehicle import acknowledged, command_of
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import Aircraft, RealFirmware
-from firmware_sim.external import compose as conducted_module
-from firmware_sim.external.airframe_check import SITL_OUTPUT, px4_airframe
-from firmware_sim.external.compose import conducted_px4
-from firmware_sim.external.launcher import Launcher
-from firmware_sim.external.process import RunningProgram, StartCommand, WorkingFolders, program_at
-from firmware_sim.external.px4 import onboard_link as link_module
-from firmware_sim.external.px4.onboard_link import OnboardLink
-from firmware_sim.external.px4.px4_program import API_LOCAL_PORT, SIMULATOR_PORT, check_free
-from firmware_sim.external.px4.px4_sitl import EPOCH_US, Px4Bridge
+from firmware_sim.external import px4_lockstep as conducted_module
+from firmware_sim.external import px4_lockstep as link_module
+from firmware_sim.external.launcher import (
+    Launcher,
+    RunningProgram,
+    StartCommand,
+    WorkingFolders,
+    program_at,
+)
+from firmware_sim.external.parameters import SITL_OUTPUT, px4_airframe
+from firmware_sim.external.programs import API_LOCAL_PORT, SIMULATOR_PORT, check_free
+from firmware_sim.external.px4_lockstep import OnboardLink, conducted_px4
+from firmware_sim.external.px4_sitl import EPOCH_US, Px4Bridge
 from firmware_sim.interfaces import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.codec import Decoder, Encoder, dialect
 from firmware_sim.plant.plant import Plant
@@ -199,7 +203,7 @@ def name_of(child: subprocess.Popen[bytes]) -> bytes:
 
 @NEEDS_PROC
 def test_a_program_at_rest_and_one_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("firmware_sim.external.process.REST_LIMIT_S", 0.1)
+    monkeypatch.setattr("firmware_sim.external.launcher.REST_LIMIT_S", 0.1)
     with program("print(flush=True); input()") as resting:
         seen = RunningProgram(resting.pid, [name_of(resting)])
         for _ in range(1000):

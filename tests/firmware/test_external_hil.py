@@ -13,10 +13,10 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.frames import HOME, Geodetic
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.external.px4 import hil_messages as hil
+from firmware_sim.external import hil_messages as hil
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample, TrueState
 from firmware_sim.mavlink.codec import Encoder, Values, WireLayout
-from firmware_sim.mavlink.streams.pose import hil_state_quaternion
+from firmware_sim.mavlink.streams.status import hil_state_quaternion
 
 BATTERY = BatterySample(16.0, 10.0, 100.0, 0.9)
 

@@ -15,10 +15,11 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
-from firmware_sim.external.px4 import board_link, hitl
-from firmware_sim.external.px4.board_link import BoardLink
-from firmware_sim.external.px4.hitl import HitlBridge
-from firmware_sim.external.transport.router import Router
+from firmware_sim.addons.px4_hitl import board_link
+from firmware_sim.addons.px4_hitl import bridge as hitl
+from firmware_sim.addons.px4_hitl.board_link import BoardLink
+from firmware_sim.addons.px4_hitl.bridge import HitlBridge
+from firmware_sim.addons.px4_hitl.line import Router
 from firmware_sim.interfaces import (
     ActuatorControls,
     BatterySample,

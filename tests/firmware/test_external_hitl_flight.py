@@ -15,19 +15,19 @@ from mavsdk.plugins.action import Action
 from mavsdk.plugins.telemetry import Telemetry
 
 from airl_mav.core.clock import SimClock, WallClock
+from firmware_sim.addons.px4_hitl import bridge
+from firmware_sim.addons.px4_hitl.board_link import BoardLink
+from firmware_sim.addons.px4_hitl.bridge import HitlBridge
+from firmware_sim.addons.px4_hitl.line import Router
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.external.airframe_check import HITL_OUTPUT, px4_airframe
-from firmware_sim.external.boot_sequence import ExternalFlightController, ExternalFlightStack
+from firmware_sim.external.flight_stack import ExternalFlightController, ExternalFlightStack
 from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import FirmwareObserver
-from firmware_sim.external.px4 import hitl
-from firmware_sim.external.px4.board_link import BoardLink
-from firmware_sim.external.px4.hitl import HitlBridge
-from firmware_sim.external.transport.router import Router
+from firmware_sim.external.parameters import HITL_OUTPUT, px4_airframe
 from firmware_sim.interfaces import FirmwareMissingError
-from firmware_sim.mavlink.udp_links import bind_udp_links
+from firmware_sim.mavlink.px4_links import bind_udp_links
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.flight_rig import quad
 from tests.support.hitl_peer import HitlPeer
@@ -95,7 +95,7 @@ class Flight:
 
 @pytest.fixture
 def flight(peer: HitlPeer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Flight]:
-    monkeypatch.setattr(hitl, "SILENCE_US", int(PATIENCE_S * 1e6))
+    monkeypatch.setattr(bridge, "SILENCE_US", int(PATIENCE_S * 1e6))
     flight = Flight(peer)
     yield flight
     flight.close()

@@ -18,9 +18,9 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.commander import CommanderState
-from firmware_sim.external.process import FirmwareProcess
-from firmware_sim.external.px4.px4_program import find_px4
-from firmware_sim.external.px4.px4_sitl import EPOCH_US, Px4Bridge
+from firmware_sim.external.launcher import FirmwareProcess
+from firmware_sim.external.programs import find_px4
+from firmware_sim.external.px4_sitl import EPOCH_US, Px4Bridge
 from firmware_sim.interfaces import (
     ActuatorControls,
     FirmwareLostError,

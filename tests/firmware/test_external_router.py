@@ -13,15 +13,10 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.clock import SimClock, WallClock
-from firmware_sim.external.transport.router import (
-    BURST_BYTES,
-    SIMULATOR_IDS,
-    Router,
-    TokenBucket,
-)
+from firmware_sim.addons.px4_hitl.line import BURST_BYTES, SIMULATOR_IDS, Router, TokenBucket
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.udp_links import bind_udp_links
+from firmware_sim.mavlink.px4_links import bind_udp_links
 from tests.support.ports import LOOPBACK, free_ports
 
 PATIENCE_S = 60.0

@@ -21,11 +21,11 @@ from airl_mav.scenario.resolve import resolve
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.external_vision import Control, yaw_by_turn
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.crash_detector import TOUCHDOWN_M_S
-from firmware_sim.external.px4 import hil_messages as hil
+from firmware_sim.external import hil_messages as hil
 from firmware_sim.interfaces import BatterySample, Odometry
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.plant.sensors import SensorSuite
+from firmware_sim.simulation import TOUCHDOWN_M_S
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig, quad, velocity_setpoint
 

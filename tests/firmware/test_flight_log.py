@@ -25,7 +25,7 @@ from firmware_sim.flight_log.flight_log import GRID_US
 from firmware_sim.flight_log.topics import TOPICS
 from firmware_sim.flight_log.ulog_writer import Topic, UlogWriter
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.pacing import Unpaced
 from firmware_sim.simulation import EpisodeSetup

@@ -11,6 +11,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from airl_mav.core.frames import Geodetic
+from firmware_sim.addons.missions.items import NavCommand
+from firmware_sim.addons.missions.manager import destination
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import PositionYaw, Reposition
@@ -23,9 +25,7 @@ from firmware_sim.autopilot.navigation.fence import (
     areas,
     braking_distance,
 )
-from firmware_sim.autopilot.navigation.flown_item import ExecutorState
-from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand, PlanItem, Plans
-from firmware_sim.autopilot.navigation.way_home import destination
+from firmware_sim.autopilot.navigation.plan import MissionType, NavigationState, PlanItem, Plans
 from tests.support.flight_rig import Rig, velocity_setpoint
 from tests.support.mission_kit import DEFAULTS, ORIGIN, at, place
 
@@ -109,7 +109,7 @@ class Watch:
         self.values = {**DEFAULTS, **parameters}
         self.plans, self.texts = Plans(), list[str]()
         self.monitor = FenceMonitor(self.plans, self.values.__getitem__, self._say)
-        self.now = ExecutorState(0, (0.0, 0.0, -10.0), 0.0, landed, ORIGIN, ORIGIN)
+        self.now = NavigationState(0, (0.0, 0.0, -10.0), 0.0, landed, ORIGIN, ORIGIN)
         if items:
             self.plans.store(MissionType.FENCE, items, 1)
 

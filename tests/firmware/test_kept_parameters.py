@@ -12,11 +12,11 @@ import pytest
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.scenario.aircraft import RealFirmware
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
-from firmware_sim.external.parameter_file import KeptParameters
+from firmware_sim.external.parameters import KeptParameters
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.pacing import Unpaced
 from firmware_sim.simulation import EpisodeSetup

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
-from airl_mav.arena.room_plan import over_doors
+from airl_mav.arena.walls import over_doors
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile

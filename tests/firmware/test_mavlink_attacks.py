@@ -15,11 +15,11 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.signing import StoredSigning
 from firmware_sim.autopilot.autopilot_state import Arming
-from firmware_sim.mavlink import clients, codec, rate_limits, server, tlog
+from firmware_sim.mavlink import clients, codec, server, traffic
 from firmware_sim.mavlink.codec import Decoder, WireMessage
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import gcs_link, onboard_link
-from firmware_sim.mavlink.tlog import TlogWriter
+from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
+from firmware_sim.mavlink.traffic import TlogWriter
 from firmware_sim.storage import Storage
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import BOOT_UNIX_US, RawClient, Rig, text_of
@@ -123,7 +123,7 @@ def test_one_datagram_full_of_commands_takes_no_more_than_its_part_of_a_tick(
     dispatch = server.MavlinkServer._dispatch
 
     def slow(this: server.MavlinkServer, sender: clients.Client, message: WireMessage) -> bool:
-        clock.advance(rate_limits.LISTEN_US // 10)
+        clock.advance(clients.LISTEN_US // 10)
         return dispatch(this, sender, message)
 
     monkeypatch.setattr(server.MavlinkServer, "_dispatch", slow)
@@ -233,7 +233,7 @@ def test_who_pretends_to_be_the_vehicle_is_heard_by_nobody() -> None:
 
 
 def test_strangers_fill_no_disk_with_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tlog, "MAX_BYTES", 5_000)
+    monkeypatch.setattr(traffic, "MAX_BYTES", 5_000)
     field = Field()
     main = TlogWriter(tmp_path / "flight-001.tlog", 0)
     field.server.log_to(main, "gcs")
@@ -243,7 +243,7 @@ def test_strangers_fill_no_disk_with_logs(tmp_path: Path, monkeypatch: pytest.Mo
     field.server.log_to(None, "gcs")
     main.close()
     logs = sorted(tmp_path.glob("flight-001.*.tlog"))
-    assert len(logs) == tlog.MAX_LOGS
+    assert len(logs) == traffic.MAX_LOGS
     assert max(path.stat().st_size for path in logs) < 6_000
     assert (tmp_path / "flight-001.tlog").stat().st_size > 20_000
 

@@ -10,11 +10,11 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
-from firmware_sim.mavlink import clients, rate_limits
+from firmware_sim.mavlink import clients
+from firmware_sim.mavlink.clients import BURST_FRAMES, FRAMES_PER_S, Allowance
 from firmware_sim.mavlink.codec import WireMessage
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import gcs_link, onboard_link
-from firmware_sim.mavlink.rate_limits import BURST_FRAMES, FRAMES_PER_S, Allowance
+from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import RawClient
@@ -267,7 +267,7 @@ def test_what_arrives_takes_no_more_than_its_share_of_a_tick(late: bool) -> None
     field = Field(clock)
     if late:
         clock.advance(1_000 * TICK_US)
-    allowed_us = rate_limits.LISTEN_US + (0 if late else rate_limits.IDLE_LISTEN_US)
+    allowed_us = clients.LISTEN_US + (0 if late else clients.IDLE_LISTEN_US)
     everything = flood(field.hub, 400)
     worst_us = 0
     for _ in range(100):
@@ -312,7 +312,7 @@ def test_on_a_slow_host_nothing_waits_while_there_is_time(
         field.autopilot.step()
         field.server.send(field.autopilot.time_us)
     assert [len(talker.received("COMMAND_ACK")) for talker in talkers] == [50] * 20
-    assert late_us <= rate_limits.LISTEN_US + cost_us
+    assert late_us <= clients.LISTEN_US + cost_us
 
 
 def test_an_allowance_is_a_rate_and_a_burst() -> None:

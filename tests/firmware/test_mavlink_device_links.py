@@ -11,9 +11,8 @@ from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import UsageError
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import gimbal_link, payload_link
+from firmware_sim.mavlink.px4_links import bind_device_links, gimbal_link, payload_link
 from firmware_sim.mavlink.server import MavlinkServer
-from firmware_sim.mavlink.udp_links import bind_device_links
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import RawClient
 

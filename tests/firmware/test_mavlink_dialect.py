@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common, development
 
-from firmware_sim.mavlink.codec import Decoder, Encoder, dialect
-from firmware_sim.mavlink.dialect import generated
+from firmware_sim.mavlink.codec import Decoder, Encoder, dialect, generated
 
 OFFICIAL_CRC_EXTRA = {
     "LINK_NODE_STATUS": 117,

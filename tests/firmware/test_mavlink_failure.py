@@ -11,7 +11,7 @@ from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.flight_rig import quad

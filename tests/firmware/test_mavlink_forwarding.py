@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from firmware_sim.autopilot.autopilot_state import Arming
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import RawClient

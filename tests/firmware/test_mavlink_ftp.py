@@ -22,7 +22,7 @@ from pymavlink import mavftp, mavutil
 from airl_mav.profiles.parameters import SPECS
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, UdpEndpoint
-from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.services.ftp import BURST_MESSAGES, DATA_BYTES
 from firmware_sim.mavlink.services.transfers import crc32part

@@ -14,7 +14,7 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from firmware_sim.flight_log.flight_log import FlightLog, LogFolder
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import LEAST_PIECES_PER_TICK, PIECES_PER_TICK, MavlinkServer
 from firmware_sim.mavlink.services.logs import PACKETS_PER_TICK
 from tests.support.kinematic_autopilot import KinematicAutopilot

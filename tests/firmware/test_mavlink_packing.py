@@ -21,7 +21,8 @@ from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.interfaces import BatterySample
 from firmware_sim.mavlink.codec import SYSTEM_ID, Encoder, Values, WireLayout, dialect, layout
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import Link, Payloads, onboard_link
+from firmware_sim.mavlink.link import Link, Payloads
+from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.streams import BUILDERS, SILENT, units
 from firmware_sim.mavlink.telemetry import payload
 from tests.support.kinematic_autopilot import ORIGIN, KinematicAutopilot

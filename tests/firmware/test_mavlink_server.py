@@ -13,9 +13,9 @@ from pymavlink import mavutil
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, OperatorText, Severity
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
-from firmware_sim.mavlink.tlog import TlogWriter
+from firmware_sim.mavlink.traffic import TlogWriter
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import RawClient, Rig, text_of
 

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import TICK_US
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
-from firmware_sim.mavlink.codec import TextEncoder
+from firmware_sim.mavlink.texts_and_events import TextEncoder
 from tests.support.mavlink_clients import CLIENT_IDS, Rig
 
 NAN = math.nan

@@ -19,11 +19,11 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.signing import StoredSigning, read_key, write_key
 from companion.link_interface import LinkError
+from companion.mavsdk_connection import SigningProxy, signed
 from companion.mavsdk_link import MavsdkLink
-from companion.signing_proxy import SigningProxy, signed
 from firmware_sim.autopilot.autopilot_state import Arming
 from firmware_sim.mavlink.endpoint import UdpEndpoint
-from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import (

@@ -17,14 +17,10 @@ from airl_mav.profiles.parameters import SPECS
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Health, Landed, Setpoint
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.interfaces import BatterySample
-from firmware_sim.mavlink.px4_custom_mode import (
-    base_mode,
-    requested_mode,
-    system_status,
-)
-from firmware_sim.mavlink.scheduler import OFF, StreamScheduler
+from firmware_sim.mavlink.link import OFF, StreamScheduler
+from firmware_sim.mavlink.services.commands import requested_mode
 from firmware_sim.mavlink.streams import status, units
-from firmware_sim.mavlink.streams.information import time_estimate_to_target
+from firmware_sim.mavlink.streams.status import base_mode, system_status, time_estimate_to_target
 from tests.support.kinematic_autopilot import ORIGIN, KinematicAutopilot
 from tests.support.mavlink_clients import BOOT_UNIX_US, Bench, RawClient
 

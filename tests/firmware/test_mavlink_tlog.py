@@ -12,9 +12,9 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
-from firmware_sim.mavlink.tlog import TlogWriter
+from firmware_sim.mavlink.traffic import TlogWriter
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import BOOT_UNIX_US, Bench, RawClient
 from tests.support.memory_hub import MemoryHub
@@ -120,7 +120,7 @@ def test_a_killed_writer_leaves_a_readable_part(tmp_path: Path) -> None:
     script = (
         "import os, sys\n"
         "from pathlib import Path\n"
-        "from firmware_sim.mavlink.tlog import TlogWriter\n"
+        "from firmware_sim.mavlink.traffic import TlogWriter\n"
         "tlog = TlogWriter(Path(sys.argv[1]), 1_700_000_000_000_000)\n"
         "frame = bytes.fromhex(sys.argv[2])\n"
         "for i in range(5_000):\n"

@@ -7,13 +7,8 @@ import math
 import pytest
 
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.navigation.plan import (
-    MissionType,
-    NavCommand,
-    PlanFrame,
-    PlanItem,
-    TripletKind,
-)
+from firmware_sim.addons.missions.items import NavCommand, PlanFrame, TripletKind
+from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem
 from tests.support.mission_kit import NAN, ORIGIN, FakeFlight, at, do, place
 
 N = NavCommand

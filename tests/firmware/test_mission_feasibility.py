@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from firmware_sim.autopilot.navigation.feasibility import check
-from firmware_sim.autopilot.navigation.plan import NavCommand, PlanFrame, PlanItem
+from firmware_sim.addons.missions.feasibility import check
+from firmware_sim.addons.missions.items import NavCommand, PlanFrame
+from firmware_sim.autopilot.navigation.plan import PlanItem
 from tests.support.mission_kit import DEFAULTS, ORIGIN, at, do
 
 N = NavCommand

@@ -24,15 +24,15 @@ from airl_mav.scenario.resolve import resolve
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.optical_flow import STUCK, OpticalFlowFusion, flow_by_errors
-from firmware_sim.crash_detector import TOUCHDOWN_M_S
 from firmware_sim.engine.dynamics import WIDTH
-from firmware_sim.external.px4 import hil_messages as hil
+from firmware_sim.external import hil_messages as hil
 from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import FlowReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder, layout
-from firmware_sim.mavlink.streams.sensor_streams import optical_flow_rad
+from firmware_sim.mavlink.streams.sensors import optical_flow_rad
 from firmware_sim.mavlink.telemetry import payload
 from firmware_sim.plant.downward_sensors import BEST, INVALID, PlantOpticalFlow
+from firmware_sim.simulation import TOUCHDOWN_M_S
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig, velocity_setpoint
 

@@ -13,7 +13,7 @@ from airl_mav.profiles.parameters import SPECS, ParameterSpec
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from tests.support.flight_rig import Rig, flight, velocity_setpoint
 

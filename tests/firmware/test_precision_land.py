@@ -7,11 +7,12 @@ import math
 import pytest
 
 from airl_mav.core.constants import US_PER_S
+from firmware_sim.addons.missions.items import NavCommand
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import LandingTarget
-from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand
+from firmware_sim.autopilot.navigation.plan import MissionType
 from firmware_sim.mavlink.codec import dialect
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig

@@ -27,15 +27,14 @@ from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.modes.automatic import landing_speed
 from firmware_sim.autopilot.modes.sticks import Piloting, TerrainHold
 from firmware_sim.autopilot.range_finder import RangeFinder
-from firmware_sim.crash_detector import TOUCHDOWN_M_S
 from firmware_sim.engine.record import LANDING, new_controller
 from firmware_sim.engine.ticks import detect_record
-from firmware_sim.external.px4 import hil_messages as hil
+from firmware_sim.external import hil_messages as hil
 from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import DOWNWARD, DistanceReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder
-from firmware_sim.mavlink.streams import sensor_streams as sensors
-from firmware_sim.mavlink.streams import status
+from firmware_sim.mavlink.streams import sensors, status
+from firmware_sim.simulation import TOUCHDOWN_M_S
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig, velocity_setpoint
 

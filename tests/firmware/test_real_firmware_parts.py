@@ -16,32 +16,40 @@ import pytest
 from pymavlink import mavparm
 from pymavlink.dialects.v20 import common as dialect
 
-from airl_mav.cli.parameters_command import KINDS, ParametersOptions
+from airl_mav.cli.parameters_command import ParametersOptions
 from airl_mav.cli.parameters_command import run as write_parameters
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.frames import Geodetic
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
-from airl_mav.scenario.aircraft import Aircraft, RealFirmware
+from airl_mav.scenario.aircraft import Aircraft, FirmwareName, RealFirmware
 from airl_mav.scenario.checks import check_firmware
 from airl_mav.scenario.model import LevelName
+from firmware_sim.addons.ardupilot.program import (
+    PARAMETERS,
+    Links,
+    ardupilot_airframe,
+    find_arducopter,
+)
+from firmware_sim.addons.ardupilot.program import start as start_arducopter
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.external.airframe_check import (
+from firmware_sim.external.launcher import (
+    Bridge,
+    FirmwareProcess,
+    Launcher,
+    StartCommand,
+    WorkingFolders,
+)
+from firmware_sim.external.observer import FirmwareObserver, ParameterClient, flight_of
+from firmware_sim.external.parameters import (
     SITL_OUTPUT,
     RequiredAirframe,
-    ardupilot_airframe,
     differences,
     px4_airframe,
+    same,
 )
-from firmware_sim.external.ardupilot.ardupilot_program import PARAMETERS, Links, find_arducopter
-from firmware_sim.external.ardupilot.ardupilot_program import start as start_arducopter
-from firmware_sim.external.launcher import Bridge, Launcher
-from firmware_sim.external.observer import FirmwareObserver, flight_of
-from firmware_sim.external.parameter_client import ParameterClient, same
-from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
-from firmware_sim.external.programs import how_to_start, load_timeout_s
-from firmware_sim.external.px4.px4_program import find_px4
+from firmware_sim.external.programs import find_px4, firmware_kind, how_to_start, load_timeout_s
 from firmware_sim.interfaces import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from tests.support.flight_rig import quad
@@ -54,7 +62,7 @@ PX4_ID, ARDUPILOT_ID = dialect.MAV_AUTOPILOT_PX4, dialect.MAV_AUTOPILOT_ARDUPILO
 HOLDER = """
 import sys, time
 from pathlib import Path
-from firmware_sim.external.process import FirmwareProcess, StartCommand
+from firmware_sim.external.launcher import FirmwareProcess, StartCommand
 folder = Path(sys.argv[1])
 child = FirmwareProcess("X", StartCommand(sys.argv[2:], {}), folder, folder / "x.log")
 print("up", flush=True)
@@ -412,7 +420,7 @@ def test_firmware_that_is_set_from_the_file_flies_the_vehicle(
 ) -> None:
     """The firmware's own tools read back the values that are checked on the ground."""
     lines = parameters_of(firmware, tmp_path / "file")
-    airframe = KINDS[firmware][0](quad())
+    airframe = firmware_kind(firmware).airframe(quad())
     if firmware == "ardupilot":
         loader = mavparm.MAVParmDict()
         assert loader.load(str(tmp_path / "file"))
@@ -566,20 +574,21 @@ def test_what_cannot_be_flown_is_told(asked: dict[str, Any], level: LevelName, w
 
 
 def test_the_user_is_told_what_to_start() -> None:
-    def told(**options: Any) -> str | None:
-        return how_to_start(Aircraft(real=RealFirmware(**options)), quad())
+    def told(firmware: FirmwareName, **options: Any) -> str | None:
+        asked = Aircraft(firmware=firmware, real=RealFirmware(**options))
+        return how_to_start(asked, quad())
 
-    assert told(px4_connect=True, instance=2) == (
+    assert told("px4", px4_connect=True, instance=2) == (
         "while PX4_SIM_MODEL=none_iris PX4_SYS_AUTOSTART=10016 build/px4_sitl_default/bin/px4 -d -i"
         " 2; do sleep 1; done"
     )
-    hint = told(ardupilot_connect=True)
+    hint = told("ardupilot", ardupilot_connect=True)
     assert hint is not None
     assert hint.startswith("airl parameters ardupilot --vehicle quad --out vehicle.parm && ")
     assert "--defaults vehicle.parm" in hint
     assert "--model JSON:127.0.0.1 --sim-port-out 9002" in hint
     assert "--serial2 udpclient:127.0.0.1:14030" in hint
-    assert told(px4_dir=Path("x")) is None
+    assert told("px4", px4_dir=Path("x")) is None
     assert load_timeout_s(Aircraft()) is None
     patient = RealFirmware(px4_connect=True, firmware_timeout=10.0)
     assert load_timeout_s(Aircraft(firmware="px4", real=patient)) == 80.0

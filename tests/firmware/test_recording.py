@@ -17,7 +17,7 @@ from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.pacing import MAX_LAG_US, Pacing, Unpaced, WallPacing
 from firmware_sim.simulation import EpisodeSetup, Simulation

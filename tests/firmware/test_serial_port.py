@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from airl_mav.core.errors import UsageError
-from firmware_sim.external.px4.board_link import check_line
-from firmware_sim.external.transport.serial_port import BUFFER_BYTES, SerialLostError, SerialPort
+from firmware_sim.addons.px4_hitl.board_link import check_line
+from firmware_sim.addons.px4_hitl.line import BUFFER_BYTES, SerialLostError, SerialPort
 from tests.support.hitl_peer import HitlPeer
 
 PATIENCE_S = 60.0

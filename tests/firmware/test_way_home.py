@@ -6,11 +6,12 @@ import math
 
 import pytest
 
+from firmware_sim.addons.missions.items import NavCommand
+from firmware_sim.addons.missions.manager import along_mission, landing_start, onwards
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand, PlanItem, Plans
-from firmware_sim.autopilot.navigation.way_home import along_mission, landing_start, onwards
+from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem, Plans
 from tests.support.flight_rig import Rig
 from tests.support.mission_kit import ORIGIN, at, do, place
 

@@ -25,7 +25,7 @@ MODULES = """
 import importlib, pkgutil, airl_mav, companion, firmware_sim
 for package in (airl_mav, companion, firmware_sim):
     for each in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
-        if not each.name.startswith((package.__name__ + ".addons.", "companion.cameras.")):
+        if not each.name.startswith((package.__name__ + ".addons.", "companion.addons.cameras.")):
             importlib.import_module(each.name)
 """
 

@@ -37,12 +37,12 @@ from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.report.comparison.runs import compare_folders
 from airl_mav.report.recorded_flight import episode_of
 from airl_mav.report.recording_folder import take_in
+from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.model import PilotSettings
-from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.black_box import SAMPLE_US, open_recorder
+from companion.addons.black_box.recorder import SAMPLE_US, open_recorder, run_of
 from companion.offboard_mission import MissionResult
-from companion.program import prepare, run_of
+from companion.program import prepare
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.lockstep_kit import demo_scenario, fly_as_companion
 

@@ -21,8 +21,7 @@ from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import FlownEpisode, load
 from airl_mav.report.recorded_flight import path_of, stamps_of
 from airl_mav.scenario.resolve import resolve
-from airl_mav.vehicle_log.clock_alignment import align
-from airl_mav.vehicle_log.ulog_reader import read_vehicle_log
+from airl_mav.vehicle_log import align, read_vehicle_log
 from tests.support.processes import ROOT
 from tests.support.recorded_flights import fly_recorded
 

@@ -21,7 +21,7 @@ from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.command_line import airl
 from tests.support.lockstep_kit import demo_scenario

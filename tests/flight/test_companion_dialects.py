@@ -14,8 +14,8 @@ from mavsdk.autopilot import Autopilot
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.clock import WallClock
-from companion.dialects import ARDUPILOT, PX4, dialect_of
 from companion.link_interface import STOP, BodyVelocity, LinkError
+from companion.mavsdk_connection import ARDUPILOT, PX4, dialect_of
 from companion.mavsdk_link import MavsdkLink
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from tests.support.ardupilot_copter import BRAKE, GUIDED, LAND, STABILIZE

@@ -35,18 +35,19 @@ from airl_mav.addons.conformance.result import (
     deviations,
     load_reference,
 )
-from airl_mav.addons.conformance.steps import (
+from airl_mav.addons.conformance.telemetry import (
     BEFORE_S,
     MANOEUVRES,
     STEP_NAMES,
+    EstimatedMotion,
     MeasuredStep,
     SetpointStep,
     StepResponse,
+    TelemetryBuffer,
     measure,
     plan,
     step_response,
 )
-from airl_mav.addons.conformance.telemetry import EstimatedMotion, TelemetryBuffer
 from airl_mav.addons.conformance.vehicle import Method, VehicleClock
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError

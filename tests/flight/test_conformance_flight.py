@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from airl_mav.addons.conformance.steps import STEP_NAMES
+from airl_mav.addons.conformance.telemetry import STEP_NAMES
 from airl_mav.profiles.loading import profiles_dir
 from tests.support.ports import LOOPBACK, TestPorts, choose_ports, free_ports
 from tests.support.processes import Running, running, write_arena

@@ -6,9 +6,9 @@ import pytest
 
 from firmware_sim.autopilot.commander import CommanderState, FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.crash_detector import is_crash
 from firmware_sim.plant.body import FLOOR
 from firmware_sim.plant.plant import Collision
+from firmware_sim.simulation import is_crash
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import WallClock
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.lockstep_flight import fly
-from airl_mav.policy.action_sets import discrete_actions
+from airl_mav.policy.actions import discrete_actions
 from airl_mav.policy.layouts import boxes
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve

@@ -394,7 +394,7 @@ class Hog:
         return Action(0.7, 0.0, 0.0)
 
 POLICIES["hog"] = ("holds the interpreter", Hog)
-from airl_mav.cli.entry import companion
+from airl_mav.cli.main import companion
 companion()
 """
 
@@ -431,7 +431,7 @@ class Raiser:
         return Action(0.7, 0.0, 0.0)
 
 POLICIES["raiser"] = ("raises", Raiser)
-from airl_mav.cli.entry import companion
+from airl_mav.cli.main import companion
 companion()
 """
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from airl_mav.arena.gates import openings_of
+from airl_mav.arena.walls import openings_of
 from airl_mav.envs.evaluation import LearnedPilots, SinglePilots, fly_seeds
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation

@@ -18,8 +18,7 @@ from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.rehearsal.episode_setup import episode_setup
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario, resolve
 from companion.offboard_mission import MissionResult
 from tests.support.lockstep_kit import SEED, demo_scenario, fly_as_companion
 

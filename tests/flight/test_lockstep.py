@@ -26,20 +26,19 @@ from airl_mav.lockstep import stage as stage_module
 from airl_mav.lockstep.conductor import REPEAT_US, Inbound
 from airl_mav.lockstep.digest import LANES
 from airl_mav.lockstep.lockstep_flight import fly
-from airl_mav.lockstep.stage import LockstepStage
-from airl_mav.lockstep.threaded import ThreadPartner
+from airl_mav.lockstep.stage import LockstepStage, ThreadPartner
+from airl_mav.lockstep.token_partner import newest
 from airl_mav.lockstep.turns import Handle, LockstepError, Turn
-from airl_mav.lockstep.wire import newest
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import FlownEpisode
+from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
-from airl_mav.scenario.piloting import TRANSPORT_US
-from airl_mav.scenario.resolved import ResolvedScenario
-from companion.conducted import Poll
+from airl_mav.scenario.resolve import ResolvedScenario
 from companion.link_interface import BodyVelocity
+from companion.lockstep_turns import Poll
 from companion.offboard_mission import fly_mission
 from firmware_sim.autopilot.failsafes.supervisor import LOOK_US
 from firmware_sim.mavlink.codec import Encoder

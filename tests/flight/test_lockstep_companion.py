@@ -10,9 +10,8 @@ import pytest
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from companion.conducted import Abandoned, ConductedClock
 from companion.frame_source import ReceivedFrame
-from companion.tokens import TokenFrameSource, TokenTurns
+from companion.lockstep_turns import Abandoned, ConductedClock, TokenFrameSource, TokenTurns
 
 
 class ScriptedLink:

@@ -20,10 +20,9 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.experiments.experiment import rehearse
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.lockstep_flight import fly
-from airl_mav.lockstep.lockstep_link import ConductedVehicle, builtin_vehicle
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.lockstep.turns import LockstepError
-from airl_mav.lockstep.vehicle_end import VehicleEnd, acknowledged
+from airl_mav.lockstep.vehicle import ConductedVehicle, VehicleEnd, acknowledged, builtin_vehicle
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
@@ -98,7 +97,7 @@ def test_simulated_time_goes_on_while_a_command_is_answered() -> None:
 
 
 def test_an_answer_that_never_comes_ends_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("airl_mav.lockstep.threaded.LONGEST_ANSWER_US", US_PER_S // 10)
+    monkeypatch.setattr("airl_mav.lockstep.stage.LONGEST_ANSWER_US", US_PER_S // 10)
     _, vehicle = late(10_000)
     with (
         LockstepStage(vehicle=vehicle) as stage,

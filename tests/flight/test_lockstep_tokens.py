@@ -31,7 +31,7 @@ from airl_mav.core.signing import StoredSigning, write_key
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.remote import RemoteStage
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneVehicle
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.plant.camera import CameraServer

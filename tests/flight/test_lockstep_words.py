@@ -17,13 +17,12 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import validated
 from airl_mav.core.signing import StoredSigning, write_key
 from airl_mav.lockstep.conductor import Inbound
-from airl_mav.lockstep.lockstep_camera import TokenCamera
-from airl_mav.lockstep.token_partner import TokenPartner
+from airl_mav.lockstep.token_partner import TokenPartner, Wire
 from airl_mav.lockstep.turns import LockstepError, Turn
-from airl_mav.lockstep.wire import Wire
+from airl_mav.lockstep.vehicle import TokenCamera
 from airl_mav.rehearsal.episode import Order
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
-from companion.tokens import PhaseToken, TurnBack, TurnGiven
+from companion.lockstep_turns import PhaseToken, TurnBack, TurnGiven
 from firmware_sim.firmware import FrameServer
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.mavlink.endpoint import UdpEndpoint

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
+from firmware_sim.addons.missions.items import NavCommand
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand, PlanItem
+from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem
 from tests.support.flight_rig import Rig, flight
 from tests.support.mission_kit import at, do
 

@@ -19,8 +19,8 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
+from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.model import PilotSettings
-from airl_mav.scenario.piloting import TRANSPORT_US
 from companion.offboard_mission import MissionResult
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Result

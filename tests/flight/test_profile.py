@@ -18,24 +18,24 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from airl_mav.addons.profiling import command, hil
-from airl_mav.addons.profiling.measurement import Recording
+from airl_mav.addons.profiling import hil
+from airl_mav.addons.profiling import profile as command
+from airl_mav.addons.profiling.hil import Exchanges
+from airl_mav.addons.profiling.measurement import ProfileRequest, Recording
 from airl_mav.addons.profiling.profile import busy_remark, profile
 from airl_mav.addons.profiling.report import correlation_line, verdict
-from airl_mav.addons.profiling.request import ProfileRequest
 from airl_mav.cli.options import read_options, run_command
 from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import UsageError
 from airl_mav.core.machine import MachineState
-from airl_mav.latency.clock_offset import Exchanges
 from airl_mav.latency.injection import latency_generator
 from airl_mav.latency.stages import STAGES
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.computer import existing_profile, load_computer, write_profile
 from airl_mav.profiles.loading import list_profiles
+from airl_mav.scenario.checks import select_latency
 from airl_mav.scenario.model import DEFAULT_POLICY, Lateness
-from airl_mav.scenario.piloting import select_latency
 from companion.offboard_mission import MissionResult
 from tests.support.ports import choose_ports
 from tests.support.processes import ROOT, allow_interrupt
@@ -163,7 +163,7 @@ def test_every_shipped_profile_is_written_as_it_was_read(tmp_path: Path) -> None
 
 def test_paper_network_has_its_size() -> None:
     paper = load_computer("ras-pi-4").workloads["template-5x32"].network
-    from airl_mav.policy.template import template_size
+    from airl_mav.policy.card_writing import template_size
 
     assert template_size(5, 32, 154, 256, 25) == (paper.parameters, paper.macs)
 
@@ -523,11 +523,11 @@ def test_on_the_drones_computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(hil, "WallClock", made)
     free = choose_ports()
-    command = [sys.executable, "-c", FIRMWARE_THAT_TELLS_ITS_EPOCH, "--arena", "no-obstacles"]
+    profile = [sys.executable, "-c", FIRMWARE_THAT_TELLS_ITS_EPOCH, "--arena", "no-obstacles"]
     log_path = tmp_path / "firmware.log"
     with log_path.open("wb") as log:
         firmware = subprocess.Popen(
-            [*command, *free.options()],
+            [*profile, *free.options()],
             cwd=tmp_path,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
             stdout=log,

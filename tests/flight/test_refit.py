@@ -40,8 +40,7 @@ from airl_mav.report.recording_folder import take_in
 from airl_mav.report.tracking import track
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.scenario_file import read_scenario_file
-from airl_mav.vehicle_log.clock_alignment import align
-from airl_mav.vehicle_log.ulog_reader import Series, VehicleLog, read_vehicle_log
+from airl_mav.vehicle_log import Series, VehicleLog, align, read_vehicle_log
 from tests.support.recorded_flights import RecordedFlight
 from tests.support.refit_truths import Truth, drawn_truth, errors_of, true_dead_time_s, uplink_s
 

@@ -25,8 +25,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.envs.navigation_env import FIRST_TRAINING_SEED, NavigationEnv
 from airl_mav.envs.registration import NAVIGATION, REHEARSAL
 from airl_mav.experiments.gym_flier import environment_of
-from airl_mav.lockstep.asked_flight import AskedFlight
-from airl_mav.lockstep.gym_env import RehearsalEnv
+from airl_mav.lockstep.gym_env import AskedFlight, RehearsalEnv
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.scenario.model import Scenario

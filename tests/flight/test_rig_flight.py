@@ -32,11 +32,10 @@ from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation import Observation
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.cameras.by_name import open_named_camera
-from companion.ground_check import CheckResult, check_on_ground
-from companion.program import prepare
+from companion.frame_source import open_named_camera
+from companion.program import CheckResult, check_on_ground, prepare
 from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.command_line import airl
 from tests.support.lockstep_kit import demo_scenario
@@ -227,8 +226,8 @@ def test_a_model_of_stable_baselines3_flies(tmp_path: Path) -> None:
 
 OWN = """
 import numpy as np
-from companion.cameras.driver import DepthImage
-from companion.cameras.fitting import Lens
+from companion.addons.cameras.drivers import DepthImage
+from companion.addons.cameras.fitting import Lens
 
 class Main:
     lens = Lens(128, 96, 64.0, 64.0, 63.5, 47.5)
@@ -269,7 +268,7 @@ def checked(
     folder: Path, policy: Path, camera: str, monkeypatch: pytest.MonkeyPatch
 ) -> CheckResult:
     """Return what `airl-companion --check` says of a driver of the user's."""
-    monkeypatch.setattr("companion.ground_check.LOOK_S", 0.1)
+    monkeypatch.setattr("companion.program.LOOK_S", 0.1)
     (folder / "mine.py").write_text(OWN)
     (udp,), _ = free_ports(1, 0)
     asked = StandAloneCompanion.model_validate(

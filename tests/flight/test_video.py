@@ -18,17 +18,21 @@ from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.plugins.camera import Camera, CameraError, CameraResult, VideoStreamInfo
 from numpy.typing import NDArray
 
+from airl_mav.addons.video.command import GIMBAL_PORT, video_words
+from airl_mav.addons.video.stream import (
+    RtpVideo,
+    ShownCamera,
+    picture_of,
+    picture_size,
+    show_video,
+)
 from airl_mav.camera.frame import Frame, FurtherImage, depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.cli.video_command import video_words
 from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
-from companion.video import GIMBAL_PORT, RtpVideo, VideoReceiver, picture_of, picture_size
-from companion.video_program import ShownCamera, show_video
-from firmware_sim.mavlink.link import gimbal_link
-from firmware_sim.mavlink.udp_links import DEVICE_PORTS
+from firmware_sim.mavlink.px4_links import DEVICE_PORTS, gimbal_link
 from firmware_sim.plant.camera import CameraServer
 from tests.support.command_line import airl
 from tests.support.ports import TestPorts, choose_ports
@@ -153,7 +157,7 @@ def test_a_further_camera_is_shown_by_its_name(tmp_path: Path) -> None:
                 frames += 1
 
         said: list[str] = []
-        watcher = VideoReceiver("127.0.0.1", port)
+        watcher = ("127.0.0.1", port)
 
         def show() -> None:
             camera = ShownCamera(server.endpoint, "quad-rig", vehicle, "down")
@@ -202,7 +206,7 @@ def test_a_link_that_carries_nothing_ends_no_video() -> None:
         ending.start()
         sent = show_video(
             ShownCamera(server.endpoint, "quad", load_vehicle("quad")),
-            VideoReceiver("255.255.255.255", port),
+            ("255.255.255.255", port),
             None,
             WallClock(),
             stop,
@@ -263,7 +267,7 @@ def ground_station(port: int) -> Iterator[Camera]:
 
 @contextlib.contextmanager
 def shown(folder: Path, ports: TestPorts, port: int, *more: str) -> Iterator[Running]:
-    words = ["-m", "airl_mav.cli.video_command", "--camera", f"tcp://127.0.0.1:{ports.camera}"]
+    words = ["-m", "airl_mav.addons.video.command", "--camera", f"tcp://127.0.0.1:{ports.camera}"]
     words += ["--to", f"127.0.0.1:{port}", "--connect", f"udpout://127.0.0.1:{ports.gcs_local}"]
     with running([*words, *more], folder) as video:
         yield video

@@ -22,7 +22,7 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.experiments.gym_flier import environment_of
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
-from airl_mav.rehearsal.stand_alone_vehicle import aircraft_of
+from airl_mav.rehearsal.firmware_process import aircraft_of
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve

@@ -28,7 +28,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from airl_mav.cli import main
 from airl_mav.core.errors import UsageError
-from airl_mav.policy.action_sets import ActionSpec
+from airl_mav.policy.actions import ActionSpec
 from airl_mav.policy.card import load_card, open_model, read_card
 from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.layouts import boxes

@@ -25,7 +25,7 @@ from airl_mav.envs.fleet import FlightStatus, FramePoses
 from airl_mav.envs.mesh_batch import MeshesSeen
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.policy.action_sets import commands
+from airl_mav.policy.actions import commands
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.support.poses import at_rest

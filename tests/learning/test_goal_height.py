@@ -15,7 +15,7 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.navigation_env import NavigationEnv
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
-from airl_mav.policy.action_sets import commands
+from airl_mav.policy.actions import commands
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.learning.test_imitation import SMALL, Taught

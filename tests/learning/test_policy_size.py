@@ -10,7 +10,7 @@ from unittest.mock import patch
 
 import pytest
 
-from airl_mav.policy.template import template_size
+from airl_mav.policy.card_writing import template_size
 from tests.support.processes import ROOT, running
 
 STUDIES = ROOT / "scripts" / "studies"

@@ -17,7 +17,7 @@ from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.experiments.gym_flier import environment_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.lockstep_flight import fly
-from airl_mav.policy.action_sets import ActionSpec, command, commands
+from airl_mav.policy.actions import ActionSpec, command, commands
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation import Observation

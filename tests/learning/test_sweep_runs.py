@@ -20,7 +20,7 @@ from airl_mav.addons.sweep.summary import SweepFolder
 from airl_mav.core.errors import EXIT_INTERRUPTED
 from airl_mav.experiments.executors import open_executor
 from airl_mav.policy.card import read_card
-from airl_mav.policy.template import NetworkSize
+from airl_mav.policy.card_writing import NetworkSize
 from tests.support.command_line import airl
 from tests.support.processes import PATIENCE_S, Running, has_ended, running, wait_until
 from tests.support.sweep_kit import TINY, write_sweep_file

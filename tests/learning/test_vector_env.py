@@ -23,7 +23,7 @@ from airl_mav.envs.navigation_env import FIRST_TRAINING_SEED, NavigationEnv
 from airl_mav.envs.sb3 import QUALITY, NavigationVecEnv
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.vector import NavigationVectorEnv
-from airl_mav.policy.action_sets import commands
+from airl_mav.policy.actions import commands
 
 BUSY: dict[str, Any] = {
     "arena": "dynamic-obstacles",

@@ -10,7 +10,7 @@ import pytest
 
 from airl_mav.addons.roofline import roofline as roofline_module
 from airl_mav.core.errors import UsageError
-from airl_mav.core.provenance import provenance
+from airl_mav.core.machine import provenance
 from airl_mav.experiments.evaluate import evaluate
 from airl_mav.experiments.experiment import rehearse
 from airl_mav.flight.statistics import aggregate

@@ -10,9 +10,8 @@ import pytest
 from PIL import Image, ImageSequence
 from rich.console import Console
 
-from airl_mav.addons.render.ground_truth import _rates
+from airl_mav.addons.render.camera_pictures import CameraMotion, _rates, optical_flow, velocities_of
 from airl_mav.arena.generate import generate
-from airl_mav.camera.flow import CameraMotion, optical_flow, velocities_of
 from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture

@@ -22,7 +22,7 @@ pytest.importorskip("viser")
 
 TOLD = """
 import sys
-from airl_mav.core.console import new_console
+from airl_mav.core.progress import new_console
 from airl_mav.cli import view_command
 
 class Told:

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.optimize import brentq
 
-from airl_mav.addons.roofline import command
-from airl_mav.addons.roofline import roofline as experiment
+from airl_mav.addons.roofline import roofline as command
 from airl_mav.addons.roofline.points import Roofline, RooflinePoint, noticed_m
 from airl_mav.addons.roofline.roofline import RooflineRequest, roofline
 from airl_mav.core.errors import UsageError
@@ -66,7 +65,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 @pytest.fixture(scope="module")
 def found(shown: tuple[Path, str]) -> Roofline:
-    data = read_json(shown[0] / experiment.RESULT_FILE, experiment.SCHEMA, "roofline")
+    data = read_json(shown[0] / command.RESULT_FILE, command.SCHEMA, "roofline")
     assert {"created_utc", "command", "versions", "machine"} <= set(data)
     return Roofline.model_validate({k: data[k] for k in Roofline.model_fields})
 

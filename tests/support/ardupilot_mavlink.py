@@ -17,14 +17,15 @@ from firmware_sim.autopilot.autopilot_state import (
     Setpoint,
     Severity,
 )
-from firmware_sim.mavlink.codec import TextEncoder, Values, WireMessage, dialect
+from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
-from firmware_sim.mavlink.event_buffer import EventBuffer
-from firmware_sim.mavlink.link import Link, LinkConfig
+from firmware_sim.mavlink.link import Link
+from firmware_sim.mavlink.px4_links import LinkConfig
 from firmware_sim.mavlink.services import commands, handle
 from firmware_sim.mavlink.services.context import Context, VehicleCommand, for_vehicle, sender
 from firmware_sim.mavlink.streams import BUILDERS, Builder, status
 from firmware_sim.mavlink.telemetry import PARTS, TickContext, flown_of
+from firmware_sim.mavlink.texts_and_events import EventBuffer, TextEncoder
 from tests.support.ardupilot_copter import LAND, STABILIZE, Copter
 
 ARDUPILOTMEGA, QUADROTOR = 3, 2

@@ -10,9 +10,9 @@ from typing import Any
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
+from firmware_sim.addons.ardupilot.bridge import ArdupilotBridge
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.commander import CommanderState
-from firmware_sim.external.ardupilot.ardupilot_sitl import ArdupilotBridge
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.ardupilot_peer import ArdupilotPeer
 from tests.support.flight_rig import quad

@@ -7,7 +7,7 @@ from typing import Any
 
 from airl_mav.cli.main import subcommands
 from airl_mav.cli.options import carry_out
-from airl_mav.core.console import new_console
+from airl_mav.core.progress import new_console
 
 
 def airl(name: str, *words: str, width: int | None = None) -> tuple[int, str]:

@@ -17,8 +17,7 @@ from mavsdk import ComponentType, Configuration, Mavsdk
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.scenario.aircraft import Aircraft
-from firmware_sim.mavlink.link import LinkConfig
-from firmware_sim.mavlink.scheduler import ONBOARD_HZ
+from firmware_sim.mavlink.px4_links import ONBOARD_HZ, LinkConfig
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.flight_rig import quad

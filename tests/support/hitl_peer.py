@@ -37,7 +37,7 @@ from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 from firmware_sim.mavlink.codec import Decoder, Encoder
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from tests.support.flight_rig import quad
 from tests.support.px4_frame import Px4Parameters

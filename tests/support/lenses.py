@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.profiles.distortion import Distortion
+from airl_mav.profiles.projections import Distortion
 
 AT_NIGHT_THE_FISHEYE: list[Any] = [
     "pinhole",

@@ -13,7 +13,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from airl_mav.policy.action_sets import ActionSpec, commands
+from airl_mav.policy.actions import ActionSpec, commands
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, PolicyFacts, Training, digest
 from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.observation_spec import ObservationSpec

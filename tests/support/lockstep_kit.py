@@ -13,10 +13,9 @@ from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.policy.actions import Policy
 from airl_mav.rehearsal.observer import Observer
+from airl_mav.scenario.checks import NATIVE_T2_US
 from airl_mav.scenario.model import LimitSettings, PilotSettings, Scenario, WatchdogSettings
-from airl_mav.scenario.piloting import NATIVE_T2_US
-from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario, resolve
 from companion.offboard_mission import MissionResult, Start, fly_mission
 from companion.pilot import SentDecision
 

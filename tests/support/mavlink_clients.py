@@ -16,7 +16,7 @@ from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, SharedEndpoint
-from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from tests.support.kinematic_autopilot import KinematicAutopilot
 

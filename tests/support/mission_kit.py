@@ -10,17 +10,12 @@ import numpy as np
 from airl_mav.core.frames import Geodetic, local_to_geodetic
 from airl_mav.profiles.parameters import SPECS
 from airl_mav.vehicle.rotation import Vec
+from firmware_sim.addons.missions.executor import MissionExecutor
+from firmware_sim.addons.missions.feasibility import FeasibilityResult, check
+from firmware_sim.addons.missions.items import NavCommand, PlanFrame
 from firmware_sim.autopilot.autopilot_state import OperatorText
-from firmware_sim.autopilot.navigation.executor import PERIOD_US, MissionExecutor
-from firmware_sim.autopilot.navigation.feasibility import FeasibilityResult, check
-from firmware_sim.autopilot.navigation.flown_item import ExecutorState
-from firmware_sim.autopilot.navigation.plan import (
-    MissionType,
-    NavCommand,
-    PlanFrame,
-    PlanItem,
-    Plans,
-)
+from firmware_sim.autopilot.navigation.navigator import PERIOD_US
+from firmware_sim.autopilot.navigation.plan import MissionType, NavigationState, PlanItem, Plans
 
 NAN = math.nan
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
@@ -72,12 +67,12 @@ class FakeFlight:
         self.texts: list[str] = []
         self.homes: list[Geodetic | None] = []
         self.returned = False
-        self.now = ExecutorState(0, (0.0, 0.0, 0.0), 0.0, True, ORIGIN, ORIGIN)
+        self.now = NavigationState(0, (0.0, 0.0, 0.0), 0.0, True, ORIGIN, ORIGIN)
         self.executor = MissionExecutor(self.plans, self.values.__getitem__, self, self._check)
         if items:
             self.plans.store(MissionType.MISSION, items, 1, 0)
 
-    def _check(self, now: ExecutorState) -> FeasibilityResult:
+    def _check(self, now: NavigationState) -> FeasibilityResult:
         return check(
             self.plans.mission,
             now.home,

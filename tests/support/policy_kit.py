@@ -16,7 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from torch import nn
 
-from airl_mav.policy.action_sets import ActionSpec, discrete_actions
+from airl_mav.policy.actions import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
 from airl_mav.policy.layouts import boxes, image_key
 from airl_mav.policy.observation_spec import Encoded, ObservationSpec

@@ -34,7 +34,7 @@ from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 from firmware_sim.mavlink.endpoint import UdpEndpoint
-from firmware_sim.mavlink.link import LinkConfig, gcs_link, onboard_link
+from firmware_sim.mavlink.px4_links import LinkConfig, gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from tests.support.ports import LOOPBACK
 from tests.support.processes import ROOT

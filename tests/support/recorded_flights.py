@@ -19,14 +19,14 @@ from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.policy.observation import Kinematics
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.episode import part_of
-from airl_mav.scenario.piloting import TRANSPORT_US
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.checks import TRANSPORT_US
+from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.black_box import SAMPLE_US, open_recorder
+from companion.addons.black_box.recorder import SAMPLE_US, open_recorder, run_of
 from companion.link_interface import BatteryState, VehicleStatus
 from companion.mavsdk_link import MavsdkLink
 from companion.offboard_mission import fly_mission
-from companion.program import prepare, run_of
+from companion.program import prepare
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 TELEMETRY_US = US_PER_S // 50

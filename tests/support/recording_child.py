@@ -18,7 +18,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.policy.observation import Kinematics
-from companion.black_box import BlackBoxRecorder
+from companion.addons.black_box.recorder import BlackBoxRecorder
 from companion.frame_source import ReceivedFrame
 from companion.link_interface import BatteryState, BodyVelocity, VehicleStatus
 from companion.pilot import SentDecision

@@ -8,7 +8,7 @@ import numpy as np
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
-from airl_mav.core.process_use import ProcessUse
+from airl_mav.core.resource_use import ProcessUse
 from airl_mav.flight.episode_record import EpisodeRecord, Part, Setup
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.flight.quality import measure_quality

@@ -18,7 +18,7 @@ from airl_mav.experiments.executors import ProcessExecutor, Stop
 if TYPE_CHECKING:  # a second of imports in every worker
     from airl_mav.experiments.executors import FlyEpisodes
     from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
-    from airl_mav.scenario.resolved import PlannedEpisode
+    from airl_mav.scenario.resolve import PlannedEpisode
 
 PATIENCE_S = 60.0
 

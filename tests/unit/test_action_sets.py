@@ -12,9 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from airl_mav.policy.action_sets import ActionSpec, commands, discrete_actions
-from airl_mav.policy.action_sets import command as any_command
-from airl_mav.policy.actions import Action, limited
+from airl_mav.policy.actions import Action, ActionSpec, commands, discrete_actions, limited
+from airl_mav.policy.actions import command as any_command
 
 DISCRETE = ["arc-25", "paper-25"]
 

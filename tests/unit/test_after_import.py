@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from airl_mav.core.after_import import after_import
+from airl_mav.core.addons import after_import
 from tests.support.processes import run_alone
 
 

@@ -23,13 +23,15 @@ from airl_mav.arena import generate as generate_module
 from airl_mav.arena.draw import draw_arena, save_png
 from airl_mav.arena.generate import LAYOUTS, free_area_fraction, generate, local_bounds
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
-from airl_mav.arena.passage import gaps_suffice, passage_exists, raster_passage
 from airl_mav.arena.placement import (
     BATCH,
     BATCHES,
     Boxes,
     NoRoomError,
+    gaps_suffice,
+    passage_exists,
     place_all,
+    raster_passage,
     zone_of,
     zone_radius_m,
 )

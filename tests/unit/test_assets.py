@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from airl_mav.arena.finishes import OBSTACLE, TEXTURES, Statics, linear_of
 from airl_mav.arena.generate import free_area_fraction, generate
 from airl_mav.arena.geometry import Arena, Shape
-from airl_mav.arena.passage import gaps_suffice
-from airl_mav.arena.placement import Boxes, bounding_boxes
+from airl_mav.arena.placement import Boxes, bounding_boxes, gaps_suffice
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError

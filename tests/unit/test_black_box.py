@@ -39,11 +39,11 @@ from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.report.recorded_flight import episode_of
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.black_box import BlackBoxRecorder
+from companion.addons.black_box.recorder import BlackBoxRecorder, run_of
 from companion.frame_source import ReceivedFrame
 from companion.link_interface import BodyVelocity
 from companion.pilot import SentDecision
-from companion.program import prepare, run_of
+from companion.program import prepare
 from tests.support.full_disk import largest_file
 from tests.support.processes import running, wait_until
 from tests.support.recording_child import PERIOD_US, Straight

@@ -22,13 +22,13 @@ from airl_mav.camera.render import render
 from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.errors import FieldError
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.distortion import UNDISTORTED
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import UNDISTORTED
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
-from companion.cameras.by_name import open_named_camera
-from companion.cameras.driver import CameraThread, DepthImage
-from companion.cameras.fitting import Fitting, Lens, check_coverage
+from companion.addons.cameras.drivers import CameraThread, DepthImage
+from companion.addons.cameras.fitting import Fitting, Lens, check_coverage
+from companion.frame_source import open_named_camera
 from tests.support.lenses import BARREL, OPENING, rays_of_fisheye
 
 WANTED = Intrinsics.from_fov(64, 48, math.radians(90.0))
@@ -288,8 +288,8 @@ def test_a_driver_that_raises_falls_silent_and_says_why(
 
 OWN = """
 import numpy as np
-from companion.cameras.driver import DepthImage
-from companion.cameras.fitting import Lens
+from companion.addons.cameras.drivers import DepthImage
+from companion.addons.cameras.fitting import Lens
 
 class Mine:
     lens = Lens(128, 96, 64.0, 64.0, 63.5, 47.5)
@@ -359,7 +359,7 @@ def test_a_library_that_is_not_installed_is_named(
     name: str, library: str, driver: str, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, library, None)
-    monkeypatch.delitem(sys.modules, f"companion.cameras.{driver}", raising=False)
+    monkeypatch.delitem(sys.modules, f"companion.addons.cameras.{driver}", raising=False)
     with pytest.raises(FieldError, match=told) as caught:
         open_named_camera(name, SimClock(), WANTED, "vehicle quad")
     assert "\n" not in str(caught.value)

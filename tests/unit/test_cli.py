@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from airl_mav import __version__
-from airl_mav.cli import entry
+from airl_mav.cli import main as entry
 from airl_mav.cli.list_command import KINDS
 from airl_mav.cli.main import main, subcommands
 from airl_mav.policy.registry import policy_names
@@ -118,7 +118,7 @@ def test_the_script_is_the_subcommand(
 )
 def test_help_loads_no_simulator_and_no_figures(words: list[str], heavy: set[str]) -> None:
     code = (
-        "import sys; from airl_mav.cli.entry import airl\n"
+        "import sys; from airl_mav.cli.main import airl\n"
         f"sys.argv[1:] = {words}\n"
         "try: airl()\n"
         "except SystemExit: pass\n"

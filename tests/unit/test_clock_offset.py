@@ -15,16 +15,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common as dialect
 
-from airl_mav.addons.profiling.hil import TimesyncLink
-from airl_mav.core.clock import NS_PER_US, WallClock
-from airl_mav.latency.clock_offset import (
+from airl_mav.addons.profiling.hil import (
     GREATEST_DRIFT,
     LEAST_EXCHANGES,
     ClockError,
     Exchanges,
+    TimesyncLink,
     best_reading,
     relate,
 )
+from airl_mav.core.clock import NS_PER_US, WallClock
 from tests.support.mavlink_clients import wait_for
 from tests.support.ports import LOOPBACK, free_ports
 

@@ -14,16 +14,15 @@ from airl_mav.arena.finishes import FLOOR, OBSTACLE, TEXTURES, linear_of, srgb_o
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera import primitives
-from airl_mav.camera.colour import unpack
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import Picture, grey, render_picture
+from airl_mav.camera.picture import Picture, grey, render_picture, unpack
 from airl_mav.camera.render import render
 from airl_mav.camera.textures import PERIOD, SIDE, atlas, pattern
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera_kind import Projection
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import Projection
 from tests.support.lenses import AT_NIGHT_THE_FISHEYE, rays_of_fisheye
 
 LEVEL = quat_from_euler(0.0, 0.0, 0.0)

@@ -18,14 +18,23 @@ from airl_mav.core.constants import GRAVITY_M_S2, CommandKind
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import down_in_body
 from airl_mav.latency.stamps import SETPOINTS, DecisionLog, commanded, setpoint_column
-from airl_mav.policy.action_sets import ActionSpec, command, commands, continuous_numbers
-from airl_mav.policy.actions import Action, Attitude, BodyRates, command_kind, flyable
+from airl_mav.policy.actions import (
+    Action,
+    ActionSpec,
+    Attitude,
+    BodyRates,
+    command,
+    command_kind,
+    commands,
+    continuous_numbers,
+    flyable,
+)
 from airl_mav.policy.layouts import boxes, encode_layout
 from airl_mav.policy.observation import InFlight, Kinematics, observe
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.registry import PolicyInfo, find_policy
+from airl_mav.scenario.checks import check_commands, check_compensated, decide_piloting
 from airl_mav.scenario.model import Scenario, WatchdogSettings
-from airl_mav.scenario.piloting import check_commands, check_compensated, decide_piloting
 from companion.link_interface import STOP, BodyVelocity, Setpoint, VehicleStatus
 from companion.watchdog import Watchdog
 from firmware_sim.recording import SetpointLog

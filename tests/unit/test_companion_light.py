@@ -51,7 +51,7 @@ for driver, needs in (
         for needed in needs:
             importlib.import_module(needed)
     except ImportError:
-        names.remove(f"companion.cameras.{driver}")
+        names.remove(f"companion.addons.cameras.{driver}")
 for name in names:
     importlib.import_module(name)
 """

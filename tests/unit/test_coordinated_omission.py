@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from airl_mav.latency.percentiles import (
+from airl_mav.latency.stages import (
     CommandAges,
     ages_in_closed_loop,
     autocorrelation,

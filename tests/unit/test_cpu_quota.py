@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from airl_mav.core.cpu_quota import CpuGroup, check_permitted, held_to, remove_left
 from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.scheduling import CpuGroup, check_permitted, held_to, remove_left
 from airl_mav.rehearsal.channel import Begin
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
@@ -20,7 +20,7 @@ from tests.support.processes import ROOT
 
 BUSY = """
 import json, os, threading, time
-from airl_mav.core.cpu_quota import held_to
+from airl_mav.core.scheduling import held_to
 
 def burn():
     # By processor time: the same work however slow this machine is.
@@ -78,7 +78,7 @@ def test_group_is_left_when_the_work_fails(permitted: None) -> None:
 
 KILLED = """
 import os
-from airl_mav.core.cpu_quota import held_to
+from airl_mav.core.scheduling import held_to
 with held_to(50.0) as group:
     print(group.path, flush=True)
     os._exit(3)

@@ -16,7 +16,7 @@ from airl_mav.envs.spec import CameraChange
 from airl_mav.policy.observation import Kinematics
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.distortion import (
+from airl_mav.profiles.projections import (
     MOST_OFF_RAD,
     UNDISTORTED,
     Distortion,

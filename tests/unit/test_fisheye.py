@@ -18,13 +18,13 @@ from airl_mav.camera.primitives import OBSTACLE
 from airl_mav.camera.render import render
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
-from airl_mav.policy.greedy import near_points
+from airl_mav.policy.images import rays_of
 from airl_mav.policy.observation import Kinematics, observe
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
-from airl_mav.policy.scans import rays_of
+from airl_mav.policy.registry import near_points
 from airl_mav.prediction import CameraPose, PosedImage, Reprojector
 from airl_mav.profiles.appearance import DEFAULT
-from airl_mav.profiles.distortion import UNDISTORTED, Distortion
+from airl_mav.profiles.projections import UNDISTORTED, Distortion
 from airl_mav.profiles.vehicle import load_vehicle
 from tests.support.lenses import BARREL, OPENING, published, rays_of_fisheye
 from tests.unit.test_colour import arena, busy, poses, sun

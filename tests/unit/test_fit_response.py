@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from airl_mav.addons.conformance.result import ConformanceResult, ConformanceSettings, StoredStep
-from airl_mav.addons.conformance.steps import (
+from airl_mav.addons.conformance.telemetry import (
     MANOEUVRES,
     MeasuredStep,
     SetpointStep,

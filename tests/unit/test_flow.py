@@ -9,18 +9,22 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from airl_mav.addons.render.camera_pictures import (
+    CameraMotion,
+    motion_of_camera,
+    optical_flow,
+    velocities_of,
+)
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.flow import CameraMotion, motion_of_camera, optical_flow, velocities_of
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import Picture, render_picture
 from airl_mav.camera.primitives import FLOOR, OBSTACLE, SKY
 from airl_mav.camera.render import Motion, Mount
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera_kind import Projection
-from airl_mav.profiles.distortion import UNDISTORTED, Distortion
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import UNDISTORTED, Distortion, Projection
 from tests.support.lenses import BARREL, OPENING, published
 from tests.unit.test_colour import rays_of
 

@@ -23,8 +23,14 @@ from airl_mav.camera.frame import (
 )
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.camera_kind import KINDS, PROJECTIONS, CameraKind, Projection
-from airl_mav.profiles.distortion import MOST_COEFFICIENT, UNDISTORTED
+from airl_mav.profiles.projections import (
+    KINDS,
+    MOST_COEFFICIENT,
+    PROJECTIONS,
+    UNDISTORTED,
+    CameraKind,
+    Projection,
+)
 
 lengths = st.floats(-MOST_PX, MOST_PX)
 focals = st.floats(LEAST_PX, MOST_PX)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.arena.generate import generate
 from airl_mav.camera.frame import Frame
-from airl_mav.camera.imaging_checks import check_noise, check_renderer, check_twin_imaging
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion, Mount, camera_pose
 from airl_mav.core.errors import FieldError, UsageError
@@ -20,7 +19,7 @@ from airl_mav.core.streams import Stream, stream, words_of
 from airl_mav.policy.observation import Kinematics
 from airl_mav.policy.registry import PolicyInfo, camera_refused
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera import Camera
+from airl_mav.profiles.camera import Camera, check_noise, check_renderer, check_twin_imaging
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.loading import list_profiles, load_profile
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle

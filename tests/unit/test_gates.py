@@ -15,10 +15,10 @@ from rich.console import Console
 from scipy import ndimage, stats
 
 from airl_mav.arena.draw import OPENING_COLOUR, draw_arena
-from airl_mav.arena.gates import openings_of, over_openings
 from airl_mav.arena.generate import free_area_fraction, generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.arena.placement import bounding_boxes
+from airl_mav.arena.walls import openings_of, over_openings
 from airl_mav.cli.arena_command import arena_table
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import goal_distance_m
@@ -26,8 +26,8 @@ from airl_mav.envs.arena_batch import NOTHING, batch_of, touches
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
+from airl_mav.scenario.checks import check_goal_height
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.piloting import check_goal_height
 from airl_mav.scenario.resolve import resolve
 
 WIDTH_M = 0.55

@@ -13,7 +13,10 @@ from scipy.integrate import quad
 from airl_mav.arena.finishes import linear_of
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
-from airl_mav.camera.gloss import (
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.picture import ColourArrays, Picture, render_picture
+from airl_mav.camera.render import camera_pose
+from airl_mav.camera.shading import (
     MATT,
     SAMPLES,
     VARNISH_ADMITS,
@@ -26,9 +29,6 @@ from airl_mav.camera.gloss import (
     pane_reflects,
     spread,
 )
-from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import ColourArrays, Picture, render_picture
-from airl_mav.camera.render import camera_pose
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.colour_images import ColourImages, Looks

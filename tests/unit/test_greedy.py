@@ -19,9 +19,16 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
 from airl_mav.policy.actions import Action, limited
-from airl_mav.policy.greedy import GreedyPolicy, GreedySettings, clearance, near_points
 from airl_mav.policy.observation import Kinematics, Observation, encode
-from airl_mav.policy.registry import POLICIES, find_policy, load_policy
+from airl_mav.policy.registry import (
+    POLICIES,
+    GreedyPolicy,
+    GreedySettings,
+    clearance,
+    find_policy,
+    load_policy,
+    near_points,
+)
 
 LENS = Intrinsics.from_fov(64, 48, math.radians(90.0))
 HALF_FOV = math.radians(45.0)

@@ -16,15 +16,14 @@ from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
 from companion.frame_source import ReceivedFrame
-from companion.ground_check import DECISIONS, CheckResult, check_on_ground, time_decisions
-from companion.program import prepare
+from companion.program import DECISIONS, CheckResult, check_on_ground, prepare, time_decisions
 from tests.support.ports import LOOPBACK, free_ports
 
 OWN = """
 import numpy as np
 from airl_mav.policy.actions import Action
-from companion.cameras.driver import DepthImage
-from companion.cameras.fitting import Lens
+from companion.addons.cameras.drivers import DepthImage
+from companion.addons.cameras.fitting import Lens
 
 class Mine:
     lens = Lens(128, 96, 64.0, 64.0, 63.5, 47.5)
@@ -61,8 +60,8 @@ def found_with(folder: Path, camera: str, **asked: Any) -> list[CheckResult]:
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.ground_check.LOOK_S", 0.1)
-    monkeypatch.setattr("companion.ground_check.FRAME_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("companion.program.LOOK_S", 0.1)
+    monkeypatch.setattr("companion.program.FRAME_TIMEOUT_S", 0.2)
 
 
 def test_a_good_camera_and_no_flight_controller(tmp_path: Path) -> None:

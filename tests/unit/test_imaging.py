@@ -26,15 +26,14 @@ from airl_mav.camera.imaging import (
     noisy,
     vignette,
 )
-from airl_mav.camera.imaging_checks import check_renderer
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera import Camera, Imaging
-from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.camera import Camera, Imaging, check_renderer
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import CameraKind
 from tests.unit.test_colour import arena, bodies, sky, sun
 
 LENS: dict[str, Any] = {

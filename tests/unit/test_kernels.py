@@ -17,7 +17,7 @@ from numba import TypingError
 from numpy.typing import NDArray
 
 from airl_mav import camera, envs
-from airl_mav.camera.colour import Work
+from airl_mav.camera.picture import Work
 from airl_mav.core import compiling, kernels
 from tests.support.processes import run_alone
 
@@ -81,7 +81,7 @@ def test_an_edit_compiles_again_what_depends_on_it_and_no_more(tmp_path: Path) -
 
 
 HEARD = """
-from airl_mav.core.compiling import heard_compiling
+from airl_mav.core.first_start import heard_compiling
 from airl_mav.core.kernels import kernel
 import held
 
@@ -155,7 +155,7 @@ def test_numba_refuses_a_borrowing_kernel_an_array_of_its_own() -> None:
 SAVES = """
 import sys
 import numpy as np
-from airl_mav.core import kernels
+from airl_mav.core import compiling, kernels
 from twofold import twofold
 
 values = [1, 1.0, 1j, np.float32(1.0)]

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from airl_mav.latency.percentiles import MIN_SAMPLES, percentile, summarize
+from airl_mav.latency.stages import MIN_SAMPLES, percentile, summarize
 
 
 @pytest.mark.parametrize("p", [90.0, 95.0, 99.0, 99.9])

@@ -23,7 +23,7 @@ from airl_mav.policy.images import NUMPY, Bytes, shrink_depth
 from airl_mav.policy.layouts import ablated, boxes, encode_layout, newest_frame
 from airl_mav.policy.observation import Kinematics, Observation, observe
 from airl_mav.policy.observation_spec import STRIP_ROWS, Encoded, ObservationSpec, camera_mismatch
-from airl_mav.profiles.camera_kind import CHANNELS, KINDS, CameraKind
+from airl_mav.profiles.projections import CHANNELS, KINDS, CameraKind
 
 FAR_MM = 65_535
 

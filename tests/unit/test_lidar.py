@@ -21,7 +21,7 @@ from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.profiles.camera import Camera, Ranging
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import load_vehicle
-from companion.presence import UNKNOWN_CM, obstacle_distance
+from companion.status_reports import UNKNOWN_CM, obstacle_distance
 from tests.unit.test_scans import posts
 
 LIDAR = load_vehicle("quad-lidar").camera

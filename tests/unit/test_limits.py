@@ -19,7 +19,7 @@ from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.observation import Kinematics
-from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.projections import CameraKind
 from airl_mav.scenario.model import LimitSettings, PilotSettings
 from companion.frame_source import ReceivedFrame
 from companion.limits import (

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from airl_mav.core.log_file import LogFile
+from airl_mav.core.files import LogFile
 from tests.support.full_disk import largest_file
 
 RECORD = b"0123456789abcdef" * 64

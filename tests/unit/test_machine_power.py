@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from airl_mav.core.clock import SimClock, WallClock
-from airl_mav.core.power_meter import NO_SENSOR, PowerMeter, PowerSampling, find_power_source
+from airl_mav.core.resource_use import NO_SENSOR, PowerMeter, PowerSampling, find_power_source
 from tests.unit.test_machine_state import write
 
 RAPL = "sys/class/powercap"

@@ -22,8 +22,7 @@ from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.profiles.appearance import Appearance
-from airl_mav.profiles.camera_kind import PROJECTIONS, Projection
-from airl_mav.profiles.distortion import UNDISTORTED, sees_to
+from airl_mav.profiles.projections import PROJECTIONS, UNDISTORTED, Projection, sees_to
 from tests.support.lenses import AT_NIGHT_THE_FISHEYE, BARREL, ENDING, OPENING, rays_of_fisheye
 from tests.support.meshes import ROOM, kept, ring, scene_of, triangles
 

@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 from airl_mav.arena.finishes import linear_of, srgb_of
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.cube_faces import cube_of, resampled
 from airl_mav.camera.intrinsics import Intrinsics, fisheye_rays
-from airl_mav.camera.mitsuba import PathTracer
+from airl_mav.camera.mitsuba import PathTracer, cube_of, resampled
 from airl_mav.camera.picture import antialiased, render_picture
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix

@@ -18,11 +18,11 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import FieldError
 from airl_mav.profiles.vehicle import load_vehicle
-from companion.cameras.by_name import open_named_camera
-from companion.cameras.driver import CameraThread, DepthImage
-from companion.cameras.fitting import Fitting, Lens
+from companion.addons.cameras.drivers import CameraThread, DepthImage
+from companion.addons.cameras.fitting import Fitting, Lens
+from companion.frame_source import open_named_camera
 
-oak_d = pytest.importorskip("companion.cameras.oak_d")  # No wheels for all that we run on.
+oak_d = pytest.importorskip("companion.addons.cameras.oak_d")  # No wheels for all that we run on.
 dai = oak_d.dai
 
 ROOT = Path(__file__).parents[2]
@@ -176,7 +176,7 @@ def test_a_camera_that_is_not_there_is_one_line() -> None:
 def test_depthai_takes_no_signals_over(tmp_path: Path) -> None:
     """A file that may not grow is an error of that file, as without depthai."""
     code = (
-        "import resource, companion.cameras.oak_d\n"
+        "import resource, companion.addons.cameras.oak_d\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))\n"
         "try: open('log', 'wb', buffering=0).write(b'x' * 11) == 10 and open('log', 'ab', "
         "buffering=0).write(b'x')\n"

@@ -21,8 +21,8 @@ from airl_mav.core.errors import FieldError
 from airl_mav.policy.observation import Kinematics
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.frame_source import ReceivedFrame, SharedFrames
-from companion.presence import UNKNOWN_CM, obstacle_distance, obstacles_told
 from companion.program import prepare
+from companion.status_reports import UNKNOWN_CM, obstacle_distance, obstacles_told
 from firmware_sim.addons.extra_modes.collision_prevention import ObstacleMap
 from tests.support import mavlink_clients
 from tests.unit.test_scans import posts

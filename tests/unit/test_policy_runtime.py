@@ -20,13 +20,12 @@ pytest.importorskip("onnxscript", reason="needs the [train] extra")
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.cli import entry
+from airl_mav.cli import main
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy import learned, registry
-from airl_mav.policy.action_sets import ActionSpec, commands
-from airl_mav.policy.actions import Action
+from airl_mav.policy.actions import Action, ActionSpec, commands
 from airl_mav.policy.card import CARD_FILE, PolicyCard, read_card
 from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.layouts import encode_layout
@@ -36,8 +35,8 @@ from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.registry import find_policy, load_policy, policy_names
 from airl_mav.policy.runtime import Runtime, TorchRuntime
 from airl_mav.profiles.loading import profiles_dir
+from airl_mav.scenario.checks import decide_piloting, select_latency
 from airl_mav.scenario.model import DEFAULT_POLICY, Decisions, PilotSettings, Scenario
-from airl_mav.scenario.piloting import decide_piloting, select_latency
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.frame_source import ReceivedFrame
@@ -375,7 +374,7 @@ def test_a_torch_program_of_a_stranger_is_not_loaded_unasked(
     exported: Path, refuse: Callable[..., str]
 ) -> None:
     path = str(exported / "discrete")
-    for command in (entry.sitl, entry.companion):
+    for command in (main.sitl, main.companion):
         line = refuse(command, "--policy", path, "--runtime", "torch")
         assert "accepted: with --trust" in line
         assert "policy.pt2" in line
@@ -433,7 +432,7 @@ def refuse(
     return run
 
 
-@pytest.mark.parametrize("command", [entry.sitl, entry.companion])
+@pytest.mark.parametrize("command", [main.sitl, main.companion])
 def test_a_policy_that_cannot_be_flown_is_refused(
     folder: Path, refuse: Callable[..., str], command: Callable[[], None]
 ) -> None:
@@ -475,7 +474,7 @@ def test_a_vehicle_with_another_camera_is_refused(
     assert old in shipped
     vehicle = tmp_path / "mine.toml"
     vehicle.write_text(shipped.replace(old, new), encoding="utf-8")
-    line = refuse(entry.sitl, "--policy", str(exported / "discrete"), "--vehicle", str(vehicle))
+    line = refuse(main.sitl, "--policy", str(exported / "discrete"), "--vehicle", str(vehicle))
     for word in ("--policy", str(vehicle), *words):
         assert word in line
 

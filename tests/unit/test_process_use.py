@@ -10,8 +10,7 @@ import psutil
 import pytest
 
 from airl_mav.core.clock import SimClock, WallClock
-from airl_mav.core.power_meter import NO_SENSOR
-from airl_mav.core.process_use import ProcessUse, UseMeter
+from airl_mav.core.resource_use import NO_SENSOR, ProcessUse, UseMeter
 from tests.unit.test_machine_power import ORIN_NX
 from tests.unit.test_machine_state import write
 

@@ -24,8 +24,7 @@ from airl_mav.core.frames import (
     quat_multiply,
     quat_to_matrix,
 )
-from airl_mav.profiles.camera_kind import PROJECTIONS, Projection
-from airl_mav.profiles.distortion import UNDISTORTED, sees_to
+from airl_mav.profiles.projections import PROJECTIONS, UNDISTORTED, Projection, sees_to
 from tests.support.lenses import BARREL, ENDING, OPENING, rays_of_fisheye
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import FieldError
-from companion.cameras.by_name import open_named_camera
-from companion.cameras.fitting import Fitting, Lens
+from companion.addons.cameras.fitting import Fitting, Lens
+from companion.frame_source import open_named_camera
 
 # No wheels for all that we run on; where there is one it wants the system's libusb.
 rs = pytest.importorskip("pyrealsense2", exc_type=ImportError)
-realsense = pytest.importorskip("companion.cameras.realsense")
+realsense = pytest.importorskip("companion.addons.cameras.realsense")
 
 NOW_US = 1_800_000_000_000_000
 

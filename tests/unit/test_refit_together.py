@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from airl_mav.addons.refit.quantity import FittedQuantity
+from airl_mav.addons.refit.flown import FittedQuantity
 from airl_mav.addons.refit.refit import pooled, random_effects, refit_together
 from airl_mav.cli.main import main
 from airl_mav.core.errors import FieldError

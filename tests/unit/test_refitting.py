@@ -11,18 +11,15 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from airl_mav.addons.refit.air import fit_air
+from airl_mav.addons.refit.air import fit_air, fit_thrust
 from airl_mav.addons.refit.files import Override, overrides_of, refitted
-from airl_mav.addons.refit.flown import Flown
-from airl_mav.addons.refit.quantity import block_intervals, mean_interval
+from airl_mav.addons.refit.flown import Flown, block_intervals, mean_interval
 from airl_mav.addons.refit.response import TELEMETRY_AGE_S, fit_response
-from airl_mav.addons.refit.thrust import fit_thrust
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from airl_mav.vehicle_log.clock_alignment import marzullo
-from airl_mav.vehicle_log.ulog_reader import Series, VehicleLog, empty, read_vehicle_log
+from airl_mav.vehicle_log import Series, VehicleLog, empty, marzullo, read_vehicle_log
 from firmware_sim.flight_log.topics import TOPICS
 from firmware_sim.flight_log.ulog_writer import UlogWriter
 

@@ -16,14 +16,14 @@ from airl_mav.arena.ground import no_relief
 from airl_mav.camera import picture
 from airl_mav.camera import render as depth_images
 from airl_mav.camera.bvh import Meshes, forest_of, meshes_of, placed_in
-from airl_mav.camera.gloss import MATT, Gloss
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import ColourArrays, Picture, render_picture
 from airl_mav.camera.render import render
+from airl_mav.camera.shading import MATT, Gloss
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera_kind import Projection
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import Projection
 
 _of = ColourArrays.of
 

@@ -23,7 +23,7 @@ from airl_mav.arena.finishes import srgb_of
 from airl_mav.arena.generate import generate, local_bounds
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, seen_across
 from airl_mav.arena.placement import bounding_boxes
-from airl_mav.arena.room_plan import Plan, draw_plan, over_doors
+from airl_mav.arena.walls import Plan, draw_plan, over_doors
 from airl_mav.camera import primitives
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
@@ -245,7 +245,7 @@ def test_walls_fill_what_is_no_room_and_no_door(
     floor = (bounds.north_max - bounds.north_min) * (bounds.east_max - bounds.east_min)
     rooms = sum(room.side(0) * room.side(1) for room in plan.rooms)
     doors = sum(door.height * (door.high - door.low) for door in plan.doors)
-    from airl_mav.arena.room_plan import room_walls
+    from airl_mav.arena.walls import room_walls
 
     boxes, things = room_walls(plan, bounds)
     volume = np.prod(2.0 * boxes.half_size, axis=1).sum()

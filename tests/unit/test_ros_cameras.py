@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.errors import FieldError, UsageError
-from companion.cameras.by_name import open_named_camera
-from companion.cameras.fitting import Lens
-from companion.cameras.ros_images import age_us, depth_mm, info_topic, lens_of
+from companion.addons.cameras.fitting import Lens
+from companion.addons.cameras.rosbag import age_us, depth_mm, info_topic, lens_of
+from companion.frame_source import open_named_camera
 from tests.support.processes import ROOT
 
 K = (57.5, 0.0, 39.5, 0.0, 58.5, 29.5, 0.0, 0.0, 1.0)
@@ -143,7 +143,7 @@ import sys, json, time
 from cyclonedds.core import Policy, Qos
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
-from companion.cameras import ros2
+from companion.addons.cameras import ros2
 topic, described = sys.argv[1:]
 participant = ros2._participant()
 reliable = Qos(Policy.Reliability.Reliable(0), Policy.History.KeepLast(5))
@@ -210,7 +210,7 @@ def test_a_topic_of_another_process_is_a_camera(topic: str) -> None:
 
 
 def test_a_topic_that_falls_silent_has_failed(topic: str) -> None:
-    from companion.cameras import ros2
+    from companion.addons.cameras import ros2
 
     camera = ros2.Ros2Camera(topic)
     heard, silent = camera._images, camera._reader("/nobody/image", ros2.Image)
@@ -234,7 +234,7 @@ def test_a_topic_that_falls_silent_has_failed(topic: str) -> None:
 def test_a_topic_that_nobody_describes_is_one_line(
     domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from companion.cameras import ros2
+    from companion.addons.cameras import ros2
 
     monkeypatch.setattr(ros2, "DESCRIBED_S", 0.2)
     line = rf"no sensor_msgs/CameraInfo on /nobody/camera_info .*ROS_DOMAIN_ID {domain}"
@@ -255,7 +255,7 @@ def test_cyclone_dds_and_rosbags_write_a_message_alike() -> None:
     pytest.importorskip("cyclonedds", reason="has no wheel for every machine")
     from rosbags.typesys import Stores, get_typestore
 
-    from companion.cameras import ros2
+    from companion.addons.cameras import ros2
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     kind = store.types
@@ -323,7 +323,7 @@ def test_a_recording_is_played_at_its_own_pace(tmp_path: Path) -> None:
         tmp_path / "bag",
         {"/camera/depth/image_rect_raw": "16UC1", "/camera/color/image_raw": "rgb8"},
     )
-    from companion.cameras.rosbag import RosBag
+    from companion.addons.cameras.rosbag import RosBag
 
     clock = SimClock(5_000_000)
     camera = RosBag(str(bag), clock)

@@ -14,7 +14,7 @@ import pytest
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import add_arrays, json_line, replace_file
-from airl_mav.core.provenance import git_state
+from airl_mav.core.machine import git_state
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, LATENCY_FILE, FlownEpisode, RunFolder, load
 from tests.support.run_demo import demo_arena, demo_episode, demo_setup, write_demo_run

@@ -19,12 +19,9 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.observations import COMPILED
-from airl_mav.policy.images import NUMPY
-from airl_mav.policy.layouts import boxes, encode_layout, newest_frame
-from airl_mav.policy.observation import Kinematics, observe
-from airl_mav.policy.observation_spec import ObservationSpec
-from airl_mav.policy.scans import (
+from airl_mav.policy.images import (
     NEAREST_M,
+    NUMPY,
     Moved,
     Scanning,
     carried,
@@ -33,6 +30,9 @@ from airl_mav.policy.scans import (
     scan_bytes,
     tilt_of,
 )
+from airl_mav.policy.layouts import boxes, encode_layout, newest_frame
+from airl_mav.policy.observation import Kinematics, observe
+from airl_mav.policy.observation_spec import ObservationSpec
 
 ROUND = Intrinsics.from_fov(512, 160, 2.0 * math.pi, "cylindrical")
 AHEAD = Intrinsics.from_fov(256, 192, math.radians(90.0))

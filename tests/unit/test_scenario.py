@@ -13,7 +13,7 @@ from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 from rich.console import Console
 
-from airl_mav.cli import entry, sitl_command
+from airl_mav.cli import main, sitl_command
 from airl_mav.cli.companion_command import CompanionOptions
 from airl_mav.cli.options import read_options
 from airl_mav.core.errors import FieldError, UsageError
@@ -21,8 +21,7 @@ from airl_mav.core.fields import unit_of, validated
 from airl_mav.profiles.conditions import Payload, WindSettings
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario, resolve
 from airl_mav.scenario.scenario_file import anchored, read_scenario_file, save_scenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion, StandAloneVehicle
 from tests.support.processes import ROOT
@@ -198,7 +197,7 @@ def test_options_that_contradict_each_other_are_named(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["airl-sitl", *words])
     with pytest.raises(SystemExit) as end:
-        entry.sitl()
+        main.sitl()
     out, err = capsys.readouterr()
     assert (end.value.code, out) == (2, "")
     assert err.startswith(f"error: {line}")
@@ -332,7 +331,7 @@ def test_contradictions_in_a_file_name_it(
     path.write_text("hold_s = 3.0\n")
     monkeypatch.setattr(sys, "argv", ["airl-sitl", str(path)])
     with pytest.raises(SystemExit) as end:
-        entry.sitl()
+        main.sitl()
     assert end.value.code == 2
     assert capsys.readouterr().err.startswith(
         f"error: {path}: watchdog.decision_timeout_s = 2: accepted: more than the hold time, 3 s"

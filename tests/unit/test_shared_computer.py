@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from airl_mav.addons.profiling.measurement import share
+from airl_mav.addons.profiling.measurement import ProfileRequest, share
 from airl_mav.addons.profiling.profile import profile
-from airl_mav.addons.profiling.request import ProfileRequest
 from airl_mav.cli.computers_command import ComputersOptions
 from airl_mav.cli.computers_command import run as computers
 from airl_mav.cli.main import main

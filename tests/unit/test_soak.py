@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from airl_mav.addons.profiling.request import ProfileRequest
+from airl_mav.addons.profiling.measurement import ProfileRequest
 from airl_mav.addons.profiling.soak import MachineReading, Soak, soak
 from airl_mav.core.clock import SimClock
 from airl_mav.core.machine import MachineState, throttled_since

@@ -15,8 +15,13 @@ from pathlib import Path
 
 import pytest
 
-from companion.presence import NO_TEMPERATURE, NOT_KNOWN_8, computer_status
-from companion.systemd import ServiceManager, service
+from companion.status_reports import (
+    NO_TEMPERATURE,
+    NOT_KNOWN_8,
+    ServiceManager,
+    computer_status,
+    service,
+)
 from tests.support.ports import LOOPBACK, choose_ports
 from tests.support.processes import running
 

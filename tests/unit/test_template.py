@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from airl_mav.policy.action_sets import ActionSpec
+from airl_mav.policy.actions import ActionSpec
 from airl_mav.policy.card import PolicyFacts, load_card
+from airl_mav.policy.card_writing import build_template, template_size, write_template
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import OnnxRuntime
-from airl_mav.policy.template import build_template, template_size, write_template
 
 onnx = pytest.importorskip("onnx")
 torch = pytest.importorskip("torch")

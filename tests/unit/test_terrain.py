@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from airl_mav.arena.generate import generate, local_bounds
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.arena.ground import Ground, no_relief
-from airl_mav.arena.passage import Hills, raster_passage
 from airl_mav.arena.placed_assets import _problem
-from airl_mav.arena.placement import Boxes, bounding_half
+from airl_mav.arena.placement import Boxes, Hills, bounding_half, raster_passage
 from airl_mav.arena.relief import draw_ground, extreme_within, plane_at, stand_on
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
@@ -29,8 +28,8 @@ from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arena_batch import FLOOR as TOUCHED_FLOOR
 from airl_mav.envs.arena_batch import NOTHING, clearance, touches
 from airl_mav.profiles.arena import MOST_CELLS, ArenaSpec, Terrain
-from airl_mav.profiles.camera_kind import Projection
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import Projection
 from tests.support.lenses import AT_NIGHT_THE_FISHEYE
 from tests.support.meshes import kept, ring, scene_of, triangles
 from tests.unit.test_meshes_seen import in_world, nearest, rays_of

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from airl_mav.cli import entry, list_command
+from airl_mav.cli import list_command, main
 from airl_mav.profiles.loading import Kind, list_profiles, profiles_dir
 from tests.support.ports import LOOPBACK, choose_ports
 from tests.support.processes import ROOT
@@ -51,39 +51,39 @@ def refuse(
     [("--vehicle", "vehicles"), ("--arena", "arenas"), ("--computer", "computers")],
 )
 def test_unknown_profile_lists_those_that_exist(refuse: Run, option: str, kind: Kind) -> None:
-    line = refuse(entry.sitl, option, "zeppelin")
+    line = refuse(main.sitl, option, "zeppelin")
     assert "'zeppelin'" in line
     for name in list_profiles(kind):
         assert name in line
 
 
 def test_unknown_policy_and_workload_list_those_that_exist(refuse: Run) -> None:
-    assert "greedy" in refuse(entry.sitl, "--policy", "telepathy")
-    line = refuse(entry.sitl, "--computer", "ras-pi-4", "--workload", "chess")
+    assert "greedy" in refuse(main.sitl, "--policy", "telepathy")
+    line = refuse(main.sitl, "--computer", "ras-pi-4", "--workload", "chess")
     for name in ("'chess'", "template-5x32", "template-4x48", "template-7x32"):
         assert name in line
-    assert "greedy" in refuse(entry.companion, "--policy", "telepathy")
+    assert "greedy" in refuse(main.companion, "--policy", "telepathy")
     assert "template-5x32" in refuse(
-        entry.companion, "--computer", "ras-pi-4", "--workload", "chess"
+        main.companion, "--computer", "ras-pi-4", "--workload", "chess"
     )
-    assert "quad" in refuse(entry.firmware, "--vehicle", "zeppelin")
-    assert "static-obstacles" in refuse(entry.firmware, "--arena", "zeppelin")
+    assert "quad" in refuse(main.firmware, "--vehicle", "zeppelin")
+    assert "static-obstacles" in refuse(main.firmware, "--arena", "zeppelin")
 
 
 def test_bad_toml_names_file_field_and_range(refuse: Run, tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text("description = [", encoding="utf-8")
-    line = refuse(entry.sitl, "--arena", str(path))
+    line = refuse(main.sitl, "--arena", str(path))
     assert str(path) in line
     assert "not valid TOML" in line
     shipped = (profiles_dir() / "vehicles" / "quad.toml").read_text(encoding="utf-8")
     path.write_text(shipped.replace("mass_kg = 1.5", "mass_kg = -1.5"), encoding="utf-8")
-    line = refuse(entry.sitl, "--vehicle", str(path))
+    line = refuse(main.sitl, "--vehicle", str(path))
     for part in (str(path), "body.mass_kg = -1.5", "accepted: ", "value"):
         assert part in line
-    assert "body.mass_kg" in refuse(entry.firmware, "--vehicle", str(path))
+    assert "body.mass_kg" in refuse(main.firmware, "--vehicle", str(path))
     path.write_text(shipped.replace("mass_kg", "mas_kg"), encoding="utf-8")
-    assert "mas_kg" in refuse(entry.sitl, "--vehicle", str(path))
+    assert "mas_kg" in refuse(main.sitl, "--vehicle", str(path))
 
 
 def test_arena_that_cannot_be_made_is_refused_before_anything_starts(
@@ -103,7 +103,7 @@ count = [200, 200]
 """,
         encoding="utf-8",
     )
-    assert "error: " in refuse(entry.sitl, "--arena", str(path))
+    assert "error: " in refuse(main.sitl, "--arena", str(path))
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ count = [200, 200]
     ids=" ".join,
 )
 def test_sitl_options(refuse: Run, options: list[str], words: list[str]) -> None:
-    line = refuse(entry.sitl, *options)
+    line = refuse(main.sitl, *options)
     for word in words:
         assert word in line
 
@@ -181,7 +181,7 @@ def test_sitl_options(refuse: Run, options: list[str], words: list[str]) -> None
     ids=" ".join,
 )
 def test_firmware_options(refuse: Run, options: list[str], words: list[str]) -> None:
-    line = refuse(entry.firmware, *options)
+    line = refuse(main.firmware, *options)
     for word in words:
         assert word in line
 
@@ -212,7 +212,7 @@ def test_firmware_options(refuse: Run, options: list[str], words: list[str]) -> 
     ids=" ".join,
 )
 def test_companion_options(refuse: Run, options: list[str], words: list[str]) -> None:
-    line = refuse(entry.companion, *options)
+    line = refuse(main.companion, *options)
     for word in words:
         assert word in line
 
@@ -220,7 +220,7 @@ def test_companion_options(refuse: Run, options: list[str], words: list[str]) ->
 def test_off_loopback_is_refused_for_the_camera_too(refuse: Run) -> None:
     """Nothing is bound before the refusal: the camera's port stays free."""
     ports = choose_ports()
-    refuse(entry.firmware, "--bind", "0.0.0.0", *ports.options())  # noqa: S104
+    refuse(main.firmware, "--bind", "0.0.0.0", *ports.options())  # noqa: S104
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.bind((LOOPBACK, ports.camera))
 
@@ -229,14 +229,14 @@ def test_used_folder_is_refused_and_left_alone(refuse: Run, tmp_path: Path) -> N
     folder = tmp_path / "old"
     folder.mkdir()
     (folder / "run.json").write_text("{}", encoding="utf-8")
-    assert "schema = None: accepted: 1" in refuse(entry.sitl, "--out", str(folder))
+    assert "schema = None: accepted: 1" in refuse(main.sitl, "--out", str(folder))
     assert (folder / "run.json").read_text(encoding="utf-8") == "{}"
     (tmp_path / "file").write_text("", encoding="utf-8")
-    assert "--out" in refuse(entry.sitl, "--out", str(tmp_path / "file" / "run"))
+    assert "--out" in refuse(main.sitl, "--out", str(tmp_path / "file" / "run"))
 
 
 def test_report_of_nothing(refuse: Run, tmp_path: Path) -> None:
-    assert "no run here" in refuse(entry.airl, "report", str(tmp_path))
+    assert "no run here" in refuse(main.airl, "report", str(tmp_path))
 
 
 @pytest.mark.parametrize("damage", ["flipped", "empty", "nested"])
@@ -251,7 +251,7 @@ def test_report_of_a_damaged_run(refuse: Run, tmp_path: Path, damage: str) -> No
         latency.write_bytes(b"")
     else:
         info.write_text('{"schema": 1, "config": ' + "[" * 100_000, encoding="utf-8")
-    line = refuse(entry.airl, "report", str(folder.path))
+    line = refuse(main.airl, "report", str(folder.path))
     assert str(info if damage == "nested" else latency) in line
 
 
@@ -264,7 +264,7 @@ def test_a_full_disk_is_the_machines_failure(
     monkeypatch.setattr(list_command, "run", full)
     monkeypatch.setattr(sys, "argv", ["airl", "list"])
     with pytest.raises(SystemExit) as end:
-        entry.airl()
+        main.airl()
     assert end.value.code == 1
     assert capsys.readouterr().err == "error: run/latency.npz: No space left on device\n"
 

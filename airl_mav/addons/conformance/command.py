@@ -1,16 +1,52 @@
-"""`airl conformance`: check any flight controller."""
+"""`airl conformance`: checks any flight controller in order, and lands after any failure."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, Field
 from rich.console import Console
 
-from airl_mav.core.console import new_console
+from airl_mav.addons.conformance import flight_checks
+from airl_mav.addons.conformance.checklist import (
+    CheckFailedError,
+    Checklist,
+    Transcript,
+    TranscriptLine,
+    require,
+)
+from airl_mav.addons.conformance.ground_checks import GROUND_CHECKS, heartbeat
+from airl_mav.addons.conformance.result import (
+    AUTO,
+    ConformanceResult,
+    ConformanceSettings,
+    judge,
+    load_reference,
+    summary,
+)
+from airl_mav.addons.conformance.telemetry import (
+    BEFORE_S,
+    MANOEUVRES,
+    STEP_NAMES,
+    STOP_NED,
+    HeldSetpoint,
+    MeasuredStep,
+    StepName,
+    StepResponse,
+    measure,
+    plan,
+)
+from airl_mav.addons.conformance.vehicle import SetpointStream, VehicleConnection
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
+from airl_mav.core.progress import new_console
 from airl_mav.rehearsal.signals import terminated_as_interrupted
+from companion.link_interface import LinkError
 
 
 class ConformanceOptions(BaseModel):
@@ -72,9 +108,8 @@ OPTIONS = ConformanceOptions
 
 def run(options: ConformanceOptions, console: Console | None = None) -> int:
     """Check a vehicle and print the result; return 0 if it conforms, else 1, or 130."""
-    from airl_mav.addons.conformance.report import check_table, line_text, step_table
-    from airl_mav.addons.conformance.run import check_conformance
-    from airl_mav.addons.conformance.steps import STEP_NAMES
+    from airl_mav.addons.conformance.result import check_table, line_text, step_table
+    from airl_mav.addons.conformance.telemetry import STEP_NAMES
 
     console = console or new_console()
     if options.out is not None and not options.out.parent.is_dir():
@@ -107,3 +142,177 @@ def run(options: ConformanceOptions, console: Console | None = None) -> int:
     if result.interrupted:
         return EXIT_INTERRUPTED
     return 0 if result.passed else EXIT_BROKEN
+
+
+FACE_NORTH_S = 5.0  # Time before the first step, to turn north and stop [s]
+RESCUE_S = 300.0  # Landing timeout after a failure [s]
+RESCUE_RETRY_S = 2.0  # Retry interval of an unanswered land request [s]
+HEARTBEAT_S = 1.5  # Maximum heartbeat interval [s]
+
+
+def check_conformance(
+    connect: str = "udpin://127.0.0.1:14540",
+    *,
+    reference: str = AUTO,
+    speed: float = 1.0,
+    altitude_m: float = 10.0,
+    steps: Sequence[StepName] = STEP_NAMES,
+    repeat: int = 1,
+    steps_only: bool = False,
+    connect_timeout_s: float = 30.0,
+    progress: Callable[[TranscriptLine], None] | None = None,
+) -> ConformanceResult:
+    """Fly a flight controller through all checks and step responses. It takes off.
+
+    After any failure and after Ctrl-C the vehicle lands; an interrupted result is `interrupted`.
+
+    Args:
+        connect: MAVSDK connection, udpin://HOST:PORT or serial://DEVICE:BAUD.
+        reference: Stored step responses: auto (by the autopilot), px4, ardupilot, or a path
+            (.toml).
+        speed: Simulated seconds per wall second of the vehicle, 0.01 to 100; 1 for a real one.
+        altitude_m: Take-off altitude, 8 to 100, with `steps_only` from 2 [m].
+        steps: Names of the steps to fly.
+        repeat: Repetitions of the steps, 1 to 20; every second one mirrored.
+        steps_only: Skip rejections, frames, offboard loss and hold.
+        connect_timeout_s: Timeout for finding a flight controller, 1 to 3600 [wall s].
+        progress: Called with each line of the transcript, by any thread.
+
+    Raises:
+        UsageError: Invalid value or connection, port taken, no heartbeat, or unknown autopilot;
+            nothing was commanded.
+    """
+    settings = ConformanceSettings(
+        connect, reference, speed, altitude_m, tuple(steps), repeat, steps_only, connect_timeout_s
+    )
+    if reference != AUTO:
+        load_reference(reference, 0)
+    transcript = Transcript(WallClock(speed), progress or (lambda _: None))
+    checklist = Checklist(transcript)
+    result = ConformanceResult(settings, checklist.checks, transcript.lines)
+    with closing(VehicleConnection(connect, speed, transcript)) as vehicle:
+        transcript.add("note", f"waiting for a flight controller on {connect}")
+        try:
+            vehicle.connect(connect_timeout_s)
+            _check(vehicle, checklist, result)
+        except LinkError:
+            pass  # Recorded with the failed check.
+        except KeyboardInterrupt:
+            result.interrupted = True
+        result.heartbeat = vehicle.telemetry.latest("HEARTBEAT")
+        result.autopilot_version = vehicle.telemetry.latest("AUTOPILOT_VERSION")
+    if result.reference is not None and result.steps:
+        for name in STEP_NAMES:
+            if name in settings.steps:
+                found, stored = result.steps.get(name), result.reference
+                checklist.perform(f"step {name}", partial(judge, found, stored))
+    return result
+
+
+def _check(vehicle: VehicleConnection, checklist: Checklist, result: ConformanceResult) -> None:
+    """Make all checks until one blocks the next. Raises UsageError and LinkError."""
+    settings = result.settings
+    if not checklist.perform("heartbeat", lambda: heartbeat(vehicle)):
+        return
+    beat = vehicle.telemetry.latest("HEARTBEAT") or {}
+    result.reference = load_reference(settings.reference, beat["autopilot"])
+    vehicle.unasked_hz = result.reference.streams_hz
+    try:
+        if checklist.perform_all(GROUND_CHECKS, vehicle, steps_only=settings.steps_only):
+            _check_in_air(vehicle, checklist, result)
+    finally:
+        _bring_down(vehicle, result)
+
+
+def _check_in_air(
+    vehicle: VehicleConnection, checklist: Checklist, result: ConformanceResult
+) -> None:
+    """Make the checks in the air; the vehicle is armed."""
+    settings = result.settings
+    checklist.perform("takeoff", lambda: flight_checks.takeoff(vehicle, settings.altitude_m))
+    if vehicle.height_m < settings.altitude_m / 2.0:
+        return
+    if not settings.steps_only:
+        checklist.perform_all(flight_checks.OFFBOARD_CHECKS, vehicle)
+        vehicle.call("offboard.stop()", vehicle.offboard.stop)
+        with SetpointStream(vehicle, flight_checks.FACING_EAST) as stream:
+            checklist.perform_all(flight_checks.setpoint_checks(stream), vehicle)
+    if settings.steps:
+        checklist.perform("step responses", lambda: _fly_steps(vehicle, settings, result.steps))
+        vehicle.call("offboard.stop()", vehicle.offboard.stop)
+    if not settings.steps_only:
+        if not checklist.perform_all(flight_checks.LOSS_CHECKS, vehicle):
+            checklist.skip("setpoints resume", "not reached")
+        checklist.perform("hold", lambda: flight_checks.hold(vehicle))
+    checklist.perform_all(flight_checks.LANDING_CHECKS, vehicle)
+
+
+def _fly_steps(
+    vehicle: VehicleConnection,
+    settings: ConformanceSettings,
+    measured: dict[StepName, MeasuredStep],
+) -> str:
+    """Fly the steps and add their responses. Raises CheckFailedError, LinkError."""
+    steps = {leg.step.name: leg.step for legs in MANOEUVRES for leg in legs if leg.step}
+    flight_checks.start_offboard(vehicle, STOP_NED)
+    vehicle.wait(FACE_NORTH_S)
+    inexact = vehicle.clock.inexact
+    for repetition in range(settings.repeat):
+        for leg in plan(settings.steps, mirrored=repetition % 2 == 1):
+            response = _fly_leg(vehicle, leg)
+            if leg.step is not None and response is not None:
+                name = leg.step.name
+                vehicle.transcript.add("note", f"{name}: {summary(response)}")
+                measured.setdefault(name, MeasuredStep(steps[name], [])).flights.append(response)
+    inexact = vehicle.clock.inexact - inexact
+    finding = f"{sum(len(each.flights) for each in measured.values())} steps"
+    finding += f", timed by {vehicle.clock.method.value}"
+    return finding + (f", {inexact} setpoints only by the newest telemetry" if inexact else "")
+
+
+def _fly_leg(vehicle: VehicleConnection, leg: HeldSetpoint) -> StepResponse | None:
+    """Hold a setpoint for its duration; return the response to its step."""
+    sent_s = vehicle.fly(leg.setpoint)
+    vehicle.wait(leg.seconds - (vehicle.telemetry.boot_s - sent_s))
+    offboard = vehicle.mode == vehicle.autopilot.offboard_mode
+    require(offboard, f"it left offboard: {vehicle.mode_name}")
+    if leg.step is None:
+        return None
+    motion = vehicle.telemetry.recent(leg.seconds + 2.0 * BEFORE_S)
+    try:
+        motion = motion.between(sent_s - BEFORE_S, sent_s + leg.seconds)
+        return measure(leg.step, motion, sent_s)
+    except ValueError as error:
+        raise CheckFailedError(f"{leg.step.name}: {error}") from None
+
+
+def _bring_down(vehicle: VehicleConnection, result: ConformanceResult) -> None:
+    """Land if still armed; repeat the request until answered. Ctrl-C aborts the landing."""
+    if not vehicle.may_be_armed:
+        return
+    note = vehicle.transcript.add
+    with suppress(LinkError):
+        # The heartbeat, once a second, may not report it yet.
+        vehicle.wait_for(lambda: vehicle.armed, HEARTBEAT_S)
+    if not vehicle.armed and vehicle.telemetry.silence_s < HEARTBEAT_S:
+        return
+    note("note", "still armed: landing")
+    result.known_to_be_down = answered = False
+    stopwatch = WallClock(vehicle.speed)
+    try:
+        while stopwatch.time_us() < RESCUE_S * US_PER_S:
+            try:
+                answered = answered or not vehicle.call("action.land()", vehicle.action.land)
+                if vehicle.wait_for(lambda: not vehicle.armed, RESCUE_RETRY_S):
+                    result.known_to_be_down = True
+                    note("note", "landed and disarmed")
+                    return
+            except LinkError as error:
+                # The link may recover.
+                note("note", f"{error}: trying to land")
+                answered = False
+                retry_us = stopwatch.time_us() + int(RESCUE_RETRY_S * US_PER_S)
+                stopwatch.sleep_until(retry_us)
+    finally:
+        if not result.known_to_be_down:
+            note("note", "NOT known to be down: take over")

@@ -17,7 +17,7 @@ from airl_mav.addons.conformance.checklist import (
     require,
 )
 from airl_mav.addons.conformance.ground_checks import TEXT_S, require_answer
-from airl_mav.addons.conformance.steps import STOP_BODY, STOP_NED, StepSetpoint
+from airl_mav.addons.conformance.telemetry import STOP_BODY, STOP_NED, StepSetpoint
 from airl_mav.addons.conformance.vehicle import (
     IGNORE_ALL,
     MODE_S,

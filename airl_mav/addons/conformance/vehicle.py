@@ -28,8 +28,7 @@ from airl_mav.addons.conformance.checklist import (
     Transcript,
     command_long,
 )
-from airl_mav.addons.conformance.steps import StepSetpoint
-from airl_mav.addons.conformance.telemetry import AUTOPILOT_COMPONENT, TelemetryBuffer
+from airl_mav.addons.conformance.telemetry import AUTOPILOT_COMPONENT, StepSetpoint, TelemetryBuffer
 from airl_mav.core.clock import NS_PER_US, WallClock
 from airl_mav.core.constants import MS_PER_S, US_PER_S
 from airl_mav.core.errors import FieldError

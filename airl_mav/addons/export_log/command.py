@@ -11,11 +11,10 @@ from rich.console import Console
 from airl_mav.addons.export_log.files import Format, flight_of, write_flight
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.shared_options import TrustArenas, folder_of
-from airl_mav.core.console import new_console
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.core.progress import RichProgress
+from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.replay.replayed_flight import ReplayedRun
 from airl_mav.report.run_arenas import trust_arenas

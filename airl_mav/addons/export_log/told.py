@@ -52,7 +52,7 @@ from airl_mav.flight.quality import commanded_velocity
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT
-from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.projections import CameraKind
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.recorded_flight import NAVIGATING
 from airl_mav.report.replay.replayed_flight import STANDING_M

@@ -11,12 +11,11 @@ from rich.console import Console
 
 from airl_mav.addons.fault_matrix import matrix as fault_matrix
 from airl_mav.core.clock import utc_now
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_NOT_MET, FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import replace_file
-from airl_mav.core.progress import RichProgress
-from airl_mav.core.provenance import provenance, usable_cores
+from airl_mav.core.machine import provenance, usable_cores
+from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.faults.fault import Fault
 from airl_mav.faults.kinds import CASES, LINKS, MATRIX_PHASES, PROCESSES, Phase
 from airl_mav.profiles.vehicle import load_vehicle

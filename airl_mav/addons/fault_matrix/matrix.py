@@ -24,13 +24,13 @@ from airl_mav.faults.fault import Fault
 from airl_mav.faults.kinds import CASE_OF, MATRIX_PHASES, Case, End, Phase
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
+from firmware_sim.addons.missions.items import NavCommand, PlanFrame
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Result, Setpoint
 from firmware_sim.autopilot.commander import FlightPhase as Commander
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.navigation.plan import MissionType, NavCommand, PlanFrame, PlanItem
-from firmware_sim.crash_detector import TOUCHDOWN_M_S
-from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
+from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem
+from firmware_sim.simulation import TOUCHDOWN_M_S, EpisodeSetup, Simulation, builtin_autopilot
 
 AFTER_S = 0.5
 """Time from the start of the phase to the fault [s]."""

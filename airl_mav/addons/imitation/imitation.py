@@ -26,18 +26,24 @@ from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
 from torch.nn import functional
 
 from airl_mav.addons.imitation.planner import Planner
-from airl_mav.arena.gates import Openings, openings_of
 from airl_mav.arena.geometry import Arena
+from airl_mav.arena.walls import Openings, openings_of
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import ned_to_heading, quats_to_euler
 from airl_mav.envs import sb3
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.saved_state import State
 from airl_mav.envs.sb3 import NavigationVecEnv
-from airl_mav.policy.action_sets import VELOCITIES, VERTICAL, ActionSpec, commands, discrete_actions
-from airl_mav.policy.actions import fastest_climb
-from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
+from airl_mav.policy.actions import (
+    VELOCITIES,
+    VERTICAL,
+    ActionSpec,
+    commands,
+    discrete_actions,
+    fastest_climb,
+)
 from airl_mav.policy.observation_spec import Encoded
+from airl_mav.policy.registry import GreedyPolicy, GreedySettings
 from airl_mav.training.config import ExpertName
 from airl_mav.training.dqn import Ring, Shapes, shapes_of
 

@@ -10,7 +10,7 @@ Guide: docs/how-to/profile.md.
 COMMANDS = {
     "profile": (
         "measure how long this computer takes for a policy's decisions",
-        "airl_mav.addons.profiling.command",
+        "airl_mav.addons.profiling.profile",
     )
 }
 

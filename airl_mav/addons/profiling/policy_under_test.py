@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.addons.profiling.measurement import Recording
-from airl_mav.addons.profiling.request import ProfileRequest
+from airl_mav.addons.profiling.measurement import ProfileRequest, Recording
 from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import WallClock, processor_time_us
@@ -26,11 +25,11 @@ from airl_mav.core.progress import Bar
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.policy.actions import flyable
 from airl_mav.policy.card import PolicyCard, PolicyFacts, vehicle_mismatch
+from airl_mav.policy.card_writing import write_template
 from airl_mav.policy.learned import LearnedPolicy, open_network
 from airl_mav.policy.observation import Kinematics, encode
 from airl_mav.policy.observation_spec import ObservationSpec, SeenCamera, camera_mismatch
 from airl_mav.policy.registry import find_policy
-from airl_mav.policy.template import write_template
 from airl_mav.profiles.computer import Network
 from airl_mav.profiles.loading import list_profiles
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle

@@ -1,4 +1,4 @@
-"""Measurement of this computer's decision latency for a policy."""
+"""`airl profile`: measure this computer's decision latency for a policy."""
 
 from __future__ import annotations
 
@@ -6,20 +6,30 @@ import re
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field, field_validator
+from rich.console import Console
 
 from airl_mav.addons.profiling import measurement
+from airl_mav.addons.profiling.measurement import ProfileRequest, ProfilingError, share
 from airl_mav.addons.profiling.policy_under_test import BareLoop, PolicyUnderTest, open_policy
-from airl_mav.addons.profiling.request import ProfileRequest
+from airl_mav.addons.profiling.report import print_measurement
 from airl_mav.addons.profiling.soak import MachineReading, Soak, soak
+from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.machine import MachineState, machine_state, mean_frequency_mhz, temperature_c
-from airl_mav.core.power_meter import PowerMeter, PowerSampling, PowerSource, find_power_source
-from airl_mav.core.progress import Bar, Progress
-from airl_mav.core.provenance import describe_machine
+from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
+from airl_mav.core.machine import (
+    MachineState,
+    describe_machine,
+    machine_state,
+    mean_frequency_mhz,
+    temperature_c,
+)
+from airl_mav.core.progress import Bar, Progress, RichProgress, new_console
+from airl_mav.core.resource_use import PowerMeter, PowerSampling, PowerSource, find_power_source
 from airl_mav.profiles.computer import (
     LONGEST_MS,
     ComputerProfile,
@@ -241,3 +251,64 @@ def _file_name(cpu: str) -> str:
     """Return a processor's name as a file name."""
     plain = re.sub(r"\((?:r|tm|c)\)", "", cpu.lower())
     return re.sub(r"[^a-z0-9]+", "-", plain).strip("-")[:48].strip("-") or "computer"
+
+
+class ProfileOptions(ProfileRequest):
+    """Measure this computer's latency for a policy's decisions, and write a computer profile.
+
+    The options --computer and --workload replay the written samples at every level of fidelity.
+
+    Examples:
+        airl profile --on my-pi --watts 6.4
+        airl profile --network 5x32
+        airl profile --soak 10min --share my-pi.toml
+        airl profile static-obstacles --level sitl
+        airl profile --level hil --connect udpin://0.0.0.0:14540 --camera tcp://192.168.1.10:5600
+    """
+
+    policy: Annotated[str | None, POSITIONAL] = Field(
+        default=None, description=ProfileRequest.model_fields["policy"].description
+    )
+    out: Path = Field(
+        default=Path("computers"), description="folder of the profile and its samples"
+    )
+    share: Path | None = Field(
+        default=None,
+        description="also write one file (.toml) to be passed on, which another machine flies with"
+        " --computer FILE: samples, state of the machine, soak, versions, digest",
+    )
+
+    @field_validator("share")
+    @classmethod
+    def _toml(cls, share: Path | None) -> Path | None:
+        if share is not None and share.suffix != ".toml":
+            raise FieldError("share", f"{share}", "a file whose name ends in .toml")
+        return share
+
+
+OPTIONS = ProfileOptions
+
+
+def run(options: ProfileOptions, console: Console | None = None) -> int:
+    """Measure, print the report, and write the profile unless it failed; return 0, 1 or 130."""
+    console = console or new_console()
+    if options.level == "sitl":
+        check_installed("sim")
+    if options.network is not None:
+        check_installed("profile")
+    request = ProfileRequest.model_validate(options.model_dump(exclude={"out", "share"}))
+    with RichProgress(console) as progress:
+        try:
+            measured = profile(request, out=options.out, progress=progress)
+        except ProfilingError as error:
+            progress.note(f"error: {error}; nothing was written", "red")
+            return EXIT_BROKEN
+        except KeyboardInterrupt:
+            progress.note(
+                "interrupted: nothing was written; the same command starts over", "yellow"
+            )
+            return EXIT_INTERRUPTED
+    if options.share is not None:
+        measured = replace(measured, files=(*measured.files, share(measured, options.share)))
+    print_measurement(measured, console)
+    return EXIT_INTERRUPTED if measured.soak is not None and measured.soak.interrupted else 0

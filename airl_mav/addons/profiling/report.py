@@ -10,14 +10,15 @@ from rich.console import Console
 from airl_mav.addons.profiling.measurement import ROUND_TRIP, T1_UNCERTAINTY, ComputerMeasurement
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.machine import NOT_OFFERED
-from airl_mav.latency.percentiles import (
+from airl_mav.latency.stages import (
     MIN_SAMPLES,
+    SHOWN_STAGES,
+    Samples,
     autocorrelation,
     corrected,
     integrated_time,
     summarize,
 )
-from airl_mav.latency.stages import SHOWN_STAGES, Samples
 from airl_mav.policy.card import PolicyCard
 from airl_mav.profiles.computer import load_computer
 from airl_mav.report.table import TOO_FEW_CELL, Column, TableView, print_table

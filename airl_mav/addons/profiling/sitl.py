@@ -9,9 +9,14 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from airl_mav.addons.profiling.measurement import ProfilingError, Recording, Stamps
+from airl_mav.addons.profiling.measurement import (
+    FLOWN_SPEED_M_S,
+    ProfileRequest,
+    ProfilingError,
+    Recording,
+    Stamps,
+)
 from airl_mav.addons.profiling.policy_under_test import PolicyUnderTest, cold_start
-from airl_mav.addons.profiling.request import FLOWN_SPEED_M_S, ProfileRequest
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.progress import Bar, Progress
 from airl_mav.latency.stamps import STAMPS
@@ -21,8 +26,7 @@ from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RunFolder, load
 from airl_mav.rehearsal.signals import terminated_as_interrupted
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.resolve import ResolvedScenario, resolve
 
 LONGEST_FLIGHT_S = 300.0
 """Maximum flight time: well within a battery, and at walking pace far from every wall."""

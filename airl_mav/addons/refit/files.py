@@ -11,10 +11,9 @@ from typing import Any
 
 import tomli_w
 
-from airl_mav.addons.refit.air import Air
-from airl_mav.addons.refit.quantity import FittedQuantity
+from airl_mav.addons.refit.air import Air, Thrust
+from airl_mav.addons.refit.flown import FittedQuantity
 from airl_mav.addons.refit.response import ResponseFit
-from airl_mav.addons.refit.thrust import Thrust
 from airl_mav.black_box.mcap_file import BlackBox
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated

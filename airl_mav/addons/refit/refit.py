@@ -13,25 +13,30 @@ from numpy.typing import NDArray
 from scipy.stats import bootstrap
 
 from airl_mav.addons.refit import files
-from airl_mav.addons.refit.air import WIND, Air, fit_air
+from airl_mav.addons.refit.air import WIND, Air, Known, Thrust, fit_air, fit_thrust, thrust_of
 from airl_mav.addons.refit.files import overrides_of, refitted, vehicle_toml, write_refit
-from airl_mav.addons.refit.flown import Flown, flown_by_log, flown_of
-from airl_mav.addons.refit.quantity import LEVEL, RESAMPLES, Array, FittedQuantity
+from airl_mav.addons.refit.flown import (
+    LEVEL,
+    RESAMPLES,
+    Array,
+    FittedQuantity,
+    Flown,
+    flown_by_log,
+    flown_of,
+)
 from airl_mav.addons.refit.response import TIMES, ResponseFit, fit_response
-from airl_mav.addons.refit.thrust import Known, Thrust, fit_thrust, thrust_of
 from airl_mav.black_box.mcap_file import BlackBox, read_black_box
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.provenance import package_versions
+from airl_mav.core.machine import package_versions
 from airl_mav.flight.statistics import QUANTILE
-from airl_mav.latency.percentiles import integrated_time
+from airl_mav.latency.stages import integrated_time
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.computer import ComputerProfile, load_computer
 from airl_mav.profiles.conditions import Payload, loaded
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.report.recorded_flight import stamps_of
-from airl_mav.vehicle_log.clock_alignment import ClockAlignment
-from airl_mav.vehicle_log.ulog_reader import read_vehicle_log
+from airl_mav.vehicle_log import ClockAlignment, read_vehicle_log
 
 LEAST = 5
 """Minimum decisions for the interval of a mean."""

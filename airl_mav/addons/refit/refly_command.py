@@ -12,9 +12,9 @@ from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.core.clock import utc_now
-from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.progress import new_console
 from airl_mav.report.comparison.runs import compare_folders
 from airl_mav.report.comparison.show import show_comparison
 from airl_mav.report.table import NONE, TableView, columns_of, print_table

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from airl_mav.addons.refit.flown import Flown, seconds
-from airl_mav.addons.refit.quantity import Array, FittedQuantity, block_intervals
+from airl_mav.addons.refit.flown import Array, FittedQuantity, Flown, block_intervals, seconds
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.frames import quats_to_euler
 from airl_mav.flight.statistics import QUANTILE

@@ -1,4 +1,11 @@
-"""Camera pictures for display: stills, and films of recorded flights."""
+"""Camera pictures for display, films of recorded flights, and ground truth of pixels.
+
+Optical flow is the image velocity of the point that each pixel shows, in closed form. A point p in
+the camera's axes moves by p' = R^T (v_point - v_camera) - w x p, where R are these axes, and w is
+their angular velocity. Its image moves by the derivative of the projection along p'
+(Longuet-Higgins and Prazdny, "The interpretation of a moving retinal image", 1980). Infinitely
+distant points move by the rotation only.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from matplotlib import colormaps
@@ -16,14 +23,20 @@ from PIL import Image
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera import primitives
+from airl_mav.camera.exposure import expose
 from airl_mav.camera.frame import depth_to_z16
-from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import antialiased, grey, render_picture
-from airl_mav.camera.render import camera_pose
-from airl_mav.core.constants import US_PER_MS
+from airl_mav.camera.imaging import ImageFormation
+from airl_mav.camera.intrinsics import Intrinsics, rays_of
+from airl_mav.camera.picture import Picture, antialiased, grey, render_picture
+from airl_mav.camera.primitives import OBSTACLE
+from airl_mav.camera.render import Motion, Mount, camera_pose
+from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
+from airl_mav.core.frames import quat_to_matrix
 from airl_mav.flight.trajectory import pose_at
+from airl_mav.profiles.camera import Camera
+from airl_mav.profiles.projections import distorted, steepness
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.replay.replayed_flight import ReplayedFlight
 from airl_mav.report.theme import coloured
@@ -167,3 +180,216 @@ def _video(pictures: Iterator[Pixels], each_ms: int) -> tuple[bytes, int]:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format=kind)))
         container.mux(stream.encode())
     return written.getvalue(), count
+
+
+TURNED_OVER_US = 20_000
+"""Half-width of the difference for angular rates of a recorded flight [µs]."""
+
+
+class TakingCamera:
+    """Camera with one ray per pixel, and image formation if its profile has `imaging`."""
+
+    def __init__(self, camera: Camera, name: str = "") -> None:
+        """Prepare a profile's camera at its mount; `name` identifies an additional camera."""
+        self._camera, self._intrinsics = camera, Intrinsics.of(camera)
+        self._forming = None if camera.imaging is None else ImageFormation(camera, name)
+        self._mount = Mount.of(camera)
+
+    def __call__(self, arena: Arena, elapsed_us: int, motion: Motion, seed: int) -> Pixels:
+        """Return a picture (h, w, 3), grey (h, w) or coloured depth, at a time of the episode."""
+        image: NDArray[Any]
+        if self._forming is not None:
+            frame = elapsed_us // self._camera.period_us
+            image = self._forming.take(arena, elapsed_us, motion, seed, frame).image
+        else:
+            at, attitude = camera_pose(motion.position, motion.quaternion, self._mount)
+            range_m, centers = self._camera.range_m, arena.centers_at(elapsed_us)
+            image = expose(arena, centers, self._intrinsics, range_m, at, attitude)
+        if self._camera.kind == "depth":
+            return coloured(image, self._camera.range_m)
+        return image if self._camera.kind == "rgb" else image[..., 0]
+
+
+def taken_film(
+    flight: ReplayedFlight, camera: TakingCamera, moments: Iterable[int]
+) -> Iterator[Pixels]:
+    """Yield a camera's pictures along a recorded flight; raise UsageError without its arena."""
+    if flight.arena is None:
+        raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
+    for time_us in moments:
+        motion = recorded_motion(flight, time_us)
+        elapsed_us = time_us - flight.record.started_us
+        yield camera(flight.arena, elapsed_us, motion, flight.record.seed)
+
+
+def recorded_motion(flight: ReplayedFlight, time_us: int) -> Motion:
+    """Return the motion of a recorded flight's vehicle at a time [µs]."""
+    position, velocity, quaternion = pose_at(flight.path, time_us)
+    return Motion(position, quaternion, velocity, _rates(flight, time_us))
+
+
+def _rates(flight: ReplayedFlight, time_us: int) -> NDArray[np.float64]:
+    """Return the angular velocity FRD (3,) [rad/s] of a recorded flight from its attitudes."""
+    *_, before = pose_at(flight.path, time_us - TURNED_OVER_US)
+    *_, after = pose_at(flight.path, time_us + TURNED_OVER_US)
+    turn = quat_to_matrix(before).T @ quat_to_matrix(after)
+    # For a small rotation, the skew part of its matrix is the rotation vector.
+    skew = 0.5 * np.array(
+        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+    )
+    rates: NDArray[np.float64] = skew * (US_PER_S / (2.0 * TURNED_OVER_US))
+    return rates
+
+
+ARRAY: Final = ".npy"
+"""Suffix of numpy arrays."""
+
+TRUTHS: Final = tuple(name for name in get_args(Shown) if name not in ("rgb", "grey"))
+"""Kinds of pictures other than colour and grey."""
+
+
+def truth_of(
+    show: Shown, arena: Arena, elapsed_us: int, camera: Intrinsics, motion: CameraMotion
+) -> NDArray[Any]:
+    """Return the ground truth of each pixel at a time after the episode's start [µs].
+
+    `depth` is float32 (h, w) [m] in the camera's projection, without a range limit; 0 = no surface.
+    `segmentation` is int32 (h, w): 0 sky, 1 floor, 2 wall across north, 3 wall across east, 4 + i
+    obstacle i. `flow` is float32 (h, w, 2), columns and rows per second [px/s]; NaN outside a
+    fisheye's image.
+    """
+    centers = arena.centers_at(elapsed_us)
+    picture = render_picture(arena, centers, camera, motion.position, motion.quaternion)
+    if show == "depth":
+        return picture.depth_m
+    if show == "segmentation":
+        return picture.seen
+    return optical_flow(picture, camera, motion, velocities_of(arena, elapsed_us))
+
+
+def truth_film(
+    show: Shown, flight: ReplayedFlight, camera: Intrinsics, moments: Iterable[int]
+) -> Iterator[NDArray[Any]]:
+    """Yield `truth_of` along a recorded flight for a camera at the vehicle's camera mount."""
+    if flight.arena is None:
+        raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
+    mount = PolicyCamera.of(flight.vehicle.camera).mount
+    for time_us in moments:
+        vehicle: Motion = recorded_motion(flight, time_us)
+        motion = motion_of_camera(vehicle, mount)
+        elapsed_us = time_us - flight.record.started_us
+        yield truth_of(show, flight.arena, elapsed_us, camera, motion)
+
+
+def coloured_flow(flow: NDArray[np.float32]) -> Pixels:
+    """Return flow (h, w, 2) as a picture: hue = direction, saturation = speed.
+
+    Red moves right, then clockwise. Saturation is full at the 99th percentile.
+    """
+    across, down = np.nan_to_num(flow[..., 0]), np.nan_to_num(flow[..., 1])
+    speed = np.hypot(across, down)
+    most = max(float(np.quantile(speed, 0.99)), 1e-6)
+    share = np.minimum(speed / most, 1.0)
+    turns = np.arctan2(down, across) / (2.0 * np.pi)
+    # In the colour wheel, each channel fades with the angle from its hue.
+    angle = np.stack([turns, turns - 1.0 / 3.0, turns - 2.0 / 3.0], axis=-1) % 1.0
+    wheel = np.clip(2.0 - 6.0 * np.minimum(angle, 1.0 - angle), 0.0, 1.0)
+    colours = 255.0 * (1.0 - share[..., None] * (1.0 - wheel))
+    colours[np.isnan(flow[..., 0])] = 0.0
+    pixels: Pixels = np.rint(colours).astype(np.uint8)
+    return pixels
+
+
+def write_array(path: Path, array: NDArray[Any]) -> None:
+    """Write an array in numpy's format. Raises OSError."""
+    written = io.BytesIO()
+    np.save(written, array)
+    replace_file(path, written.getvalue())
+
+
+Floats = NDArray[np.float64]
+
+MOVED_OVER_US = 1_000
+"""Half interval of the central difference for velocities of moving obstacles [µs]."""
+
+# Distance from the optical axis below which 1 / z replaces theta_d / aside.
+_ON_AXIS = 1e-9
+
+
+class CameraMotion(NamedTuple):
+    """Pose and velocity of a camera."""
+
+    position: Floats
+    """(3,) NED [m]."""
+    quaternion: Floats
+    """(4,) camera -> NED; its x axis is the optical axis."""
+    velocity: Floats
+    """(3,) NED [m/s]."""
+    rates: Floats
+    """(3,) angular velocity about the camera's axes forward, right, down [rad/s]."""
+
+
+def motion_of_camera(vehicle: Motion, mount: Mount) -> CameraMotion:
+    """Return the motion of a camera mounted on a vehicle."""
+    at, attitude = camera_pose(vehicle.position, vehicle.quaternion, mount)
+    body = quat_to_matrix(vehicle.quaternion)
+    lever = np.cross(vehicle.rates, np.array(mount.offset))
+    axes = quat_to_matrix(np.array(attitude))
+    rates = axes.T @ body @ vehicle.rates
+    return CameraMotion(np.array(at), np.array(attitude), vehicle.velocity + body @ lever, rates)
+
+
+def velocities_of(arena: Arena, elapsed_us: int) -> Floats:
+    """Return the velocities (n, 3) NED [m/s] of all obstacles, `elapsed_us` after the start."""
+    before, after = (
+        arena.centers_at(elapsed_us + step) for step in (-MOVED_OVER_US, MOVED_OVER_US)
+    )
+    found: Floats = (after - before) * (US_PER_S / (2.0 * MOVED_OVER_US))
+    return found
+
+
+def optical_flow(
+    picture: Picture, camera: Intrinsics, motion: CameraMotion, velocities: Floats
+) -> NDArray[np.float32]:
+    """Return the flow (h, w, 2) of a picture [px/s]; NaN outside a fisheye's field of view."""
+    rays = rays_of(camera)
+    axes = quat_to_matrix(motion.quaternion)
+    depth = picture.depth_m.astype(np.float64)
+    # Depth 0 is infinitely distant. Such points only turn, for which any depth will do.
+    far = depth <= 0.0
+    points = rays * np.where(far, 1.0, depth)
+    number = picture.seen - OBSTACLE
+    moves = np.zeros((*depth.shape, 3))
+    if len(velocities):
+        # Only obstacles move; room and sky have numbers below OBSTACLE.
+        moves = np.where((number >= 0)[..., None], velocities[np.maximum(number, 0)], 0.0)
+    apart = (moves - motion.velocity) @ axes
+    apart[far] = 0.0
+    turning = np.cross(motion.rates, np.moveaxis(points, 0, -1))
+    flow = np.stack(_pushed(camera, points, np.moveaxis(apart - turning, -1, 0)), axis=-1)
+    flow[~rays.any(axis=0)] = np.nan
+    return flow.astype(np.float32)
+
+
+def _pushed(camera: Intrinsics, points: Floats, moves: Floats) -> tuple[Any, Any]:
+    """Return the image velocity [px/s] of points (3, h, w) with velocities `moves` (3, h, w)."""
+    (z, x, y), (dz, dx, dy), f = points, moves, camera.focal
+    # On the optical axis `aside` is 0; `np.where` selects the limit there.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if camera.projection == "pinhole":
+            return f * (dx - x / z * dz) / z, f * (dy - y / z * dz) / z
+        if camera.cylindrical:
+            # Derivatives of focal * atan2(x, z) and focal * y / hypot(x, z).
+            square = x * x + z * z
+            away = np.sqrt(square)
+            receding = (x * dx + z * dz) / square
+            return f * (z * dx - x * dz) / square, f * (dy - y * receding) / away
+        aside = np.hypot(x, y)
+        off = np.arctan2(aside, z)
+        growing = (x * dx + y * dy) / aside
+        # Columns and rows are f c x and f c y, with c = theta_d / aside: 1 / z on the axis.
+        share = np.where(aside > _ON_AXIS, distorted(off, camera.distortion) / aside, 1.0 / z)
+        opening = (z * growing - aside * dz) / (aside * aside + z * z)
+        opening = steepness(off, camera.distortion) * opening
+        changing = np.where(aside > _ON_AXIS, (opening - share * growing) / aside, -dz / (z * z))
+        return f * (changing * x + share * dx), f * (changing * y + share * dy)

@@ -12,25 +12,29 @@ import numpy as np
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.addons.render import camera_pictures, ground_truth
+from airl_mav.addons.render import camera_pictures
+from airl_mav.addons.render.camera_pictures import CameraMotion
 from airl_mav.arena.generate import generate
 from airl_mav.black_box.messages import SUFFIX
-from airl_mav.camera.flow import CameraMotion
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.shared_options import folder_of
-from airl_mav.core.console import new_console
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.frames import quat_from_euler
-from airl_mav.core.progress import RichProgress
+from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import Coefficients
-from airl_mav.profiles.camera_kind import Projection, Renderer, check_fov
-from airl_mav.profiles.distortion import UNDISTORTED, check_distortion
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import (
+    UNDISTORTED,
+    Projection,
+    Renderer,
+    check_distortion,
+    check_fov,
+)
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.replay.replayed_flight import ReplayedRun
@@ -204,14 +208,14 @@ def _check(options: RenderOptions, filmed: bool) -> None:
         if value != RenderOptions.model_fields[name].default:
             subject = "a flight" if filmed else "an arena"
             raise FieldError(name, value, problem=f"not for the picture of {subject}")
-    suffixes = (*(camera_pictures.FILMS if filmed else (".png",)), ground_truth.ARRAY)
+    suffixes = (*(camera_pictures.FILMS if filmed else (".png",)), camera_pictures.ARRAY)
     if options.out is not None and options.out.suffix.lower() not in suffixes:
         names = " or ".join(", ".join(suffixes).rsplit(", ", 1))
         raise FieldError("out", f"{options.out}", f"a file name that ends in {names}")
-    numbers = options.out is not None and options.out.suffix.lower() == ground_truth.ARRAY
-    if numbers and (options.camera is not None or options.show not in ground_truth.TRUTHS):
-        accepted = " or ".join(", ".join(ground_truth.TRUTHS).rsplit(", ", 1))
-        accepted += f" in a file {ground_truth.ARRAY}, without --camera"
+    numbers = options.out is not None and options.out.suffix.lower() == camera_pictures.ARRAY
+    if numbers and (options.camera is not None or options.show not in camera_pictures.TRUTHS):
+        accepted = " or ".join(", ".join(camera_pictures.TRUTHS).rsplit(", ", 1))
+        accepted += f" in a file {camera_pictures.ARRAY}, without --camera"
         raise FieldError("show", options.show, accepted)
     for name in _not_asked_for(options):
         value = getattr(options, name)
@@ -235,20 +239,20 @@ def _not_asked_for(options: RenderOptions) -> tuple[str, ...]:
     return OF_A_VEHICLE[-1:] if options.show == "flow" else OF_A_VEHICLE
 
 
-def _taking(vehicle: str, name: str | None) -> ground_truth.TakingCamera:
+def _taking(vehicle: str, name: str | None) -> camera_pictures.TakingCamera:
     """Return a camera of a vehicle profile, the main one or an additional one by name."""
     profile = load_vehicle(vehicle)
     if name is None:
-        return ground_truth.TakingCamera(profile.camera)
+        return camera_pictures.TakingCamera(profile.camera)
     if name not in profile.cameras:
         known = ", ".join(profile.cameras) or f"none: vehicle {vehicle} has its main camera alone"
         raise FieldError("camera_name", name, known)
-    return ground_truth.TakingCamera(profile.cameras[name], name)
+    return camera_pictures.TakingCamera(profile.cameras[name], name)
 
 
 def _is_truth(options: RenderOptions, out: Path) -> bool:
     """Return True for ground truth as numbers, or as a drawing of optical flow."""
-    return options.show == "flow" or out.suffix.lower() == ground_truth.ARRAY
+    return options.show == "flow" or out.suffix.lower() == camera_pictures.ARRAY
 
 
 def _camera(options: RenderOptions, size: tuple[int, int]) -> Intrinsics:
@@ -297,11 +301,11 @@ def _picture(options: RenderOptions, out: Path) -> str:
     camera = _camera(options, STILL_PX)
     if _is_truth(options, out):
         moves = CameraMotion(position, attitude, velocity, rates)
-        truth = ground_truth.truth_of(options.show, arena, elapsed_us, camera, moves)
-        if out.suffix.lower() == ground_truth.ARRAY:
-            ground_truth.write_array(out, truth)
+        truth = camera_pictures.truth_of(options.show, arena, elapsed_us, camera, moves)
+        if out.suffix.lower() == camera_pictures.ARRAY:
+            camera_pictures.write_array(out, truth)
             return options.show
-        camera_pictures.write_png(out, ground_truth.coloured_flow(truth))
+        camera_pictures.write_png(out, camera_pictures.coloured_flow(truth))
         return "picture"
     drawn = _drawn(options, options.samples or SAMPLES[options.renderer])
     camera_pictures.write_png(out, drawn(arena, centers, camera, position, attitude))
@@ -329,15 +333,15 @@ def _film(options: RenderOptions, path: Path, out: Path, console: Console) -> st
 
         pictures: Iterator[camera_pictures.Pixels]
         if _is_truth(options, out):
-            truths = ground_truth.truth_film(options.show, flight, camera, told())
-            if out.suffix.lower() == ground_truth.ARRAY:
+            truths = camera_pictures.truth_film(options.show, flight, camera, told())
+            if out.suffix.lower() == camera_pictures.ARRAY:
                 stack = np.stack(list(truths))
-                ground_truth.write_array(out, stack)
+                camera_pictures.write_array(out, stack)
                 return f"{options.show} of flight {record.index}, {len(stack)} pictures"
-            pictures = map(ground_truth.coloured_flow, truths)
+            pictures = map(camera_pictures.coloured_flow, truths)
         elif taking is None:
             pictures = camera_pictures.film(flight, camera, drawn, told())
         else:
-            pictures = ground_truth.taken_film(flight, taking, told())
+            pictures = camera_pictures.taken_film(flight, taking, told())
         count = camera_pictures.write_film(out, pictures, options.rate_hz)
     return f"film of flight {record.index}, {count} pictures"

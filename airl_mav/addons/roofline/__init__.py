@@ -9,6 +9,6 @@ Guide: docs/how-to/roofline.md.
 COMMANDS = {
     "roofline": (
         "safe velocity against reaction time: which computer, and what binds it",
-        "airl_mav.addons.roofline.command",
+        "airl_mav.addons.roofline.roofline",
     )
 }

@@ -31,7 +31,7 @@ from airl_mav.envs.stopping import (
 from airl_mav.flight.energy import level_powers_w
 from airl_mav.latency.injection import Injection, longest_ms
 from airl_mav.latency.stages import f1_knee_hz, f1_velocity, max_acceleration
-from airl_mav.policy.action_sets import commands
+from airl_mav.policy.actions import commands
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import InFlight, Kinematics, observe

@@ -1,4 +1,4 @@
-"""Roofline: maximum safe speed against reaction rate, with the points of computers."""
+"""`airl roofline`: maximum safe speed against reaction rate, with the points of computers."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from pydantic import Field
+from rich.console import Console
 
 from airl_mav.addons.roofline.page import roofline_document
 from airl_mav.addons.roofline.points import (
@@ -23,7 +24,8 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.files import write_json
-from airl_mav.core.provenance import provenance
+from airl_mav.core.machine import provenance
+from airl_mav.core.progress import new_console
 from airl_mav.envs.stopping import DecisionLoop, StoppingTask
 from airl_mav.experiments.gap import DEFAULT_WORKLOAD
 from airl_mav.latency.injection import ESTIMATE, Injection, choose_injection
@@ -33,7 +35,7 @@ from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.profiles.computer import ComputerProfile, load_computer
 from airl_mav.profiles.conditions import Payload, loaded
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from airl_mav.report.document import Document, write_document
+from airl_mav.report.document import Document, print_document, print_place, write_document
 from airl_mav.scenario import model
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, VehicleName
 
@@ -234,3 +236,35 @@ def _measured(computer: ComputerProfile, workload: str, policy: PolicyInfo) -> I
     except UsageError:
         known = ", ".join(computer.workloads) or "none"
         return f"no workload {workload} measured (measured: {known})"
+
+
+class RooflineOptions(RooflineRequest):
+    """The F-1 roofline: safe velocity against reaction time, for a vehicle and its computers.
+
+    The vehicle carries and powers each computer. The results show the closed-form limit, the limit
+    from the vehicle's measured braking, and the flown speed.
+
+    Examples:
+        airl roofline
+        airl roofline --policy static-obstacles-ras-pi-4 --sensing-distance-m 8
+        airl roofline --policy MINE --computers my-pi.toml my-jetson.toml --workload policy
+    """
+
+    out: Path | None = Field(
+        default=None,
+        description="folder of roofline.json, roofline.html and roofline.png; by default"
+        " runs/<UTC time>-roofline-<vehicle>",
+    )
+
+
+OPTIONS = RooflineOptions
+
+
+def run(options: RooflineOptions, console: Console | None = None) -> int:
+    """Compute, fly and show the roofline; return 0. Raises UsageError as `roofline` does."""
+    asked = {name: getattr(options, name) for name in RooflineRequest.model_fields}
+    result = roofline(RooflineRequest(**asked), out=options.out)
+    console = console or new_console()
+    print_document(result.document, console)
+    print_place(result.document.name, result.page, console)
+    return 0

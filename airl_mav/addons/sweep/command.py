@@ -33,11 +33,10 @@ from airl_mav.addons.sweep.summary import (
 )
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.core.clock import WallClock
-from airl_mav.core.console import new_console
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
 from airl_mav.core.fields import optional, quantity, switch, validated
-from airl_mav.core.progress import Bar, Progress, RichProgress
+from airl_mav.core.progress import Bar, Progress, RichProgress, new_console
 from airl_mav.experiments.campaign import open_campaign
 from airl_mav.experiments.executors import (
     Executor,

@@ -14,10 +14,10 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import Each, ProfileModel, quantity
 from airl_mav.envs.evaluation import OUTCOMES, EpisodeResult, mean_of_successes
 from airl_mav.flight.judge import Outcome
+from airl_mav.policy.card_writing import NetworkSize, template_size
 from airl_mav.policy.runtime import outputs_of
-from airl_mav.policy.template import NetworkSize, template_size
-from airl_mav.profiles.camera_kind import CHANNELS
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projections import CHANNELS
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.training.config import SELECTION_SEED, NetworkSpec, TrainingConfig
 

@@ -12,8 +12,7 @@ from airl_mav.core.files import read_typed, write_json
 from airl_mav.flight.episode_record import Setup
 from airl_mav.flight.paired import PairedComparison
 from airl_mav.flight.statistics import Aggregate
-from airl_mav.latency.percentiles import Summary
-from airl_mav.latency.stages import SETPOINT_TO_MOTOR, Stage
+from airl_mav.latency.stages import SETPOINT_TO_MOTOR, Stage, Summary
 from airl_mav.profiles.published import PublishedGap, PublishedRun
 
 T = TypeVar("T")

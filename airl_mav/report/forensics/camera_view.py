@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Obstacles, PlacedMesh, Shape
 from airl_mav.arena.ground import Ground
-from airl_mav.camera.colour import RANGE_M
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.picture import RANGE_M
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.control.loops import heading_of
 from airl_mav.flight.trajectory import Trajectory, pose_at

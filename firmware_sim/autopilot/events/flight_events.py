@@ -10,7 +10,6 @@ from __future__ import annotations
 from functools import partial
 
 from firmware_sim.autopilot.events.definition import (
-    Definition,
     Level,
     critical,
     define,
@@ -85,31 +84,10 @@ TAKEOFF_DEFAULT = define(
 TAKEOFF_ALREADY_HIGHER = error(
     "navigator_takeoff_already_higher", "Already higher than takeoff altitude (not descending)"
 )
-MISSION_EXECUTE = define("mission_execute", "Executing Mission")
-MISSION_FINISHED = define("mission_finished", "Mission finished, landed")
-MISSION_FINISHED_LOITER = define("mission_finished_loiter", "Mission finished, loitering")
-MISSION_REFUSED = define(
-    "mission_not_valid_refuse",
-    "No valid mission available, refusing takeoff",
-    level=Level.ERROR,
-    internal=Level.DISABLED,
-)
-MISSION_LOITER = define(
-    "mission_not_valid_loiter",
-    "No valid mission available, loitering",
-    level=Level.ERROR,
-    internal=Level.DISABLED,
-)
-MISSION_CLIMB = define(
-    "mission_climb_before_start", "Climb to {1:.1m_v} above home", "float mission_init_climb_alt"
-)
 RTL_RETURN_AT = define(
     "vrtl_return_at",
     "RTL: start return at {1m_v} ({2m_v} above destination)",
     "int32_t rtl_alt, int32_t rtl_alt_above_destination",
-)
-RTL_MISSION_LAND = define(
-    "rtl_mission_land_climb", "RTL Mission Land: climb to {1m_v}", "int32_t rtl_alt"
 )
 RTL_LAND = define("rtl_land_at_destination", "RTL: land at destination")
 RTL_LOITERING = define("rtl_completed_loiter", "RTL: completed, loitering")
@@ -177,53 +155,6 @@ FAILSAFE = _failsafe(
 )
 
 
-# --- rejected missions and failed transfers
-
-
-def _rejected(name: str, words: str, listed: str = "", internal: Level = Level.INFO) -> Definition:
-    return define(name, f"Mission rejected: {words}", listed, level=Level.ERROR, internal=internal)
-
-
-def _transfer(name: str, message: str, level: Level = Level.ERROR) -> Definition:
-    return define(f"mavlink_mission_{name}", message, level=level)
-
-
-NO_POSITION = define("navigator_mis_no_pos_lock", "Not yet ready for mission, no position lock")
-UNSUPPORTED_COMMAND = _rejected(
-    "navigator_mis_unsup_cmd",
-    "item {1}: unsupported command: {2}",
-    "uint16_t item, uint16_t nav_cmd",
-    internal=Level.WARNING,
-)
-STARTS_WITH_LANDING = _rejected("navigator_mis_starts_w_landing", "starts with landing")
-TAKEOFF_TOO_LOW = _rejected(
-    "navigator_mis_takeoff_too_low", "takeoff altitude too low! Minimum: {1:.1m_v}", "float minimum"
-)
-TAKEOFF_NOT_FIRST = _rejected(
-    "navigator_mis_takeoff_not_first", "takeoff is not the first waypoint item"
-)
-VTOL_ITEMS = _rejected(
-    "navigator_mis_vtol_items", "Mission contains VTOL items but vehicle is not a VTOL"
-)
-TAKEOFF_MISSING = _rejected("navigator_mis_takeoff_missing", "Takeoff waypoint required")
-LAND_MISSING = _rejected("navigator_mis_land_missing", "Landing waypoint/pattern required")
-LAND_MISSING_IN_AIR = _rejected(
-    "feasibility_mis_in_air_landing_req", "Landing waypoint/pattern required"
-)
-TAKEOFF_OR_LAND_MISSING = _rejected(
-    "navigator_mis_takeoff_or_land_missing", "Takeoff or Landing item missing"
-)
-ADD_LANDING = _rejected("navigator_mis_add_land_or_rm_to", "Add Landing item or remove Takeoff")
-ADD_TAKEOFF = _rejected("navigator_mis_add_to_or_rm_land", "Add Takeoff item or remove Landing")
-OUTSIDE_FENCE = error(
-    "navigator_mis_geofence_violation", "Geofence violation for waypoint {1}", "int16_t waypoint"
-)
-FIRST_FAR_AWAY = warning(
-    "navigator_mis_first_wp_far",
-    "First waypoint far away from Home: {1m} Correct mission loaded?",
-    "uint32_t distance",
-)
-
 FENCE_WITHOUT_HOME = define(
     "navigator_geofence_invalid_against_home",
     "Geofence invalid, doesn't contain Home position",
@@ -236,35 +167,6 @@ FENCE_WITHOUT_VEHICLE = define(
     level=Level.CRITICAL,
     internal=Level.WARNING,
 )
-
-DOWNLOAD_IGNORED = _transfer(
-    "req_ignored", "Mission download request ignored, already active", Level.WARNING
-)
-REQUEST_OF_ANOTHER = _transfer(
-    "partner_id_mismatch2", "Rejecting mission request command, component or system ID mismatch"
-)
-REQUEST_WHILE_BUSY = _transfer("mis_req_ignored_busy", "Ignoring mission request, currently busy")
-REQUEST_UNEXPECTED = _transfer("wp_unexpected", "Unexpected waypoint index, aborting transfer")
-REQUEST_BEYOND_END = _transfer(
-    "wp_unexpected2", "Unexpected waypoint index, aborting mission transfer"
-)
-ACK_OF_ANOTHER = _transfer(
-    "partner_id_mismatch", "Rejecting waypoint command, component or system ID mismatch"
-)
-COUNT_WHILE_SENDING = _transfer("ignore_mis_count", "Mission upload busy, ignoring MISSION_COUNT")
-COUNT_WHILE_RECEIVING = _transfer("getlist_busy", "Mission upload busy, already receiving waypoint")
-ITEM_OF_ANOTHER = _transfer(
-    "item_partner_id_mismatch", "Rejecting mission item, component or system ID mismatch"
-)
-ITEM_WHILE_SENDING = _transfer("mis_item_busy", "Ignoring mission item, busy")
-ITEM_WITHOUT_TRANSFER = _transfer("no_transfer", "Ignoring mission item, no transfer in progress")
-ITEM_INVALID = _transfer("mis_item_invalid", "Ignoring mission item, invalid item")
-CLEAR_WHILE_BUSY = _transfer("ignore_clear", "Ignoring mission clear command, busy")
-CURRENT_WHILE_BUSY = _transfer(
-    "state_busy", "Mission manager currently busy, ignoring new waypoint index"
-)
-CURRENT_NOT_LISTED = _transfer("seq_out_of_bounds", "New mission waypoint sequence out of bounds")
-TIMED_OUT = _transfer("op_timeout", "Operation timeout, aborting transfer")
 
 
 ARM_PARAMETER = wrong(

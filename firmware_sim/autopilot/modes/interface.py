@@ -23,7 +23,7 @@ from firmware_sim.autopilot.inputs import (
     PositionYaw,
     Sticks,
 )
-from firmware_sim.autopilot.navigation.plan import STANDING, Triplet
+from firmware_sim.autopilot.navigation.plan import Missions
 from firmware_sim.autopilot.smooth_trajectory import Travel
 
 NAN: float = math.nan
@@ -62,10 +62,8 @@ class FlightContext:
     """Newest offboard setpoint by type."""
     return_place: Callable[[], PositionYaw | None] | None = None
     """Returns Return's destination, or None if it flies mission items. None = home."""
-    triplet: Triplet = STANDING
-    """Waypoints of Mission mode, and of Return if it flies mission items."""
-    mission_over: bool = False
-    """True if the mission has ended."""
+    missions: Missions = field(default_factory=Missions)
+    """Missions of Mission mode, and of Return if it flies mission items."""
     armed: bool = False
     """True if armed: a mode selected earlier is only entered."""
     standing: bool = True

@@ -1,1 +1,1 @@
-"""Navigation as in PX4's navigator: missions, geofence and rally points."""
+"""Navigation as in PX4's navigator: geofence, destination of Return, and stored plans."""

@@ -20,21 +20,18 @@ from firmware_sim.autopilot.autopilot_state import FenceStatus, OperatorText, Se
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Definition
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.navigation.flown_item import ExecutorState
 from firmware_sim.autopilot.navigation.plan import (
     MissionType,
-    NavCommand,
+    NavigationState,
     PlanItem,
     Plans,
     distance_m,
 )
 from firmware_sim.autopilot.smooth_trajectory import Axis
 
-_POLYGONS = {
-    NavCommand.FENCE_POLYGON_VERTEX_INCLUSION: True,
-    NavCommand.FENCE_POLYGON_VERTEX_EXCLUSION: False,
-}
-_CIRCLES = {NavCommand.FENCE_CIRCLE_INCLUSION: True, NavCommand.FENCE_CIRCLE_EXCLUSION: False}
+_POLYGONS = {5001: True, 5002: False}
+_CIRCLES = {5003: True, 5004: False}
+"""MAV_CMD_NAV_FENCE_* of polygon vertices and circles: True = inclusion, False = exclusion."""
 
 
 class Polygon(NamedTuple):
@@ -82,13 +79,12 @@ def areas(items: Sequence[PlanItem]) -> Iterator[Area]:
         item = items[index]
         radius_or_count = item.params[0] if math.isfinite(item.params[0]) else 0.0
         if item.command in _CIRCLES:
-            inclusion = _CIRCLES[NavCommand(item.command)]
-            yield Circle((item.x, item.y), radius_or_count, inclusion)
+            yield Circle((item.x, item.y), radius_or_count, _CIRCLES[item.command])
         elif item.command in _POLYGONS:
             count = max(1, int(radius_or_count + 0.5))
             corners = items[index : index + count]
-            inclusion = _POLYGONS[NavCommand(item.command)]
-            yield Polygon(tuple((corner.x, corner.y) for corner in corners), inclusion)
+            vertices = tuple((corner.x, corner.y) for corner in corners)
+            yield Polygon(vertices, _POLYGONS[item.command])
             index += count
             continue
         index += 1
@@ -175,7 +171,7 @@ class FenceMonitor:
         far, high = self._limits(place, home)
         return not (far or high) and all_allow(self._areas, place)
 
-    def step(self, now: ExecutorState, mode: Mode, place: Callable[[], Geodetic]) -> None:
+    def step(self, now: NavigationState, mode: Mode, place: Callable[[], Geodetic]) -> None:
         """Check the fence if due; `place` returns the position selected by GF_SOURCE."""
         if self._plans.stored(MissionType.FENCE).revision != self._revision:
             self._take(now, place)
@@ -220,7 +216,7 @@ class FenceMonitor:
         far = farthest > 0.0 and distance_m(place[:2], home[:2]) >= farthest
         return far, highest > 0.0 and place.altitude_m - home.altitude_m >= highest
 
-    def _take(self, now: ExecutorState, place: Callable[[], Geodetic]) -> None:
+    def _take(self, now: NavigationState, place: Callable[[], Geodetic]) -> None:
         """Load a new fence, without areas that home or the flying vehicle violates."""
         fence = self._plans.stored(MissionType.FENCE)
         self._revision = fence.revision

@@ -1,138 +1,20 @@
-"""Plans stored on board: mission, geofence, rally points; with jumps and distances.
+"""Plans stored on board, and the interface of missions, which the add-on `missions` implements.
 
-Source of commands, frames and limits: MAVLink common.xml and PX4 1.16 (navigation.h, dataman.h); of
-jumps: MissionBase::getNonJumpItem, getNextPositionItems.
+Source: PX4 1.16, navigation.h and dataman.h.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import Enum, IntEnum, auto
-from typing import NamedTuple
+from enum import IntEnum
+from typing import NamedTuple, Protocol
 
 from airl_mav.core.constants import EARTH_RADIUS_M
-from airl_mav.core.frames import Geodetic
+from airl_mav.core.frames import Geodetic, geodetic_to_local
 from airl_mav.vehicle.rotation import Vec
-
-
-class TripletKind(Enum):
-    """Type of a triplet."""
-
-    IDLE = auto()
-    """No flight: the vehicle is on the ground."""
-    TAKEOFF = auto()
-    """Take-off, slow at first."""
-    POSITION = auto()
-    """Flight to the target, continuing to the next waypoint."""
-    LOITER = auto()
-    """Flight to the target, with a stay."""
-    LAND = auto()
-    """Landing."""
-
-
-class Triplet(NamedTuple):
-    """Path of a mission. Places are local NED [m]."""
-
-    kind: TripletKind
-    target: Vec
-    previous: Vec | None = None
-    """Start of the path; None = the vehicle's position."""
-    next: Vec | None = None
-    """Next waypoint; None = the vehicle stops at the target."""
-    yaw: float = math.nan
-    """Heading [rad]; NaN = by MPC_YAW_MODE."""
-    acceptance_m: float = 0.0
-    precision: int = 0
-    """Precision landing: 0 = off, 1 = on a target visible at once, 2 = search for the target."""
-    cruise_m_s: float = math.nan
-    """Cruise speed [m/s]; NaN = MPC_XY_CRUISE."""
-
-    def same_target(self, other: Triplet) -> bool:
-        """Return whether both have the same target and attributes."""
-        return self._replace(previous=None, next=None) == other._replace(previous=None, next=None)
-
-
-STANDING = Triplet(TripletKind.IDLE, (0.0, 0.0, 0.0))
-"""Triplet without flight."""
-
-
-class NavCommand(IntEnum):
-    """MAV_CMD of supported plan items; values are MAVLink's."""
-
-    WAYPOINT = 16
-    LOITER_UNLIM = 17
-    LOITER_TIME = 19
-    RETURN_TO_LAUNCH = 20
-    LAND = 21
-    TAKEOFF = 22
-    LOITER_TO_ALT = 31
-    ROI = 80
-    VTOL_TAKEOFF = 84
-    VTOL_LAND = 85
-    DELAY = 93
-    CONDITION_DELAY = 112
-    CONDITION_DISTANCE = 114
-    DO_JUMP = 177
-    DO_CHANGE_SPEED = 178
-    DO_SET_HOME = 179
-    DO_LAND_START = 189
-    DO_SET_ROI_LOCATION = 195
-    DO_SET_ROI_WPNEXT_OFFSET = 196
-    DO_SET_ROI_NONE = 197
-    DO_CONTROL_VIDEO = 200
-    DO_SET_ROI = 201
-    DO_DIGICAM_CONTROL = 203
-    DO_MOUNT_CONFIGURE = 204
-    DO_MOUNT_CONTROL = 205
-    DO_SET_CAM_TRIGG_DIST = 206
-    DO_SET_ACTUATOR = 187
-    DO_GRIPPER = 211
-    DO_SET_CAM_TRIGG_INTERVAL = 214
-    OBLIQUE_SURVEY = 260
-    SET_CAMERA_MODE = 530
-    SET_CAMERA_ZOOM = 531
-    SET_CAMERA_FOCUS = 532
-    SET_CAMERA_SOURCE = 534
-    DO_GIMBAL_MANAGER_PITCHYAW = 1000
-    DO_GIMBAL_MANAGER_CONFIGURE = 1001
-    IMAGE_START_CAPTURE = 2000
-    IMAGE_STOP_CAPTURE = 2001
-    DO_TRIGGER_CONTROL = 2003
-    VIDEO_START_CAPTURE = 2500
-    VIDEO_STOP_CAPTURE = 2501
-    DO_VTOL_TRANSITION = 3000
-    CONDITION_GATE = 4501
-    FENCE_RETURN_POINT = 5000
-    FENCE_POLYGON_VERTEX_INCLUSION = 5001
-    FENCE_POLYGON_VERTEX_EXCLUSION = 5002
-    FENCE_CIRCLE_INCLUSION = 5003
-    FENCE_CIRCLE_EXCLUSION = 5004
-    RALLY_POINT = 5100
-    DO_WINCH = 42600
-
-
-NOT_IN_MISSIONS = frozenset(
-    {
-        NavCommand.FENCE_POLYGON_VERTEX_INCLUSION,
-        NavCommand.FENCE_POLYGON_VERTEX_EXCLUSION,
-        NavCommand.FENCE_CIRCLE_INCLUSION,
-        NavCommand.FENCE_CIRCLE_EXCLUSION,
-        NavCommand.RALLY_POINT,
-    }
-)
-"""Fence points and rally points."""
-
-
-class PlanFrame(IntEnum):
-    """MAV_FRAME of plan items."""
-
-    GLOBAL = 0
-    MISSION = 2
-    """No place: seven parameters."""
-    GLOBAL_RELATIVE_ALT = 3
-    GLOBAL_INT = 5
-    GLOBAL_RELATIVE_ALT_INT = 6
+from firmware_sim.autopilot.autopilot_state import OperatorText
+from firmware_sim.autopilot.flight_modes import Mode
 
 
 class MissionType(IntEnum):
@@ -143,24 +25,12 @@ class MissionType(IntEnum):
     RALLY = 2
 
 
-MOST_ITEMS = {MissionType.MISSION: 65_534, MissionType.FENCE: 64, MissionType.RALLY: 32}
-"""Maximum number of items per list, as in PX4's SITL."""
+POSITION_COMMANDS = frozenset({16, 17, 19, 21, 22, 31, 84, 85})
+"""MAV_CMD with a place to fly to: waypoint, loiter, take-off, land
+(MissionBlock::item_contains_position)."""
 
-POSITION_COMMANDS = frozenset(
-    {
-        NavCommand.WAYPOINT,
-        NavCommand.LOITER_UNLIM,
-        NavCommand.LOITER_TIME,
-        NavCommand.LAND,
-        NavCommand.TAKEOFF,
-        NavCommand.LOITER_TO_ALT,
-        NavCommand.VTOL_TAKEOFF,
-        NavCommand.VTOL_LAND,
-    }
-)
-"""Commands with a place to fly to (MissionBlock::item_contains_position)."""
-
-_RELATIVE = (PlanFrame.GLOBAL_RELATIVE_ALT, PlanFrame.GLOBAL_RELATIVE_ALT_INT)
+_RELATIVE = (3, 6)
+"""MAV_FRAME_GLOBAL_RELATIVE_ALT and MAV_FRAME_GLOBAL_RELATIVE_ALT_INT."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,63 +155,62 @@ def distance_m(a: tuple[float, float], b: tuple[float, float]) -> float:
     return EARTH_RADIUS_M * 2.0 * math.atan2(math.sqrt(h), math.sqrt(max(0.0, 1.0 - h)))
 
 
-MOST_JUMPS = 10
-"""Maximum number of consecutive jumps before the search stops (PX4's MAX_JUMP_ITERATION)."""
+class NavigationState(NamedTuple):
+    """State of the vehicle for navigation."""
+
+    time_us: int
+    position: Vec
+    """Local NED [m]."""
+    yaw: float
+    """Heading [rad]."""
+    landed: bool
+    home: Geodetic
+    origin: Geodetic
+    """Geodetic origin of local NED."""
+    velocity: Vec = (0.0, 0.0, 0.0)
+    """NED [m/s]."""
+
+    def local(self, place: Geodetic) -> Vec:
+        """Return a place in local NED [m]."""
+        north, east, down = geodetic_to_local(place, self.origin).tolist()
+        return north, east, down
 
 
-def resolve(plans: Plans, index: int, *, count: bool) -> int | None:
-    """Return the index of the item to fly after resolving DO_JUMP.
+class Crew(Protocol):
+    """Callbacks for mission commands other than flight."""
 
-    Args:
-        plans: Mission with its jump counts.
-        index: First index.
-        count: True if jumps count as executed.
+    def say(self, message: OperatorText, /) -> None:
+        """Send a text to the operator."""
 
-    Returns:
-        None at the end of the mission, or if a jump leads out of it.
-    """
-    items = plans.mission
-    for _ in range(MOST_JUMPS):
-        if not 0 <= index < len(items):
-            return None
-        item = items[index]
-        if item.command != NavCommand.DO_JUMP:
-            return index
-        target, repeats = _whole(item.params[0]), _whole(item.params[1])
-        if not 0 <= target < len(items):
-            return None
-        done = plans.jumps_done.get(index, 0)
-        if done < repeats:
-            if count:
-                plans.jumps_done[index] = done + 1
-                plans.jumped = index
-            index = target
-        else:
-            index += 1
-    return index if 0 <= index < len(items) else None
+    def set_home(self, place: Geodetic | None, /) -> object:
+        """Move home; None = the current position."""
+
+    def return_to_launch(self) -> None:
+        """Abort the mission and return."""
 
 
-def go_to(plans: Plans, index: int) -> int | None:
-    """Return the item to fly for an index, and count the jumps; None = end."""
-    return resolve(plans, index, count=True)
+class Missions:
+    """Missions of a vehicle. The add-on `missions` extends this class, which has none."""
 
+    @property
+    def valid(self) -> bool:
+        """True if a feasible mission is stored, as required by Mission mode."""
+        return False
 
-def next_places(plans: Plans, index: int, most: int) -> list[PlanItem]:
-    """Return up to `most` next items with a place, starting at an index."""
-    found: list[PlanItem] = []
-    # Bounded, so that mutual jumps end.
-    for _ in range(2 * len(plans.mission)):
-        if len(found) == most:
-            break
-        following = resolve(plans, index, count=False)
-        if following is None:
-            break
-        if plans.mission[following].has_position:
-            found.append(plans.mission[following])
-        index = following + 1
-    return found
+    @property
+    def over(self) -> bool:
+        """True if the active mission has ended."""
+        return False
 
+    def review(self, _now: NavigationState, /) -> None:
+        """Check the mission after a change of mission, fence or home."""
 
-def _whole(value: float) -> int:
-    """Return a number of the wire as in PX4, truncated; -1 if out of range or NaN."""
-    return int(value) if abs(value) < 65_536.0 else -1
+    def step(self, _now: NavigationState, _mode: Mode, /, *, armed: bool) -> None:
+        """Advance by a period of the navigator."""
+
+    def destination(self, now: NavigationState, /) -> Geodetic | None:
+        """Return the destination of Return at ground altitude; None = along mission items."""
+        return now.home
+
+    def look_at(self, _place: Geodetic | None, /) -> None:
+        """Set the region of interest; None = clear it."""

@@ -22,12 +22,12 @@ from airl_mav.faults.kinds import MOTORS, Part
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.events.definition import NavigationMode
+from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, MODE_NOT_AVAILABLE
+from firmware_sim.autopilot.flight_modes import MAIN_AUTO, MAIN_POSCTL, Mode
 from firmware_sim.autopilot.inputs import OrbitRequest, PositionYaw, Reposition
-from firmware_sim.autopilot.navigation.plan import NavCommand
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.px4_custom_mode import requested_mode
-from firmware_sim.mavlink.services import calibration, logs, message_requests, params
+from firmware_sim.mavlink.services import calibration, connection, logs, params
 from firmware_sim.mavlink.services.context import (
     ANY,
     Action,
@@ -119,7 +119,7 @@ def _start_landing(_command: VehicleCommand, context: Context) -> Result:
     """Go to the mission's landing: DO_LAND_START, or the first landing; CANCELLED without one."""
     commands = [item.command for item in context.port.plans.mission]
     # DO_LAND_START has precedence; without one the first LAND item marks the landing.
-    for marker in (NavCommand.DO_LAND_START, NavCommand.LAND):
+    for marker in (dialect.MAV_CMD_DO_LAND_START, dialect.MAV_CMD_NAV_LAND):
         if marker in commands:
             return context.port.start_mission(commands.index(marker))
     return Result.CANCELLED
@@ -139,8 +139,8 @@ def _look(command: VehicleCommand, context: Context) -> Result:
     """Handle DO_SET_ROI_LOCATION, DO_SET_ROI (parameter 1: MAV_ROI) and DO_SET_ROI_NONE."""
     place = Geodetic(*command.params[4:7])
     # DO_SET_ROI carries the region type in parameter 1.
-    located = command.number == NavCommand.DO_SET_ROI_LOCATION or (
-        command.number != NavCommand.DO_SET_ROI_NONE and command.params[0] == _ROI_LOCATION
+    located = command.number == dialect.MAV_CMD_DO_SET_ROI_LOCATION or (
+        command.number != dialect.MAV_CMD_DO_SET_ROI_NONE and command.params[0] == _ROI_LOCATION
     )
     valid = math.isfinite(place.latitude_deg) and math.isfinite(place.longitude_deg)
     context.port.look_at(place if located and valid else None)
@@ -409,7 +409,7 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     dialect.MAV_CMD_INJECT_FAILURE: _inject,
     **logs.ACTIONS,
-    **message_requests.ACTIONS,
+    **connection.ACTIONS,
     **calibration.ACTIONS,
     **_NAVIGATION,
     **params.ACTIONS,
@@ -464,3 +464,55 @@ def is_addressed(message: WireMessage, context: Context) -> bool:
     if message.command in (_REQUEST_CAPABILITIES, _REQUEST_PROTOCOL):
         return message.target_system in (context.system_id, ANY)
     return for_vehicle(message, context)
+
+
+_CRITICAL = Severity.CRITICAL
+_UNSUPPORTED = OperatorText.of(_CRITICAL, AUTO_MODE_UNSUPPORTED)
+
+
+def _unavailable(name: str, mode: NavigationMode, main: int, sub: int) -> OperatorText:
+    """Return PX4's rejection of a known but unavailable mode."""
+    number = sub << 24 | main << 16
+    text = f"Switching to {name} is currently not available"
+    return OperatorText.of(_CRITICAL, MODE_NOT_AVAILABLE, number, mode, text=text)
+
+
+# Modes by main and sub mode. Texts stand for modes that a real PX4 knows by name but never makes
+# available; a mode of the table replaces them.
+_REQUESTABLE: dict[tuple[int, int], Mode | OperatorText] = {
+    (MAIN_AUTO, 0): Mode.MISSION,
+    (MAIN_POSCTL, 2): _unavailable("Position Slow", NavigationMode.POSITION_SLOW, MAIN_POSCTL, 2),
+    # External modes exist in PX4 only after a ROS 2 node registers them.
+    **{
+        (MAIN_AUTO, 10 + n): _unavailable(
+            f"External {n}", NavigationMode(15 + n), MAIN_AUTO, 10 + n
+        )
+        for n in range(1, 9)
+    },
+    **{(mode.spec.main, mode.spec.sub): mode for mode in Mode if mode.spec.requestable},
+}
+
+
+def requested_mode(base: int, main: int, sub: int) -> Mode | OperatorText | None:
+    """Return the mode requested by DO_SET_MODE, given parameters 1 to 3.
+
+    The parameters are MAV_MODE_FLAG bits, main mode and sub mode. A message is PX4's explanation of
+    an unavailable mode. None: PX4 accepts the request without effect (unknown main mode).
+    """
+    if not base & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+        # Clients without custom modes describe the mode by bits.
+        return _from_base_mode(base)
+    # PX4 treats an unknown sub mode of POSCTL as Position.
+    other = _UNSUPPORTED if main == MAIN_AUTO else _REQUESTABLE.get((main, 0))
+    return _REQUESTABLE.get((main, sub), other)
+
+
+def _from_base_mode(base: int) -> Mode | None:
+    """Return the mode that PX4 derives from the bits of clients without custom modes."""
+    if base & dialect.MAV_MODE_FLAG_AUTO_ENABLED:
+        return Mode.MISSION
+    if not base & dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED:
+        return None
+    if base & dialect.MAV_MODE_FLAG_GUIDED_ENABLED:
+        return Mode.POSITION
+    return Mode.STABILIZED if base & dialect.MAV_MODE_FLAG_STABILIZE_ENABLED else Mode.MANUAL

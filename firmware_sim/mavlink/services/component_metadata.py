@@ -15,6 +15,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+from airl_mav.core.addons import entries, load
 from airl_mav.profiles.parameters import SPECS, ParameterSpec
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.events import check_events, flight_events
@@ -124,7 +125,8 @@ def _parameter_described(spec: ParameterSpec) -> dict[str, Any]:
 
 def definitions() -> Iterator[Definition]:
     """Yield all events that this vehicle can send."""
-    for module in (flight_events, check_events):
+    added = map(load, entries("firmware_sim", "EVENTS").values())
+    for module in (flight_events, check_events, *added):
         for value in vars(module).values():
             if isinstance(value, Definition):
                 yield value

@@ -5,24 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 from airl_mav.core.signing import Signing
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
-from firmware_sim.mavlink.event_buffer import EventBuffer
 from firmware_sim.mavlink.link import Link
-from firmware_sim.mavlink.own_streams import Radio
 from firmware_sim.mavlink.services.transfers import (
     FtpClient,
     LogDownload,
     LogListing,
     LogStream,
-    MissionTransfer,
     RunningCalibration,
     Shell,
 )
+from firmware_sim.mavlink.streams.sensors import Radio
+from firmware_sim.mavlink.texts_and_events import EventBuffer
 from firmware_sim.storage import Storage
+
+S = TypeVar("S")
 
 ANY = 0
 """System or component id of a broadcast."""
@@ -51,7 +53,8 @@ class Context:
     system_id: int = SYSTEM_ID
     next_parameter: int | None = None
     """Next index of a running parameter list; -1 = the hash; None = no list is running."""
-    transfer: MissionTransfer = field(default_factory=MissionTransfer)
+    states: dict[type, Any] = field(default_factory=dict)
+    """States of the services of add-ons, by class; each has `is_running`."""
     storage: Storage = field(default_factory=Storage)
     ftp: FtpClient = field(default_factory=FtpClient)
     shell: Shell = field(default_factory=Shell)
@@ -66,7 +69,7 @@ class Context:
 
     @property
     def is_getting(self) -> bool:
-        """True if any transfer except a mission's is in progress."""
+        """True if any transfer of the core is in progress."""
         ftp = self.ftp
         return (
             self.next_parameter is not None
@@ -82,7 +85,14 @@ class Context:
     @property
     def is_busy(self) -> bool:
         """True if any transfer or repetition is in progress."""
-        return self.is_getting or self.transfer.is_running
+        return self.is_getting or any(state.is_running for state in self.states.values())
+
+    def state(self, kind: type[S]) -> S:
+        """Return the state of an add-on's service for this client; new at the first call."""
+        if kind not in self.states:
+            self.states[kind] = kind()
+        found: S = self.states[kind]
+        return found
 
     def announce_once(self, refusal: OperatorText) -> None:
         """Announce a rejection unless it was announced before."""

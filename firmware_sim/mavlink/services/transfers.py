@@ -6,13 +6,12 @@ import os
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from enum import Enum, IntEnum, auto
+from enum import IntEnum
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import OperatorText
-from firmware_sim.autopilot.navigation.plan import PlanItem
 from firmware_sim.autopilot.port import LogEntry
 
 _ALL_ONES = 0xFFFF_FFFF
@@ -289,66 +288,6 @@ class MessageBoundaries:
 
 
 # --- missions
-
-RETRY_US = 250_000
-"""Time without an item after which the request is repeated [µs] (PX4)."""
-
-TIMEOUT_US = 5_000_000
-"""Time without a message after which a transfer is aborted [µs] (PX4)."""
-
-NOBODY = (-1, -1)
-
-
-class Activity(Enum):
-    """State of a link's mission protocol."""
-
-    IDLE = auto()
-    SENDING = auto()
-    """Download to a client."""
-    RECEIVING = auto()
-    """Upload from a client."""
-
-
-REPEATS = 10
-"""Number of repetitions of MISSION_ITEM_REACHED, at intervals of REPEAT_US."""
-REPEAT_US = 1_000_000
-
-
-@dataclass(slots=True)
-class MissionTransfer:
-    """State of one link's mission transfers."""
-
-    activity: Activity = Activity.IDLE
-    kind: int = 0
-    """MAV_MISSION_TYPE of the newest transfer."""
-    index: int = 0
-    count: int = 0
-    current: int = -1
-    """Item that the upload marks as current; -1 = none."""
-    checksum: int = 0
-    items: list[PlanItem] = field(default_factory=list)
-    partner: tuple[int, int] = NOBODY
-    """System and component id of the client."""
-    integer: bool = False
-    """True if items are sent as MISSION_ITEM_INT; PX4 starts with MISSION_REQUEST and adapts."""
-    sent_us: int = 0
-    """Time of the newest request to the client [µs]."""
-    heard_us: int = 0
-    """Time of the client's newest message [µs]."""
-
-    # Mission progress that this link has reported to its clients.
-    told_current: int = 0
-    told_reached: int = -1
-    repeats: int = 0
-    """Number of repetitions of the newest MISSION_ITEM_REACHED."""
-    repeated_us: int = 0
-    told_jumped: tuple[int, int] = (-1, 0)
-
-    @property
-    def is_running(self) -> bool:
-        """True if timed messages are due: requests to the client, or repetitions."""
-        repeats = self.told_reached >= 0 and self.repeats < REPEATS
-        return self.activity is not Activity.IDLE or repeats
 
 
 # --- calibrations

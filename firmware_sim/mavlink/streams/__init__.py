@@ -1,4 +1,6 @@
-"""Streamed messages: a table of message names with their builder functions.
+"""Streamed messages: tables of message names with their builder functions.
+
+A new message is a builder function and a line in `BUILDERS` or `VEHICLE_BUILDERS`.
 
 Sources of fields, units and "unknown" values: MAVLink common.xml and PX4
 src/modules/mavlink/streams/*.hpp.
@@ -10,8 +12,11 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from firmware_sim.autopilot.autopilot_state import AutopilotState
-from firmware_sim.mavlink.codec import Values
-from firmware_sim.mavlink.streams import information, pose, sensor_streams, status
+from firmware_sim.autopilot.port import AutopilotPort
+from firmware_sim.interfaces import TrueState
+from firmware_sim.mavlink.codec import SYSTEM_ID, Values
+from firmware_sim.mavlink.streams import sensors, status
+from firmware_sim.mavlink.streams.sensors import VibrationMeter
 
 Builder = Callable[[AutopilotState], "Values | None"]
 """Returns one message's fields, in order of definition, from a snapshot; None = no content yet.
@@ -55,29 +60,77 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "EXTENDED_SYS_STATE": status.extended_sys_state,
         "SYS_STATUS": None,
         "ESTIMATOR_STATUS": status.estimator_status,
-        "SCALED_PRESSURE": sensor_streams.scaled_pressure,
+        "SCALED_PRESSURE": sensors.scaled_pressure,
         # PX4's simulator sends one measurement to two barometers.
-        "SCALED_PRESSURE2": sensor_streams.scaled_pressure,
+        "SCALED_PRESSURE2": sensors.scaled_pressure,
         "MISSION_CURRENT": status.mission_current,
         "FENCE_STATUS": status.fence_status,
-        "HOME_POSITION": pose.home_position,
-        "GPS_GLOBAL_ORIGIN": pose.gps_global_origin,
+        "HOME_POSITION": status.home_position,
+        "GPS_GLOBAL_ORIGIN": status.gps_global_origin,
         "AUTOPILOT_VERSION": status.autopilot_version,
-        "ORBIT_EXECUTION_STATUS": pose.orbit_execution_status,
+        "ORBIT_EXECUTION_STATUS": status.orbit_execution_status,
         "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE": status.autopilot_state_for_gimbal_device,
-        "CURRENT_MODE": information.current_mode,
+        "CURRENT_MODE": status.current_mode,
         "ESC_INFO": None,
         "ESC_STATUS": None,
-        "ACTUATOR_OUTPUT_STATUS": sensor_streams.actuator_output_status,
-        "HIL_ACTUATOR_CONTROLS": sensor_streams.hil_actuator_controls,
-        "SCALED_IMU": sensor_streams.scaled_imu,
-        "FLIGHT_INFORMATION": information.flight_information,
-        "PROTOCOL_VERSION": information.protocol_version,
+        "ACTUATOR_OUTPUT_STATUS": sensors.actuator_output_status,
+        "HIL_ACTUATOR_CONTROLS": sensors.hil_actuator_controls,
+        "SCALED_IMU": sensors.scaled_imu,
+        "FLIGHT_INFORMATION": status.flight_information,
+        "PROTOCOL_VERSION": status.protocol_version,
         "HIGH_LATENCY2": status.high_latency2,
         # Last, because start times of streams depend on their order.
-        "DISTANCE_SENSOR": sensor_streams.distance_sensor,
-        "OPTICAL_FLOW_RAD": sensor_streams.optical_flow_rad,
+        "DISTANCE_SENSOR": sensors.distance_sensor,
+        "OPTICAL_FLOW_RAD": sensors.optical_flow_rad,
     }
 )
-"""Streams that need only the snapshot; the server adds the others. None = packed by compiled code
-(`telemetry`)."""
+"""Streams that need only the snapshot. None = packed by compiled code (`telemetry`)."""
+
+
+class Vehicle:
+    """Source of the streams that need more than the snapshot, for any attached autopilot."""
+
+    port: AutopilotPort
+
+    def __init__(self, boot_unix_us: int) -> None:
+        """Start without an autopilot; simulated time 0 is at `boot_unix_us` [µs since 1970]."""
+        self.boot_unix_us = boot_unix_us
+        self.system_id = SYSTEM_ID
+        self.vibration = VibrationMeter()
+        self.truth: Callable[[], TrueState] | None = None
+
+    def attach(
+        self, port: AutopilotPort, truth: Callable[[], TrueState] | None, system_id: int
+    ) -> None:
+        """Attach another autopilot, with its vehicle's true state; None = unavailable."""
+        self.port, self.truth, self.system_id = port, truth, system_id
+        self.vibration = VibrationMeter()
+
+
+VEHICLE_BUILDERS: Mapping[str, Callable[[Vehicle, AutopilotState], Values | None]] = (
+    MappingProxyType(
+        {
+            "SYSTEM_TIME": lambda vehicle, state: status.system_time(state, vehicle.boot_unix_us),
+            "VIBRATION": lambda vehicle, state: vehicle.vibration.message(state),
+            "BATTERY_STATUS": lambda vehicle, state: sensors.battery_status(
+                state, vehicle.port.parameters
+            ),
+            "TIME_ESTIMATE_TO_TARGET": lambda vehicle, state: status.time_estimate_to_target(
+                state, vehicle.port.parameters.value
+            ),
+            "HIL_STATE_QUATERNION": lambda vehicle, _state: (
+                None
+                if (truth := vehicle.truth and vehicle.truth()) is None
+                else status.hil_state_quaternion(truth, truth.time_us)
+            ),
+            "MAG_CAL_REPORT": lambda vehicle, _state: sensors.mag_cal_report(
+                vehicle.port.parameters.value
+            ),
+            "MANUAL_CONTROL": lambda vehicle, state: status.manual_control(
+                state, vehicle.system_id
+            ),
+        }
+    )
+)
+"""Streams that need more than the snapshot. Shared by all links, so each message is built once per
+tick."""

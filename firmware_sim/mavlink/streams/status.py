@@ -1,6 +1,8 @@
-"""Vehicle status: identity, heartbeat, health, landed state, estimator, clock.
+"""Vehicle status: identity, heartbeat, modes, health, estimator, mission, home, orbit, times.
 
-Source of the gimbal message: PX4 1.16, streams/AUTOPILOT_STATE_FOR_GIMBAL_DEVICE.hpp.
+Sources: PX4 1.16, src/lib/modes, src/modules/mavlink/streams/*.hpp (AVAILABLE_MODES, CURRENT_MODE,
+HEARTBEAT, AUTOPILOT_STATE_FOR_GIMBAL_DEVICE), src/modules/commander/px4_custom_mode.h, and the
+messages of a running PX4.
 """
 
 from __future__ import annotations
@@ -9,13 +11,27 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from airl_mav.core.frames import local_to_geodetic, quat_yaw
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
-from firmware_sim.autopilot.flight_modes import Mode
+import numpy as np
+
+from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local, local_to_geodetic, quat_yaw
+from firmware_sim.autopilot.autopilot_state import (
+    Arming,
+    AutopilotState,
+    CommanderStatus,
+    Landed,
+)
+from firmware_sim.autopilot.flight_modes import (
+    BY_CUSTOM_MODE,
+    MAIN_AUTO,
+    WITH_STICKS,
+    Mode,
+    ModeSpec,
+)
+from firmware_sim.autopilot.modes.return_to_launch import return_time_s
+from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import Values, dialect
-from firmware_sim.mavlink.px4_custom_mode import base_mode, system_status
 from firmware_sim.mavlink.streams import units
-from firmware_sim.mavlink.streams.sensor_streams import percent
+from firmware_sim.mavlink.streams.units import boot_ms, percent
 
 CAPABILITIES: int = (
     dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
@@ -267,13 +283,9 @@ def autopilot_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a buil
     )
 
 
-def system_time(boot_unix_us: int) -> Callable[[AutopilotState], Values]:
-    """Return the builder of SYSTEM_TIME, given the calendar time of boot [µs since 1970, UTC]."""
-
-    def build(state: AutopilotState) -> Values:
-        return boot_unix_us + state.time_us, units.boot_ms(state.time_us)
-
-    return build
+def system_time(state: AutopilotState, boot_unix_us: int) -> Values:
+    """Return the present time [µs since 1970, UTC], given that of boot, and the time since boot."""
+    return boot_unix_us + state.time_us, units.boot_ms(state.time_us)
 
 
 _ALL = 0
@@ -394,3 +406,185 @@ def _failures(state: AutopilotState) -> int:
         dialect.HL_FAILURE_FLAG_ESTIMATOR: not (health.attitude and health.position),
     }
     return sum(bit for bit, has_failed in failed.items() if has_failed)
+
+
+_VERSION, _LEAST_VERSION, _GREATEST_VERSION = 200, 100, 200
+"""Sent, minimum and maximum version: MAVLink 2.0 is sent, 1.0 is accepted, as in PX4."""
+
+_NO_HASH = (0,) * 8
+
+
+def flight_information(state: AutopilotState) -> Values:
+    """Return the times of arming and takeoff [µs since boot]; 0 while disarmed."""
+    flight_uuid = landing_time = 0
+    armed, took_off = state.armed_us, state.takeoff_us
+    return boot_ms(state.time_us), armed, took_off, flight_uuid, landing_time
+
+
+def protocol_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder
+    """Return the supported MAVLink versions."""
+    return _VERSION, _LEAST_VERSION, _GREATEST_VERSION, *_NO_HASH, *_NO_HASH
+
+
+_UNKNOWN_TIME = -1
+"""Value of unknown times: PX4 estimates only the return time."""
+
+
+def time_estimate_to_target(state: AutopilotState, value: Callable[[str], float]) -> Values | None:
+    """Return the duration of a safe return [s]; 0 on the ground, None without home.
+
+    `value` returns the current value of a PX4 parameter by name.
+    """
+    home, origin = state.home, state.origin
+    if home is None or origin is None:
+        return None
+    took = 0.0
+    # On the ground the return takes no time.
+    if state.status.landed is not Landed.ON_GROUND:
+        target = geodetic_to_local(home, origin).tolist()
+        north, east, down = (
+            b - a for a, b in zip(target, state.estimate.position.tolist(), strict=True)
+        )
+        took = return_time_s(value, -down, math.hypot(north, east))
+    unknown = (_UNKNOWN_TIME,) * 4
+    return int(took) if math.isfinite(took) else _UNKNOWN_TIME, *unknown
+
+
+AVAILABLE = tuple(sorted(BY_CUSTOM_MODE.values(), key=lambda mode: mode.spec.state))
+"""Modes as clients distinguish them, in the order of AVAILABLE_MODES."""
+
+
+def available_modes() -> list[tuple[int, int, int, int, int, bytes]]:
+    """Return the fields of AVAILABLE_MODES for each mode, in order."""
+    # The count and the number of each mode, starting at 1, in every message.
+    return [
+        (len(AVAILABLE), number, spec.standard, spec.custom_mode, _properties(spec), name)
+        for number, spec in enumerate((mode.spec for mode in AVAILABLE), start=1)
+        # A standard mode implies its name.
+        for name in (b"" if spec.standard else spec.title.encode("ascii"),)
+    ]
+
+
+def _properties(spec: ModeSpec) -> int:
+    """Return the bits of MAV_MODE_PROPERTY."""
+    advanced: int = dialect.MAV_MODE_PROPERTY_ADVANCED if spec.advanced else 0
+    hidden: int = 0 if spec.requestable else dialect.MAV_MODE_PROPERTY_NOT_USER_SELECTABLE
+    return advanced | hidden
+
+
+def current_mode(state: AutopilotState) -> Values:
+    """Return the active mode and the mode requested by the user."""
+    active, intended = state.status.mode.spec, state.status.intended_mode.spec
+    return intended.standard, active.custom_mode, intended.custom_mode
+
+
+_NO_APPROACH = (0.0, 0.0, 0.0)
+"""Approach vector of HOME_POSITION: no special approach."""
+
+
+def orbit_execution_status(state: AutopilotState) -> Values | None:
+    """Return the current orbit, with its global centre; None in other modes."""
+    orbit, origin = state.orbit, state.origin
+    if orbit is None or origin is None:
+        return None
+    centre = local_to_geodetic(np.array(orbit.centre), origin)
+    return (
+        state.time_us,
+        orbit.radius_m,
+        dialect.MAV_FRAME_GLOBAL,
+        units.deg_e7(centre.latitude_deg),
+        units.deg_e7(centre.longitude_deg),
+        centre.altitude_m,
+    )
+
+
+def home_position(state: AutopilotState) -> Values | None:
+    """Return home in global coordinates and in local NED; None if unset."""
+    home, origin = state.home, state.origin
+    if home is None:
+        return None
+    # Without an origin the home position has no local coordinates.
+    local = (
+        [math.nan, math.nan, math.nan]
+        if origin is None
+        else geodetic_to_local(home, origin).tolist()
+    )
+    return *_wire(home), *local, *_level(state.home_yaw), *_NO_APPROACH, state.time_us
+
+
+def gps_global_origin(state: AutopilotState) -> Values | None:
+    """Return the origin of local NED in global coordinates; None if unset."""
+    return None if state.origin is None else (*_wire(state.origin), state.time_us)
+
+
+def _wire(place: Geodetic) -> Values:
+    """Return latitude, longitude [degE7] and altitude [mm]."""
+    return (
+        units.deg_e7(place.latitude_deg),
+        units.deg_e7(place.longitude_deg),
+        units.mm(place.altitude_m),
+    )
+
+
+def _level(yaw: float) -> Values:
+    """Return a level attitude w, x, y, z with a heading [rad]."""
+    return math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)
+
+
+# HIL_STATE_QUATERNION is sent on request only, as PX4 SITL sends its simulator's state. Real
+# firmware receives it from the same function. No flight code reads it. Source: PX4 1.16,
+# streams/HIL_STATE_QUATERNION.hpp.
+
+
+_NO_ACCELERATION = (0, 0, 0)
+"""Placeholder: `TrueState` has no acceleration, and PX4 only logs it."""
+
+
+def hil_state_quaternion(truth: TrueState, time_us: int) -> Values:
+    """Return attitude (w, x, y, z, body -> NED), rates [rad/s], position and velocity [cm/s].
+
+    Args:
+        truth: True state.
+        time_us: Time stamp on the receiver's clock [µs].
+    """
+    place = local_to_geodetic(truth.position, HOME)
+    return (
+        time_us,
+        *truth.quaternion.tolist(),
+        *truth.angular_velocity.tolist(),
+        units.deg_e7(place.latitude_deg),
+        units.deg_e7(place.longitude_deg),
+        units.mm(place.altitude_m),
+        *(units.cm_s(v) for v in truth.velocity.tolist()),
+        *_NO_AIRSPEEDS,
+        *_NO_ACCELERATION,
+    )
+
+
+def base_mode(status: CommanderStatus) -> int:
+    """Return the MAV_MODE_FLAG bits of HEARTBEAT."""
+    bits: int = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+    if status.mode.spec.stabilized:
+        bits |= dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
+    if status.mode.spec.main == MAIN_AUTO:
+        bits |= dialect.MAV_MODE_FLAG_AUTO_ENABLED | dialect.MAV_MODE_FLAG_GUIDED_ENABLED
+    if status.mode in WITH_STICKS:
+        bits |= dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+    if status.arming is Arming.ARMED:
+        bits |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
+    return bits
+
+
+def system_status(status: CommanderStatus, *, can_arm: bool) -> int:
+    """Return the MAV_STATE of HEARTBEAT.
+
+    Armed: ACTIVE, or CRITICAL in a failsafe. Disarmed: STANDBY, or UNINIT if the mode cannot be
+    armed. After a termination: FLIGHT_TERMINATION, armed or not.
+    """
+    if status.mode is Mode.TERMINATION:
+        return int(dialect.MAV_STATE_FLIGHT_TERMINATION)
+    if status.arming is Arming.ARMED:
+        # ACTIVE or CRITICAL applies only to an armed vehicle.
+        return int(dialect.MAV_STATE_CRITICAL if status.failsafe else dialect.MAV_STATE_ACTIVE)
+    standby = status.arming is Arming.STANDBY and can_arm
+    return int(dialect.MAV_STATE_STANDBY if standby else dialect.MAV_STATE_UNINIT)

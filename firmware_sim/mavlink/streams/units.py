@@ -86,3 +86,8 @@ def triangle(diagonal: Sequence[float]) -> tuple[float, ...]:
     a, b, c, d, e, f = diagonal
     n = math.nan
     return a, n, n, n, n, n, b, n, n, n, n, c, n, n, n, d, n, n, e, n, f
+
+
+def percent(share: float) -> int:
+    """Return a fraction 0..1 as percent for an int8 field; -1 if unknown."""
+    return saturate(share * 100.0, 0, 100, -1)

@@ -1,0 +1,440 @@
+"""Reader of PX4 flight logs, versions 1.14 to 1.16; times since boot [µs], NED and FRD."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pyulog import ULog
+from pyulog.exceptions import ULogException
+from scipy.optimize import minimize_scalar
+from scipy.signal import correlate, correlation_lags
+
+from airl_mav.core.constants import UNMEASURED_A, US_PER_S, CommandKind
+from airl_mav.core.errors import UsageError
+from airl_mav.core.frames import quat_from_euler
+from airl_mav.flight.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+MOTORS = 4
+
+_TOPICS = (
+    "actuator_motors",
+    "battery_status",
+    "sensor_combined",
+    "trajectory_setpoint",
+    "vehicle_acceleration",
+    "vehicle_attitude",
+    "vehicle_attitude_setpoint",
+    "vehicle_local_position",
+    "vehicle_local_position_setpoint",
+    "vehicle_rates_setpoint",
+    "vehicle_status",
+    "wind",
+)
+
+_THRUST = "thrust_body[2]"
+"""Thrust field of multicopters, along the body's down axis, so negative."""
+
+_BROKEN = (
+    EOFError,
+    IndexError,
+    KeyError,
+    TypeError,
+    UnicodeDecodeError,
+    ValueError,
+    struct.error,
+    ULogException,
+)
+"""Exceptions that pyulog raises for other or damaged files."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """Samples of one topic; their number is n."""
+
+    time_us: Times
+    """Times (n,), increasing [µs]."""
+    values: Floats
+    """Values (n, k)."""
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self.time_us)
+
+    def at(self, times_us: NDArray[Any]) -> Floats:
+        """Return the values (m, k) at times (m,) [µs], linearly interpolated."""
+        columns = [np.interp(times_us, self.time_us, column) for column in self.values.T]
+        return np.stack(columns, axis=1)
+
+    def newest(self, times_us: NDArray[Any]) -> Floats:
+        """Return the newest values (m, k) at times (m,) [µs]; NaN before the first sample."""
+        if not len(self):
+            return np.full((len(times_us), self.values.shape[1]), np.nan)
+        newest = np.searchsorted(self.time_us, times_us, side="right") - 1
+        return np.where(newest[:, None] >= 0, self.values[np.maximum(newest, 0)], np.nan)
+
+    def between(self, start_us: float, end_us: float) -> Series:
+        """Return the samples from `start_us` to `end_us` [µs]."""
+        inside = (self.time_us >= start_us) & (self.time_us <= end_us)
+        return Series(self.time_us[inside], self.values[inside])
+
+
+def empty(width: int) -> Series:
+    """Return an empty series for a missing topic."""
+    return Series(np.zeros(0, np.int64), np.zeros((0, width)))
+
+
+@dataclass(frozen=True)
+class VehicleLog:
+    """Topics from a flight controller's log; missing topics are empty."""
+
+    path: Path
+    attitude: Series
+    """Estimated attitude w, x, y, z, body to world."""
+    motion: Series
+    """Estimated position north, east, down [m], then velocity [m/s]."""
+    motors: Series
+    """Commands of the four motors, 0 to 1."""
+    specific_force: Series
+    """Specific force forward, right, down [m/s²], corrected by the estimated bias."""
+    raw_specific_force: Series
+    """Measured specific force forward, right, down [m/s²], including bias."""
+    raw_rates: Series
+    """Measured angular velocity about forward, right, down [rad/s], including bias."""
+    setpoint: Series
+    """Velocity setpoint north, east, down [m/s] and yaw rate setpoint [rad/s]."""
+    yaw_rate_setpoint: Series
+    """Yaw rate setpoint [rad/s]; logged more often than `setpoint`."""
+    attitude_setpoint: Series
+    """Attitude setpoint w, x, y, z, body to world, then thrust, 0 to 1."""
+    rates_setpoint: Series
+    """Body rate setpoint about forward, right, down [rad/s], then thrust, 0 to 1."""
+    more_than_velocity: Series
+    """Commanded position north, east, down [m], then acceleration [m/s²]; NaN = not commanded."""
+    nav_state: Series
+    """Flight mode, numbered as in `vehicle_status`."""
+    battery: Series
+    """Voltage [V], current [A] (NaN if not measured), remaining charge 1 to 0."""
+    wind: Series
+    """Estimated wind velocity north, east [m/s]."""
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    """Parameters at the start of the log."""
+
+
+def read_vehicle_log(path: Path) -> VehicleLog:
+    """Read a .ulg file; raise UsageError without attitude or velocity."""
+    accepted = "a ULog (.ulg) with vehicle_attitude and vehicle_local_position"
+    try:
+        with path.open("rb") as file:
+            read = ULog(file, list(_TOPICS))
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+    except _BROKEN:
+        raise UsageError(f"{path}: accepted: {accepted}") from None
+    topics = {each.name: each.data for each in reversed(read.data_list) if each.multi_id == 0}
+    attitude = _series(topics, "vehicle_attitude", _numbered("q", 4))
+    motion = _series(topics, "vehicle_local_position", ("x", "y", "z", "vx", "vy", "vz"))
+    if len(attitude) < 2 or len(motion) < 2:
+        raise UsageError(f"{path}: accepted: {accepted}")
+    return VehicleLog(
+        path=path,
+        attitude=_known(attitude),
+        motion=_known(motion),
+        motors=_known(_series(topics, "actuator_motors", _numbered("control", MOTORS))),
+        specific_force=_known(_series(topics, "vehicle_acceleration", _numbered("xyz", 3))),
+        raw_specific_force=_known(
+            _series(topics, "sensor_combined", _numbered("accelerometer_m_s2", 3))
+        ),
+        raw_rates=_known(_series(topics, "sensor_combined", _numbered("gyro_rad", 3))),
+        setpoint=_setpoint(topics),
+        yaw_rate_setpoint=_known(
+            _series(topics, "vehicle_attitude_setpoint", ("yaw_sp_move_rate",))
+        ),
+        attitude_setpoint=_upward(
+            _series(topics, "vehicle_attitude_setpoint", (*_numbered("q_d", 4), _THRUST))
+        ),
+        rates_setpoint=_upward(
+            _series(topics, "vehicle_rates_setpoint", ("roll", "pitch", "yaw", _THRUST))
+        ),
+        more_than_velocity=_series(
+            topics,
+            "trajectory_setpoint",
+            (*_numbered("position", 3), *_numbered("acceleration", 3)),
+        ),
+        nav_state=_series(topics, "vehicle_status", ("nav_state",)),
+        battery=_battery(topics),
+        wind=_known(_series(topics, "wind", ("windspeed_north", "windspeed_east"))),
+        parameters={name: float(value) for name, value in read.initial_parameters.items()},
+    )
+
+
+def _battery(topics: Mapping[str, Any]) -> Series:
+    """Return the battery measurements; an unmeasured current is NaN."""
+    told = _series(topics, "battery_status", ("voltage_v", "current_a", "remaining"))
+    told.values[told.values[:, 1] == UNMEASURED_A, 1] = np.nan
+    return told
+
+
+def _setpoint(topics: Mapping[str, Any]) -> Series:
+    local = _series(topics, "vehicle_local_position_setpoint", ("vx", "vy", "vz", "yawspeed"))
+    trajectory = _series(topics, "trajectory_setpoint", (*_numbered("velocity", 3), "yawspeed"))
+    return max(local, trajectory, key=len)
+
+
+def _series(topics: Mapping[str, Any], topic: str, fields: Sequence[str]) -> Series:
+    data = topics.get(topic)
+    if data is None or any(name not in data for name in fields):
+        return empty(len(fields))
+    # Values belong to the sample's time; `timestamp` is the later time of publication.
+    times = np.asarray(data.get("timestamp_sample", data["timestamp"]), np.int64)
+    later = np.diff(times, prepend=-1) > 0
+    values = np.stack([np.asarray(data[name], np.float64) for name in fields], axis=1)
+    return Series(times[later], values[later])
+
+
+def _known(series: Series) -> Series:
+    """Return the finite samples: stopped motors are NaN."""
+    there = np.isfinite(series.values).all(axis=1)
+    return Series(series.time_us[there], series.values[there])
+
+
+def _upward(series: Series) -> Series:
+    """Return the finite samples with the thrust, their last column, made positive."""
+    known = _known(series)
+    return Series(known.time_us, np.column_stack([known.values[:, :-1], -known.values[:, -1]]))
+
+
+def _numbered(name: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{name}[{i}]" for i in range(count))
+
+
+GRID_US = 40_000
+"""Step of the search over all shifts [µs]: the period of the companion's recording."""
+
+FINE_US = 100_000
+"""Half-width of the refinement around the coarse shift [µs]."""
+
+LEAST_CORRELATION = 0.8
+"""Minimum correlation of the velocities; below it, the recordings are of different flights."""
+
+LEAST_SPEED_M_S = 0.5
+"""Minimum top speed of a flight [m/s]; slower motion is indistinguishable from noise."""
+
+LEAST_SETPOINTS = 3
+"""Minimum number of matched setpoints for an uplink delay."""
+
+SAME_SPEED_M_S, SAME_RATE_RAD_S = 0.02, 0.01
+"""Tolerances for equal setpoints: speed and yaw rate, which do not depend on the heading."""
+
+SAME_TURN, SAME_THRUST = 0.001, 0.001
+"""Tolerances for equal body rates [rad/s], components of `_down_and_nose`, and thrusts. Unlike yaw
+rates, they reach the log unfiltered."""
+
+LONGEST_LINK_US = US_PER_S
+"""Maximum uplink delay of a setpoint [µs]."""
+
+
+@dataclass(frozen=True)
+class ClockAlignment:
+    """Relation of the clocks of a recording and a log of the same flight."""
+
+    told_us: float
+    """Downlink shift: companion's telemetry time minus the flight controller's time [µs]."""
+    correlation: float
+    """Correlation of the velocities at that shift, 0 to 1."""
+    error_m_s: float
+    """Root mean square difference of the velocities at that shift [m/s]."""
+    accepted_us: float | None
+    """Uplink shift: flight controller's time of accepting a setpoint minus the companion's send
+    time [µs]; None = fewer than `LEAST_SETPOINTS` matched setpoints."""
+    accepted_range_us: tuple[float, float] | None
+    """Bounds of the uplink shift that most setpoints agree on [µs]."""
+    setpoints: int
+
+    @property
+    def round_trip_us(self) -> float | None:
+        """Time from sending a setpoint to its telemetry [µs], without the vehicle's response."""
+        return None if self.accepted_us is None else self.told_us + self.accepted_us
+
+
+def align(
+    path: Trajectory,
+    log: VehicleLog,
+    sent_us: NDArray[np.int64],
+    setpoints: NDArray[np.float64],
+    commands: CommandKind = "velocity",
+) -> ClockAlignment:
+    """Return the clock relation of a recorded flight and its vehicle's log, or raise UsageError."""
+    told_us = _refined(path, log, _coarse(path, log))
+    flown, logged = path.velocity[:, :2], log.motion.at(path.time_us - told_us)[:, 3:5]
+    inside = _inside(path, log, told_us)
+    error = flown[inside] - logged[inside]
+    correlation = _correlation(flown[inside], logged[inside])
+    if correlation < LEAST_CORRELATION:
+        raise UsageError(
+            f"{log.path}: its velocities agree with those of the recording by {correlation:.2f} at "
+            f"best; accepted: the log of the same flight, {LEAST_CORRELATION:g} or more"
+        )
+    low_us, high_us, count = _accepted(sent_us, setpoints, commands, log, told_us)
+    known = count >= LEAST_SETPOINTS
+    return ClockAlignment(
+        told_us=told_us,
+        correlation=correlation,
+        error_m_s=float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
+        accepted_us=0.5 * (low_us + high_us) if known else None,
+        accepted_range_us=(low_us, high_us) if known else None,
+        setpoints=count,
+    )
+
+
+def _coarse(path: Trajectory, log: VehicleLog) -> float:
+    """Return the shift [µs] of maximum velocity correlation, rounded to the grid."""
+    times = [
+        np.arange(int(each[0]), int(each[-1]), GRID_US)
+        for each in (path.time_us, log.motion.time_us)
+    ]
+    told = np.stack([np.interp(times[0], path.time_us, each) for each in path.velocity.T])
+    logged = log.motion.at(times[1])[:, 3:].T
+    if min(len(each) for each in times) < 2 or np.abs(told).max() < LEAST_SPEED_M_S:
+        raise UsageError(
+            f"{log.path}: the clocks cannot be aligned; accepted: a flight with motion of "
+            f"{LEAST_SPEED_M_S:g} m/s or more"
+        )
+    score = sum(correlate(a, b) for a, b in zip(told, logged, strict=True))
+    lag = correlation_lags(len(times[0]), len(times[1]))[int(np.argmax(score))]
+    return float(times[0][0] - times[1][0] + lag * GRID_US)
+
+
+def _refined(path: Trajectory, log: VehicleLog, coarse_us: float) -> float:
+    """Return the best shift [µs] for attitude and velocity near a coarse shift."""
+
+    def cost(shift_us: float) -> float:
+        inside = _inside(path, log, shift_us)
+        times = path.time_us[inside] - shift_us
+        leaning = _down_and_nose(path.quaternion[inside])
+        logged = _down_and_nose(log.attitude.at(times))
+        moved = path.velocity[inside] - log.motion.at(times)[:, 3:]
+        turned = (leaning - logged) / max(float(leaning.std()), 1e-3)
+        return float(np.mean(turned**2) + np.mean((moved / path.velocity[inside].std()) ** 2))
+
+    bounds = (coarse_us - FINE_US, coarse_us + FINE_US)
+    return float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 50.0}).x)
+
+
+def _down_and_nose(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the horizontal parts of the body's down and nose axes (n, 4), equal for q and -q."""
+    w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
+    return np.stack(
+        [
+            2.0 * (x * z + w * y),
+            2.0 * (y * z - w * x),
+            1.0 - 2.0 * (y * y + z * z),
+            2.0 * (x * y + w * z),
+        ],
+        axis=1,
+    )
+
+
+def _inside(path: Trajectory, log: VehicleLog, shift_us: float) -> NDArray[np.bool_]:
+    """Return a mask (n,) of the samples within the log's time range."""
+    times = path.time_us - shift_us
+    first = max(log.motion.time_us[0], log.attitude.time_us[0])
+    last = min(log.motion.time_us[-1], log.attitude.time_us[-1])
+    inside: NDArray[np.bool_] = (times >= first) & (times <= last)
+    if not inside.any():
+        raise UsageError(f"{log.path}: accepted: the log of the same flight")
+    return inside
+
+
+def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    power = float(np.sum(a * a) * np.sum(b * b))
+    return float(np.sum(a * b) / np.sqrt(power)) if power > 0.0 else 0.0
+
+
+def _accepted(
+    sent_us: NDArray[np.int64],
+    setpoints: NDArray[np.float64],
+    commands: CommandKind,
+    log: VehicleLog,
+    told_us: float,
+) -> tuple[float, float, int]:
+    """Return the bounds [µs] of the uplink shift and the number of setpoints that agree."""
+    expected_us = np.asarray(sent_us - told_us, np.float64)
+    bounds = [
+        bound
+        for sent, seen, near in _looked_for(setpoints, commands, log)
+        for bound in _bounds(expected_us, sent, seen, np.array(near))
+    ]
+    if not bounds:
+        return 0.0, 0.0, 0
+    low_us, high_us, count = marzullo(np.array(bounds, np.float64))
+    return low_us - told_us, high_us - told_us, count
+
+
+def _looked_for(
+    setpoints: NDArray[np.float64], commands: CommandKind, log: VehicleLog
+) -> Iterator[tuple[NDArray[np.float64], Series, tuple[float, ...]]]:
+    """Yield sent setpoints (k, m), their series (n, m) in the log and match tolerances (m,)."""
+    if commands == "body_rates":
+        yield setpoints, log.rates_setpoint, (*3 * (SAME_TURN,), SAME_THRUST)
+        return
+    if commands == "attitude":
+        turned = [quat_from_euler(*angles) for angles in setpoints[:, :3].tolist()]
+        sent = _down_and_nose(np.array(turned).reshape(-1, 4))
+        seen = log.attitude_setpoint
+        attitude = _down_and_nose(seen.values[:, :4])
+        yield (
+            np.column_stack([sent, setpoints[:, 3]]),
+            Series(seen.time_us, np.column_stack([attitude, seen.values[:, 4]])),
+            (*4 * (SAME_TURN,), SAME_THRUST),
+        )
+        return
+    level = log.setpoint.values
+    # Speed and yaw rate do not depend on the heading, so they are equal at both ends.
+    sent = np.stack([np.hypot(setpoints[:, 0], setpoints[:, 1]), setpoints[:, 3]], axis=1)
+    seen_level = np.stack([np.hypot(level[:, 0], level[:, 1]), level[:, 3]], axis=1)
+    yield sent, Series(log.setpoint.time_us, seen_level), (SAME_SPEED_M_S, SAME_RATE_RAD_S)
+    yield sent[:, 1:], log.yaw_rate_setpoint, (SAME_RATE_RAD_S,)
+
+
+def _bounds(
+    expected_us: NDArray[np.float64],
+    sent: NDArray[np.float64],
+    seen: Series,
+    near: NDArray[np.float64],
+) -> list[tuple[float, float]]:
+    """Return intervals [µs] after the expected times (k,) in which setpoints enter the log."""
+    bounds = []
+    for k in range(1, len(sent)):
+        if (np.abs(sent[k] - sent[k - 1]) < 2.0 * near).all():
+            continue  # The log shows no change.
+        window = slice(
+            int(np.searchsorted(seen.time_us, expected_us[k] - FINE_US)),
+            int(np.searchsorted(seen.time_us, expected_us[k] + LONGEST_LINK_US)),
+        )
+        same = (np.abs(seen.values[window] - sent[k]) < near).all(axis=1)
+        first = int(np.argmax(same)) if same.any() else 0
+        if first > 0:
+            times = seen.time_us[window][first - 1 : first + 1] - expected_us[k]
+            bounds.append((float(times[0]), float(times[1])))
+    return bounds
+
+
+def marzullo(bounds: NDArray[np.float64]) -> tuple[float, float, int]:
+    """Return the interval covered by most of the intervals (n, 2), and their number."""
+    edges = [(low, -1) for low in bounds[:, 0]] + [(high, 1) for high in bounds[:, 1]]
+    edges.sort()
+    open_now, best, found = 0, 0, (0.0, 0.0)
+    for i, (at, kind) in enumerate(edges):
+        open_now -= kind
+        if kind == -1 and open_now > best:
+            best, found = open_now, (float(at), float(edges[i + 1][0]))
+    return found[0], found[1], best

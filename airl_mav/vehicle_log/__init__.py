@@ -1,1 +1,0 @@
-"""Flight controller's log (PX4's .ulg) and its alignment with a companion's recording."""

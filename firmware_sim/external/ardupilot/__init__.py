@@ -1,1 +1,0 @@
-"""ArduPilot SITL as the flight controller, over its JSON interface."""

@@ -1,1 +1,0 @@
-"""Transports to external firmware: serial port, and the router between a board and UDP."""
