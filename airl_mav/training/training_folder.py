@@ -51,23 +51,6 @@ class Evaluation:
 _EVALUATION = TypeAdapter(Evaluation)
 
 
-class TrainingProgress:
-    """Progress callbacks of a training run; the base class does nothing."""
-
-    def waiting(self, why: str) -> None:
-        """Called while another process holds the folder's lock."""
-
-    def trained(self, steps: int, success: float | None, zone: int | None) -> None:
-        """Called after each step of all vehicles, with their decisions so far.
-
-        `success` is the rate of the newest episodes, None before the first; `zone` is the open
-        curriculum zone.
-        """
-
-    def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
-        """Called after an evaluation; `best`: better than all previous ones."""
-
-
 class TrainingFolder:
     """A training run on disk; it can be read and resumed after a kill at any time."""
 
@@ -245,26 +228,31 @@ class Exported(Event):
     path: str
 
 
-class TrainingBar(TrainingProgress):
-    """A bar with the success rate, a line for every evaluation. A `TrainingProgress`."""
+class TrainingProgress:
+    """Progress of a training: a bar with the success rate, and a line for every evaluation."""
 
-    def __init__(self, progress: Progress, steps: int) -> None:
-        self._progress = progress
-        self._bar = progress.bar("training", steps, unit="decisions")
+    def __init__(self, progress: Progress | None = None, steps: int = 0) -> None:
+        """Show a training of `steps` decisions; without `progress` nothing is shown."""
+        self._progress = progress or Progress()
+        self._bar = self._progress.bar("training", steps, unit="decisions")
 
     def waiting(self, why: str) -> None:
-        """Print a line."""
+        """Show why the training waits: another process holds the folder's lock."""
         self._progress.note(why)
 
     def trained(self, steps: int, success: float | None, zone: int | None) -> None:
-        """Draw the bar."""
+        """Show the decisions of all vehicles so far; called after each step.
+
+        `success` is the rate of the newest episodes, None before the first; `zone` is the open
+        curriculum zone.
+        """
         text = "" if success is None else f"success {success:.0%} in training"
         text += "" if zone is None else f", zone {zone}"
         figures = {"training_success": success, "zone": zone}
         self._bar.update(completed=steps, postfix=text, figures=figures)
 
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
-        """Print a line, and report the evaluation to programs."""
+        """Show an evaluation, and report it to programs; `best`: better than all earlier ones."""
         shared = (each.name for each in fields(Evaluated) if each.name != "best")
         self._progress.tell(Evaluated(**{n: getattr(evaluation, n) for n in shared}, best=best))
         time = "" if evaluation.flight_time_s is None else f"{evaluation.flight_time_s:6.2f} s"
