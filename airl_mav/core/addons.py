@@ -5,6 +5,7 @@ The `__init__` of an add-on is light and may define tables, which the core reads
 
     COMMANDS: {command of `airl`: (purpose, module with OPTIONS and run)}
     EXECUTORS: {value of `--executor`: module with `connected`}
+    EXPORTS: {option of `airl export`: function from a policy's folder to a new policy}
     ALGORITHMS: {name in training files: `Algorithm` of `training.algorithm_table`}
     LIGHT: the commands can be imported without the simulator
     SITL_OPTIONS: {option of `airl sitl`: function to a context manager around the flights}
