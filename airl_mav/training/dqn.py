@@ -184,7 +184,8 @@ class NStepReplay(Ring):
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Return the complete memory by name; views, not copies."""
-        state = super().get_state() | {f"last/{key}": each for key, each in self._last.items()}
+        state = super().get_state()
+        state |= {f"last/{key}": each for key, each in self._last.items()}
         state["free"] = np.array(self._free, np.int32)
         return state
 
