@@ -270,7 +270,7 @@ def encode_body(
 def heading_told(quaternion: Quat, turn: Vec) -> tuple[float, float]:
     """Return cosine and sine of the heading that telemetry reports for an attitude, body -> NED.
 
-    `turn` is the attitude error [rad], as in `estimation.perturbed`.
+    `turn` is the attitude error [rad], as in `draws.perturbed`.
     """
     angle = math.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
     # The same operations as `np.sinc`, so that the result has the same bits.

@@ -196,8 +196,9 @@ class NStepReplay(Ring):
         self._free = state["free"].tolist()
 
     def _named(self) -> dict[str, NDArray[Any]]:
-        own = {"rewards": self._rewards, "ends": self._ends, "slots": self._slots}
-        return super()._named() | own
+        named = super()._named()
+        named |= {"rewards": self._rewards, "ends": self._ends, "slots": self._slots}
+        return named
 
     def _put_aside(self, observation: Mapping[str, NDArray[Any]]) -> int:
         """Store an episode's last observation and return its slot."""

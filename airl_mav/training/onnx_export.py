@@ -95,7 +95,7 @@ def export_network(
     `goal` (n, 3) float32, or (n, 4) with the goal's height. The output is a score per discrete
     action (n, k), or the continuous action (n, 2), in three dimensions (n, 3). The network scales
     the image itself. Memory is passed as additional inputs and outputs, with shapes in the
-    attribute `state` (`recurrent.RecurrentNetwork`).
+    attribute `state` (`RecurrentNetwork`).
 
     Nothing is written unless ONNX Runtime and torch agree. After a kill there is no card, or an old
     card that rejects the new policy: never a card for the wrong one. Raises UsageError if the
