@@ -4,6 +4,11 @@ Behaviour cloning flies the expert and learns its actions (Pomerleau, "ALVINN", 
 flies the learner for a growing share of decisions, and labels the visited states with the expert's
 actions (Ross, Gordon, Bagnell, AISTATS 2011, arXiv 1011.0686). Behaviour cloning is DAgger with the
 expert always in control.
+
+Experts decide for the flights of a batch twin, in its action set. `greedy` is the classical
+baseline with the policy's observations. `planner` uses the true arena, `gates` the true openings of
+its gates and computes its own actions (`GatePilot`). The others choose among commands of the action
+set: all of a discrete set, or a fan of directions and speeds of the continuous set.
 """
 
 from __future__ import annotations
