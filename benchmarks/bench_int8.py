@@ -22,8 +22,8 @@ from rich.table import Table
 from airl_mav.addons.int8.quantisation import export_int8, quantised
 from airl_mav.policy.card import ONNX_FILE, PolicyFacts, load_card, read_card
 from airl_mav.policy.card_writing import write_template
-from airl_mav.policy.layouts import boxes
-from airl_mav.policy.observation_spec import Encoded, ObservationSpec
+from airl_mav.policy.layouts import Encoded, boxes
+from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.registry import find_policy
 from airl_mav.policy.runtime import OnnxRuntime
 

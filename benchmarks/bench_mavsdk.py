@@ -40,7 +40,7 @@ from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.machine import provenance, usable_cores
 from airl_mav.latency.stages import summarize
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.report.table import (
+from airl_mav.report.document import (
     DURATION_COLUMNS,
     Column,
     TableView,

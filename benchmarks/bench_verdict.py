@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy import special, stats
 
-from airl_mav.flight.sequential import (
+from airl_mav.flight.requirements import (
     ALPHA,
     HALF_SPENT,
     LOOKS,

@@ -38,6 +38,16 @@ import psutil
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from airl_mav.addons.view.view_messages import (  # noqa: E402
+    CameraImage,
+    Decided,
+    Episode,
+    Image,
+    VehicleShape,
+    VehicleState,
+    ViewSettings,
+)
+from airl_mav.addons.view.viewer import Feed, Viewer  # noqa: E402
 from airl_mav.arena.generate import generate  # noqa: E402 (from here on the checkout is found)
 from airl_mav.camera.frame import depth_to_z16  # noqa: E402
 from airl_mav.camera.intrinsics import Intrinsics  # noqa: E402
@@ -46,17 +56,7 @@ from airl_mav.core.frames import quat_from_euler  # noqa: E402
 from airl_mav.profiles.arena import ArenaSpec  # noqa: E402
 from airl_mav.profiles.loading import load_profile  # noqa: E402
 from airl_mav.profiles.vehicle import load_vehicle  # noqa: E402
-from airl_mav.view.ends import ViewEnds, ViewSettings  # noqa: E402
-from airl_mav.view.feed import Feed  # noqa: E402
-from airl_mav.view.view_messages import (  # noqa: E402
-    CameraImage,
-    Decided,
-    Episode,
-    Image,
-    VehicleShape,
-    VehicleState,
-)
-from airl_mav.view.viewer import Viewer  # noqa: E402
+from airl_mav.rehearsal.live_view import ViewEnds  # noqa: E402
 from tests.support.browser import Page, browser  # noqa: E402
 
 VEHICLE_US, PICTURE_US, DECISION_US = 32_000, 96_000, 512_000
@@ -255,7 +255,7 @@ def viewed(*, paced: bool = False) -> Iterator[Viewer]:
 def drawing_process() -> psutil.Process:
     """Return the view's own process."""
     children = psutil.Process().children()
-    return next(each for each in children if "airl_mav.view.view_server" in each.cmdline())
+    return next(each for each in children if "airl_mav.addons.view.view_server" in each.cmdline())
 
 
 @contextmanager
@@ -286,7 +286,9 @@ def measure_live(folder: Path) -> None:
         open_page(page, viewer.url)
         wait_for(lambda: page.evaluate("window.told?.pose > 20"))
         server = next(
-            p for p in psutil.Process().children() if "airl_mav.view.view_server" in p.cmdline()
+            p
+            for p in psutil.Process().children()
+            if "airl_mav.addons.view.view_server" in p.cmdline()
         )
         for size, name in (((900, 600), "page 900x600"),):
             page.resize(*size)
@@ -318,7 +320,9 @@ def measure_memory(folder: Path, minutes: float = 30.0, speed: float = 30.0) -> 
     with viewed() as viewer, browser(folder) as page:
         open_page(page, viewer.url)
         server = next(
-            p for p in psutil.Process().children() if "airl_mav.view.view_server" in p.cmdline()
+            p
+            for p in psutil.Process().children()
+            if "airl_mav.addons.view.view_server" in p.cmdline()
         )
         with flying(viewer.ends, 60.0 * minutes, speed) as flight:
             wait_for(lambda: page.evaluate("window.told?.pose > 20"))
@@ -418,8 +422,8 @@ def measure_drawing(run: Path) -> None:
     """Measure the server's time to draw a moment of a replayed flight in the scene."""
     import viser
 
-    from airl_mav.report.replay.page import ReplayPage
-    from airl_mav.report.replay.replayed_flight import ReplayedRun
+    from airl_mav.addons.view.replay_page import ReplayPage
+    from airl_mav.addons.view.replayed_flight import ReplayedRun
 
     began = time.process_time()
     replayed = ReplayedRun(run)

@@ -38,12 +38,11 @@ sys.path.insert(0, str(ROOT))
 
 from bench_view import load, say, viewed, wait_for  # noqa: E402 (from here on it is found)
 
-from airl_mav.flight.paired import median_ratio  # noqa: E402
-from airl_mav.flight.statistics import Estimate  # noqa: E402
+from airl_mav.flight.statistics import Estimate, median_ratio  # noqa: E402
 from airl_mav.profiles.loading import load_profile  # noqa: E402
+from airl_mav.rehearsal.live_view import ViewEnds  # noqa: E402
 from airl_mav.scenario.model import Scenario  # noqa: E402
 from airl_mav.scenario.resolve import resolve  # noqa: E402
-from airl_mav.view.ends import ViewEnds  # noqa: E402
 from tests.support.browser import Page, browser  # noqa: E402
 from tests.support.processes import SITL_WITHOUT_REPORT  # noqa: E402
 

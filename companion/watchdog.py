@@ -117,10 +117,8 @@ class Watchdog:
         last = self._last
         # After body rates or an attitude, PX4 applies a velocity up to half a second later. Until
         # then the last setpoint must neither rotate nor tilt the vehicle.
-        if isinstance(last, BodyRates):
-            self._link.send_setpoint(BodyRates(0.0, 0.0, 0.0, last.thrust))
-        elif isinstance(last, Attitude):
-            self._link.send_setpoint(Attitude(0.0, 0.0, last.yaw_rad, last.thrust))
+        if isinstance(last, BodyRates | Attitude):
+            self._link.send_setpoint(last.stopped())
         self._link.send_setpoint(STOP)
 
     @property

@@ -12,17 +12,17 @@ from typing import Protocol
 import numpy as np
 
 from airl_mav.camera.frame import Frame
+from airl_mav.core.addons import entries, load
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
 from airl_mav.profiles.projections import SLOW, Renderer
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
+from firmware_sim.autopilot.autopilot_state import AutopilotState, OperatorText, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
 from firmware_sim.engine.record import Record
-from firmware_sim.faults.faulty_link import FailingEndpoint
-from firmware_sim.flight_log.flight_log import ULOG_SUFFIX, FlightLog, LogFolder
-from firmware_sim.interfaces import FlightController, TrueState
+from firmware_sim.fault_timeline import FailingLink
+from firmware_sim.interfaces import ULOG_SUFFIX, FlightController, TrueState
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.traffic import TlogWriter
@@ -60,6 +60,22 @@ class FrameServer(Protocol):
     def close(self) -> None:
         """Release the resources."""
         ...
+
+
+class FlightLog(Protocol):
+    """Flight log of the vehicle, by an add-on (table FLIGHT_LOGS)."""
+
+    def after_ticks(self, flown: Record, truths: Record, state: AutopilotState) -> None:
+        """Log n ticks, from their logs and the final state of the autopilot."""
+
+    def text(self, message: OperatorText, time_us: int) -> None:
+        """Log an operator text."""
+
+    def close(self) -> None:
+        """Complete the log. Idempotent; further ticks and texts are ignored."""
+
+    def discard(self) -> None:
+        """Complete the log, and release all files."""
 
 
 class FlightStack(Protocol):
@@ -207,7 +223,7 @@ class Firmware:
         pacing: Pacing,
         *,
         recording: bool = True,
-        failing: FailingEndpoint | None = None,
+        failing: FailingLink | None = None,
     ) -> None:
         """Create the firmware without an episode.
 
@@ -237,9 +253,7 @@ class Firmware:
         self._sockets: Sequence[int] = ()
         self._tlog: TlogWriter | None = None
         self._flight_log: FlightLog | None = None
-        self._log_folder: LogFolder | None = None
-        self._stop_listening: Callable[[], None] = lambda: None
-        """Unsubscribe the flight log from parameter changes."""
+        """Flight log; None without the add-on `flight_log`."""
 
     @property
     def camera_endpoint(self) -> str:
@@ -318,11 +332,10 @@ class Firmware:
         internals = None if simulation is None else simulation.autopilot.internals
         if simulation is not None and internals is not None:
             now_us = simulation.time_us
-            self._flight_log = log = FlightLog(
-                path, internals.parameters, now_us, start_unix_us - now_us, self._lose_log
-            )
-            self._stop_listening = internals.parameters.on_change(log.parameters_changed)
-            internals.logs = self._log_folder = LogFolder(path.parent, log)
+            for place in entries("firmware_sim", "FLIGHT_LOGS").values():
+                self._flight_log = load(place)(
+                    path, internals, now_us, start_unix_us - now_us, self._lose_log
+                )
 
     def _lose_log(self, what: str) -> None:
         """Report a log that can no longer be written; the flight continues without it."""
@@ -402,9 +415,7 @@ class Firmware:
     def close_logs(self) -> None:
         """Complete the logs of the episode. Idempotent."""
         if self._flight_log is not None:
-            self._stop_listening()
             self._flight_log.close()
-            self._flight_log = None
         if self._tlog is not None:
             self.flight_stack.log_to(None)
             self._tlog.close()
@@ -413,9 +424,9 @@ class Firmware:
     def discard(self) -> None:
         """Close the episode without saving it."""
         self.close_logs()
-        if self._log_folder is not None:
-            self._log_folder.close()
-            self._log_folder = None
+        if self._flight_log is not None:
+            self._flight_log.discard()
+            self._flight_log = None
         if self.simulation is not None:
             if self.epoch_ns is not None:
                 gc.unfreeze()

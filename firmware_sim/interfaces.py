@@ -9,8 +9,8 @@ a hundred times real time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from firmware_sim.autopilot.autopilot import BuiltinAutopilot
     from firmware_sim.autopilot.autopilot_state import OperatorText
     from firmware_sim.autopilot.commander import CommanderState
+
+ULOG_SUFFIX = ".ulg"
+"""Suffix of PX4's flight logs."""
 
 UNKNOWN_VARIANCE = np.full(3, np.nan)
 UNKNOWN_VARIANCE.setflags(write=False)
@@ -106,6 +109,13 @@ class FlowReading(NamedTuple):
     """(3,) angle integrated by the flow sensor's gyro, FRD [rad]; NaN = no gyro."""
 
 
+class Received(NamedTuple):
+    """Reading and its time of arrival [µs]."""
+
+    reading: Any
+    time_us: int
+
+
 class BatterySample(NamedTuple):
     """Sample of the power module."""
 
@@ -137,6 +147,8 @@ class SensorSample(NamedTuple):
     """Range of the vehicle's own rangefinder."""
     flow: FlowReading | None = None
     """Reading of the vehicle's own optical flow sensor."""
+    further: Mapping[str, Any] | None = None
+    """Readings of the vehicle's further sensors by name (`sensor_table`)."""
 
 
 class ActuatorControls(NamedTuple):

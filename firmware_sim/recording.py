@@ -17,7 +17,7 @@ from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Wire
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
 from firmware_sim.engine.record import Record
-from firmware_sim.faults.fault_timeline import Acted
+from firmware_sim.fault_timeline import Acted
 
 Ints = NDArray[np.int64]
 

@@ -45,9 +45,7 @@ from firmware_sim.engine.ticks import (
     log_flown_record,
     log_record,
 )
-from firmware_sim.faults.fault_timeline import ClientFaults, FaultTimeline
-from firmware_sim.faults.faulty_camera import FailingCamera
-from firmware_sim.faults.faulty_controller import FailingParts
+from firmware_sim.fault_timeline import ClientFaults, FaultTimeline, fault_effect
 from firmware_sim.interfaces import ActuatorControls, FlightController, SensorSample, TrueState
 from firmware_sim.pacing import Arrivals
 from firmware_sim.plant.body import FLOOR
@@ -235,7 +233,8 @@ class Simulation:
                 *(asked.renderer, vehicle.cameras),
             )
             if self.faults is not None:
-                self._camera = FailingCamera(self._camera, self.faults, setup.seed)
+                failing_camera = fault_effect("camera")
+                self._camera = failing_camera(self._camera, self.faults, setup.seed)
         self.recorder: FlightRecorder | None = None
         """Flight recorder; None = no recording."""
         if recording:
@@ -273,7 +272,8 @@ class Simulation:
         """Insert the fault layer between plant and flight controller; return its timeline."""
         setup = self._setup
         self.faults = FaultTimeline(setup.aircraft.faults, setup.seed, start_us)
-        self._fly = FailingParts(self.autopilot, self.plant, setup.vehicle, self.faults).step
+        failing_parts = fault_effect("parts")
+        self._fly = failing_parts(self.autopilot, self.plant, setup.vehicle, self.faults).step
         return self.faults
 
     def _faults_now(self) -> FaultTimeline:

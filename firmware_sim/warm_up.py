@@ -20,15 +20,12 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import DEFAULT_PLANT, Aircraft, PlantName
 from firmware_sim.autopilot.climb import Climb
-from firmware_sim.autopilot.error_state import INITIAL_SIGMA, KernelFilter, new_state
+from firmware_sim.autopilot.estimator import aiding
 from firmware_sim.autopilot.failsafes.watch import is_calm
-from firmware_sim.autopilot.range_finder import Aids, RangeFinder
-from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 from firmware_sim.engine.controller import Controller
 from firmware_sim.engine.record import FLOWN_TICK, RISING
 from firmware_sim.engine.ticks import detect_record
-from firmware_sim.interfaces import DistanceReading
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -41,10 +38,6 @@ LONGEST_TICKS = 1300
 
 ARMED_TICKS = 60
 """Number of ticks for the rotors to spin up and every stream to be sent."""
-
-GROUND_STEPS, GROUND_STEP_US = 30, 50_000
-"""Number of ranges on the ground and in the air, and their interval [µs]; longer than
-EKF2_RNG_QLTY_T."""
 
 HIGH_M = 20.0
 """Altitude above all obstacles [m]."""
@@ -76,7 +69,7 @@ def compile_others(vehicle: str) -> None:
     flown, context = np.zeros(1, FLOWN_TICK), np.zeros(TickContext.SIZE)
     Packer().pack(flown, 0, context, none, none.copy(), none.copy(), 1, 0, 1)
     _fuse_in_the_air()
-    _measure_the_ground(builtin_autopilot(EpisodeSetup(profile, None, 0)).parameters.value)
+    aiding().warm_up(builtin_autopilot(EpisodeSetup(profile, None, 0)).parameters.value)
     SimulatedCamera(profile.camera, _arena(profile), further=profile.cameras)
 
 
@@ -115,7 +108,7 @@ def _fly(vehicle: VehicleProfile, plant: PlantName, arena: Arena | None) -> None
     detect_record(autopilot.record)
     is_calm(autopilot.record, np.zeros(6))
     Climb(autopilot.record).fly(RISING, 0)
-    _measure_the_ground(autopilot.parameters.value)
+    aiding().warm_up(autopilot.parameters.value)
 
 
 def _fly_every_kind(value: Callable[[str], float]) -> None:
@@ -134,16 +127,3 @@ def _fuse_in_the_air() -> None:
     estimator = YawEstimator()
     estimator.feel(np.zeros(3), HOVER)
     estimator.observe(np.zeros(3), 0.5, np.zeros(3), flying=True)
-
-
-def _measure_the_ground(value: Callable[[str], float]) -> None:
-    """Fuse ranges on the ground and in the air: any client may send them at any time."""
-    state = new_state()
-    terrain = TerrainFilter(KernelFilter(np.diag(INITIAL_SIGMA**2), np.zeros(len(INITIAL_SIGMA))))
-    finder = RangeFinder(value, state, terrain, 0)
-    aids = Aids(horizontal=True, vertical_speed=True, height_us=0)
-    for step in range(1, 2 * GROUND_STEPS):
-        now_us = step * GROUND_STEP_US
-        terrain.predict(state, np.zeros(3), HOVER)
-        finder.take(DistanceReading(0.5, 0.1, 12.0), now_us, 1)
-        finder.step(now_us, lambda: aids, flying=step > GROUND_STEPS)

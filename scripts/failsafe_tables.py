@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 
 from airl_mav.profiles.parameters import SPEC_BY_NAME
 from firmware_sim.autopilot import prearm
+from firmware_sim.autopilot.events.definition import FailsafeAction, words
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     Clear,
-    FailsafeAction,
     Options,
     Takeover,
 )
@@ -23,11 +23,11 @@ from firmware_sim.autopilot.flight_modes import Mode
 ACTION_NAMES = {
     FailsafeAction.NONE: "nothing",
     FailsafeAction.WARN: "warn",
-    FailsafeAction.FALLBACK_POSITION: "Position",
-    FailsafeAction.FALLBACK_ALTITUDE: "Altitude",
+    FailsafeAction.FALLBACK_POSCTRL: "Position",
+    FailsafeAction.FALLBACK_ALTCTRL: "Altitude",
     FailsafeAction.FALLBACK_STABILIZED: "Stabilized",
     FailsafeAction.HOLD: "Hold",
-    FailsafeAction.RETURN: "Return",
+    FailsafeAction.RTL: "Return",
     FailsafeAction.LAND: "Land",
     FailsafeAction.DESCEND: "Descend",
     FailsafeAction.DISARM: "disarm",
@@ -80,7 +80,7 @@ def _shown(row: Row) -> Options | None:
     chosen = row.answers.get(value)
     if chosen is not None and chosen.action > FailsafeAction.WARN:
         return chosen
-    returning = [options for options in acting if options.action is FailsafeAction.RETURN]
+    returning = [options for options in acting if options.action is FailsafeAction.RTL]
     return next(iter(returning or acting), None)
 
 
@@ -122,15 +122,8 @@ def needs() -> str:
 
 def checks() -> str:
     """Return the pre-arm checks in reporting order."""
-    rows = (
-        (
-            check.text,
-            (check.part.name or "").lower().replace("_", " "),
-            _told(check),
-        )
-        for check in prearm.CHECKS
-    )
-    return _table(("text", "part", "told"), rows)
+    rows = ((check.text, words(check.component), _told(check)) for check in prearm.CHECKS)
+    return _table(("text", "component", "told"), rows)
 
 
 def _told(check: prearm.PrearmCheck) -> str:

@@ -38,7 +38,6 @@ from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.constants import LOOPBACK, TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.signing import read_key
-from airl_mav.policy.actions import limited
 from airl_mav.policy.observation import Kinematics, encode
 from airl_mav.policy.registry import GreedyPolicy
 from airl_mav.profiles.loading import load_profile, profiles_dir
@@ -288,7 +287,7 @@ def see_hostile_frames(number: int, frames: int = 50) -> str:
                 assert seen.frame.image.shape == k.shape
                 if k.kind != "depth":
                     continue  # A companion rejects such a camera for its policy before take-off.
-                action = limited(policy.act(encode(seen.frame, still, (20.0, 5.0))), 5.0)
+                action = policy.act(encode(seen.frame, still, (20.0, 5.0))).within(5.0)
                 numbers = (action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s)
                 assert all(map(math.isfinite, numbers)), action
             return f"{source.malformed} of {frames} frames refused"

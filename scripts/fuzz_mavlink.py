@@ -34,8 +34,7 @@ from firmware_sim.mavlink.codec import Encoder, WireLayout, dialect, message_id
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
-from firmware_sim.mavlink.services import handlers
-from firmware_sim.mavlink.services.commands import ACTIONS
+from firmware_sim.mavlink.services import table
 from firmware_sim.pacing import Unpaced
 from firmware_sim.simulation import EpisodeSetup
 
@@ -67,7 +66,7 @@ PARAMETERS = tuple(spec.name.encode() for spec in SPECS)
 KNOWN: Mapping[str, tuple[int, ...]] = {
     "target_system": (1, 1, 1, 1, 1, 1, 1, 1, 1, 0),
     "target_component": (1, 1, 1, 1, 1, 1, 1, 1, 1, 0),
-    "command": tuple(ACTIONS),
+    "command": tuple(table("ACTIONS")),
     "param_type": (6, 9),
     "device": (10,),
     "flags": (0, 2, 6),
@@ -124,7 +123,11 @@ class Fuzzer:
     def __init__(self, rng: np.random.Generator, *, steering: bool = False) -> None:
         self._dice = dice = Dice(rng)
         # A signing key would reject all later frames.
-        names = STEERING if steering else [name for name in handlers() if name != "SETUP_SIGNING"]
+        names = (
+            STEERING
+            if steering
+            else [name for name in table("HANDLERS") if name != "SETUP_SIGNING"]
+        )
         known = {**KNOWN, "command": STEERING_COMMANDS} if steering else KNOWN
         self._kinds = [_Kind(dialect.mavlink_map[message_id(name)], dice, known) for name in names]
         self._encoders = [Encoder(245, 190), Encoder(1, 191), Encoder(0, 0), Encoder(255, 255)]

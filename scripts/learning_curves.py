@@ -29,7 +29,7 @@ from scipy import stats
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json, replace_file
-from airl_mav.report.table import NONE, Column, TableView, markdown_table, write_table
+from airl_mav.report.document import NONE, Column, TableView, markdown_table, write_table
 from airl_mav.training.training_folder import CONFIG_FILE, SCHEMA, Evaluation, TrainingFolder
 
 CONFIGS = (

@@ -27,7 +27,7 @@ from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.machine import provenance
 from airl_mav.core.progress import new_console
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.report.table import NONE, Column, TableView, print_table, write_table
+from airl_mav.report.document import NONE, Column, TableView, print_table, write_table
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Result, Setpoint
 from firmware_sim.autopilot.flight_modes import Mode

@@ -29,7 +29,6 @@ SUBCOMMANDS: dict[str, str] = {
     "ladder": "the same policy and seeds at several levels of the fidelity ladder",
     "train": "train a policy on the batch twin",
     "export": "turn a stable-baselines3 model into a policy folder",
-    "view": "replay the flights of a run in a browser",
     "report": "a run's tables and page again, or a comparison of several runs",
     "arena": "look at an arena, or at what its profile draws",
     "asset": "an arena whose obstacles are a mesh of yours (STL, OBJ, GLB)",

@@ -93,8 +93,7 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
 
 
 def _compare(options: ReportOptions, console: Console) -> int:
-    from airl_mav.report.comparison.runs import compare_folders
-    from airl_mav.report.comparison.show import show_comparison
+    from airl_mav.report.comparison.show import compare_folders, show_comparison
 
     out = options.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-compare"
     if (out / RUN_FILE).exists():

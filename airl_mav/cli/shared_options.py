@@ -13,12 +13,13 @@ from rich.console import Console
 from airl_mav import __version__
 from airl_mav.black_box.messages import SUFFIX
 from airl_mav.cli.options import REPEATED, check_installed
+from airl_mav.core.addons import entries, load
 from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import FieldError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.progress import Event, JsonProgress, Progress, RichProgress, new_console
+from airl_mav.rehearsal.live_view import ViewRequest, check_view
 from airl_mav.scenario.aircraft import GREATEST_PORT
-from airl_mav.view.ends import ViewRequest
 
 if TYPE_CHECKING:
     from airl_mav.flight.requirements import Requirement
@@ -102,6 +103,7 @@ def view_of(options: Viewing) -> ViewRequest | None:
                 "view_port", options.view_port, problem="accepted: together with --view"
             )
         return None
+    check_view()
     check_installed("view")
     return ViewRequest(options.view_port)
 
@@ -111,10 +113,10 @@ def folder_of(path: Path, ulg: Path | None = None) -> Path:
     if path.suffix != SUFFIX or path.is_dir():
         return path
     check_installed("black-box" if ulg is None else "refit")
-    # Imported here: MCAP is an extra.
-    from airl_mav.report.recording_folder import take_in
-
-    return take_in(path, ulg)
+    converter = entries("airl_mav", "RECORDINGS").get(path.suffix)
+    if converter is None:
+        raise UsageError(f"{path}: needs the add-on recordings (airl_mav/addons/recordings)")
+    return Path(load(converter)(path, ulg))
 
 
 SCHEMA = 1

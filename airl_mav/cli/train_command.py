@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 from rich.console import Console
@@ -19,11 +19,11 @@ from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.first_start import compile_shown
 from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.rehearsal.live_view import ViewError, view_part
 from airl_mav.training.training_folder import Exported, TrainingProgress, TrainRequest
 
 if TYPE_CHECKING:
-    from airl_mav.view.ends import ViewRequest
-    from airl_mav.view.viewer import Viewer
+    from airl_mav.rehearsal.live_view import ViewRequest
 
 
 class TrainOptions(Telling, TrainRequest, Viewing):
@@ -111,14 +111,10 @@ def run(
 
 
 @contextmanager
-def _viewer(name: str, asked: ViewRequest) -> Iterator[Viewer]:
+def _viewer(name: str, asked: ViewRequest) -> Iterator[Any]:
     """Show a training in a viewer. Raises UsageError if the viewer cannot start."""
-    # Imported here: only trainings with a viewer need it.
-    from airl_mav.training.watched_training import request_of
-    from airl_mav.view.viewer import Viewer, ViewError
-
     try:
-        viewer = Viewer(request_of(name, asked.port))
+        viewer = view_part("viewer")(view_part("training page")(name, asked.port))
     except ViewError as error:
         raise UsageError(str(error)) from None
     with closing(viewer):

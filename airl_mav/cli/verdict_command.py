@@ -13,7 +13,7 @@ from airl_mav.cli.options import POSITIONAL, REPEATED, scenario_of
 from airl_mav.cli.shared_options import Gate, Voice, leave, requirements_of
 from airl_mav.experiments.gap import seek_verdict
 from airl_mav.experiments.live import EXIT_CODES
-from airl_mav.flight.sequential import LOOKS
+from airl_mav.flight.requirements import LOOKS
 from airl_mav.scenario import model
 
 DEFAULT_REQUIREMENT = "success >= 95 %"

@@ -7,6 +7,9 @@ The `__init__` of an add-on is light and may define tables, which the core reads
     EXECUTORS: {value of `--executor`: module with `connected`}
     EXPORTS: {option of `airl export`: function from a policy's folder to a new policy}
     ALGORITHMS: {name in training files: `Algorithm` of `training.algorithm_table`}
+    VIEW: {part of the live view: its class or function} (`rehearsal.live_view`)
+    RECORDINGS: {suffix of a flight's recording: function that makes a run folder of it}
+    NOTEBOOK: {`run` or `comparison`: function that returns its HTML}
     LIGHT: the commands can be imported without the simulator
     SITL_OPTIONS: {option of `airl sitl`: function to a context manager around the flights}
 
@@ -21,10 +24,16 @@ In `firmware_sim.addons`:
 
 In `firmware_sim.addons`:
 
+    AIDING: {any name: class of the `estimator.Aiding` that fuses further sensors}
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
+    SENSORS: {name in `profiles.vehicle.Sensors`: its `sensor_table.Sensor`}
     MISSIONS: {name: subclass of `navigation.plan.Missions`}
-    SERVICES: {name: MAVLink service, a module with HANDLERS and `send_pending`}
+    SERVICES: {name: MAVLink service, a module as described in `firmware_sim.mavlink.services`}
+    STREAMS: {name: module with BUILDERS of streamed messages, as `firmware_sim.mavlink.streams`}
+    CAPABILITIES: {name: bit of MAV_PROTOCOL_CAPABILITY}
     EVENTS: {name: module with event `Definition`s}
+    FLIGHT_LOGS: {name: function that opens a `firmware_sim.firmware.FlightLog`}
+    FAULT_EFFECTS: {`parts`, `camera` or `link`: class that executes faults there}
 
 Values are text (`module` or `module:name`); `load` imports what they name, on first use.
 `after_import` runs a module of this package once another package is imported.

@@ -132,6 +132,21 @@ def load_part(door: PluginKind, name: str, fits: Callable[[Any], bool] = callabl
     return part
 
 
+def load_object(door: PluginKind, name: str, methods: Sequence[str]) -> Any:
+    """Return an object with methods, constructed without arguments if the component is a class.
+
+    Raises FieldError as `load_part`, and if it cannot be constructed.
+    """
+    found = load_part(
+        door, name, lambda part: all(callable(getattr(part, each, None)) for each in methods)
+    )
+    try:
+        return found() if isinstance(found, type) else found
+    except Exception as error:
+        problem = f"cannot be made without arguments: {type(error).__name__}: {error}"
+        raise FieldError(door.field, name, problem=problem) from error
+
+
 def digest_of(found: str) -> str | None:
     """Return the SHA-256 of a component's file; None without a file. Raises OSError."""
     where = found.rpartition(":")[0]

@@ -24,10 +24,9 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
 from airl_mav.latency.stamps import NO_STAMP, SETPOINTS
 from airl_mav.policy.actions import Action, Policy, command_numbers, commands, flyable
-from airl_mav.policy.layouts import encode_layout
+from airl_mav.policy.layouts import Encoded, encode_layout
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
-from airl_mav.policy.observation_spec import Encoded
 
 Decide = Callable[[Encoded], NDArray[Any]]
 """Function from observations of n vehicles to n actions; must treat each row independently."""

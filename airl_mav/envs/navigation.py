@@ -48,10 +48,10 @@ from airl_mav.faults.fault import Fault, check_twin
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import UPRIGHT_S
 from airl_mav.policy.images import Bytes, body_bytes
-from airl_mav.policy.layouts import GOAL, VELOCITY, encode_layout
+from airl_mav.policy.layouts import GOAL, VELOCITY, Encoded, encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, Rows, observe
-from airl_mav.policy.observation_spec import Encoded, ObservationSpec
-from airl_mav.prediction import Compensator
+from airl_mav.policy.observation_spec import ObservationSpec
+from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.conditions import Payload, check_spread, equipped

@@ -21,8 +21,8 @@ from airl_mav.envs.spec import SHIPPED_REWARDS, Costs, EnvironmentSpec, gymnasiu
 from airl_mav.envs.stopping import bounded
 from airl_mav.envs.world import GOES_ON, TERMINATED, TRUNCATED
 from airl_mav.policy.actions import ActionSpec, commands, continuous_numbers, discrete_actions
-from airl_mav.policy.layouts import boxes, newest_frame
-from airl_mav.policy.observation_spec import Encoded, ObservationSpec
+from airl_mav.policy.layouts import Encoded, boxes, newest_frame
+from airl_mav.policy.observation_spec import ObservationSpec
 
 FIRST_TRAINING_SEED = 1_000_000
 """First seed that episodes draw automatically; lower seeds are reserved for evaluation."""

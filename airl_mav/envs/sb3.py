@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.saved_state import Stateful
 from airl_mav.envs.vector import NavigationVectorEnv
-from airl_mav.policy.observation_spec import Encoded
+from airl_mav.policy.layouts import Encoded
 
 QUALITY = ("success", "outcome", "flight_time_s", "distance_m", "energy_j", "seed", "zone")
 """Keys of `info` in SB3's `episode` info, in addition to return, length and time."""

@@ -21,15 +21,8 @@ from airl_mav.policy.actions import (
     DecisionTiming,
     MaxRate,
 )
-from airl_mav.policy.observation_spec import (
-    LEAST_ROWS,
-    STRIP_ROWS,
-    CameraName,
-    Frames,
-    GoalHeight,
-    LayoutName,
-    Told,
-)
+from airl_mav.policy.layouts import LEAST_ROWS, STRIP_ROWS
+from airl_mav.policy.observation_spec import CameraName, Frames, GoalHeight, LayoutName, Told
 from airl_mav.profiles.camera import Camera, check_matched, check_rows
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 from airl_mav.profiles.projections import (

@@ -36,7 +36,7 @@ from airl_mav.envs.saved_state import (
 )
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.envs.world import GOES_ON, TERMINATED, TRUNCATED
-from airl_mav.policy.observation_spec import Encoded
+from airl_mav.policy.layouts import Encoded
 
 AHEAD = 32
 """Number of arenas generated ahead at a time."""

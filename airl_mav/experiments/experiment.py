@@ -14,6 +14,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from airl_mav.core import addons
 from airl_mav.core.clock import utc_now
 from airl_mav.core.files import Arrays
 from airl_mav.core.progress import Progress, RichProgress, new_console
@@ -38,7 +39,7 @@ from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.comparison_model import Comparison, Kind, RunEntry
-from airl_mav.report.table import count_outcomes
+from airl_mav.report.document import count_outcomes
 from airl_mav.scenario.model import Scenario, free_fields
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
 
@@ -119,13 +120,13 @@ class ExperimentResult:
     """Statistics of every run, and paired differences between runs."""
     page: Path
 
-    def _repr_html_(self) -> str:
+    def _repr_html_(self) -> str | None:
         """Return the notebook view: results, statistics and the first figure."""
-        # Imported here: matplotlib takes half a second, which flights do not need.
-        from airl_mav.report.notebook import comparison_html
-
+        html = addons.entries("airl_mav", "NOTEBOOK").get("comparison")
+        if html is None:
+            return None
         loaded = {name: load(run.path) for name, run in self.runs.items()}
-        return comparison_html(self.comparison, loaded, self.path, self.page)
+        return str(addons.load(html)(self.comparison, loaded, self.path, self.page))
 
 
 def file_name(text: str) -> str:
@@ -311,11 +312,10 @@ class Run:
         """True if all planned episodes have been flown."""
         return len(self.episodes) == len(self.info.seeds)
 
-    def _repr_html_(self) -> str:
+    def _repr_html_(self) -> str | None:
         """Return the notebook view: the verdict, the statistics and a map of the flights."""
-        from airl_mav.report.notebook import run_html
-
-        return run_html(self._loaded)
+        html = addons.entries("airl_mav", "NOTEBOOK").get("run")
+        return None if html is None else str(addons.load(html)(self._loaded))
 
     def report(self) -> Path:
         """Write the page and pictures of the run and return the page, or raise UsageError."""

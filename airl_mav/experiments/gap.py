@@ -30,8 +30,7 @@ from airl_mav.experiments.experiment import (
     workers_of,
 )
 from airl_mav.experiments.live import Ended, FlownRun
-from airl_mav.flight.requirements import Requirement
-from airl_mav.flight.sequential import LOOKS, RequirementDecision
+from airl_mav.flight.requirements import LOOKS, Requirement, RequirementDecision
 from airl_mav.flight.statistics import reached_goals
 from airl_mav.policy.card import PolicyCard
 from airl_mav.policy.registry import PolicyInfo, find_policy

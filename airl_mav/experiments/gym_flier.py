@@ -27,7 +27,7 @@ from airl_mav.experiments.executors import FlyEpisodes, Stop
 from airl_mav.faults.fault import check_twin
 from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.quality import measure_quality
+from airl_mav.flight.trajectory import measure_quality
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation_spec import ObservationSpec, SeenCamera
 from airl_mav.prediction import Compensator

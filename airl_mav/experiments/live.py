@@ -15,12 +15,12 @@ from airl_mav.core.progress import Progress
 from airl_mav.core.scheduling import remove_left
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.lockstep.turns import LockstepError
+from airl_mav.rehearsal.live_view import ViewEnds, ViewError, ViewRequest, view_part
 from airl_mav.rehearsal.observer import LiveObserver, Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RUN_FILE, locked, open_folder
 from airl_mav.rehearsal.signals import terminated_as_interrupted
 from airl_mav.scenario.resolve import ResolvedScenario, plan_of
-from airl_mav.view.ends import ViewEnds, ViewRequest
 from firmware_sim.external.programs import check_program
 
 Ended = Literal["complete", "interrupted", "broken off"]
@@ -117,19 +117,15 @@ def _watched(
     scenario: ResolvedScenario, asked: ViewRequest, onwards: Observer, progress: Progress
 ) -> Iterator[tuple[ViewEnds, Observer]]:
     """Start a viewer; yield its connections and an observer that also notifies `onwards`."""
-    # Imported here: only runs with a viewer need it.
-    from airl_mav.rehearsal.view_observer import ViewObserver
-    from airl_mav.view.viewer import Viewer, ViewError, request_of
-
     onwards.waiting("starting the view")
     name = f"{scenario.policy.name} in {scenario.arena_name}, {scenario.level}"
     try:
-        started = Viewer(request_of(scenario, name, asked.port))
+        started = view_part("viewer")(view_part("flights")(scenario, name, asked.port))
     except ViewError as error:
         raise RehearsalError(str(error)) from None
     with closing(started) as viewer:
         progress.note(f"view       {viewer.url}")
-        with closing(ViewObserver(viewer.ends, onwards)) as observer:
+        with closing(view_part("observer")(viewer.ends, onwards)) as observer:
             yield viewer.ends, observer
 
 

@@ -14,7 +14,7 @@ from airl_mav.core.files import typed
 from airl_mav.core.frames import Goal
 from airl_mav.core.resource_use import ProcessUse
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.quality import Quality
+from airl_mav.flight.trajectory import Quality
 from airl_mav.latency.injection import Injection
 
 BUILT_IN = "built-in"

@@ -1,14 +1,23 @@
-"""Referee: ends an episode and returns its verdict."""
+"""Referee: ends an episode and returns its verdict. Validity: a test, or disturbed by the host.
+
+Flights paced by the wall clock share a machine with other programs. An overloaded host or another
+client's commands invalidate a flight. Invalid flights are repeated, and never counted silently.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
-from airl_mav.core.constants import US_PER_S
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.fields import quantity
 from airl_mav.core.frames import Goal, goal_distance_m
+from airl_mav.latency.stamps import NO_STAMP
 
 GOAL_RADIUS_M = 3.0
 """Default goal radius [m], from the paper's code; horizontal distance."""
@@ -131,3 +140,144 @@ class Referee:
         if flying and sample.time_us - (self.navigation_us or 0) >= task.time_limit_s * US_PER_S:
             return Outcome.TIMEOUT, f"{distance:.2f} m from the goal after {task.time_limit_s:g} s"
         return None
+
+
+BY_HAND = "latency or compensation was changed by hand"
+"""Invalidity reason after a manual change in flight."""
+
+LATE_FRAMES = 3.0
+"""Delay limit in camera periods, for a frame's age at its decision, and for a decision's start
+after the previous hold time. With a fast host the delay is one period plus transport."""
+
+
+@dataclass(frozen=True)
+class HostFigures:
+    """Disturbance of a flight by the host. None without data."""
+
+    given_up: float
+    """Skipped simulated time, as a share of the flight."""
+    tick_lateness_ms: float | None
+    """99th percentile of the ticks' start delay [simulated ms]."""
+    speed: float | None
+    """Simulated seconds per wall second, as a share of the requested speed."""
+    stale_frames: float | None
+    """Share of decisions on a frame older than `LATE_FRAMES` camera periods."""
+    late_decisions: float | None
+    """Share of decisions that began more than `LATE_FRAMES` camera periods after the hold time."""
+
+
+class Rule(NamedTuple):
+    """Bound that a flight must keep to be valid."""
+
+    figure: str
+    """Field of `HostFigures`."""
+    limit: float
+    least: bool
+    """True for a minimum, False for a maximum."""
+    scale: float
+    """Factor from the figure to the unit of the text."""
+    text: str
+    """Problem description, with placeholders for the figure and the limit."""
+
+
+RULES = (
+    Rule(
+        "given_up", 0.01, False, 100.0, "{:.1f} % of its simulated time was given up (limit {:g} %)"
+    ),
+    Rule("tick_lateness_ms", 40.0, False, 1.0, "1 % of ticks began {:.0f} ms late (limit {:g} ms)"),
+    Rule("speed", 0.95, True, 100.0, "flown at {:.0f} % of the speed asked for (limit {:g} %)"),
+    Rule(
+        "stale_frames",
+        0.05,
+        False,
+        100.0,
+        "{:.0f} % of decisions were on a camera frame missed by the host (limit {:g} %)",
+    ),
+    Rule(
+        "late_decisions",
+        0.05,
+        False,
+        100.0,
+        "{:.0f} % of decisions were paced too late (limit {:g} %)",
+    ),
+)
+"""Validity rules. Ticks are 4 ms apart and camera frames mostly 33 ms. A decision moves a vehicle
+at 4 m/s by 0.16 m in 40 ms, a tenth of its effect in a hold time of 0.5 s."""
+
+
+def host_figures(
+    *,
+    flight_us: int,
+    slipped_us: int,
+    wall_s: float | None,
+    speed: float | None,
+    lateness_us: NDArray[np.int64],
+    decisions: Mapping[str, NDArray[Any]],
+    frame_period_us: int,
+    excused: Sequence[tuple[int, int]] = (),
+) -> HostFigures:
+    """Return the disturbance of a flight by the host, in simulated time.
+
+    `flight_us` is the time from the reset to the verdict, without skipped time, `slipped_us`;
+    `wall_s` is the wall time, None without pacing. `lateness_us` (n,) is the start delay of each
+    tick. `decisions` has stamps by column, as in `latency.npz`. `excused` are intervals in which
+    requested faults or slow images may delay decisions: faults of the camera, a link or a process.
+    """
+    kept = None
+    if wall_s and speed:
+        kept = flight_us / US_PER_S / (wall_s * speed)
+    whole_us = flight_us + slipped_us
+    late_us = LATE_FRAMES * frame_period_us
+    return HostFigures(
+        given_up=slipped_us / whole_us if whole_us > 0 else 0.0,
+        tick_lateness_ms=float(np.percentile(lateness_us, 99.0)) / US_PER_MS
+        if lateness_us.size
+        else None,
+        speed=kept,
+        stale_frames=_share_beyond(decisions, "capture_us", "infer_start_us", late_us, excused),
+        late_decisions=_share_beyond(
+            _shifted(decisions), "held_until_us", "infer_start_us", late_us, excused
+        ),
+    )
+
+
+def host_faults(figures: HostFigures, strangers: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the reasons why a flight is invalid; `strangers` are other commanding clients."""
+    faults = []
+    for rule in RULES:
+        value = getattr(figures, rule.figure)
+        if value is None:
+            continue
+        if value < rule.limit if rule.least else value > rule.limit:
+            faults.append(rule.text.format(rule.scale * value, rule.scale * rule.limit))
+    faults.extend(f"commanded by a stranger: {stranger}" for stranger in strangers)
+    return tuple(faults)
+
+
+def _shifted(decisions: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return the end of each hold time beside the start of the next decision."""
+    if "held_until_us" not in decisions or "infer_start_us" not in decisions:
+        return {}
+    return {
+        "held_until_us": decisions["held_until_us"][:-1],
+        "infer_start_us": decisions["infer_start_us"][1:],
+    }
+
+
+def _share_beyond(
+    stamps: Mapping[str, NDArray[Any]],
+    start: str,
+    end: str,
+    limit_us: float,
+    excused: Sequence[tuple[int, int]],
+) -> float | None:
+    """Return the share of intervals over a limit, without excused times; None: no interval."""
+    if start not in stamps or end not in stamps:
+        return None
+    first, last = stamps[start], stamps[end]
+    both = (first != NO_STAMP) & (last != NO_STAMP)
+    for from_us, to_us in excused:
+        both &= (last < from_us) | (first > to_us)
+    if not both.any():
+        return None
+    return float(np.mean((last - first)[both] > limit_us))

@@ -1,13 +1,19 @@
-"""True path of one episode, sampled at 50 Hz from the plant."""
+"""True path of one episode at 50 Hz, and its quality: time, distance, energy, smoothness."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import heading_to_ned, quats_to_euler
+from airl_mav.latency.stages import ages_at_effect, deadline_miss_ratio
+from airl_mav.latency.stamps import NO_STAMP, SETPOINT
 
 SAMPLE_US = 20_000
 """Sampling period [µs]: 50 Hz."""
@@ -98,3 +104,232 @@ def pose_at(
     time = min(max(time_us, int(path.time_us[0])), int(path.time_us[-1]))
     at = path.between(time, time)
     return at.position[0], at.velocity[0], at.quaternion[0]
+
+
+@dataclass(frozen=True)
+class Leg:
+    """Part of a flight."""
+
+    time_s: float
+    distance_m: float
+    """Path length in three dimensions [m]."""
+    energy_j: float | None
+    """Electrical energy of the vehicle, without its computer [J]; None: not measured."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Measures of one episode. All but `takeoff` count from the start of navigation."""
+
+    flight_time_s: float
+    distance_m: float
+    """Path length in three dimensions [m]."""
+    energy_j: float | None
+    """Electrical energy of the vehicle, without its computer [J]; None: not measured."""
+    computer_energy_j: float
+    """Energy of the onboard computer: its watts times the flight time; 0 on the ground [J]."""
+    mean_speed_m_s: float
+    max_speed_m_s: float
+    takeoff: Leg
+    endurance_s: float | None = None
+    """Endurance of the pack's initial charge at this flight's mean power, with its computer [s];
+    None without power, and in older records."""
+    range_m: float | None = None
+    """Range at the endurance and the flight's mean speed [m]."""
+    missions_per_charge: float | None = None
+    """Number of such flights per charge."""
+    deadline_misses: float | None = None
+    """Share of decisions that took effect later than the hold time after their frame was exposed,
+    or never (`latency.stages`), 0 to 1. This and the following: None without data and in older
+    records."""
+    jerk_rms_m_s3: float | None = None
+    """RMS jerk of the flown velocity, at the bandwidth of `jerk_of` [m/s³]."""
+    jerk_peak_m_s3: float | None = None
+    command_jerk_rms_m_s3: float | None = None
+    """RMS jerk of the commanded velocity, at the same bandwidth [m/s³]."""
+    command_jerk_peak_m_s3: float | None = None
+    command_step_m_s: float | None = None
+    """Mean step of the commanded velocity at a switch of action [m/s]."""
+    command_step_max_m_s: float | None = None
+
+    @property
+    def total_energy_j(self) -> float | None:
+        """Energy of vehicle and computer together [J]."""
+        return None if self.energy_j is None else self.energy_j + self.computer_energy_j
+
+
+def measure_leg(trajectory: Trajectory, start_us: int, end_us: int) -> Leg:
+    """Measure the part of a flight between two simulated times [µs]."""
+    part = trajectory.between(start_us, end_us)
+    steps_s = np.diff(part.time_us) / US_PER_S
+    energy_j = float(np.sum(part.power_w[1:] * steps_s))
+    return Leg(
+        time_s=(end_us - start_us) / US_PER_S,
+        distance_m=float(np.linalg.norm(np.diff(part.position, axis=0), axis=1).sum()),
+        energy_j=energy_j if math.isfinite(energy_j) else None,
+    )
+
+
+def measure_quality(
+    trajectory: Trajectory,
+    navigation_us: int,
+    ended_us: int,
+    computer_watts: float,
+    pack_j: float | None = None,
+    *,
+    decisions: Mapping[str, NDArray[Any]] | None = None,
+    hold_s: float = 0.0,
+) -> Quality:
+    """Measure an episode from its start to the verdict.
+
+    `pack_j` is the initial energy of the pack (`Battery.energy_j`) [J]; `decisions` are the columns
+    of the decision log, as in `latency.npz`. None for unknown values. Actions held for 0 s have no
+    deadline.
+    """
+    if ended_us < navigation_us:
+        raise ValueError(f"ended_us={ended_us} lies before navigation_us={navigation_us}")
+    leg = measure_leg(trajectory, navigation_us, ended_us)
+    speed = trajectory.between(navigation_us, ended_us).speed()
+    began_us = min(int(trajectory.time_us[0]), navigation_us) if len(trajectory) else navigation_us
+    computer_j = computer_watts * leg.time_s
+    spent_j = 0.0 if leg.energy_j is None else leg.energy_j + computer_j
+    missions = None if pack_j is None or spent_j <= 0.0 else pack_j / spent_j
+    return Quality(
+        flight_time_s=leg.time_s,
+        distance_m=leg.distance_m,
+        energy_j=leg.energy_j,
+        computer_energy_j=computer_j,
+        mean_speed_m_s=leg.distance_m / leg.time_s if leg.time_s else 0.0,
+        max_speed_m_s=float(speed.max()) if speed.size else 0.0,
+        takeoff=measure_leg(trajectory, began_us, navigation_us),
+        endurance_s=None if missions is None else missions * leg.time_s,
+        range_m=None if missions is None else missions * leg.distance_m,
+        missions_per_charge=missions,
+        **_conduct(trajectory, decisions or {}, navigation_us, ended_us, hold_s),
+    )
+
+
+def _conduct(
+    trajectory: Trajectory,
+    decisions: Mapping[str, NDArray[Any]],
+    start_us: int,
+    end_us: int,
+    hold_s: float,
+) -> dict[str, float | None]:
+    """Return the measures of deadlines and smoothness by field; arguments as `measure_quality`."""
+    times_us = sample_times(trajectory, start_us, end_us)
+    flown = jerk_of(flown_velocity(trajectory, times_us))
+    steps = command_steps(decisions)
+    commanded = None
+    if SETPOINT in decisions:
+        commanded = jerk_of(commanded_velocity(trajectory, decisions, times_us))
+    misses = None
+    if hold_s > 0.0:
+        misses = deadline_miss_ratio(ages_at_effect(decisions), hold_s * US_PER_S)
+    return {
+        "deadline_misses": misses,
+        "jerk_rms_m_s3": None if flown is None else flown.rms_m_s3,
+        "jerk_peak_m_s3": None if flown is None else flown.peak_m_s3,
+        "command_jerk_rms_m_s3": None if commanded is None else commanded.rms_m_s3,
+        "command_jerk_peak_m_s3": None if commanded is None else commanded.peak_m_s3,
+        "command_step_m_s": float(steps.mean()) if steps.size else None,
+        "command_step_max_m_s": float(steps.max()) if steps.size else None,
+    }
+
+
+SAMPLE_S = SAMPLE_US / US_PER_S
+
+BANDWIDTH_HZ = 5.0
+"""Half-power bandwidth [Hz]. Well above a multicopter's velocity loop (about 1 Hz), well below the
+25 Hz Nyquist frequency of 50 Hz samples."""
+
+SIGMA_S = math.sqrt(math.log(2.0)) / (2.0 * math.pi * BANDWIDTH_HZ)
+"""Standard deviation of the Gaussian [s]: its gain is exp(-2 (pi SIGMA_S f)^2)."""
+
+REACH = math.ceil(5.0 * SIGMA_S / SAMPLE_S)
+"""Samples to each side that a jerk value uses; the first and last ones have no jerk."""
+
+
+def _second_derivative() -> NDArray[np.float64]:
+    """Return the sampled second derivative of the Gaussian, as a convolution kernel."""
+    t = np.arange(-REACH, REACH + 1) * SAMPLE_S
+    gauss = np.exp(-0.5 * (t / SIGMA_S) ** 2)
+    kernel = (t**2 / SIGMA_S**4 - 1.0 / SIGMA_S**2) * gauss / gauss.sum()
+    kernel -= kernel.mean()  # A constant velocity has zero jerk.
+    return np.asarray(kernel, np.float64)
+
+
+_KERNEL = _second_derivative()
+
+
+@dataclass(frozen=True)
+class Jerk:
+    """Magnitude of the jerk over a part of a flight, at `BANDWIDTH_HZ`."""
+
+    rms_m_s3: float
+    peak_m_s3: float
+
+
+def jerk_of(velocity: NDArray[np.float64]) -> Jerk | None:
+    """Return the jerk of velocities (n, 3) [m/s], sampled at 50 Hz; None with too few samples."""
+    if len(velocity) < len(_KERNEL):
+        return None
+    columns = [np.convolve(column, _KERNEL, "valid") for column in velocity.T]
+    squares = np.sum(np.square(columns), axis=0)
+    return Jerk(math.sqrt(squares.mean()), math.sqrt(squares.max()))
+
+
+def sample_times(trajectory: Trajectory, start_us: int, end_us: int) -> NDArray[np.int64]:
+    """Return the times (n,) [µs] of an even 50 Hz grid between two times.
+
+    The grid begins at a recorded sample. Evenly sampled recordings, all except real firmware's, are
+    therefore not interpolated.
+    """
+    inside = trajectory.time_us[(trajectory.time_us >= start_us) & (trajectory.time_us <= end_us)]
+    if not inside.size:
+        return np.zeros(0, np.int64)
+    return np.arange(inside[0], inside[-1] + 1, SAMPLE_US, dtype=np.int64)
+
+
+def flown_velocity(trajectory: Trajectory, times_us: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the true velocity (n, 3) NED [m/s] at times (n,) [µs]."""
+    columns = [np.interp(times_us, trajectory.time_us, column) for column in trajectory.velocity.T]
+    return np.stack(columns, axis=1)
+
+
+def commanded_velocity(
+    trajectory: Trajectory, decisions: Mapping[str, NDArray[Any]], times_us: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the commanded velocity (n, 3) NED [m/s] at increasing times (n,) [µs].
+
+    A command holds from its sending to the next one's. Before the first one, the command is zero.
+    Commands are in the heading frame: they turn with the vehicle's true heading. Watchdog stops
+    between commands (`hover_after_s`) are not included. `decisions` has the columns `sent_us` and
+    `setpoint` of `latency.npz`.
+    """
+    sent_us, setpoints = _sent(decisions)
+    commands = np.vstack([np.zeros(3), setpoints])
+    flown = commands[np.searchsorted(sent_us, times_us, side="right")]
+    headings = np.unwrap(quats_to_euler(trajectory.quaternion)[2])
+    return heading_to_ned(flown, np.interp(times_us, trajectory.time_us, headings))
+
+
+def command_steps(decisions: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
+    """Return the change of the commanded velocity at each switch of action (k - 1,) [m/s].
+
+    The length of the difference between successive commands of k sent. Both use the heading frame
+    at the switch, so the length is equal in the world frame.
+    """
+    _, setpoints = _sent(decisions)
+    steps: NDArray[np.float64] = np.linalg.norm(np.diff(setpoints, axis=0), axis=1)
+    return steps
+
+
+def _sent(
+    decisions: Mapping[str, NDArray[Any]],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return times (k,) [µs] and velocities (k, 3) [m/s] of the sent commands."""
+    if "sent_us" not in decisions or SETPOINT not in decisions:
+        return np.zeros(0, np.int64), np.zeros((0, 3))
+    sent = decisions["sent_us"] != NO_STAMP
+    return decisions["sent_us"][sent], decisions[SETPOINT][sent, :3].astype(np.float64)

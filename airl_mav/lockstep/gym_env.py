@@ -39,9 +39,8 @@ from airl_mav.envs.stopping import bounded, injections_of
 from airl_mav.flight.judge import Outcome, Referee
 from airl_mav.lockstep.lockstep_flight import LockstepFlight
 from airl_mav.policy.actions import Action, AnyAction, BodyRates, command, commands
-from airl_mav.policy.layouts import encode_layout, newest_frame
+from airl_mav.policy.layouts import Encoded, encode_layout, newest_frame
 from airl_mav.policy.observation import Observation
-from airl_mav.policy.observation_spec import Encoded
 from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.conditions import SensorNoise, Spread
 from airl_mav.rehearsal.run_folder import FlownEpisode

@@ -11,13 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from airl_mav.arena.geometry import Arena
-from airl_mav.camera.frame import Frame
 from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.constants import MAX_ATTEMPTS
-from airl_mav.flight.judge import Outcome, Referee, Verdict
+from airl_mav.flight.judge import BY_HAND, Outcome, Referee, Verdict
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.flight.validity import BY_HAND
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.lockstep.digest import FlightDigest, Unwitnessed, WitnessedPolicy
 from airl_mav.lockstep.judging import Judge
@@ -35,13 +32,12 @@ from airl_mav.rehearsal.episode import (
     part_of,
 )
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
+from airl_mav.rehearsal.live_view import FlightTap, ViewEnds, view_part
 from airl_mav.rehearsal.observer import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.resolve import ResolvedScenario
-from airl_mav.view.ends import ViewEnds
 from companion.offboard_mission import MissionResult, Start, check_camera, fly_mission
-from companion.pilot import SentDecision
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.simulation import Simulation
@@ -177,7 +173,7 @@ class LockstepFlight:
             ticked: Called after every tick, with the first object that was hit.
         """
         self._view = view
-        self._watched: Watched | None = None
+        self._watched: FlightTap | None = None
         self._patience_s = patience_s
         self._lands = lands
         self._ticked = ticked
@@ -220,7 +216,8 @@ class LockstepFlight:
         vehicle = real_vehicle(asked, resolved.vehicle, log)
         with ExitStack() as held:
             if self._view is not None:
-                self._watched = held.enter_context(closing(Watched(self._view, resolved)))
+                tap = view_part("flight")(self._view, resolved)
+                self._watched = held.enter_context(closing(tap))
             self._stage = held.enter_context(
                 LockstepStage(
                     transport_us=TRANSPORT_US,
@@ -374,44 +371,3 @@ class LockstepFlight:
         if not self._witnessed:
             return None
         return {"flight": self._digest.hexdigest(), **self._digest.lanes()}
-
-
-class Watched:
-    """Connection of one flight to a viewer, until it is closed.
-
-    Call the companion's methods on its thread, all others on the waiting conductor's thread.
-    """
-
-    def __init__(self, ends: ViewEnds, scenario: ResolvedScenario) -> None:
-        """Connect to a viewer; the pace is real time until a spectator changes it."""
-        # Imported on demand: a flight without viewer needs no web server.
-        from airl_mav.view.taps import CompanionTap, SimulationTap
-        from airl_mav.view.viewer import REAL_TIME, Pace
-
-        self._open = ExitStack()
-        self._simulation = self._open.enter_context(closing(SimulationTap(ends, scenario)))
-        self.companion = self._open.enter_context(closing(CompanionTap(ends, scenario)))
-        """Companion's part of the connection."""
-        self._pace = self._open.enter_context(closing(Pace(ends, scenario.speed or REAL_TIME)))
-
-    def close(self) -> None:
-        """Disconnect."""
-        self._open.close()
-
-    def begin(self, seed: int, arena: Arena, started_us: int) -> None:
-        """Show the start of an episode, at a simulated time [µs]."""
-        self._simulation.begin(seed, arena, started_us)
-
-    def frame(self, frame: Frame) -> None:
-        """Show a camera frame."""
-        self._simulation.frame(frame)
-
-    def tick(self, simulation: Simulation, collision: str | None) -> None:
-        """Show the newest ticks, and wait as the pace requires."""
-        self._simulation.tick(simulation, collision, self._pace.tick)
-        self._pace.tick(simulation.time_us)
-
-    def decided(self, decision: SentDecision) -> None:
-        """Show an executed decision."""
-        self.companion.decided(decision)
-        self._pace.decided()

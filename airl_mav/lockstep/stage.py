@@ -30,7 +30,7 @@ from companion.lockstep_turns import Abandoned, ConductedClock, Poll
 from companion.mavsdk_connection import RAW_TIMEOUT_S, RAW_URL
 from companion.mavsdk_link import MavsdkLink
 from firmware_sim.autopilot.commander import FlightPhase
-from firmware_sim.faults.fault_timeline import FaultTimeline
+from firmware_sim.fault_timeline import FaultTimeline
 from firmware_sim.firmware import Firmware
 from firmware_sim.mavlink.codec import Encoder, dialect, layout
 from firmware_sim.simulation import EpisodeSetup, Simulation

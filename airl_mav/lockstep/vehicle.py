@@ -18,7 +18,7 @@ from airl_mav.scenario.aircraft import Aircraft
 from companion.frame_source import ReceivedFrame
 from companion.lockstep_turns import NO_FRAME
 from firmware_sim.external.px4_lockstep import OnboardLink, conducted_px4
-from firmware_sim.faults.faulty_link import FailingEndpoint
+from firmware_sim.fault_timeline import FailingLink, failing_link
 from firmware_sim.firmware import BuiltinFlightStack, FlightStack, FrameServer
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, SharedEndpoint
@@ -58,7 +58,7 @@ class ConductedVehicle:
     stack: FlightStack
     end: VehicleEnd
     """Vehicle's end of the companion's link."""
-    failing: FailingEndpoint | None = None
+    failing: FailingLink | None = None
     """Link with simulated faults; None = no link faults."""
     heard_after_us: int = 0
     """Maximum time from loading an episode to the first heartbeat [µs]."""
@@ -69,12 +69,12 @@ def builtin_vehicle(clock: Clock, faults: Sequence[Fault] = ()) -> ConductedVehi
 
     Args:
         clock: Clock of the conductor.
-        faults: Faults of the flight; link faults add a `FailingEndpoint`.
+        faults: Faults of the flight; link faults add a `FailingLink`.
     """
     endpoint = MemoryEndpoint()
     failing = None
     if link_fails(faults):
-        failing = FailingEndpoint(endpoint, clock, conducted=True)
+        failing = failing_link(endpoint, clock, conducted=True)
     link = lockstep_link(endpoint if failing is None else failing)
     server = MavlinkServer([link], boot_unix_us=BOOT_UNIX_US)
     return ConductedVehicle(BuiltinFlightStack(server), InMemory(endpoint), failing)

@@ -8,16 +8,24 @@ course; `velocity-fixed-yaw`: the same pair with a fixed heading. Sets of three 
 command the vertical speed; the other sets hold an altitude. `velocity3d` and `velocity3d-fixed-yaw`
 are these two with a third number, and `arc3d-75` is `arc-25` climbing, level and sinking.
 `body-rates` commands no velocity: three body rates and a collective thrust. Any other name is a
-custom set: a class, constructed without arguments, whose objects are an `ActionSet`.
+custom set: a class, constructed without arguments.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Any, Literal, NamedTuple, Protocol, TypeAlias, cast, runtime_checkable
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    Protocol,
+    TypeAlias,
+    runtime_checkable,
+)
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +41,19 @@ DecisionTiming = Literal["sequential", "pipelined"]
 """Start of a decision: after the previous hold time, or as soon as the previous one is ready."""
 
 
+CLIMB_SHARE = 0.3
+"""Maximum climb and descent rate as a share of the maximum level speed: 1.5 m/s at 5 m/s, as in
+PX4's default descent (MPC_Z_VEL_MAX_DN)."""
+
+
+def fastest_climb(speed_m_s: float) -> float:
+    """Return the maximum vertical speed of an action [m/s] for a maximum level speed [m/s]."""
+    return CLIMB_SHARE * speed_m_s
+
+
+# --- kinds of commands
+
+
 @dataclass(frozen=True)
 class Action:
     """A velocity command. Without a vertical speed the pilot holds an altitude."""
@@ -43,6 +64,21 @@ class Action:
     """Yaw rate, positive clockwise seen from above."""
     down_m_s: float | None = None
     """Vertical speed, positive downwards; None = the pilot holds the altitude."""
+
+    def within(self, speed_m_s: float) -> Action:
+        """Return the action with its speed limited and non-finite values set to zero.
+
+        The vertical speed, if present, is limited to `fastest_climb` of `speed_m_s`.
+        """
+        numbers = (self.forward_m_s, self.right_m_s, self.yaw_rate_rad_s)
+        forward, right, turn = (n if math.isfinite(n) else 0.0 for n in numbers)
+        speed = math.hypot(forward, right)
+        scale = min(1.0, speed_m_s / speed) if speed > 0.0 else 1.0
+        down = self.down_m_s
+        if down is not None:
+            climb = fastest_climb(speed_m_s)
+            down = max(-climb, min(climb, down)) if math.isfinite(down) else 0.0
+        return Action(forward * scale, right * scale, turn, down)
 
 
 class Attitude(NamedTuple):
@@ -79,6 +115,14 @@ class Attitude(NamedTuple):
         thrust = hover_thrust * force_m_s2 / GRAVITY_M_S2
         return cls(roll, -math.atan2(forward_m_s2, up_m_s2), yaw_rad, thrust)
 
+    def within(self, speed_m_s: float) -> Attitude:  # noqa: ARG002 (for velocities)
+        """Return the attitude with a thrust of 0 to 1. Raises ValueError if not finite."""
+        return self._replace(thrust=_flyable_thrust(self))
+
+    def stopped(self) -> Attitude:
+        """Return the level attitude of the same heading and thrust."""
+        return Attitude(0.0, 0.0, self.yaw_rad, self.thrust)
+
 
 class BodyRates(NamedTuple):
     """Body rates and a collective thrust (CTBR). Only the policy controls the attitude."""
@@ -92,18 +136,47 @@ class BodyRates(NamedTuple):
     thrust: float
     """Collective thrust as in `Attitude`."""
 
+    def within(self, speed_m_s: float) -> BodyRates:  # noqa: ARG002 (for velocities)
+        """Return the rates with a thrust of 0 to 1. Raises ValueError if not finite."""
+        return self._replace(thrust=_flyable_thrust(self))
+
+    def stopped(self) -> BodyRates:
+        """Return zero rates with the same thrust."""
+        return BodyRates(0.0, 0.0, 0.0, self.thrust)
+
+
+def _flyable_thrust(action: Attitude | BodyRates) -> float:
+    if not all(map(math.isfinite, action)):
+        raise ValueError(f"it returned what is no number: {action}")
+    return min(1.0, max(0.0, action.thrust))
+
 
 AnyAction: TypeAlias = "Action | Attitude | BodyRates"
 
-KINDS: dict[CommandKind, type[Any]] = {
-    "velocity": Action,
-    "attitude": Attitude,
-    "body_rates": BodyRates,
+
+@dataclass(frozen=True)
+class CommandSpec:
+    """Kind of commands; limits and encoding are methods of its action."""
+
+    action: type[Action] | type[Attitude] | type[BodyRates]
+    title: str
+    """Name in messages."""
+    levels: tuple[str, ...] = ("gym", "lockstep", "sitl")
+    """Fidelity levels that support the kind."""
+    steady: bool = False
+    """True if the vehicle stays upright while the last command persists. The effect of other kinds
+    is not predicted by latency compensation, and ArduPilot does not support them."""
+
+
+KINDS: dict[CommandKind, CommandSpec] = {
+    "velocity": CommandSpec(Action, "velocity", steady=True),
+    "attitude": CommandSpec(Attitude, "attitude", ("lockstep", "sitl")),
+    "body_rates": CommandSpec(BodyRates, "body rates"),
 }
 
 UPRIGHT_S = 0.15
-"""Default timeout of an attitude, or of body rates, beyond the hold time [s]. The flight controller
-then holds the vehicle. At 3 rad/s the vehicle has turned by 26 degrees."""
+"""Default timeout of commands that are not `steady`, beyond the hold time [s]. The flight
+controller then holds the vehicle. At 3 rad/s the vehicle has turned by 26 degrees."""
 
 ALTITUDE_P = 0.5
 """Vertical speed per metre of altitude error [1/s]; stable with decisions 1.5 s apart."""
@@ -111,26 +184,11 @@ ALTITUDE_P = 0.5
 MAX_VERTICAL_M_S = 1.0
 """Limit of the altitude correction [m/s]."""
 
-CLIMB_SHARE = 0.3
-"""Maximum climb and descent rate as a share of the maximum level speed: 1.5 m/s at 5 m/s, as in
-PX4's default descent (MPC_Z_VEL_MAX_DN)."""
-
-
-def fastest_climb(speed_m_s: float) -> float:
-    """Return the maximum vertical speed of an action [m/s] for a maximum level speed [m/s]."""
-    return CLIMB_SHARE * speed_m_s
-
 
 def vertical_speed(altitude_m: float, down_m: float) -> float:
     """Return the downward speed [m/s] that holds a height above the start [m], from a position."""
-    return float(vertical_speeds(altitude_m, np.array(down_m)))
-
-
-def vertical_speeds(altitude_m: float, down_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the downward speeds [m/s] of n vehicles; as `vertical_speed`."""
-    error_m = -altitude_m - down_m
-    speeds: NDArray[np.float64] = np.clip(ALTITUDE_P * error_m, -MAX_VERTICAL_M_S, MAX_VERTICAL_M_S)
-    return speeds
+    speed = ALTITUDE_P * (-altitude_m - down_m)
+    return float(np.clip(speed, -MAX_VERTICAL_M_S, MAX_VERTICAL_M_S))
 
 
 class Policy(Protocol):
@@ -173,51 +231,17 @@ class RigBound(CameraBound, Protocol):
 
 
 def flyable(action: AnyAction, kind: CommandKind, speed_m_s: float) -> AnyAction:
-    """Return an action within limits: a velocity `limited`, a thrust within 0..1.
+    """Return an action within limits: a limited speed, or a thrust within 0..1.
 
     Raises:
         TypeError: The action has another command kind.
         ValueError: An attitude, a body rate or a thrust is not finite. There is no safe default.
     """
-    wanted = KINDS[kind]
+    wanted = KINDS[kind].action
     if not isinstance(action, wanted):
         raise TypeError(f"it returned {type(action).__name__}; accepted: {wanted.__name__}")
-    if isinstance(action, Action):
-        return limited(action, speed_m_s)
-    if not all(map(math.isfinite, action)):
-        raise ValueError(f"it returned what is no number: {action}")
-    within: AnyAction = action._replace(thrust=min(1.0, max(0.0, action.thrust)))
-    return within
+    return action.within(speed_m_s)
 
-
-def limited(action: Action, speed_m_s: float) -> Action:
-    """Return the action with its speed limited and non-finite values set to zero.
-
-    The vertical speed, if present, is limited to `fastest_climb` of `speed_m_s`.
-    """
-    numbers = (action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s)
-    forward, right, turn = (n if math.isfinite(n) else 0.0 for n in numbers)
-    speed = math.hypot(forward, right)
-    scale = min(1.0, speed_m_s / speed) if speed > 0.0 else 1.0
-    down = action.down_m_s
-    if down is not None:
-        climb = fastest_climb(speed_m_s)
-        down = max(-climb, min(climb, down)) if math.isfinite(down) else 0.0
-    return Action(forward * scale, right * scale, turn, down)
-
-
-BODY_RATES = "body-rates"
-FIXED_YAW = ("velocity-fixed-yaw", "velocity3d-fixed-yaw")
-VELOCITIES = ("velocity", "velocity3d", *FIXED_YAW)
-CONTINUOUS = (*VELOCITIES, BODY_RATES)
-VERTICAL = ("arc3d-75", "velocity3d", "velocity3d-fixed-yaw")
-"""Sets that also command a vertical speed."""
-
-DISCRETE = {"arc-25": 25, "paper-25": 25, "arc3d-75": 75}
-"""Number of actions of each discrete set."""
-
-SHIPPED = ("arc-25", "paper-25", "velocity", "velocity-fixed-yaw", *VERTICAL, BODY_RATES)
-ActionSetName = Annotated[str, plugins.part_name(plugins.ACTION_SETS, SHIPPED)]
 
 PAPER_SPEED_M_S = 5.0
 """Maximum speed of the paper's actions [m/s]."""
@@ -251,6 +275,155 @@ MaxRate = Annotated[
 ]
 
 
+class ActionSet:
+    """Action set: number of actions, commands, and their kind. Base class of the shipped sets.
+
+    Custom sets need no base class: they have the attribute `discrete`, None for continuous actions
+    of two numbers -1..1, and a method `commands(actions, max_speed_m_s)` that returns (n, 3).
+    """
+
+    kind: CommandKind = "velocity"
+    discrete: int | None = None
+    """Number of discrete actions; None for a continuous set."""
+    numbers = 2
+    """Length of an action of a continuous set."""
+    vertical = False
+    """True if the set also commands a vertical speed; otherwise an altitude is held."""
+
+    @property
+    def command_numbers(self) -> int:
+        """Length of a command."""
+        return 3 + self.vertical
+
+    def commands(self, spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the commands of n actions; see the function `commands`."""
+        raise NotImplementedError
+
+
+Row = tuple[float, ...]
+
+
+class DiscreteSet(ActionSet):
+    """Table of commands at a maximum speed [m/s]."""
+
+    def __init__(
+        self,
+        count: int,
+        rows: Callable[[float], list[tuple[float, ...]]],
+        *,
+        vertical: bool = False,
+    ) -> None:
+        self.discrete, self.vertical = count, vertical
+        self._table = cache(lambda max_speed_m_s: np.array(rows(max_speed_m_s)))
+
+    def commands(self, spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the rows of n numbers."""
+        chosen: NDArray[np.float64] = self._table(spec.max_speed_m_s)[np.asarray(actions)]
+        return chosen
+
+
+class VelocitySet(ActionSet):
+    """Continuous velocities, clipped; without a fixed heading the nose turns to the course."""
+
+    def __init__(self, *, vertical: bool = False, fixed_yaw: bool = False) -> None:
+        self.vertical, self.numbers, self._fixed_yaw = vertical, 2 + vertical, fixed_yaw
+
+    def commands(self, spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the velocities of n shares of the maximum."""
+        shares = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
+        wanted = shares[:, :2] * spec.max_speed_m_s
+        # Limit the vector's length: a corner of the square is no faster than an edge.
+        speed = np.hypot(wanted[:, 0], wanted[:, 1])
+        wanted *= np.minimum(1.0, spec.max_speed_m_s / np.maximum(speed, 1e-9))[:, None]
+        down = shares[:, 2:] * fastest_climb(spec.max_speed_m_s)
+        if self._fixed_yaw:
+            return np.concatenate([wanted, np.zeros((len(wanted), 1)), down], axis=1)
+        course = np.arctan2(wanted[:, 1], wanted[:, 0])
+        # The turn grows with the speed, as the course is undefined in hover.
+        turn = np.clip(FOLLOW_GAIN_1_S * course, -FOLLOW_MAX_RAD_S, FOLLOW_MAX_RAD_S)
+        turn *= np.minimum(1.0, speed / (0.2 * spec.max_speed_m_s))
+        return np.concatenate([wanted, turn[:, None], down], axis=1)
+
+
+class BodyRateSet(ActionSet):
+    """Continuous body rates and thrust."""
+
+    kind = "body_rates"
+    numbers = command_numbers = 4
+
+    def commands(self, spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the rates of n shares of the maximum, and the thrusts."""
+        shares = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
+        rates = shares[:, :3] * math.radians(spec.max_rate_deg_s)
+        return np.concatenate([rates, 0.5 * (1.0 + shares[:, 3:])], axis=1)
+
+
+class CustomSet(ActionSet):
+    """Set of a custom class, which is loaded on first use. Raises FieldError."""
+
+    def __init__(self, name: str) -> None:
+        door = plugins.ACTION_SETS
+        self._custom = plugins.load_object(door, name, ("commands",))
+        count = getattr(self._custom, "discrete", None)
+        if not (count is None or (type(count) is int and count > 1)):
+            problem = f"its number of actions is discrete = {count!r}; accepted: 2 or more, or None"
+            raise FieldError(door.field, name, problem=problem)
+        self.discrete = count
+
+    def commands(self, spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the commands. Raises UsageError if shape or values are invalid."""
+        given = self._custom.commands(np.asarray(actions), spec.max_speed_m_s)
+        asked, wanted = np.asarray(given, np.float64), (len(actions), 3)
+        if asked.shape != wanted or not np.isfinite(asked).all():
+            found = f"an array {asked.shape}" if asked.shape != wanted else "what is no number"
+            raise UsageError(f"actions {spec.set!r}: gives {found}; accepted: {wanted} numbers")
+        return asked
+
+
+def _arc(max_speed_m_s: float) -> list[Row]:
+    return [
+        (share * max_speed_m_s, 0.0, math.radians(rate))
+        for share in ARC_SPEEDS
+        for rate in ARC_YAW_RATES_DEG_S
+    ]
+
+
+def _arc_3d(max_speed_m_s: float) -> list[Row]:
+    climb = fastest_climb(max_speed_m_s)
+    return [(*arc, share * climb) for share in CLIMB_SHARES for arc in _arc(max_speed_m_s)]
+
+
+def _paper(max_speed_m_s: float) -> list[Row]:
+    slowest = max_speed_m_s / PAPER_SPEED_M_S
+    return [
+        *((speed, 0.0, 0.0) for speed in np.linspace(max_speed_m_s, slowest, 10)),
+        *((-speed, 0.0, 0.0) for speed in np.linspace(max_speed_m_s, slowest, 5)),
+        *((0.0, 0.0, math.radians(rate)) for rate in (*PAPER_RIGHT_DEG_S, *PAPER_LEFT_DEG_S)),
+    ]
+
+
+BODY_RATES = "body-rates"
+
+ACTION_SETS: dict[str, ActionSet] = {
+    "arc-25": DiscreteSet(25, _arc),
+    "paper-25": DiscreteSet(25, _paper),
+    "velocity": VelocitySet(),
+    "velocity-fixed-yaw": VelocitySet(fixed_yaw=True),
+    "arc3d-75": DiscreteSet(75, _arc_3d, vertical=True),
+    "velocity3d": VelocitySet(vertical=True),
+    "velocity3d-fixed-yaw": VelocitySet(vertical=True, fixed_yaw=True),
+    BODY_RATES: BodyRateSet(),
+}
+"""Shipped action sets by name."""
+
+SHIPPED = tuple(ACTION_SETS)
+VELOCITIES = tuple(name for name, each in ACTION_SETS.items() if isinstance(each, VelocitySet))
+VERTICAL = tuple(name for name, each in ACTION_SETS.items() if each.vertical)
+"""Sets that also command a vertical speed."""
+
+ActionSetName = Annotated[str, plugins.part_name(plugins.ACTION_SETS, SHIPPED)]
+
+
 class ActionSpec(ProfileModel):
     """An action set and its maximum speed, or maximum rate."""
 
@@ -262,43 +435,36 @@ class ActionSpec(ProfileModel):
 
     @property
     def commands(self) -> CommandKind:
-        """Command kind of the set."""
-        return "body_rates" if self.set == BODY_RATES else "velocity"
-
-
-class ActionSet(Protocol):
-    """Interface of a custom action set."""
+        """Command kind of the set; a custom set commands velocities."""
+        return ACTION_SETS[self.set].kind if self.set in ACTION_SETS else "velocity"
 
     @property
-    def discrete(self) -> int | None:
-        """Number of discrete actions; None for a continuous set of two numbers -1..1."""
+    def vertical(self) -> bool:
+        """True if the set commands a vertical speed; otherwise an altitude is held."""
+        return self.set in VERTICAL
 
-    def commands(self, actions: NDArray[Any], max_speed_m_s: float) -> NDArray[np.float64]:
-        """Return the commands (n, 3) of n actions, as the function `commands` does."""
+
+def set_of(spec: ActionSpec) -> ActionSet:
+    """Return the action set of a specification. Raises FieldError for an unusable custom set."""
+    return ACTION_SETS.get(spec.set) or _custom(spec.set)
+
+
+_custom = cache(CustomSet)
 
 
 def discrete_actions(spec: ActionSpec) -> int | None:
     """Return the number of discrete actions; None for a continuous set."""
-    if spec.set not in SHIPPED:
-        return _own(spec.set).discrete
-    return DISCRETE.get(spec.set)
+    return set_of(spec).discrete
 
 
 def continuous_numbers(spec: ActionSpec) -> int:
     """Return the length of an action of a continuous set."""
-    if spec.set == BODY_RATES:
-        return len(BodyRates._fields)
-    return 3 if spec.set in VERTICAL else 2
-
-
-def commands_vertical_speed(spec: ActionSpec) -> bool:
-    """Return whether an action set commands the vertical speed; otherwise an altitude is held."""
-    return spec.set in VERTICAL
+    return set_of(spec).numbers
 
 
 def command_numbers(spec: ActionSpec) -> int:
     """Return the length of a command from `commands`."""
-    return 4 if spec.set in (*VERTICAL, BODY_RATES) else 3
+    return set_of(spec).command_numbers
 
 
 def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
@@ -313,87 +479,10 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
     clockwise positive. Sets of three dimensions append the downward speed [m/s]. `body-rates`
     returns (n, 4), as `actions.BodyRates`. Raises UsageError if a custom set returns anything else.
     """
-    if spec.set not in SHIPPED:
-        return _checked(spec, actions)
-    if spec.set not in CONTINUOUS:
-        chosen: NDArray[np.float64] = _table(spec.set, spec.max_speed_m_s)[np.asarray(actions)]
-        return chosen
-    shares = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
-    if spec.set == BODY_RATES:
-        rates = shares[:, :3] * math.radians(spec.max_rate_deg_s)
-        return np.concatenate([rates, 0.5 * (1.0 + shares[:, 3:])], axis=1)
-    wanted = shares[:, :2] * spec.max_speed_m_s
-    # Limit the vector's length: a corner of the square is no faster than an edge.
-    speed = np.hypot(wanted[:, 0], wanted[:, 1])
-    wanted *= np.minimum(1.0, spec.max_speed_m_s / np.maximum(speed, 1e-9))[:, None]
-    down = shares[:, 2:] * fastest_climb(spec.max_speed_m_s)
-    if spec.set in FIXED_YAW:
-        return np.concatenate([wanted, np.zeros((len(wanted), 1)), down], axis=1)
-    course = np.arctan2(wanted[:, 1], wanted[:, 0])
-    # The turn grows with the speed, as the course is undefined in hover.
-    turn = np.clip(FOLLOW_GAIN_1_S * course, -FOLLOW_MAX_RAD_S, FOLLOW_MAX_RAD_S)
-    turn *= np.minimum(1.0, speed / (0.2 * spec.max_speed_m_s))
-    return np.concatenate([wanted, turn[:, None], down], axis=1)
+    return set_of(spec).commands(spec, actions)
 
 
-def _checked(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the commands of a custom set. Raises UsageError if shape or values are invalid."""
-    asked = np.asarray(_own(spec.set).commands(np.asarray(actions), spec.max_speed_m_s), np.float64)
-    wanted = (len(actions), 3)
-    if asked.shape != wanted or not np.isfinite(asked).all():
-        found = f"an array {asked.shape}" if asked.shape != wanted else "what is no number"
-        raise UsageError(f"actions {spec.set!r}: gives {found}; accepted: {wanted} numbers")
-    return asked
-
-
-@cache
-def _own(name: str) -> ActionSet:
-    """Return a custom action set. Raises FieldError."""
-    door = plugins.ACTION_SETS
-    found = plugins.load_part(door, name, lambda made: callable(getattr(made, "commands", None)))
-    try:
-        own = found() if isinstance(found, type) else found
-    except Exception as error:
-        problem = f"cannot be made without arguments: {type(error).__name__}: {error}"
-        raise FieldError(door.field, name, problem=problem) from error
-    count = getattr(own, "discrete", None)
-    if not (count is None or (type(count) is int and count > 1)):
-        problem = f"its number of actions is discrete = {count!r}; accepted: 2 or more, or None"
-        raise FieldError(door.field, name, problem=problem)
-    return cast("ActionSet", own)
-
-
-def command(spec: ActionSpec, action: NDArray[Any]) -> Action | BodyRates:
+def command(spec: ActionSpec, action: NDArray[Any]) -> AnyAction:
     """Return the command of one action, (), (2,), (3,) or (4,) by action set."""
     numbers = commands(spec, np.asarray(action)[None])[0].tolist()
-    if spec.set == BODY_RATES:
-        return BodyRates(*numbers)
-    forward, right, turn, *down = numbers
-    return Action(forward, right, turn, down[0] if down else None)
-
-
-@cache
-def _table(name: str, max_speed: float) -> NDArray[np.float64]:
-    """Return the commands of a discrete set: (k, 3), or (k, 4) with a vertical speed."""
-    if name == "arc3d-75":
-        climb = fastest_climb(max_speed)
-        return np.array(
-            [
-                (*arc, share * climb)
-                for share in CLIMB_SHARES
-                for arc in _table("arc-25", max_speed).tolist()
-            ]
-        )
-    if name == "arc-25":
-        rows = [
-            (share * max_speed, 0.0, math.radians(rate))
-            for share in ARC_SPEEDS
-            for rate in ARC_YAW_RATES_DEG_S
-        ]
-    else:
-        slowest = max_speed / PAPER_SPEED_M_S
-        rows = [(speed, 0.0, 0.0) for speed in np.linspace(max_speed, slowest, 10)]
-        rows += [(-speed, 0.0, 0.0) for speed in np.linspace(max_speed, slowest, 5)]
-        rows += [(0.0, 0.0, math.radians(rate)) for rate in PAPER_RIGHT_DEG_S]
-        rows += [(0.0, 0.0, math.radians(rate)) for rate in PAPER_LEFT_DEG_S]
-    return np.array(rows)
+    return KINDS[spec.commands].action(*numbers)

@@ -18,9 +18,8 @@ from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
 from airl_mav.core.files import read_json
-from airl_mav.policy.actions import CONTINUOUS, ActionSpec, DecisionTiming
-from airl_mav.policy.actions import SHIPPED as SHIPPED_ACTION_SETS
-from airl_mav.policy.observation_spec import SHIPPED as SHIPPED_LAYOUTS
+from airl_mav.policy.actions import ACTION_SETS, ActionSpec, DecisionTiming
+from airl_mav.policy.layouts import LAYOUTS, layout_of
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch, further_mismatch
 from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.profiles.camera import Camera
@@ -172,7 +171,8 @@ class PolicyFacts(ProfileModel):
     @model_validator(mode="after")
     def _random_actions_are_discrete(self) -> PolicyFacts:
         # Custom sets are not loaded: reading a card runs no code.
-        if self.epsilon and self.actions.set in CONTINUOUS:
+        known = ACTION_SETS.get(self.actions.set)
+        if self.epsilon and known is not None and known.discrete is None:
             raise ValueError(
                 f"epsilon = {self.epsilon:g}: accepted: 0 with the action set {self.actions.set!r}"
             )
@@ -262,8 +262,8 @@ def check_trust(folder: Path, card: PolicyCard, *, trust: bool) -> None:
 
     Cards of this package name no code.
     """
-    named = {"actions.set": card.actions.set} if card.actions.set not in SHIPPED_ACTION_SETS else {}
-    if card.observation.layout not in SHIPPED_LAYOUTS:
+    named = {"actions.set": card.actions.set} if card.actions.set not in ACTION_SETS else {}
+    if card.observation.layout not in LAYOUTS:
         named["observation.layout"] = card.observation.layout
     if named and not trust:
         listed = ", ".join(f"{field} = {name!r}" for field, name in named.items())
@@ -293,8 +293,8 @@ def vehicle_mismatch(
     lenses = {name: Intrinsics.of(each) for name, each in others.items()}
     if (reason := further_mismatch(seen, lenses)) is not None:
         return reason
-    if seen.layout == "scan" and camera.yaw_deg != 0.0:
-        return f"camera with yaw_deg = {camera.yaw_deg:g}; accepted: 0 with layout 'scan'"
+    if layout_of(seen.layout).looks_ahead and camera.yaw_deg != 0.0:
+        return f"camera with yaw_deg = {camera.yaw_deg:g}; accepted: 0 with layout {seen.layout!r}"
     for name, each in seen.cameras.items():
         if each.kind == "depth" and others[name].range_m < each.range_m:
             return (

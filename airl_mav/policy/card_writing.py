@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.files import replace_file, write_json
-from airl_mav.policy.actions import ActionSpec, commands_vertical_speed
+from airl_mav.policy.actions import ActionSpec
 from airl_mav.policy.card import (
     CARD_FILE,
     ONNX_FILE,
@@ -112,7 +112,7 @@ def _page(card: PolicyCard) -> Iterator[str]:
         yield f"| decides | `{actions.set}`, up to {actions.max_rate_deg_s:g} deg/s, and a thrust |"
     if actions.commands == "velocity" or card.decisions == "sequential":
         yield f"| holds each action | {card.hold_s:g} s |"
-    holds_altitude = actions.commands == "velocity" and not commands_vertical_speed(actions)
+    holds_altitude = actions.commands == "velocity" and not actions.vertical
     flies = "flies" if holds_altitude else "begins"
     yield f"| {flies} at | {card.altitude_m:g} m, to within {card.goal_radius_m:g} m of the goal |"
     yield f"| network | {' '.join(card.network.split())} |"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.errors import UsageError
-from airl_mav.policy.actions import Action, ActionSpec, BodyRates, command, discrete_actions
+from airl_mav.policy.actions import ActionSpec, AnyAction, command, discrete_actions
 from airl_mav.policy.card import (
     TORCH_FILE,
     PolicyCard,
@@ -91,7 +91,7 @@ class LearnedPolicy:
         """Return why additional cameras, by name, cannot serve the policy, or None."""
         return further_mismatch(self.card.observation, cameras)
 
-    def act(self, observation: Observation) -> Action | BodyRates:
+    def act(self, observation: Observation) -> AnyAction:
         """Return the action for an observation of one vehicle.
 
         Raises:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core import plugins
 from airl_mav.core.fields import ProfileModel, later_field, quantity
-from airl_mav.policy.images import goes_round
+from airl_mav.policy.layouts import INPUTS, LEAST_ROWS, SHIPPED, layout_of
 from airl_mav.profiles.camera import Coefficients, camera_named
 from airl_mav.profiles.projections import (
     CHANNELS,
@@ -27,33 +26,12 @@ from airl_mav.profiles.projections import (
     undistorted,
 )
 
-SHIPPED = ("body", "paper", "scan")
 LayoutName = Annotated[str, plugins.part_name(plugins.LAYOUTS, SHIPPED)]
-Encoded = dict[str, NDArray[Any]]
-"""Arrays of a layout, by key."""
 
-Told = Literal["command", "latency", "age", "setpoint", "tilt", "rates", "height"]
-
-TOLD: dict[Told, int] = {
-    "command": 3,
-    "latency": 1,
-    "age": 1,
-    "setpoint": 4,
-    "tilt": 3,
-    "rates": 3,
-    "height": 1,
-}
-"""Length of each additional input."""
-
-STRIP_ROWS = 10
-"""`paper`: rows on top of the image that draw the bearing of the goal, the last one black."""
-
-SEAM_SHARE = 8
-"""`scan`: divisor for the bearings of an all-round camera that are repeated at either end, so that
-a convolution sees the rear without a gap."""
-
-LEAST_ROWS = 4
-"""Minimum rows of a network's image; a scan has one row per frame instead."""
+if TYPE_CHECKING:
+    Told = str
+else:
+    Told = Literal[tuple(INPUTS)]
 
 SAME_DEG = 0.1
 """Maximum angle between matching lenses at any position of the image [deg]."""
@@ -171,10 +149,8 @@ class ObservationSpec(ProfileModel):
     frames: Frames = 1
     in_flight: tuple[Told, ...] = Field(
         default=(),
-        description="additional inputs of the network: command, the newest velocity setpoint;"
-        " latency, the expected t2; age, the age of the image; setpoint, all four numbers of the"
-        " newest setpoint of any kind; tilt, the down direction in body axes; rates, the body"
-        " rates; height, the height above the start",
+        description="additional inputs of the network: "
+        + "; ".join(f"{name}, {each.meaning}" for name, each in INPUTS.items()),
     )
     goal_height: GoalHeight = later_field(default=False)
     cameras: dict[CameraName, SeenCamera] = later_field(
@@ -184,31 +160,9 @@ class ObservationSpec(ProfileModel):
     )
 
     @model_validator(mode="after")
-    def _camera_has_rows(self) -> ObservationSpec:
-        if self.camera_rows < 1:
-            raise ValueError(
-                f"height_px = {self.height_px}: accepted: more than {STRIP_ROWS}, the rows of "
-                "the strip of layout 'paper'"
-            )
-        if self.height_px < LEAST_ROWS and self.layout in SHIPPED and self.layout != "scan":
-            raise ValueError(
-                f"height_px = {self.height_px}: accepted: {LEAST_ROWS} or more with layout"
-                f" {self.layout!r}"
-            )
-        if self.frames > 1 and self.layout == "paper":
-            raise ValueError(f"frames = {self.frames}: accepted: 1 with layout 'paper'")
-        if self.kind != "depth" and self.layout in ("paper", "scan"):
-            raise ValueError(f"kind = {self.kind!r}: accepted: 'depth' with layout {self.layout!r}")
-        if self.projection == "fisheye" and self.layout == "scan":
-            raise ValueError(
-                "projection = 'fisheye': accepted: pinhole or cylindrical with layout 'scan'"
-            )
-        if self.goal_height and self.layout == "paper":
-            raise ValueError("goal_height = true: accepted: false with layout 'paper'")
-        if self.cameras and self.layout == "paper":
-            raise ValueError(
-                f"cameras = {', '.join(self.cameras)}: accepted: none with layout 'paper'"
-            )
+    def _fits_the_layout(self) -> ObservationSpec:
+        if (problem := layout_of(self.layout).problem(self)) is not None:
+            raise ValueError(problem)
         check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
         check_distortion("distortion", self.projection, self.horizontal_fov_deg, self.distortion)
         return self
@@ -216,20 +170,12 @@ class ObservationSpec(ProfileModel):
     @property
     def camera_rows(self) -> int:
         """Rows of the image that come from the camera."""
-        return self.height_px - (STRIP_ROWS if self.layout == "paper" else 0)
+        return self.height_px - layout_of(self.layout).strip_rows
 
     @property
     def image_shape(self) -> tuple[int, int]:
         """Rows and columns of the image as it goes into the network."""
-        if self.layout != "scan":
-            return self.height_px, self.width_px
-        return self.frames, self.width_px + 2 * self.seam
-
-    @property
-    def seam(self) -> int:
-        """Bearings of a scan that are repeated at either end."""
-        whole = self.layout == "scan" and goes_round(math.radians(self.horizontal_fov_deg))
-        return self.width_px // SEAM_SHARE if whole else 0
+        return layout_of(self.layout).image_shape(self)[1:]
 
     @property
     def goal_numbers(self) -> int:
@@ -239,21 +185,12 @@ class ObservationSpec(ProfileModel):
     @property
     def channels(self) -> int:
         """Channels of the network's image, over all frames."""
-        return 1 if self.layout == "scan" else CHANNELS[self.kind] * self.frames
+        return layout_of(self.layout).image_shape(self)[0]
 
     @property
     def further_keys(self) -> dict[str, str]:
         """Keys of the additional cameras' images, by camera name."""
         return {name: f"{seen.kind}_{name}" for name, seen in self.cameras.items()}
-
-
-class Box(NamedTuple):
-    """Shape, type and bounds of one array of a layout, without the leading axis."""
-
-    shape: tuple[int, ...]
-    dtype: type[np.generic]
-    low: float
-    high: float
 
 
 def further_mismatch(spec: ObservationSpec, cameras: Mapping[str, Intrinsics]) -> str | None:

@@ -20,8 +20,8 @@ from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError
 from airl_mav.core.fields import field_error
 from airl_mav.core.frames import Goal
 from airl_mav.core.resource_use import ProcessUse
+from airl_mav.rehearsal.live_view import ViewEnds
 from airl_mav.scenario.resolve import ResolvedScenario
-from airl_mav.view.ends import ViewEnds
 
 
 class _Line(BaseModel):

@@ -9,7 +9,7 @@ import sys
 import threading
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK
@@ -18,6 +18,7 @@ from airl_mav.core.files import save_arrays
 from airl_mav.core.resource_use import UseMeter
 from airl_mav.core.scheduling import held_to
 from airl_mav.rehearsal import channel
+from airl_mav.rehearsal.live_view import CompanionTap, view_part
 from airl_mav.scenario.resolve import ResolvedScenario
 from companion.frame_source import open_camera
 from companion.link_interface import LinkError
@@ -25,9 +26,6 @@ from companion.mavsdk_connection import signed
 from companion.mavsdk_link import MavsdkLink
 from companion.offboard_mission import check_camera, fly_mission
 from companion.watchdog import ThreadGuard
-
-if TYPE_CHECKING:  # Loaded only for a view.
-    from airl_mav.view.taps import CompanionTap
 
 CONNECT_TIMEOUT_S = 30.0
 """Connection timeout of the flight controller [wall s]."""
@@ -132,9 +130,7 @@ def fly(begin: channel.Begin, harness: channel.ChildChannel) -> None:
     with ExitStack() as held:
         tap: CompanionTap | None = None
         if begin.view is not None:
-            from airl_mav.view.taps import CompanionTap
-
-            tap = held.enter_context(closing(CompanionTap(begin.view, begin.scenario)))
+            tap = held.enter_context(closing(view_part("companion")(begin.view, begin.scenario)))
         missions = Missions(begin.scenario, harness, tap)
         # Without its rehearsal the companion must not fly: its setpoints end and the flight
         # controller's offboard-loss failsafe takes over.

@@ -17,10 +17,16 @@ from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.faults.fault import Fault
 from airl_mav.faults.kinds import LINKS, PROCESSES
 from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
-from airl_mav.flight.judge import Outcome, Referee, TruthSample, Verdict
-from airl_mav.flight.quality import measure_quality
-from airl_mav.flight.trajectory import Trajectory
-from airl_mav.flight.validity import BY_HAND, host_faults, host_figures
+from airl_mav.flight.judge import (
+    BY_HAND,
+    Outcome,
+    Referee,
+    TruthSample,
+    Verdict,
+    host_faults,
+    host_figures,
+)
+from airl_mav.flight.trajectory import Trajectory, measure_quality
 from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, STAMPS, setpoint_column
 from airl_mav.profiles.projections import SLOW

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from airl_mav.arena.generate import generate
 from airl_mav.core.clock import utc_now
@@ -28,6 +28,7 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
+from airl_mav.rehearsal.live_view import SimulationTap, view_part
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.checks import check_fitted
 from airl_mav.scenario.resolve import ResolvedScenario
@@ -36,8 +37,7 @@ from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.external.flight_stack import FirmwareRequest, real_firmware
 from firmware_sim.external.parameters import KeptParameters
 from firmware_sim.external.programs import how_to_start
-from firmware_sim.faults.fault_timeline import FaultTimeline
-from firmware_sim.faults.faulty_link import FailingEndpoint
+from firmware_sim.fault_timeline import FailingLink, FaultTimeline, failing_link
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack, fly
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, bind_device_links, bind_udp_links
@@ -46,9 +46,6 @@ from firmware_sim.pacing import Pacing, Unpaced, WallPacing
 from firmware_sim.plant.camera import CameraServer
 from firmware_sim.simulation import CrashDetector, EpisodeSetup, Simulation
 from firmware_sim.warm_up import warm_up
-
-if TYPE_CHECKING:
-    from airl_mav.view.taps import SimulationTap
 
 STATE_EVERY_US = 40_000
 """Period of true-state reports to the rehearsal [simulated µs]: 25 Hz."""
@@ -92,11 +89,11 @@ def build_firmware(
     signing = None if aircraft.signing_key is None else StoredSigning(aircraft.signing_key)
     insecure = insecure or signing is not None
     flight_stack: FlightStack
-    failing: FailingEndpoint | None = None
+    failing: FailingLink | None = None
     if aircraft.firmware == "builtin":
         links = ends()
         if link_fails(aircraft.faults):
-            failing = FailingEndpoint(links.api, pacing.clock)
+            failing = failing_link(links.api, pacing.clock)
         try:
             devices = bind_devices()
         except UsageError:
@@ -241,9 +238,7 @@ def fly_requested(begin: channel.Begin, harness: channel.ChildChannel) -> None:
         held.enter_context(closing(firmware))
         tap: SimulationTap | None = None
         if begin.view is not None:
-            from airl_mav.view.taps import SimulationTap
-
-            tap = held.enter_context(closing(SimulationTap(begin.view, scenario)))
+            tap = held.enter_context(closing(view_part("simulation")(begin.view, scenario)))
         with heard_compiling(lambda begins: harness.send(channel.Compiling(begins=begins))):
             warm_up(scenario.vehicle, scenario.scenario.plant)
         harness.send(channel.Ready())

@@ -12,8 +12,8 @@ from airl_mav.core.frames import Goal, goal_distance_m
 from airl_mav.core.progress import Event, Progress
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.quality import Quality
 from airl_mav.flight.statistics import reached_goals, wilson
+from airl_mav.flight.trajectory import Quality
 from airl_mav.rehearsal.channel import State, Text
 
 WARNING = 4

@@ -13,8 +13,7 @@ from pathlib import Path
 from airl_mav.core.clock import WallClock
 from airl_mav.core.compiling import COMPILING
 from airl_mav.core.constants import MAX_ATTEMPTS, US_PER_S
-from airl_mav.flight.judge import Referee, TruthSample, Verdict
-from airl_mav.flight.validity import BY_HAND
+from airl_mav.flight.judge import BY_HAND, Referee, TruthSample, Verdict
 from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.episode import (
     TAKEOFF_LIMIT_S,
@@ -25,6 +24,7 @@ from airl_mav.rehearsal.episode import (
     disturbing,
     join_episode,
 )
+from airl_mav.rehearsal.live_view import ViewEnds
 from airl_mav.rehearsal.observer import WARNING, Observer
 from airl_mav.rehearsal.process_pair import (
     COMPANION,
@@ -37,7 +37,6 @@ from airl_mav.rehearsal.process_pair import (
 )
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.resolve import ResolvedScenario
-from airl_mav.view.ends import ViewEnds
 from firmware_sim.external.programs import load_timeout_s
 
 WRAP_UP_S = 90.0

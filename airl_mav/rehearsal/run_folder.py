@@ -401,3 +401,7 @@ def _try(descriptor: int) -> bool:
         # runs in one folder.
         return True
     return True
+
+
+MOTOR_TIMES, MOTOR_OUTPUTS = "motors/time_us", "motors/output"
+"""Columns from the vehicle's log: times (n,) [µs] and outputs (n, 4), 0 to 1, in PX4's order."""

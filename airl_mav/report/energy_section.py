@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
@@ -11,14 +12,15 @@ from matplotlib.ticker import MaxNLocator
 from airl_mav.flight.energy import EnergySplit, add_up, split_energy
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.quality import Quality
+from airl_mav.flight.trajectory import Quality
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
-from airl_mav.report.document import Section, tables_section
+from airl_mav.report.document import NONE, Column, Section, TableView, columns_of, tables_section
 from airl_mav.report.run_tables import MAX_FLIGHTS, failures_first
-from airl_mav.report.shown_flights import ReportInput
-from airl_mav.report.table import NONE, Column, TableView, columns_of
+
+if TYPE_CHECKING:
+    from airl_mav.report.run_report import ReportInput
 
 COMPUTER_COLOUR = "#a35bb8"
 """Colour of medium lightness, legible on light and dark backgrounds."""

@@ -11,9 +11,15 @@ from airl_mav.core.constants import MS_PER_S, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.flight import statistics
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.paired import Change, PairedComparison
-from airl_mav.flight.quality import BANDWIDTH_HZ, command_steps
-from airl_mav.flight.statistics import Aggregate, Estimate, known, successful
+from airl_mav.flight.statistics import (
+    Aggregate,
+    Change,
+    Estimate,
+    PairedComparison,
+    known,
+    successful,
+)
+from airl_mav.flight.trajectory import BANDWIDTH_HZ, command_steps
 from airl_mav.latency.stages import (
     ALL_STAGES,
     SETPOINT_TO_MOTOR,
@@ -29,8 +35,8 @@ from airl_mav.latency.stages import (
 )
 from airl_mav.policy.registry import find_policy
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.document import NONE, TOO_FEW_CELL, TableView, columns_of, with_interval
 from airl_mav.report.run_arenas import vehicle_of
-from airl_mav.report.table import NONE, TOO_FEW_CELL, TableView, columns_of
 
 FEW_FLIGHTS = 10
 """Number of flights below which a bootstrap interval covers clearly less than 95 %."""
@@ -112,25 +118,6 @@ PACK = (ENDURANCE, RANGE, MISSIONS)
 
 MEASURES = (SUCCESS_RATE, FLIGHT_TIME, DISTANCE, ENERGY)
 ALL_MEASURES = (*MEASURES, COMPUTER_ENERGY, TOTAL_ENERGY)
-
-
-def with_interval(estimate: Estimate, digits: int = 1, sign: str = "") -> str:
-    """Return an estimate with its 95 % interval in brackets; `sign` is "+" for differences."""
-    if estimate.value is None:
-        return NONE
-    form = f"{sign}.{digits}f"
-    text = f"{estimate.value:{form}}"
-    if estimate.low is not None and estimate.high is not None:
-        text += f" [{estimate.low:{form}}, {estimate.high:{form}}]"
-    return text
-
-
-def interval_of(estimate: Estimate, digits: int, sign: str = "") -> str:
-    """Return only the 95 % interval; empty without one."""
-    if estimate.low is None or estimate.high is None:
-        return ""
-    form = f"{sign}.{digits}f"
-    return f"{estimate.low:{form}} … {estimate.high:{form}}"
 
 
 def rate_digits(rate: Estimate) -> int:

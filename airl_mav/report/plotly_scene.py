@@ -23,11 +23,11 @@ from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.document import OUTCOME_LABELS
 from airl_mav.report.forensics.camera_view import headings
 from airl_mav.report.forensics.worst import flown_path
 from airl_mav.report.run_figures import OUTCOME_COLOURS, speed_colours
-from airl_mav.report.table import OUTCOME_LABELS
-from airl_mav.view.style import GLASS_OPACITY
+from airl_mav.report.scene import GLASS_OPACITY
 
 POINTS = 240
 """Maximum number of points of a path."""

@@ -1,39 +1,317 @@
-"""Page of a run: its sections in order."""
+"""Page of a run: its sections in order, single flights, and the data of its script."""
 
 from __future__ import annotations
 
+import base64
 import gc
+import gzip
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.core.files import replace_file
+from airl_mav.camera.frame import rgb_of
+from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.files import Arrays, replace_file
+from airl_mav.flight.episode_record import EpisodeRecord
+from airl_mav.latency.stages import STAGES, decision_series
+from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report import document, run_tables
-from airl_mav.report.document import Section, tables_section
+from airl_mav.report.document import Section, ms, tables_section
 from airl_mav.report.energy_section import energy_section
-from airl_mav.report.flights_above import overview_picture
-from airl_mav.report.forensics.evidence import ranked
-from airl_mav.report.forensics.worst import EXAMINED, causes_table, worst_table
-from airl_mav.report.measures import RunSummary, conduct_table, rate_digits
-from airl_mav.report.plotly_scene import plotly_script
-from airl_mav.report.run_arenas import arenas_of, vehicle_of
-from airl_mav.report.run_verdict import OverallVerdict, save_verdict, verdict_of
-from airl_mav.report.shown_flights import (
-    ReportInput,
-    by_flight_section,
-    flights_section,
-    packed,
-    page_data,
-    report_input,
-    shown,
+from airl_mav.report.forensics.evidence import Cause, ranked
+from airl_mav.report.forensics.worst import (
+    EXAMINED,
+    ExaminedFlight,
+    causes_table,
+    examine_worst,
+    flown_path,
+    worst_table,
 )
-from airl_mav.report.table import ms
+from airl_mav.report.measures import RunSummary, conduct_table, rate_digits, summarize_run
+from airl_mav.report.plotly_scene import (
+    ALL_FLIGHTS,
+    SceneFlight,
+    plotly_script,
+    scene_json,
+    top_speed,
+)
+from airl_mav.report.policy_view import PolicyAgain, SeenDecision, policy_again, seen_decisions
+from airl_mav.report.run_arenas import arenas_of, vehicle_of
+from airl_mav.report.run_figures import map_figure, overview_picture
+from airl_mav.report.run_tables import MAX_FLIGHTS, episodes_table
+from airl_mav.report.run_verdict import OverallVerdict, save_verdict, verdict_of
+from airl_mav.report.theme import FigureImage, palette, shades
 from airl_mav.report.timeline import latency_section
+from airl_mav.report.tracking import (
+    IMAGES,
+    EstimateErrors,
+    TrackedFlight,
+    TrackedMotion,
+    track,
+    tracking_figure,
+)
+
+
+class Steps(TypedDict):
+    """Sequence of numbers stored as integer differences, which compress well."""
+
+    unit: float
+    """Value of a step of 1."""
+    steps: list[int]
+    """Differences from 0 to the first number and from each number to the next."""
+
+
+LEVEL = 7
+"""Compression level of gzip, 1 to 9; level 9 takes three times longer for 1 % smaller data."""
+
+
+def packed(text: str) -> str:
+    """Return a text as base64 of gzip; the output is reproducible."""
+    return base64.b64encode(gzip.compress(text.encode(), compresslevel=LEVEL, mtime=0)).decode()
+
+
+def steps_of(values: NDArray[np.float64] | Sequence[float], unit: float) -> Steps:
+    """Encode finite numbers (n,) as steps of a unit, accurate to half a unit."""
+    whole = np.round(np.asarray(values, np.float64) / unit).astype(np.int64)
+    return {"unit": unit, "steps": np.diff(whole, prepend=0).tolist()}
+
+
+TIME_POINTS = 1000
+"""Maximum number of points of a line: 20 s at the recorded rate; longer flights are thinned."""
+
+UNITS = {"_m_s": 0.01, "_m": 0.01, "_deg": 0.1, "_deg_s": 0.1, "thrust": 0.001}
+"""Resolution of stored numbers by the suffix of their name."""
+
+MAX_IMAGES = 24
+"""Maximum number of decisions with an image: first, last and evenly spaced ones."""
+
+LAST = 8
+"""Number of these images from the last decisions, which led to the outcome."""
+
+BEST = 5
+"""Number of scores shown per decision, best first."""
+
+
+def chosen(count: int, most: int = MAX_IMAGES, last: int = LAST) -> list[int]:
+    """Return the indices of up to `most` of `count` decisions, increasing."""
+    if count <= most:
+        return list(range(count))
+    before = np.linspace(0, count - last - 1, most - last).round().astype(int)
+    return [*np.unique(before).tolist(), *range(count - last, count)]
+
+
+def flight_data(
+    flight: TrackedFlight,
+    stamps: Arrays,
+    seen: Sequence[SeenDecision],
+    range_m: float,
+    again: PolicyAgain | None,
+) -> dict[str, Any]:
+    """Return a flight as plain data, with depth up to `range_m` [m] and the policy's scores."""
+    count = len(flight.time_s)
+    keep = np.unique(np.linspace(0, count - 1, min(count, TIME_POINTS)).round().astype(int))
+    commands = flight.commands
+    return {
+        "time": steps_of(flight.time_s[keep], 0.001),
+        "flown": _lines(flight.flown, keep),
+        "estimated": None if flight.estimated is None else _lines(flight.estimated, keep),
+        "errors": None if flight.errors is None else _lines(flight.errors, keep),
+        "power": None if flight.power_w is None else steps_of(flight.power_w[keep], 1.0),
+        "motors": None
+        if flight.motors is None
+        else [steps_of(column, 0.002) for column in flight.motors[keep].T],
+        "altitude": flight.altitude_m,
+        "commands": {
+            "sent": steps_of(commands.sent_s, 0.001),
+            **{name: steps_of(values, _unit(name)) for name, values in commands.values.items()},
+        },
+        "stages": _stages(stamps),
+        "seen": [_seen(seen[k], range_m, again) for k in chosen(len(seen))],
+    }
+
+
+def _lines(of: TrackedMotion | EstimateErrors, keep: NDArray[np.int64]) -> dict[str, Steps]:
+    known = {name: values for name, values in vars(of).items() if values is not None}
+    return {name: steps_of(values[keep], _unit(name)) for name, values in known.items()}
+
+
+def _unit(name: str) -> float:
+    ends = [end for end in UNITS if name.endswith(end)]
+    return UNITS[max(ends, key=len)]
+
+
+def _stages(stamps: Arrays) -> dict[str, list[float | None]]:
+    """Return the durations of the sent decisions by stage [ms]; None = unknown."""
+    series = decision_series(stamps)
+    sent = np.asarray(stamps.get("sent_us", np.zeros(0, np.int64)))
+    there = sent != NO_STAMP
+    found = {}
+    for stage in STAGES:
+        values = series.get(stage.key)
+        if values is None or len(values) != len(sent) or (values[there] == NO_STAMP).all():
+            continue
+        found[stage.key] = [
+            None if us == NO_STAMP else round(float(us) / US_PER_MS, 2) for us in values[there]
+        ]
+    return found
+
+
+def _seen(decision: SeenDecision, range_m: float, again: PolicyAgain | None) -> Mapping[str, Any]:
+    """Return a decision: its image as base64, and its best actions."""
+    seen = decision.image
+    height, width = seen.shape[:2]
+    # One palette byte per depth pixel, three bytes per colour pixel.
+    pixels = rgb_of(seen) if seen.ndim == 3 else shades(seen, range_m)
+    image = base64.b64encode(pixels.tobytes()).decode()
+    told: dict[str, Any] = {"number": decision.number, "size": [width, height], "image": image}
+    if decision.scores is not None and again is not None:
+        best = np.argsort(-decision.scores, kind="stable")[:BEST]
+        told["best"] = [
+            [round(float(decision.scores[k]), 3), *np.round(again.actions[k], 3).tolist()]
+            for k in best
+        ]
+        told["again"] = decision.again
+    return told
+
+
+MAX_PICTURED = 6
+"""Maximum number of flights with still pictures, worst first."""
+
+MAX_SHOWN = 24
+"""Maximum number of flights in the view of single flights, worst first."""
+
+
+@dataclass(frozen=True)
+class ShownFlight:
+    """Flight in the view of single flights."""
+
+    scene: SceneFlight
+    tracked: TrackedFlight
+    seen: tuple[SeenDecision, ...]
+    """Recomputed decisions; empty if the arena or the vehicle is unknown."""
+
+
+@dataclass(frozen=True)
+class ReportInput:
+    """Run and data derived from it, for the sections of its page."""
+
+    run: LoadedRun
+    arenas: Mapping[int, Arena]
+    """Arenas by episode index; flights without pictures and cause may be missing."""
+    vehicle: VehicleProfile | None
+    summary: RunSummary
+    worst: Sequence[ExaminedFlight]
+    view: Sequence[ShownFlight]
+    """Flights in the view of single flights, worst first."""
+    policy: PolicyAgain | None
+
+    @cached_property
+    def numbers(self) -> dict[int, int]:
+        """Number of each flight in the view, by episode index."""
+        return {flight.scene.record.index: k for k, flight in enumerate(self.view)}
+
+
+def pictured(run: LoadedRun) -> list[EpisodeRecord]:
+    """Return the episodes with still pictures, worst first."""
+    return ranked(run)[:MAX_PICTURED]
+
+
+def shown(run: LoadedRun) -> list[EpisodeRecord]:
+    """Return the episodes for the view of single flights, worst first."""
+    return ranked(run)[:MAX_SHOWN]
+
+
+def report_input(
+    run: LoadedRun, arenas: Mapping[int, Arena], vehicle: VehicleProfile | None
+) -> ReportInput:
+    """Return the input of a run's page; the view skips flights without a path."""
+    again = None if vehicle is None else policy_again(run.info)
+    flights = []
+    for record in shown(run):
+        path, tracked, arena = flown_path(run, record), track(run, record), arenas.get(record.index)
+        if path is None or tracked is None:
+            continue
+        seen: tuple[SeenDecision, ...] = ()
+        if arena is not None and vehicle is not None:
+            seen = tuple(seen_decisions(run, record, arena, vehicle, again))
+        flights.append(ShownFlight(SceneFlight(record, path, arena), tracked, seen))
+    worst = examine_worst(run, arenas, vehicle)
+    return ReportInput(run, arenas, vehicle, summarize_run(run), worst, flights, again)
+
+
+def by_flight_section(page: ReportInput) -> tuple[Section, ...]:
+    """Return the view of single flights; empty without recorded paths."""
+    note = "Rendered again from the recorded path, without the camera's noise."
+    asked = [d.again for flight in page.view for d in flight.seen if d.again is not None]
+    if asked:
+        chosen_again = f"{sum(asked):,} of {len(asked):,} decisions"
+        note += f" The policy, asked again, chose the flown action in {chosen_again}."
+    data = {"together": min(len(page.run.episodes), ALL_FLIGHTS), "best": BEST}
+    section = Section("Flight by flight", note=note, template="by_flight.html.j2", data=data)
+    return (section,) if page.view else ()
+
+
+def flights_section(page: ReportInput) -> tuple[Section, ...]:
+    """Return the table of flights, and still pictures of the worst."""
+    top = top_speed([flight.scene for flight in page.view])
+    range_m = 0.0 if page.vehicle is None else page.vehicle.camera.range_m
+    causes = {each.record.index: each.cause for each in page.worst}
+    drawn: list[tuple[EpisodeRecord, Cause | None, list[FigureImage]]] = []
+    for record in pictured(page.run):
+        number = page.numbers.get(record.index)
+        flight = None if number is None else page.view[number]
+        path = None if flight is None else flight.scene.path
+        pictures = [map_figure(record, path, page.arenas.get(record.index), top)]
+        if flight is not None:
+            seen = [flight.seen[k] for k in chosen(len(flight.seen), IMAGES, 2)]
+            pictures.append(tracking_figure(flight.tracked, seen, range_m))
+        drawn.append((record, causes.get(record.index), pictures))
+    return tables_section(
+        episodes_table(page.run, MAX_FLIGHTS),
+        draw=lambda: [picture for *_, pictures in drawn for picture in pictures],
+        template="flights.html.j2",
+        data=drawn,
+    )
+
+
+def page_data(page: ReportInput, pictures: Iterable[FigureImage]) -> str:
+    """Return the data of the page's script as JSON: pictures, views and flights."""
+    run, vehicle = page.run, page.vehicle
+    fov, range_m = (0.0, 0.0) if vehicle is None else (
+        vehicle.camera.horizontal_fov_deg, vehicle.camera.range_m,
+    )  # fmt: skip
+    everyone = ranked(run)[:ALL_FLIGHTS]
+    data: dict[str, Any] = {
+        "pictures": {picture.name: picture.svg for picture in pictures},
+        "flights": [
+            {
+                **flight_data(
+                    flight.tracked,
+                    run.latency.get(flight.scene.record.index, {}),
+                    flight.seen,
+                    range_m,
+                    page.policy,
+                ),
+                "faults": flight.scene.record.fault_spans_s(),
+            }
+            for flight in page.view
+        ],
+        "palette": palette(),
+    }
+    views = scene_json(run, [flight.scene for flight in page.view], everyone, fov)
+    text = json.dumps(data, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return f'{text[:-1]},"views":{views}}}'
+
 
 YOUNG_OBJECTS = 50_000
 """Number of new containers that trigger a collection, instead of Python's 700."""

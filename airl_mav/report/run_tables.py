@@ -21,7 +21,7 @@ from airl_mav.flight.statistics import NO_ESTIMATE, Estimate
 from airl_mav.latency.stages import CommandAges, Summary, command_ages, summarize
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, TICK_LATENESS, LoadedRun
-from airl_mav.report import table
+from airl_mav.report import document
 from airl_mav.report.document import print_place, print_verdict
 from airl_mav.report.measures import (
     COMPUTER_ENERGY,
@@ -80,14 +80,14 @@ def _part(part: Part) -> str:
     return f"{part.name} – {part.description}" if part.description else part.name
 
 
-def latency_table(summary: RunSummary) -> table.TableView:
+def latency_table(summary: RunSummary) -> document.TableView:
     """Return the latencies by stage."""
-    head, last = table.columns_of("<stage | *<from → to")
-    columns = (head, *table.DURATION_COLUMNS, last)
+    head, last = document.columns_of("<stage | *<from → to")
+    columns = (head, *document.DURATION_COLUMNS, last)
     rows, short = [], False
     for stage in summary.shown_stages:
-        cells = table.duration_cells(summary.stages[stage.key])
-        short = short or table.TOO_FEW_CELL in cells
+        cells = document.duration_cells(summary.stages[stage.key])
+        short = short or document.TOO_FEW_CELL in cells
         rows.append((stage.title, *cells, stage.meaning))
     notes = ["Milliseconds of simulated time."]
     if summary.modelled:
@@ -96,8 +96,8 @@ def latency_table(summary: RunSummary) -> table.TableView:
             "drawn from the distribution named above."
         )
     if short:
-        notes.append(table.TOO_FEW_NOTE)
-    return table.TableView("latency", "Decision latency", columns, tuple(rows), tuple(notes))
+        notes.append(document.TOO_FEW_NOTE)
+    return document.TableView("latency", "Decision latency", columns, tuple(rows), tuple(notes))
 
 
 def failures_first(episodes: Sequence[EpisodeRecord], most: int) -> list[EpisodeRecord]:
@@ -106,10 +106,10 @@ def failures_first(episodes: Sequence[EpisodeRecord], most: int) -> list[Episode
     return sorted(ranked[:most], key=lambda e: e.index)
 
 
-def episodes_table(run: LoadedRun, most: int | None = None) -> table.TableView:
+def episodes_table(run: LoadedRun, most: int | None = None) -> document.TableView:
     """Return the quality of up to `most` flights, failed flights preferred."""
     feeds = not run.info.setup.computer_on_ground
-    columns = table.columns_of(
+    columns = document.columns_of(
         "# | seed | <outcome | time [s] | distance [m] | energy [kJ] | speed [m/s] | "
         f"*top speed [m/s]{' | *computer [J]' if feeds else ''} | *take-off [s, kJ] | "
         "*battery [%] | *<why"
@@ -124,13 +124,13 @@ def episodes_table(run: LoadedRun, most: int | None = None) -> table.TableView:
         notes.append(
             f"{len(shown)} of {total:,} flights, those that failed first; all: {EPISODES_FILE}."
         )
-    return table.TableView("episodes", "Flights", columns, rows, tuple(notes))
+    return document.TableView("episodes", "Flights", columns, rows, tuple(notes))
 
 
 def _episode_row(episode: EpisodeRecord, *, computer: bool) -> tuple[str, ...]:
     q = episode.quality
     figures = (
-        (table.NONE,) * (6 + computer)
+        (document.NONE,) * (6 + computer)
         if q is None
         else (
             f"{q.flight_time_s:.2f}",
@@ -143,19 +143,19 @@ def _episode_row(episode: EpisodeRecord, *, computer: bool) -> tuple[str, ...]:
         )
     )
     battery = episode.battery_remaining
-    left = table.NONE if battery is None else f"{100.0 * battery:.1f}"
+    left = document.NONE if battery is None else f"{100.0 * battery:.1f}"
     why = "; ".join([episode.reason, *episode.notes])
-    label = table.OUTCOME_LABELS[episode.outcome]
+    label = document.OUTCOME_LABELS[episode.outcome]
     return (f"{episode.index}", f"{episode.seed}", label, *figures, left, why)
 
 
 def _kilojoules(joules: float | None) -> str:
-    return table.NONE if joules is None else f"{joules / 1e3:.2f}"
+    return document.NONE if joules is None else f"{joules / 1e3:.2f}"
 
 
-def quality_table(summary: RunSummary, *, computer: bool = True) -> table.TableView:
+def quality_table(summary: RunSummary, *, computer: bool = True) -> document.TableView:
     """Return the flight quality with intervals; `computer` adds the row of its energy."""
-    columns = table.columns_of("<measure | value | 95 % interval | median | *95 % interval | n")
+    columns = document.columns_of("<measure | value | 95 % interval | median | *95 % interval | n")
     q = summary.quality
     rate = replace(SUCCESS_RATE, digits=rate_digits(q.success_rate))
     measures = [rate, FLIGHT_TIME, DISTANCE, ENERGY]
@@ -179,25 +179,27 @@ def quality_table(summary: RunSummary, *, computer: bool = True) -> table.TableV
         )
     if 1 < q.flight_time_s.n < FEW_FLIGHTS:
         notes.append(f"Bootstrap intervals of fewer than {FEW_FLIGHTS} flights are too narrow.")
-    return table.TableView("quality", "Quality of flight", columns, rows, tuple(notes))
+    return document.TableView("quality", "Quality of flight", columns, rows, tuple(notes))
 
 
 def _estimate_row(measure: QualityMeasure, mean: Estimate, median: Estimate) -> tuple[str, ...]:
 
     def interval(of: Estimate) -> str:
         return (
-            table.NONE if of.low is None else f"{measure.plain(of.low)} … {measure.plain(of.high)}"
+            document.NONE
+            if of.low is None
+            else f"{measure.plain(of.low)} … {measure.plain(of.high)}"
         )
 
     value, middle = measure.plain(mean.value, unit=True), measure.plain(median.value)
     return measure.title, value, interval(mean), middle, interval(median), f"{mean.n}"
 
 
-def real_time_table(run: LoadedRun, summary: RunSummary) -> table.TableView | None:
+def real_time_table(run: LoadedRun, summary: RunSummary) -> document.TableView | None:
     """Return real-time pace and the companion's resource use; None for runs in simulated time."""
     if not summary.timed:
         return None
-    columns = table.columns_of("<measure | value | n")
+    columns = document.columns_of("<measure | value | n")
     nothing: NDArray[np.int64] = np.zeros(0, np.int64)
     lateness = [stamps.get(TICK_LATENESS, nothing) for stamps in run.latency.values()]
     accepted = [stamps["accepted_us"] for stamps in run.latency.values() if "accepted_us" in stamps]
@@ -206,34 +208,34 @@ def real_time_table(run: LoadedRun, summary: RunSummary) -> table.TableView | No
     slipped_us = sum(episode.slipped_us for episode in run.episodes)
     uses = [e.companion_use for e in run.episodes if e.companion_use]
     if run.info.setup.level == "flight":
-        return table.TableView("real-time", "Companion", columns, tuple(_use_rows(uses)))
+        return document.TableView("real-time", "Companion", columns, tuple(_use_rows(uses)))
     rows = [
         *_tail_rows("tick lateness", summarize(np.concatenate([nothing, *lateness]))),
         ("real-time factor", _real_time_factor(run), flights),
-        ("simulated time given up", f"{table.ms(slipped_us)} ms", flights),
+        ("simulated time given up", f"{document.ms(slipped_us)} ms", flights),
         *_tail_rows("setpoint → motor", summary.stages["setpoint_to_motor"]),
         ("setpoints never accepted", f"{unmatched:,}", f"{sum(map(len, accepted)):,}"),
         *_use_rows(uses),
     ]
-    return table.TableView("real-time", "Real time", columns, tuple(rows))
+    return document.TableView("real-time", "Real time", columns, tuple(rows))
 
 
 def _use_rows(uses: Sequence[ProcessUse]) -> list[tuple[str, ...]]:
     if not uses:
         return []
     n, wall_s = f"{len(uses)}", sum(use.wall_s for use in uses)
-    cores = f"{sum(use.cpu_s for use in uses) / wall_s:.2f} cores" if wall_s else table.NONE
+    cores = f"{sum(use.cpu_s for use in uses) / wall_s:.2f} cores" if wall_s else document.NONE
     mean_s = sum(use.cpu_s for use in uses) / len(uses)
     peaks = [use.peak_memory_bytes for use in uses if use.peak_memory_bytes is not None]
     begun = all(use.peak_since == "begin" for use in uses)
     since = "of any flight" if begun else "since the process began"
     powers = [use.power_w for use in uses if use.power_w is not None]
-    watts = f"{np.mean(powers):.1f} W ({uses[-1].power_source})" if powers else table.NONE
+    watts = f"{np.mean(powers):.1f} W ({uses[-1].power_source})" if powers else document.NONE
     return [
         ("companion, processor time a flight", f"{mean_s:.2f} s, {cores}", n),
         (
             f"companion, greatest memory {since}",
-            f"{max(peaks) / BYTES_PER_MIB:.0f} MiB" if peaks else table.NONE,
+            f"{max(peaks) / BYTES_PER_MIB:.0f} MiB" if peaks else document.NONE,
             f"{len(peaks)}",
         ),
         ("mean power of the machine", watts, f"{len(powers)}"),
@@ -243,12 +245,12 @@ def _use_rows(uses: Sequence[ProcessUse]) -> list[tuple[str, ...]]:
 def _tail_rows(title: str, summary: Summary) -> list[tuple[str, ...]]:
     n = summary.n
     if not n:
-        return [(title, table.NONE, "0")]
-    p99 = table.percentile_cell(summary.p99, n)
+        return [(title, document.NONE, "0")]
+    p99 = document.percentile_cell(summary.p99, n)
     return [
-        (f"{title}, p50", f"{table.ms(summary.p50)} ms", f"{n:,}"),
-        (f"{title}, p99", p99 if p99 == table.TOO_FEW_CELL else f"{p99} ms", f"{n:,}"),
-        (f"{title}, max", f"{table.ms(summary.max)} ms", f"{n:,}"),
+        (f"{title}, p50", f"{document.ms(summary.p50)} ms", f"{n:,}"),
+        (f"{title}, p99", p99 if p99 == document.TOO_FEW_CELL else f"{p99} ms", f"{n:,}"),
+        (f"{title}, max", f"{document.ms(summary.max)} ms", f"{n:,}"),
     ]
 
 
@@ -272,7 +274,7 @@ ROWS = (
 )
 
 
-def estimation_table(flights: Sequence[TrackedFlight]) -> table.TableView | None:
+def estimation_table(flights: Sequence[TrackedFlight]) -> document.TableView | None:
     """Return the errors of the estimator in navigation; None without recorded estimates."""
     known = [(f.time_s >= 0.0, f.errors) for f in flights if f.errors is not None]
     known = [(flies, errors) for flies, errors in known if flies.any()]
@@ -283,12 +285,12 @@ def estimation_table(flights: Sequence[TrackedFlight]) -> table.TableView | None
         values = np.concatenate([getattr(errors, name)[flies] for flies, errors in known])
         figures = (np.median(values), np.percentile(values, 95.0), values.max())
         rows.append((title, unit, *(f"{figure:.2f}" for figure in figures)))
-    columns = table.columns_of("<error of the estimate | <unit | median | p95 | greatest")
+    columns = document.columns_of("<error of the estimate | <unit | median | p95 | greatest")
     notes = (
         f"Between what the flight controller believed and the true state, 50 times a second, "
         f"{len(known):,} flights from the start of navigation.",
     )
-    return table.TableView("estimation", "Estimator", columns, tuple(rows), notes)
+    return document.TableView("estimation", "Estimator", columns, tuple(rows), notes)
 
 
 def run_ages(run: LoadedRun) -> CommandAges:
@@ -313,20 +315,20 @@ def _acted(stamps: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.int64], NDArr
     return frames[both].astype(np.int64), motors[both].astype(np.int64)
 
 
-def ages_table(ages: CommandAges, end_to_end: Summary) -> table.TableView | None:
+def ages_table(ages: CommandAges, end_to_end: Summary) -> document.TableView | None:
     """Return age and latency of the flown command; None without consecutive commands."""
     n = ages.youngest_us.size
     if not n or not ages.time_us:
         return None
-    columns = (*table.columns_of("<how old the flown command was"), *table.DURATION_COLUMNS)
+    columns = (*document.columns_of("<how old the flown command was"), *document.DURATION_COLUMNS)
     rows = (
-        ("as it took effect, by decision", *table.duration_cells(end_to_end)),
+        ("as it took effect, by decision", *document.duration_cells(end_to_end)),
         (
             "at any moment, by time",
             f"{n:,}",
-            table.ms(ages.mean),
-            *(table.percentile_cell(ages.percentile(p), n) for p in (50.0, 90.0, 99.0)),
-            table.ms(float(ages.oldest_us.max())),
+            document.ms(ages.mean),
+            *(document.percentile_cell(ages.percentile(p), n) for p in (50.0, 90.0, 99.0)),
+            document.ms(float(ages.oldest_us.max())),
         ),
     )
     notes = (
@@ -334,16 +336,22 @@ def ages_table(ages: CommandAges, end_to_end: Summary) -> table.TableView | None
         "however long it lasts; by time it weighs what the vehicle flew of it (coordinated "
         "omission).",
     )
-    return table.TableView("ages", "Age of the flown command", columns, rows, notes)
+    return document.TableView("ages", "Age of the flown command", columns, rows, notes)
 
 
 MAX_LISTED = 60
 
 
-def faults_table(run: LoadedRun) -> table.TableView | None:
+def faults_table(run: LoadedRun) -> document.TableView | None:
     """Return the active faults, one per line; None without faults."""
     lines = [
-        (f"{e.index}", acted.fault, f"{from_s:.2f}", f"{to_s:.2f}", table.OUTCOME_LABELS[e.outcome])
+        (
+            f"{e.index}",
+            acted.fault,
+            f"{from_s:.2f}",
+            f"{to_s:.2f}",
+            document.OUTCOME_LABELS[e.outcome],
+        )
         for e in run.episodes
         for acted, (from_s, to_s) in zip(e.faults, e.fault_spans_s(), strict=True)
     ]
@@ -352,8 +360,8 @@ def faults_table(run: LoadedRun) -> table.TableView | None:
     notes = ["Simulated time since the start of navigation; negative: before it."]
     if len(lines) > MAX_LISTED:
         notes.append(f"{MAX_LISTED} of {len(lines):,} lines; all: {EPISODES_FILE}.")
-    columns = table.columns_of("# | <fault | from [s] | to [s] | <outcome of the flight")
-    return table.TableView("faults", "Faults", columns, tuple(lines[:MAX_LISTED]), tuple(notes))
+    columns = document.columns_of("# | <fault | from [s] | to [s] | <outcome of the flight")
+    return document.TableView("faults", "Faults", columns, tuple(lines[:MAX_LISTED]), tuple(notes))
 
 
 MAX_PRINTED = 25
@@ -365,8 +373,8 @@ def print_report(run: LoadedRun, console: Console, verdict: OverallVerdict) -> N
     print_verdict(verdict.lines, console)
     console.print()
     summary, feeds = summarize_run(run), not run.info.setup.computer_on_ground
-    flights = table.count_outcomes([episode.outcome for episode in run.episodes])
-    table.print_facts([*setup_rows(run), ("flights", flights)], console)
+    flights = document.count_outcomes([episode.outcome for episode in run.episodes])
+    document.print_facts([*setup_rows(run), ("flights", flights)], console)
     for view in (
         latency_table(summary),
         episodes_table(run, MAX_PRINTED),
@@ -377,7 +385,7 @@ def print_report(run: LoadedRun, console: Console, verdict: OverallVerdict) -> N
     ):
         if view is not None:
             console.print()
-            table.print_table(view, console)
+            document.print_table(view, console)
 
 
 def show_report(

@@ -18,10 +18,8 @@ from pydantic import TypeAdapter
 from airl_mav.core.errors import EXIT_INVALID, EXIT_NOT_MET, EXIT_UNDECIDED
 from airl_mav.core.files import read_typed, replace_file, write_json
 from airl_mav.flight.episode_record import EpisodeRecord, Setup
-from airl_mav.flight.paired import PairedComparison
-from airl_mav.flight.requirements import Finding, Requirement, find
-from airl_mav.flight.sequential import RequirementDecision
-from airl_mav.flight.statistics import Aggregate, Estimate, aggregate
+from airl_mav.flight.requirements import Finding, Requirement, RequirementDecision, find
+from airl_mav.flight.statistics import Aggregate, Estimate, PairedComparison, aggregate
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
 from airl_mav.report.document import environment
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,10 +26,18 @@ from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import run_tables, theme
-from airl_mav.report.document import SHEET_COLUMNS, Section, tables_section
+from airl_mav.report.document import (
+    SHEET_COLUMNS,
+    Section,
+    TableView,
+    columns_of,
+    ms,
+    tables_section,
+)
 from airl_mav.report.run_figures import latency_figure, long_tail
-from airl_mav.report.shown_flights import ReportInput
-from airl_mav.report.table import TableView, columns_of, ms
+
+if TYPE_CHECKING:
+    from airl_mav.report.run_report import ReportInput
 
 COLUMNS = 320
 """Maximum number of columns per row; longer runs have several decisions per column."""

@@ -19,7 +19,7 @@ from airl_mav.core.scheduling import check_permitted
 from airl_mav.faults.fault import TWIN, Fault, check_twin
 from airl_mav.faults.kinds import LINKS
 from airl_mav.latency.injection import Injection, select_injection
-from airl_mav.policy.actions import Policy
+from airl_mav.policy.actions import KINDS, Policy
 from airl_mav.policy.registry import PolicyInfo, load_policy
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.projections import SLOW, Renderer
@@ -192,7 +192,7 @@ def decide_piloting(
     """
     card = policy.card
     known: dict[str, Any] = {"goal_radius_m": goal_radius_m}
-    if policy.commands != "velocity":
+    if not KINDS[policy.commands].steady:
         # Decide on every image: nothing else keeps the vehicle level.
         known["decisions"] = "pipelined"
     hover_s = asked.watchdog.hover_after_s
@@ -230,16 +230,14 @@ def check_commands(
     policy: PolicyInfo, asked: str, *, level: str, firmware: str = "builtin"
 ) -> None:
     """Raise FieldError for commands that the level or the firmware does not support."""
-    if policy.commands == "velocity":
-        return
-    words = policy.commands.replace("_", " ")
-    if level == "gym" and policy.commands == "attitude":
+    kind = KINDS[policy.commands]
+    if level not in kind.levels:
         accepted = "at level lockstep or sitl: the batch twin flies velocities and body rates"
-    elif firmware == "ardupilot":
+    elif firmware == "ardupilot" and not kind.steady:
         accepted = "with firmware builtin or PX4: ArduPilot takes a thrust for a climb rate"
     else:
         return
-    raise FieldError("policy", asked, f"one that commands {words}, {accepted}")
+    raise FieldError("policy", asked, f"one that commands {kind.title}, {accepted}")
 
 
 def check_compensated(pilot: PilotSettings, policy: PolicyInfo, vehicle: VehicleProfile) -> None:
@@ -248,12 +246,13 @@ def check_compensated(pilot: PilotSettings, policy: PolicyInfo, vehicle: Vehicle
     Compensation does not support policies without velocity commands, whose effect is not predicted,
     nor policies with additional cameras, whose images are not predicted.
     """
-    if pilot.compensate and policy.commands != "velocity":
+    kind = KINDS[policy.commands]
+    if pilot.compensate and not kind.steady:
         raise FieldError(
             "compensate",
             True,
-            problem=f"policy {policy.name} commands {policy.commands.replace('_', ' ')}, whose"
-            " effect is not foreseen; accepted: no compensation",
+            problem=f"policy {policy.name} commands {kind.title}, whose effect is not foreseen;"
+            " accepted: no compensation",
         )
     seen: Iterable[str] = ()
     if policy.card is not None:
@@ -333,6 +332,6 @@ def between_commands(pilot: PilotSettings, hover_s: float | None) -> str:
         words.append(f"{pilot.decisions} decisions")
     if pilot.compensate:
         words.append("latency compensated")
-    if pilot.commands != "velocity":
-        words.append(f"{pilot.commands.replace('_', ' ')} and thrust")
+    if not KINDS[pilot.commands].steady:
+        words.append(f"{KINDS[pilot.commands].title} and thrust")
     return ", ".join(words)

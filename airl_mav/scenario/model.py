@@ -14,7 +14,7 @@ from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_va
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.fields import ProfileModel, field_error, optional, quantity, switch
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
-from airl_mav.policy.actions import UPRIGHT_S, DecisionTiming
+from airl_mav.policy.actions import KINDS, UPRIGHT_S, DecisionTiming
 from airl_mav.scenario.aircraft import FREE, NO_TWIN, Aircraft
 
 Place = tuple[
@@ -98,7 +98,7 @@ class WatchdogSettings(ProfileModel):
             return self.decision_timeout_s
         if on_card is not None:
             return on_card
-        return DECISION_TIMEOUT_S if commands == "velocity" else hold_s + UPRIGHT_S
+        return DECISION_TIMEOUT_S if KINDS[commands].steady else hold_s + UPRIGHT_S
 
 
 class LimitSettings(ProfileModel):

@@ -26,7 +26,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.dqn.policies import DQNPolicy
 from torch.nn import functional
 
-from airl_mav.policy.observation_spec import Encoded
+from airl_mav.policy.layouts import Encoded
 from airl_mav.training.config import Precision
 
 RUNNING, TERMINATED, TRUNCATED = 0, 1, 2

@@ -31,7 +31,8 @@ from airl_mav.envs.spec import EnvironmentSpec, Randomisation
 from airl_mav.envs.stopping import bounded
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
-from airl_mav.policy.observation_spec import SHIPPED
+from airl_mav.policy.layouts import SHIPPED
+from airl_mav.rehearsal.live_view import ViewEnds, view_part
 from airl_mav.rehearsal.run_folder import locked
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
@@ -50,7 +51,6 @@ from airl_mav.training.training_folder import (
     TrainingFolder,
     TrainingProgress,
 )
-from airl_mav.view.ends import ViewEnds
 
 
 def begin_with(model: BaseAlgorithm, run: Path, log_std: float | None = None) -> None:
@@ -129,10 +129,7 @@ def train(
         if view is None:
             best = fit(config, folder, progress, device)
         else:
-            # Imported here: only needed for a live view.
-            from airl_mav.training.watched_training import WatchedTraining
-
-            with closing(WatchedTraining(view, config.environment, progress)) as watched:
+            with closing(view_part("training")(view, config.environment, progress)) as watched:
                 best = fit(config, folder, watched, device, watched)
         return TrainingResult(folder, best, export_best(folder, config, name))
 

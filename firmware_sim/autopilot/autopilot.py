@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Gains, RateDemand
 from airl_mav.control.loops import Motors
@@ -59,15 +60,9 @@ from firmware_sim.engine.record import LANDING, LIFT_OFF, NOTHING
 from firmware_sim.engine.ticks import ALIGN, CLIMBED, REPEATED_BITS, control_record, detect_record
 from firmware_sim.interfaces import (
     ActuatorControls,
-    DistanceReading,
-    FlowReading,
-    Odometry,
     SensorSample,
     TrueState,
 )
-
-CLIENTS_SENSOR = 1
-"""Source id of ranges from a client, as opposed to the vehicle's sensor."""
 
 # Bound once: looking up an enum member in every tick is slow.
 _GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR
@@ -147,6 +142,8 @@ class BuiltinAutopilot:
             value,
         )
         self._snapshot: AutopilotState | None = None
+        self._unfused: set[str] = set()
+        """Kinds of client sensors that were reported as not fused."""
         self.failures: Failures | None = None
         """Failure injection for client requests. Set by the simulation."""
         self.logs: LogStore = NoLogs()
@@ -186,9 +183,9 @@ class BuiltinAutopilot:
         self.estimator.step(sensors.trusted(sample) if sensors.distrusted else sample)
         self._taken_us, self._snapshot = sample.time_us, None
         self._newest.take(sample)
-        finder = self.estimator.range
-        if finder is not None:
-            self._guidance.context.ground = ground = finder.clearance()
+        ground = self.estimator.aiding.ground
+        if ground is not None:
+            self._guidance.context.ground = ground
             self._land_detector.see(ground)
         if sample.esc_outputs is not None:
             self.supervisor.watch.hear_escs(sample.time_us, self._motors, sample.esc_outputs)
@@ -625,19 +622,12 @@ class BuiltinAutopilot:
             self._commander.handle(Ask(Mode.POSITION))
             self._say(OperatorText.of(Severity.INFO, events.PILOT_TOOK_OVER))
 
-    def see(self, odometry: Odometry) -> None:
-        """Pass on a pose from an external estimator."""
-        self.estimator.see(odometry)
-        self._snapshot = None
-
-    def measure_distance(self, reading: DistanceReading) -> None:
-        """Pass on a range from a client's distance sensor."""
-        self.estimator.measure(reading, CLIENTS_SENSOR)
-        self._snapshot = None
-
-    def look_down(self, reading: FlowReading) -> None:
-        """Pass on a reading from a client's optical flow sensor."""
-        self.estimator.look_down(reading)
+    def receive(self, name: str, reading: Any) -> None:
+        """Pass on a reading of a client's sensor: odometry, distance or flow."""
+        fused, self._snapshot = self.estimator.receive(name, reading), None
+        if not fused and name not in self._unfused:
+            self._unfused.add(name)
+            self._say(OperatorText(Severity.WARNING, f"No add-on fuses the sensor: {name}"))
 
     def see_obstacles(self, obstacles: ObstacleBins) -> None:
         """Pass on the distances to obstacles."""

@@ -6,6 +6,7 @@ Types created for every snapshot are named tuples, which are faster than datacla
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple, Protocol, TypeAlias
@@ -17,13 +18,7 @@ from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.events.definition import Definition, MavlinkEvent
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import Sticks
-from firmware_sim.interfaces import (
-    BatterySample,
-    DistanceReading,
-    FlowReading,
-    GpsFix,
-    Odometry,
-)
+from firmware_sim.interfaces import BatterySample, GpsFix, Received
 
 Vector = NDArray[np.float64]
 
@@ -353,28 +348,8 @@ class AutopilotState(Protocol):
         """Motor outputs reported by the speed controllers; None: outputs equal commands."""
 
     @property
-    def odometry(self) -> Odometry | None:
-        """Newest pose from an external estimator; None before the first."""
-
-    @property
-    def odometry_us(self) -> int:
-        """Time of arrival of the pose [µs]."""
-
-    @property
-    def distance(self) -> DistanceReading | None:
-        """Newest distance reading; None before the first."""
-
-    @property
-    def distance_us(self) -> int:
-        """Time of arrival of the distance reading [µs]."""
-
-    @property
-    def flow(self) -> FlowReading | None:
-        """Newest optical flow reading; None before the first."""
-
-    @property
-    def flow_us(self) -> int:
-        """Time of arrival of the flow reading [µs]."""
+    def readings(self) -> Mapping[str, Received]:
+        """Newest readings of further sensors by name (`sensor_table.Sensor.reading`)."""
 
     @property
     def clearance(self) -> Clearance | None:

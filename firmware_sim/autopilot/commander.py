@@ -20,8 +20,7 @@ from firmware_sim.autopilot.autopilot_state import (
     Severity,
 )
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import ArmingReason, words
-from firmware_sim.autopilot.events.definition import MavlinkEvent as Told
+from firmware_sim.autopilot.events.definition import ArmingReason, MavlinkEvent, words
 from firmware_sim.autopilot.flight_modes import Mode
 
 
@@ -113,11 +112,11 @@ class TransitionCell:
     text: OperatorText | None = None
 
 
-def _info(text: str, event: Told) -> OperatorText:
+def _info(text: str, event: MavlinkEvent) -> OperatorText:
     return OperatorText(Severity.INFO, text, event)
 
 
-def _critical(text: str, event: Told) -> OperatorText:
+def _critical(text: str, event: MavlinkEvent) -> OperatorText:
     return OperatorText(Severity.CRITICAL, text, event)
 
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from airl_mav.core.constants import TICK_S, US_PER_S
+from airl_mav.core.addons import entries, load
+from airl_mav.core.constants import TICK_S
 from airl_mav.core.frames import (
     HOME,
     MAGNETIC_DECLINATION,
@@ -24,7 +26,7 @@ from airl_mav.core.frames import (
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.alignment import Alignment, FieldCheck
-from firmware_sim.autopilot.autopilot_state import StateEstimate
+from firmware_sim.autopilot.autopilot_state import Clearance, StateEstimate
 from firmware_sim.autopilot.error_state import (
     FusionHorizon,
     KernelFilter,
@@ -32,11 +34,7 @@ from firmware_sim.autopilot.error_state import (
     NewFilter,
     selecting,
 )
-from firmware_sim.autopilot.external_vision import Control, ExternalVision
-from firmware_sim.autopilot.optical_flow import OpticalFlowFusion
-from firmware_sim.autopilot.range_finder import Aids, RangeFinder
 from firmware_sim.autopilot.recovery import Recovery, RecoveryState
-from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 from firmware_sim.engine.record import (
     OFF,
@@ -46,22 +44,13 @@ from firmware_sim.engine.record import (
     new_controller,
 )
 from firmware_sim.engine.ticks import HEADING_BY_TURN_NED, settle_record
-from firmware_sim.interfaces import (
-    DistanceReading,
-    FlowReading,
-    GpsFix,
-    Odometry,
-    SensorSample,
-)
+from firmware_sim.interfaces import GpsFix, Received, SensorSample
 
 _NO_COMPASS = 5
 """EKF2_MAG_TYPE: the compass is not used."""
 
 GPS_GONE_US = 1_000_000
 """Time without GPS fusion after which GPS counts as lost (EKF2: its data are delayed) [µs]."""
-
-_JUDGED_EVERY_US = US_PER_S // 10
-"""Interval of velocity checks by `Consistency`, the sample period of a typical GPS [µs]."""
 
 BIAS_STEP_S = 0.01
 """Time step of PX4's filter, 100 Hz [s]; its bias process noises (EKF2_*_B_NOISE) are per step."""
@@ -76,6 +65,66 @@ _GYRO_BIAS = slice(es.GYRO_BIAS, es.ACCEL_BIAS)
 _ACCEL_BIAS = slice(es.ACCEL_BIAS, es.BARO_OFFSET)
 _SIGMA, _INNOVATION_RATIO = slice(es.SIGMA, es.RATIO), slice(es.RATIO, None)
 """Slices of the state for the fields of an `StateEstimate`."""
+
+
+class Aiding:
+    """Fusion of sensors beside GPS, barometer and compass: none here.
+
+    An add-on names its implementation in the table AIDING. It fuses through the public attributes
+    of the `Estimator`, and keeps the attributes below up to date.
+    """
+
+    is_idle = True
+    """True if nothing is fused and nothing needs every tick: compiled ticks may run."""
+    sees_vision = False
+    """True if poses of external vision are fused."""
+    gives_heading = False
+    """True if the compass must not be fused."""
+    gives_height = False
+    """True if GPS height must not be fused: two height sources would differ by a bias."""
+    is_reference = False
+    """True if the ground is the height reference: of GPS only the vertical speed is fused."""
+    ground: Clearance | None = None
+    """Height above ground; None = not measured."""
+
+    def __init__(self, estimator: Estimator) -> None:
+        """Start without measurements."""
+
+    @staticmethod
+    def warm_up(value: Callable[[str], float]) -> None:
+        """Compile all kernels, with a look-up for parameters."""
+
+    def step(self, sample: SensorSample) -> None:
+        """Fuse a tick's sample, after GPS, barometer and compass."""
+
+    def receive(self, name: str, reading: Any) -> bool:
+        """Process a reading of a client's sensor; return False if none of its kind is fused."""
+        del name, reading
+        return False
+
+    def height_moved(self, down_m: float) -> None:
+        """Shift all heights with the origin of local NED, positive down [m]."""
+
+    def correct(self, baro: Measurement) -> None:
+        """Correct the offset of a barometer that was rejected, if another height is trusted."""
+
+    def knows_motion(self, now_us: int, longest_us: float, *, flying: bool) -> bool:
+        """Return whether horizontal motion was measured within a time [µs]."""
+        del now_us, longest_us, flying
+        return False
+
+    def knows_height(self, now_us: int, longest_us: float) -> bool:
+        """Return whether height was measured within a time [µs]."""
+        del now_us, longest_us
+        return False
+
+
+def aiding() -> type[Aiding]:
+    """Return the installed fusion of further sensors."""
+    for place in entries("firmware_sim", "AIDING").values():
+        found: type[Aiding] = load(place)
+        return found
+    return Aiding
 
 
 class Estimator:
@@ -96,7 +145,8 @@ class Estimator:
         """
         self.record = record = new_controller() if record is None else record
         """Record of the flight controller."""
-        self._value = value
+        self.value = value
+        """Look-up for EKF2_* parameters by name."""
         self.origin: Geodetic | None = None
         """Geodetic origin of local NED: mean of the first fixes, or a client's choice; None while
         unknown."""
@@ -113,11 +163,10 @@ class Estimator:
         self.innovations: Callable[[str, Vector, Vector], None] | None = None
         """Callback with name, innovation and its covariance for every measurement."""
         self._alignment = Alignment(value, record)
-        self._judged_us = 0
-        """Time of the last check of external vision velocity against the inertial sensors [µs]."""
         self._chosen_origin: Geodetic | None = None
         """Origin of local NED chosen before alignment; None = the vehicle's position."""
-        self._time_us = 0
+        self.time_us = 0
+        """Time of the newest sample [µs]."""
         self._fixed_us: int | None = None
         """Time of alignment with a GPS position; None: not aligned, or aligned without GPS."""
         self._estimate: StateEstimate | None = None
@@ -128,13 +177,13 @@ class Estimator:
         self._gps_horizontal = Measurement(
             "gps_horizontal", 0, record["gps_horizontal_h"][0], record["gps_horizontal_us"]
         )
-        self._gps_vertical = Measurement(
+        self.gps_vertical = Measurement(
             "gps_vertical", 3, record["gps_vertical_h"][0], record["gps_vertical_us"]
         )
         self._gps_sinking = Measurement("gps_down_velocity", 3, selecting(es.VEL + 2))
         # A barometer measures -z plus its own offset.
         record["baro_h"] = selecting(es.BARO) - selecting(es.POS + 2)
-        self._baro = Measurement("baro", 1, record["baro_h"][0], record["baro_fused_us"])
+        self.baro = Measurement("baro", 1, record["baro_h"][0], record["baro_fused_us"])
         # `observe_heading` writes this Jacobian for every sample: it depends on the attitude.
         heading_h, heading_us = record["heading_h"][0], record["heading_fused_us"]
         self._heading = Measurement("heading", 2, heading_h, heading_us)
@@ -143,17 +192,14 @@ class Estimator:
         """Heading estimate without a compass."""
         self.recovery = Recovery(self.state, self.filter, self.yaw, record)
         """Recovery from inertial sensor and heading faults."""
-        self.vision = ExternalVision(value, self.state, self.filter, self._fuse, self._judge)
-        """Fusion of poses from an external estimator."""
-        self._horizons = [self._horizon, self.vision.horizon]
-        self.odometry: Odometry | None = None
-        """Newest pose from an external estimator; None before the first."""
-        self.odometry_us = 0
-        """Time of arrival of the pose [µs]."""
-        self.range: RangeFinder | None = None
-        """Range fusion for the height above ground; None before the first range or flow reading."""
-        self.flow: OpticalFlowFusion | None = None
-        """Optical flow fusion; None before the first reading."""
+        self.horizons = [self._horizon]
+        """Horizons of delayed measurements."""
+        self.is_north_known = True
+        """True if the heading is relative to north; False: relative to a frame of its own."""
+        self.readings: dict[str, Received] = {}
+        """Newest readings of further sensors by name (`sensor_table.Sensor.reading`)."""
+        self.aiding = aiding()(self)
+        """Fusion of further sensors."""
         self.is_changed = True
         """True if Python has changed inputs of compiled ticks; see `prepare`."""
 
@@ -186,7 +232,7 @@ class Estimator:
 
     def step(self, sample: SensorSample) -> None:
         """Process one tick's sensors."""
-        self._time_us, self._estimate, self.is_changed = sample.time_us, None, True
+        self.time_us, self._estimate, self.is_changed = sample.time_us, None, True
         # Alignment and logs read the newest samples from the record.
         self._note(sample)
         if not self.aligned:
@@ -197,22 +243,10 @@ class Estimator:
             # The yaw estimator runs beside the filter and needs every IMU sample.
             self.yaw.feel(sample.gyro, sample.accel)
             self._fuse_slower(sample)
-            if sample.odometry is not None:
-                self.see(sample.odometry)
-            elif self.vision.fused:
-                # Without a new pose only the timeout of vision is checked.
-                self.vision.look(sample.time_us)
-            if sample.distance is not None:
-                self.measure(sample.distance)
-            # Ranges are fused before flow, which needs the height above ground.
-            if self.range is not None:
-                self.range.step(sample.time_us, self._aids, flying=self.flying)
-            if self.flow is not None:
-                self.flow.turn(sample.gyro)
-            if sample.flow is not None:
-                self.look_down(sample.flow)
-            if self.flow is not None:
-                self.flow.step(sample.time_us, aided=self._aided, flying=self.flying)
+            self.aiding.step(sample)
+        if sample.further is not None:
+            for name, reading in sample.further.items():
+                self.readings[name] = Received(reading, sample.time_us)
         self._settle()
 
     def _note(self, sample: SensorSample) -> None:
@@ -234,7 +268,7 @@ class Estimator:
 
     def _fuse_slower(self, sample: SensorSample) -> None:
         """Fuse the measurements of GPS, barometer and compass."""
-        if sample.gps is not None and self._uses_gps:
+        if sample.gps is not None and self.uses_gps:
             self._fuse_gps(sample.gps)
         if sample.pressure_hpa is not None:
             self._fuse_baro(sample.pressure_hpa)
@@ -252,9 +286,7 @@ class Estimator:
         """True if compiled ticks are equivalent to `step`: GPS is the only aid in use."""
         # These conditions need code that exists only in Python.
         return (
-            self.range is None
-            and self.flow is None
-            and not self.vision.fused
+            self.aiding.is_idle
             and self.innovations is None
             and not self._horizon.is_past
             and isinstance(self.filter, KernelFilter)
@@ -268,7 +300,7 @@ class Estimator:
         if not self.is_changed:
             return
         self.is_changed = False
-        record, value = self.record, self._value
+        record, value = self.record, self.value
         record["baro_variance"] = value("EKF2_BARO_NOISE") ** 2
         record["heading_variance"] = value("EKF2_HEAD_NOISE") ** 2
         record["gps_variance"] = value("EKF2_GPS_P_NOISE") ** 2, value("EKF2_GPS_V_NOISE") ** 2
@@ -283,14 +315,14 @@ class Estimator:
         recovery = self.recovery
         headed, moving = recovery.consistency.heading_deviates, recovery.consistency
         suspect = recovery.compass.is_suspect or headed
-        used = self._value("EKF2_MAG_TYPE") != _NO_COMPASS
+        used = self.value("EKF2_MAG_TYPE") != _NO_COMPASS
         self.record["compass"] = OFF if not used else SUSPECT if suspect else TRUSTED
-        suspect = moving.velocity_deviates or recovery.emergency.is_doubted(self._time_us)
-        self.record["gps"] = OFF if not self._uses_gps else SUSPECT if suspect else TRUSTED
+        suspect = moving.velocity_deviates or recovery.emergency.is_doubted(self.time_us)
+        self.record["gps"] = OFF if not self.uses_gps else SUSPECT if suspect else TRUSTED
 
     def fuse_rest(self, sample: SensorSample) -> None:
         """Fuse the measurements that a compiled tick leaves to Python."""
-        self._time_us, self._estimate = sample.time_us, None
+        self.time_us, self._estimate = sample.time_us, None
         self._fuse_slower(sample)
         self._suspect()
         # The same test of convergence as in compiled ticks.
@@ -298,44 +330,14 @@ class Estimator:
 
     def flown(self) -> int:
         """Process the end of compiled ticks; return the time of the estimate [µs]."""
-        self._time_us, self._estimate = self.record["time_us"].item(0), None
-        return self._time_us
+        self.time_us, self._estimate = self.record["time_us"].item(0), None
+        return self.time_us
 
-    def see(self, odometry: Odometry) -> None:
-        """Process a pose from an external estimator, received now."""
-        self.odometry, self.odometry_us = odometry, self._time_us
-        if self.aligned:
-            # Vision position is not used while GPS is fused, see `external_vision`.
-            gps = self._uses_gps and self.fuses_gps(self._time_us)
-            self.vision.take(odometry, self._time_us, gps=gps, flying=self.flying)
-            self._estimate = None
-
-    def measure(self, reading: DistanceReading, source: int = 0) -> None:
-        """Process a range measured now; source 0 = the vehicle's sensor, else a client's."""
-        if self.aligned:
-            self._know_ground().take(reading, self._time_us, source)
-
-    def look_down(self, reading: FlowReading) -> None:
-        """Process an optical flow reading measured now."""
-        if not self.aligned:
-            return
-        if self.flow is None:
-            self.flow = OpticalFlowFusion(self._value, self.state, self._know_ground(), self._fuse)
-            self._horizons.append(self.flow.horizon)
-        self.flow.take(reading, self._time_us)
-
-    def _know_ground(self) -> RangeFinder:
-        """Return the range finder; the first call adds the terrain state to the filter."""
-        # Flights without ranges and flow keep the cheaper filter of 16 states.
-        if self.range is None:
-            terrain = TerrainFilter(self.filter)
-            self.filter = terrain
-            # All users of the filter must see the wrapped one.
-            self.recovery.use(terrain)
-            self.vision.use(terrain)
-            self.range = RangeFinder(self._value, self.state, terrain, self._time_us)
-            self.vision.on_height_moved = self.range.moved
-        return self.range
+    def receive(self, name: str, reading: Any) -> bool:
+        """Process a reading of a client's sensor, received now; False = its kind is not fused."""
+        fused = self.aiding.receive(name, reading)
+        self._estimate = None
+        return fused
 
     def estimate(self) -> StateEstimate:
         """Return a copy of the estimate after the newest tick."""
@@ -343,7 +345,7 @@ class Estimator:
             row = self.state.copy()
             # Positional arguments and prebuilt slices: this runs in nearly every tick.
             self._estimate = StateEstimate(
-                self._time_us,
+                self.time_us,
                 row[_POSITION],
                 row[_VELOCITY],
                 row[_ACCELERATION],
@@ -372,8 +374,7 @@ class Estimator:
         here = local_to_geodetic(self.state[es.P : es.V], before)
         self.state[es.P : es.V] = geodetic_to_local(here, origin)
         # Terrain and barometer refer to the origin's altitude and shift with it.
-        if self.range is not None:
-            self.range.moved(origin.altitude_m - before.altitude_m)
+        self.aiding.height_moved(origin.altitude_m - before.altitude_m)
         self._origin_altitude_baro += origin.altitude_m - before.altitude_m
         self.origin, self._estimate = origin, None
 
@@ -385,47 +386,21 @@ class Estimator:
         Without GPS they stay valid for EKF2_NOAID_TOUT in flight (dead reckoning). On the ground,
         where the biases are barely observable, the limit is `GPS_GONE_US`.
         """
-        longest_us = self._value("EKF2_NOAID_TOUT") if flying else GPS_GONE_US
+        longest_us = self.value("EKF2_NOAID_TOUT") if flying else GPS_GONE_US
         if not self.aligned:
             return False
-        vision, flow = self.vision, self.flow
-        return (
-            self._recent(self._gps_horizontal, now_us, longest_us)
-            or any(
-                m.fused_us is not None and now_us - m.fused_us <= longest_us
-                for m in (vision.position, vision.velocity)
-                # Position or velocity: either limits the drift of dead reckoning.
-            )
-            or (flow is not None and flow.told_motion_since(now_us - longest_us))
-            # On the ground, flow that arrives proves a source of position before take-off.
-            or (flow is not None and not flying and flow.is_coming(now_us))
+        return self._recent(self._gps_horizontal, now_us, longest_us) or self.aiding.knows_motion(
+            now_us, longest_us, flying=flying
         )
 
     def knows_height(self, now_us: int) -> bool:
         """Return whether height and vertical speed are valid: barometer or GPS, as above."""
-        longest_us = self._value("EKF2_NOAID_TOUT")
+        longest_us = self.value("EKF2_NOAID_TOUT")
         return self.aligned and (
-            self._recent(self._baro, now_us, longest_us)
-            or self._recent(self._gps_vertical, now_us, longest_us)
-            or self._recent(self.vision.height, now_us, longest_us)
-            or (self.range is not None and self.range.told_height_since(now_us - longest_us))
+            self._recent(self.baro, now_us, longest_us)
+            or self._recent(self.gps_vertical, now_us, longest_us)
+            or self.aiding.knows_height(now_us, longest_us)
         )
-
-    def _aids(self) -> Aids:
-        """Return the aids besides ranges that measure motion."""
-        gps, seen = self._uses_gps and self.fuses_gps(self._time_us), self.vision.fused
-        told = (self._baro, self._gps_vertical, self.vision.height)
-        return Aids(
-            horizontal=self._aided or (self.flow is not None and self.flow.fused),
-            vertical_speed=gps or bool(seen & Control.VELOCITY),
-            height_us=max(m.fused_us or 0 for m in told),
-        )
-
-    @property
-    def _aided(self) -> bool:
-        """True if a sensor other than optical flow measures horizontal motion."""
-        seen = self.vision.fused & (Control.HORIZONTAL | Control.VELOCITY)
-        return bool(seen) or (self._uses_gps and self.fuses_gps(self._time_us))
 
     @property
     def aligned(self) -> bool:
@@ -439,7 +414,7 @@ class Estimator:
     @property
     def knows_place(self) -> bool:
         """True if positions in local NED can be converted to geodetic ones."""
-        return self.origin is not None and self.vision.is_north_known
+        return self.origin is not None and self.is_north_known
 
     def fuses_gps(self, now_us: int) -> bool:
         """Return whether GPS was fused recently."""
@@ -453,7 +428,7 @@ class Estimator:
         field = self.record["mag"][0] if self.aligned else self._alignment.field
         if field is None:
             return False
-        return FieldCheck.read(self._value).disturbed(field, es.attitude(self.state))
+        return FieldCheck.read(self.value).disturbed(field, es.attitude(self.state))
 
     def accuracy(self) -> tuple[float, float]:
         """Return the standard deviations of horizontal position [m] and velocity [m/s]."""
@@ -477,22 +452,22 @@ class Estimator:
         self.aligned = self.is_changed = True
         self.state[es.Q : es.RATES] = aligned.quaternion
         # Without a compass the heading is arbitrary: local NED is not yet geographic.
-        self.vision.is_north_known = aligned.by_compass
+        self.is_north_known = aligned.by_compass
         self._origin_altitude_baro = aligned.altitude_baro_m
         if aligned.fix is not None:
-            self.origin, self._fixed_us = aligned.fix, self._time_us
+            self.origin, self._fixed_us = aligned.fix, self.time_us
         # The origin is at the vehicle here: move it to the chosen place.
         if self._chosen_origin is not None:
             self.move_origin(self._chosen_origin)
         return True
 
     @property
-    def _uses_gps(self) -> bool:
+    def uses_gps(self) -> bool:
         """True if GPS fusion is enabled by EKF2_GPS_CTRL."""
-        return self._value("EKF2_GPS_CTRL") != 0
+        return self.value("EKF2_GPS_CTRL") != 0
 
     def _process_noise(self) -> Vector:
-        value = self._value
+        value = self.value
         q = np.zeros(es.N_STATES)
         # As in PX4, the variance grows by (noise dt)² per step.
         q[es.VEL : es.ATT] = (value("EKF2_ACC_NOISE") * TICK_S) ** 2
@@ -506,7 +481,7 @@ class Estimator:
     def _predict(self, sample: SensorSample) -> None:
         state = self.state
         # Only delayed horizons need the motion of every tick.
-        past = [each for each in self._horizons if each.is_past]
+        past = [each for each in self.horizons if each.is_past]
         before = state[es.P : es.Q].copy() if past else None
         self.filter.predict(state, sample.gyro, sample.accel)
         if before is not None:
@@ -515,7 +490,7 @@ class Estimator:
 
     # --- measurements
 
-    def _fuse(self, m: Measurement) -> bool:
+    def fuse(self, m: Measurement) -> bool:
         """Fuse a measurement if it is within the gate; return whether it was."""
         if self.innovations is not None:
             # Consistency tests need the innovation before the fusion changes the state.
@@ -526,18 +501,18 @@ class Estimator:
         # False for NaN, too: a NaN never counts as fused.
         within = ratio <= 1.0
         if within:
-            m.fused_us = self._time_us
+            m.fused_us = self.time_us
         return within
 
     def _fuse_gps(self, fix: GpsFix) -> None:
         if self.origin is None:
             # Vision has defined the local position; the first fix gives its geodetic origin.
             self.origin = local_to_geodetic(-self.state[es.P : es.V], fix.position)
-        measured, value = geodetic_to_local(fix.position, self.origin), self._value
+        measured, value = geodetic_to_local(fix.position, self.origin), self.value
         r_p, r_v = value("EKF2_GPS_P_NOISE") ** 2, value("EKF2_GPS_V_NOISE") ** 2
         self._horizon.assume(value("EKF2_GPS_DELAY"))
         self._observe_yaw(fix.velocity_ned, math.sqrt(r_v))
-        recovery, now = self.recovery, self._now
+        recovery, now = self.recovery, self.now
         # The excess of earlier fixes: a fix must not change its own weight.
         excess = recovery.consistency.velocity_excess
         recovery.take_velocity(fix.velocity_ned - self._then()[3:], r_v, now)
@@ -549,21 +524,21 @@ class Estimator:
         m.innovation[:2] = measured[:2] - then[:2]
         m.innovation[2:] = fix.velocity_ned[:2] - then[3:5]
         m.variance[:2], m.variance[2:] = r_p, r_v
-        self._fuse(m)
+        self.fuse(m)
         # The horizontal fusion has changed the state: read the reference again.
-        m, then = self._gps_vertical, self._then()
+        m, then = self.gps_vertical, self._then()
         m.innovation[0] = measured[2] - then[2]
         m.innovation[1] = fix.velocity_ned[2] - then[5]
         # The height error of a receiver is about twice its horizontal error.
         m.variance[0], m.variance[1] = max(fix.epv_m, math.sqrt(r_p)) ** 2, r_v
-        if self.range is not None and self.range.is_reference:
+        if self.aiding.is_reference:
             # The ground is the height reference: GPS height would need a separate bias state.
             sinking = self._gps_sinking
             sinking.innovation[0], sinking.variance[0] = m.innovation[1], r_v
-            self._fuse(sinking)
+            self.fuse(sinking)
         # The bias between two height sources is not estimated: fuse only one of them.
-        elif not self.vision.fused & Control.VERTICAL:
-            self._fuse(m)
+        elif not self.aiding.gives_height:
+            self.fuse(m)
 
     def _observe_yaw(self, velocity: Vector, accuracy: float) -> None:
         state = self.state
@@ -582,14 +557,13 @@ class Estimator:
         height = altitude_m(pressure) - self._origin_altitude_baro
         # The filter's height is -z; the barometer reads it with its offset.
         expected = -self.state.item(es.P + 2) + self.state.item(es.BARO_OFFSET)
-        self._baro.innovation[0] = height - expected
-        self._baro.variance[0] = self._value("EKF2_BARO_NOISE") ** 2
-        # A barometer that is rejected for long is corrected if the ground is the height reference.
-        if not self._fuse(self._baro) and self.range is not None:
-            self.range.correct(self._baro, self._time_us)
+        self.baro.innovation[0] = height - expected
+        self.baro.variance[0] = self.value("EKF2_BARO_NOISE") ** 2
+        if not self.fuse(self.baro):
+            self.aiding.correct(self.baro)
 
     def _fuse_heading(self, field: Vector) -> None:
-        if self.vision.fused & Control.YAW or self._value("EKF2_MAG_TYPE") == _NO_COMPASS:
+        if self.aiding.gives_heading or self.value("EKF2_MAG_TYPE") == _NO_COMPASS:
             return
         m = self._heading
         observable = es.observe_heading(
@@ -598,21 +572,13 @@ class Estimator:
         innovation = m.innovation.item(0)
         if not (observable and self.recovery.compass.admits(innovation)):
             return
-        m.variance[0] = self._value("EKF2_HEAD_NOISE") ** 2
-        self._fuse(m)
-        self.recovery.take_heading(innovation, self.state.item(m.slot), self._now)
+        m.variance[0] = self.value("EKF2_HEAD_NOISE") ** 2
+        self.fuse(m)
+        self.recovery.take_heading(innovation, self.state.item(m.slot), self.now)
 
     # --- inertial sensor faults
 
     @property
-    def _now(self) -> RecoveryState:
-        return RecoveryState(self._time_us, self.flying, self._gps_horizontal.fused_us)
-
-    def _judge(self, innovation: Vector, variance: Vector) -> float:
-        """Check a velocity of external vision against the inertial sensors, at GPS's rate."""
-        # GPS velocities are checked in `_fuse_gps`; vision replaces them only without GPS.
-        by_gps = self._uses_gps and self.fuses_gps(self._time_us)
-        if not by_gps and self._time_us - self._judged_us >= _JUDGED_EVERY_US:
-            self._judged_us = self._time_us
-            self.recovery.take_velocity(innovation, variance, self._now)
-        return self.recovery.consistency.velocity_excess
+    def now(self) -> RecoveryState:
+        """Time and flight state for `recovery`."""
+        return RecoveryState(self.time_us, self.flying, self._gps_horizontal.fused_us)

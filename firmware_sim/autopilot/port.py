@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from airl_mav.control.demand import AttitudeDemand, RateDemand
 from airl_mav.core.frames import Geodetic, Vector
@@ -29,7 +29,7 @@ from firmware_sim.autopilot.inputs import (
     Sticks,
 )
 from firmware_sim.autopilot.navigation.plan import Plans
-from firmware_sim.interfaces import DistanceReading, FlowReading, Odometry, SensorSample
+from firmware_sim.interfaces import SensorSample
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,14 +236,8 @@ class AutopilotPort(Protocol):
     def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
         """Pass on the pilot's sticks, received at `time_us` of simulated time."""
 
-    def see(self, odometry: Odometry) -> None:
-        """Pass on a pose from an external estimator, received now."""
-
-    def measure_distance(self, reading: DistanceReading) -> None:
-        """Pass on a range from a client's distance sensor, received now."""
-
-    def look_down(self, reading: FlowReading) -> None:
-        """Pass on a reading from a client's optical flow sensor, received now."""
+    def receive(self, name: str, reading: Any) -> None:
+        """Pass on a reading of a client's sensor, received now: odometry, distance or flow."""
 
     def see_obstacles(self, obstacles: ObstacleBins) -> None:
         """Pass on the distances to obstacles."""

@@ -7,35 +7,16 @@ commander/HealthAndArmingChecks, without checks of components that this vehicle 
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import IntFlag, auto
-from functools import lru_cache
-from typing import NamedTuple
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
 
 from firmware_sim.autopilot.autopilot_state import Severity
-from firmware_sim.autopilot.events import check_events as events
-from firmware_sim.autopilot.events.check_events import CheckEvent
-from firmware_sim.autopilot.events.definition import Level
+from firmware_sim.autopilot.events.definition import Component, Definition, Level, arguments
 from firmware_sim.autopilot.failsafes.failsafe_conditions import BatteryWarning, Conditions
 from firmware_sim.autopilot.flight_modes import Mode, Need
 
 SUPPLY_CHECK_OFF = 894281
 """Value of CBRK_SUPPLY_CHK that disables the battery checks."""
-
-
-class HealthComponent(IntFlag):
-    """Vehicle components of the checks."""
-
-    GYRO = auto()
-    ACCEL = auto()
-    MAG = auto()
-    BARO = auto()
-    GPS = auto()
-    DISTANCE_SENSOR = auto()
-    BATTERY = auto()
-    ESTIMATOR = auto()
-    MANUAL_CONTROL = auto()
-    LINK = auto()
-    SYSTEM = auto()
 
 
 class ArmingSettings(NamedTuple):
@@ -98,10 +79,10 @@ class Readiness(NamedTuple):
 class PrearmCheck(NamedTuple):
     """Pre-arm check."""
 
-    part: HealthComponent
+    event: Definition
+    """Event for ground stations; its first arguments are the affected modes and the component."""
+    component: Component
     fails: Callable[[Readiness], bool]
-    event: CheckEvent
-    """Event for ground stations."""
     told: str = ""
     """Text for the operator; "" = `prefix` and the event's message."""
     prefix: str = "Preflight Fail: "
@@ -117,11 +98,24 @@ class PrearmCheck(NamedTuple):
     the blocked modes, or all modes if it blocks none."""
     of_present_mode: bool = False
     """True if the check is reported only while the current mode fails it."""
+    values: tuple[float, ...] = ()
+    """Additional arguments of the event."""
 
     @property
     def text(self) -> str:
         """Text for the operator."""
-        return self.told or self.prefix + self.event.definition.message
+        return self.told or self.prefix + self.event.message
+
+    @property
+    def is_health(self) -> bool:
+        """True for a hardware fault, False for an unmet arming requirement."""
+        return self.event.group == "health"
+
+
+_ABOUT = arguments("navigation_mode_group_t modes, uint8_t health_component_index")
+_INSTANCE = arguments("uint8_t instance")
+_C, _L = Component, Level
+_SYSTEM, _ESTIMATE = Component.SYSTEM, Component.LOCAL_POSITION_ESTIMATE
 
 
 def never(_readiness: Readiness) -> bool:
@@ -129,51 +123,115 @@ def never(_readiness: Readiness) -> bool:
     return False
 
 
+def _check(
+    component: Component,
+    name: str,
+    message: str,
+    fails: Callable[[Readiness], bool],
+    event_level: Level = Level.ERROR,
+    description: str = "",
+    *,
+    parameters: str = "",
+    **rest: Any,
+) -> PrearmCheck:
+    """Return an arming requirement; `parameters` configure the check if given."""
+    if parameters:
+        named = " and ".join(f"<param>{each}</param>" for each in parameters.split())
+        description = f"Configured by {named}."
+    definition = Definition(
+        f"check_{name}", message, _ABOUT, event_level, description=description, group="arming_check"
+    )
+    return PrearmCheck(definition, component, fails, **rest)
+
+
+def _health(
+    component: Component,
+    name: str,
+    message: str,
+    fails: Callable[[Readiness], bool],
+    *,
+    numbered: bool = False,
+    event_level: Level = Level.ERROR,
+    told: str = "",
+) -> PrearmCheck:
+    """Return a check of hardware; `numbered`: the event has the number of the sensor, 0."""
+    extra = _INSTANCE if numbered else ()
+    event = Definition(f"check_{name}", message, _ABOUT + extra, event_level, group="health")
+    return PrearmCheck(event, component, fails, told, values=(0,) * len(extra))
+
+
+def _no_data(
+    component: Component, name: str, sensor: str, told: str, fails: Callable[[Readiness], bool]
+) -> PrearmCheck:
+    return _health(
+        component,
+        f"{name}_no_data",
+        f"No valid data from {sensor} {{3}}",
+        fails,
+        numbered=True,
+        told=f"Preflight Fail: No valid data from {told} 0",
+    )
+
+
 def _needs(r: Readiness, need: Need) -> bool:
     return bool(r.mode.spec.needs & need)
 
 
-# Before convergence, another check explains the missing position.
-def _global_required(r: Readiness) -> bool:
-    # Before convergence, another check explains the missing position.
-    return r.settings.com_arm_wo_gps == _GLOBAL_REQUIRED and not r.armed and r.converged
-
-
-def _estimate(
-    name: str, event: CheckEvent, need: Need, fails: Callable[[Conditions], bool]
+def _needed(
+    name: str,
+    message: str,
+    need: Need,
+    fails: Callable[[Conditions], bool],
+    *event: Any,
+    component: Component = _SYSTEM,
+    estimate: str = "",
+    **rest: Any,
 ) -> PrearmCheck:
-    return PrearmCheck(
-        HealthComponent.ESTIMATOR,
-        lambda r: fails(r.conditions),
-        event,
-        f"Preflight Fail: No valid {name} estimate",
+    """Return a requirement of the mode, reported by an event alone until arming is rejected.
+
+    An `estimate` fails in every mode, and blocks the modes that need it.
+    """
+    told = f"Preflight Fail: No valid {estimate} estimate" if estimate else ""
+    if estimate:
+        rest["blocks"] = lambda r: _needs(r, need)
+    return _check(
+        component,
+        f"modes_{name}",
+        message,
+        lambda r: fails(r.conditions) and (bool(estimate) or _needs(r, need)),
+        *event,
+        told=told,
         said=False,
-        blocks=lambda r: _needs(r, need),
+        **rest,
     )
 
 
-def _fence(kind: str, event: CheckEvent) -> PrearmCheck:
-    def breached(r: Readiness) -> bool:
-        return getattr(r.conditions.geofence, kind) and r.settings.gf_action != 0
-
-    return PrearmCheck(HealthComponent.SYSTEM, breached, event, prefix="")
+# Before convergence, another check explains the missing position.
+def _global_required(r: Readiness) -> bool:
+    return r.settings.com_arm_wo_gps == _GLOBAL_REQUIRED and not r.armed and r.converged
 
 
-def _sensor(
-    part: HealthComponent, name: str, event: CheckEvent, fails: Callable[[Readiness], bool]
+def _fence(kind: str, name: str, message: str, parameters: str) -> PrearmCheck:
+    return _check(
+        _SYSTEM,
+        f"gf_violation_{name}",
+        f"Geofence violation: {message}",
+        lambda r: getattr(r.conditions.geofence, kind) and r.settings.gf_action != 0,
+        parameters=parameters,
+        prefix="",
+    )
+
+
+def _battery(
+    warning: BatteryWarning, name: str, message: str, level: Level, threshold: str
 ) -> PrearmCheck:
-    return PrearmCheck(part, fails, event, f"Preflight Fail: No valid data from {name}")
-
-
-def _field_fails(r: Readiness, as_asked: int) -> bool:
-    return r.field_disturbed and not r.armed and r.settings.com_arm_mag_str == as_asked
-
-
-def _battery(level: BatteryWarning, event: CheckEvent) -> PrearmCheck:
-    return PrearmCheck(
-        HealthComponent.BATTERY,
-        lambda r: _supply_checked(r) and _battery_level(r) is level,
-        event,
+    return _check(
+        _C.BATTERY,
+        name,
+        message,
+        lambda r: _supply_checked(r) and _battery_level(r) is warning,
+        level,
+        f"The charge is below <param>{threshold}</param>.",
         prefix="",
         blocks=_battery_blocks,
         severity=Severity.EMERGENCY,
@@ -192,9 +250,7 @@ def _charge_required(r: Readiness) -> bool:
 def _battery_level(r: Readiness) -> BatteryWarning:
     """Return the warning; a charge below COM_ARM_BAT_MIN is at least LOW."""
     warning = r.conditions.battery_warning
-    if _charge_required(r) and r.charge_short:
-        return max(warning, BatteryWarning.LOW)
-    return warning
+    return max(warning, BatteryWarning.LOW) if _charge_required(r) and r.charge_short else warning
 
 
 def _battery_blocks(r: Readiness) -> bool:
@@ -210,6 +266,14 @@ def _battery_urgency(r: Readiness) -> Level:
     return Level.CRITICAL if critical else Level.WARNING
 
 
+def _no_sticks_wanted(r: Readiness) -> bool:
+    return r.settings.com_rc_in_mode == _STICKS_DISABLED
+
+
+def _field_fails(r: Readiness, as_asked: int) -> bool:
+    return r.field_disturbed and not r.armed and r.settings.com_arm_mag_str == as_asked
+
+
 _FIELD_REQUIRED, _FIELD_WARNED = 1, 2
 """COM_ARM_MAG_STR: 1 rejects arming in a disturbed magnetic field, 2 warns, 0 is off."""
 _GLOBAL_REQUIRED = 0
@@ -220,214 +284,316 @@ _STICKS_DISABLED = 4
 _POSITION = Need.LOCAL_POSITION | Need.LOCAL_POSITION_RELAXED | Need.GLOBAL_POSITION
 _ANYTHING = Need.ANGULAR_VELOCITY | Need.MANUAL_CONTROL | Need.NOT_ARMING
 """Needs that together cover every mode."""
+_NOT_ENOUGH = "The available positioning data is not enough for the mode."
 
-
-def _no_sticks_wanted(r: Readiness) -> bool:
-    return r.settings.com_rc_in_mode == _STICKS_DISABLED
-
+_gps_fix = partial(
+    _check, _C.GPS, "estimator_gps_fix_too_low", "GPS fix too low", parameters="COM_ARM_WO_GPS"
+)
+_no_gcs = partial(
+    _check,
+    _C.COMMUNICATION_LINKS,
+    "rc_dl_no_dllink",
+    "No connection to the ground control station",
+    parameters="NAV_DLL_ACT",
+)
+_mag_interference = partial(
+    PrearmCheck,
+    Definition(
+        "check_estimator_mag_interference",
+        "Strong magnetic interference",
+        _ABOUT
+        + arguments("float strength, float strength_ref, float inclination, float inclination_ref"),
+        Level.WARNING,
+        description="Configured by <param>COM_ARM_MAG_STR</param>.",
+        group="arming_check",
+    ),
+    _ESTIMATE,
+    # Field strength [gauss] and inclination [deg], measured and expected: not available here.
+    values=(float("nan"),) * 4,
+)
 
 CHECKS: tuple[PrearmCheck, ...] = (
-    _sensor(HealthComponent.ACCEL, "Accel 0", events.ACCEL_NO_DATA, lambda r: not r.accel),
-    _sensor(HealthComponent.GYRO, "Gyro 0", events.GYRO_NO_DATA, lambda r: not r.gyro),
-    _sensor(
-        HealthComponent.BARO,
-        "Baro 0",
-        events.BARO_NO_DATA,
+    _no_data(_C.ACCEL, "accel", "Accelerometer", "Accel", lambda r: not r.accel),
+    _no_data(_C.GYRO, "gyro", "Gyro", "Gyro", lambda r: not r.gyro),
+    _no_data(
+        _C.ABSOLUTE_PRESSURE,
+        "baro",
+        "barometer",
+        "Baro",
         lambda r: bool(r.settings.sys_has_baro) and not r.baro,
     ),
-    _sensor(
-        HealthComponent.MAG,
-        "Compass 0",
-        events.MAG_NO_DATA,
+    _no_data(
+        _C.MAGNETOMETER,
+        "mag",
+        "Compass",
+        "Compass",
         lambda r: bool(r.settings.sys_has_mag) and not r.mag,
     ),
-    PrearmCheck(
-        HealthComponent.GPS,
-        lambda r: bool(r.settings.sys_has_gps) and not r.gps and r.settings.com_arm_wo_gps == 0,
-        events.GPS_FIX_TOO_LOW,
+    _gps_fix(
+        lambda r: bool(r.settings.sys_has_gps) and not r.gps and r.settings.com_arm_wo_gps == 0
     ),
-    PrearmCheck(
-        HealthComponent.GPS,
+    _gps_fix(
         lambda r: (
             bool(r.settings.sys_has_gps)
             and not r.gps
             and not r.armed
             and r.settings.com_arm_wo_gps == 1
         ),
-        events.GPS_FIX_TOO_LOW,
         prefix="Preflight: ",
         blocks=never,
         severity=Severity.WARNING,
         level=lambda _: Level.WARNING,
         shown=lambda _: _POSITION,
     ),
-    PrearmCheck(
-        HealthComponent.DISTANCE_SENSOR,
+    _health(
+        _C.DISTANCE_SENSOR,
+        "distance_sensor_missing",
+        "Distance sensor {3} missing",
         lambda r: r.settings.sys_has_num_dist > 0 and r.distance is None,
-        events.DISTANCE_SENSOR_MISSING,
+        numbered=True,
         told="Preflight Fail: Distance Sensor 0 missing",
     ),
-    PrearmCheck(
-        HealthComponent.DISTANCE_SENSOR,
+    _health(
+        _C.DISTANCE_SENSOR,
+        "distance_sensor_invalid",
+        "No valid data from distance sensor {3}",
         lambda r: r.settings.sys_has_num_dist > 0 and r.distance is False,
-        events.DISTANCE_SENSOR_INVALID,
+        numbered=True,
         told="Preflight Fail: no valid data from distance sensor 0",
     ),
-    _battery(BatteryWarning.LOW, events.BATTERY_LOW),
-    _battery(BatteryWarning.CRITICAL, events.BATTERY_CRITICAL),
-    _battery(BatteryWarning.EMERGENCY, events.BATTERY_EMERGENCY),
-    PrearmCheck(
-        HealthComponent.BATTERY,
-        lambda r: _supply_checked(r) and r.conditions.battery_unhealthy,
-        events.BATTERY_UNHEALTHY,
+    _battery(BatteryWarning.LOW, "battery_low", "Low battery", _L.WARNING, "BAT_LOW_THR"),
+    _battery(
+        BatteryWarning.CRITICAL,
+        "battery_critical",
+        "Critical battery",
+        _L.CRITICAL,
+        "BAT_CRIT_THR",
     ),
-    PrearmCheck(
-        HealthComponent.BATTERY,
+    _battery(
+        BatteryWarning.EMERGENCY,
+        "battery_emergency",
+        "Emergency battery level",
+        _L.CRITICAL,
+        "BAT_EMERGEN_THR",
+    ),
+    _health(
+        _C.BATTERY,
+        "battery_unhealthy",
+        "Battery unhealthy",
+        lambda r: _supply_checked(r) and r.conditions.battery_unhealthy,
+    ),
+    _check(
+        _C.BATTERY,
+        "battery_rem_flight_time_low",
+        "Remaining flight time low",
         lambda r: _supply_checked(r) and r.conditions.battery_low_remaining_time,
-        events.BATTERY_TIME_LOW,
         prefix="",
         said=False,
     ),
-    PrearmCheck(
-        HealthComponent.ESTIMATOR,
+    _check(
+        _ESTIMATE,
+        "estimator_missing_data",
+        "Waiting for estimator to initialize",
         lambda r: not r.converged and not r.armed,
-        events.ESTIMATOR_MISSING,
+        _L.INFO,
         told="Preflight Fail: ekf2 missing data",
         said=False,
     ),
-    PrearmCheck(
-        HealthComponent.ESTIMATOR,
+    _check(
+        _ESTIMATE,
+        "estimator_heading_not_stable",
+        "Heading estimate not stable",
         lambda r: not r.compass_agrees and not r.armed,
-        events.HEADING_UNSTABLE,
         told="Preflight Fail: heading estimate not stable",
     ),
-    PrearmCheck(
-        HealthComponent.ESTIMATOR,
-        lambda r: _field_fails(r, _FIELD_REQUIRED),
-        events.MAG_INTERFERENCE,
-    ),
-    PrearmCheck(
-        HealthComponent.ESTIMATOR,
+    _mag_interference(lambda r: _field_fails(r, _FIELD_REQUIRED)),
+    _mag_interference(
         lambda r: _field_fails(r, _FIELD_WARNED),
-        events.MAG_INTERFERENCE,
         prefix="Preflight: ",
         # The estimator starts only after the disturbance has ended.
         blocks=lambda r: not r.converged,
         severity=Severity.WARNING,
     ),
-    PrearmCheck(
-        HealthComponent.SYSTEM,
+    _check(
+        _SYSTEM,
+        "failure_detector_roll",
+        "Attitude failure detected",
         lambda r: r.rolled,
-        events.ROLLED,
+        _L.CRITICAL,
+        "Roll exceeds <param>FD_FAIL_R</param>.",
         told="Preflight Fail: Attitude failure (roll)",
     ),
-    PrearmCheck(
-        HealthComponent.SYSTEM,
+    _check(
+        _SYSTEM,
+        "failure_detector_pitch",
+        "Attitude failure detected",
         lambda r: r.pitched and not r.rolled,
-        events.PITCHED,
+        _L.CRITICAL,
+        "Pitch exceeds <param>FD_FAIL_P</param>.",
         told="Preflight Fail: Attitude failure (pitch)",
     ),
-    PrearmCheck(
-        HealthComponent.SYSTEM, lambda r: r.conditions.fd_motor_failure, events.MOTOR_FAILED
+    _health(
+        _C.MOTORS_ESCS,
+        "failure_detector_motor",
+        "Motor failure detected",
+        lambda r: r.conditions.fd_motor_failure,
+        event_level=_L.CRITICAL,
     ),
-    _fence("distance", events.FENCE_DISTANCE),
-    _fence("altitude", events.FENCE_ALTITUDE),
-    _fence("custom", events.FENCE_CUSTOM),
-    PrearmCheck(
-        HealthComponent.SYSTEM,
+    _fence(
+        "distance",
+        "max_hor_dist",
+        "exceeding maximum distance to Home",
+        "GF_ACTION GF_MAX_HOR_DIST",
+    ),
+    _fence(
+        "altitude",
+        "max_alt",
+        "exceeding maximum altitude above Home",
+        "GF_ACTION GF_MAX_VER_DIST",
+    ),
+    _fence("custom", "custom_gf", "approaching or outside geofence", "GF_ACTION"),
+    _check(
+        _SYSTEM,
+        "gf_no_home",
+        "Geofence RTL requires valid home",
         lambda r: (
             r.settings.gf_action == _FENCE_RETURN
             and r.conditions.home_position_invalid
             and r.converged
         ),
-        events.FENCE_NO_HOME,
     ),
-    PrearmCheck(
-        HealthComponent.SYSTEM,
+    _check(
+        _SYSTEM,
+        "mission_failure",
+        "Mission cannot be completed",
         lambda r: r.conditions.mission_failure,
-        events.MISSION_FAILURE,
         prefix="",
     ),
-    PrearmCheck(
-        HealthComponent.SYSTEM,
+    _check(
+        _SYSTEM,
+        "flight_time_limit",
+        "Maximum flight time reached",
         lambda r: r.conditions.flight_time_limit_exceeded,
-        events.FLIGHT_TIME,
+        parameters="COM_FLT_TIME_MAX",
         prefix="",
     ),
-    PrearmCheck(
-        HealthComponent.LINK,
+    _no_gcs(
         lambda r: r.conditions.gcs_connection_lost and r.settings.nav_dll_act > 0,
-        events.NO_GCS,
         severity=Severity.WARNING,
     ),
-    PrearmCheck(
-        HealthComponent.LINK,
+    _no_gcs(
         lambda r: r.conditions.gcs_connection_lost and r.settings.nav_dll_act <= 0,
-        events.NO_GCS,
         prefix="",
         said=False,
         blocks=never,
         level=lambda _: Level.INFO,
     ),
-    PrearmCheck(HealthComponent.SYSTEM, lambda r: r.terminated, events.TERMINATED),
-    PrearmCheck(
-        HealthComponent.SYSTEM,
-        lambda r: _global_required(r) and r.conditions.global_position_invalid,
-        events.NO_GLOBAL_POSITION,
+    _check(
+        _SYSTEM,
+        "system_flight_term_active",
+        "Flight termination active",
+        lambda r: r.terminated,
+        _L.CRITICAL,
     ),
-    PrearmCheck(
-        HealthComponent.SYSTEM,
+    _check(
+        _SYSTEM,
+        "system_no_global_pos",
+        "Global position estimate required",
+        lambda r: _global_required(r) and r.conditions.global_position_invalid,
+        parameters="COM_ARM_WO_GPS",
+    ),
+    _check(
+        _SYSTEM,
+        "system_no_home_pos",
+        "Home position required",
         lambda r: _global_required(r) and r.conditions.home_position_invalid,
-        events.NO_HOME,
+        parameters="COM_ARM_WO_GPS",
     ),
     # Mode requirements. Like PX4, reported by events only until arming is rejected.
-    PrearmCheck(
-        HealthComponent.SYSTEM,
+    _check(
+        _SYSTEM,
+        "modes_cannot_takeoff",
+        "Mode not suitable for arming",
         lambda r: _needs(r, Need.NOT_ARMING) and not r.terminated and not r.armed,
-        events.MODE_CANNOT_ARM,
+        _L.INFO,
+        "Switch to another mode first.",
         said=False,
         of_present_mode=True,
     ),
-    _estimate("attitude", events.MODE_ATTITUDE, Need.ATTITUDE, lambda c: c.attitude_invalid),
-    _estimate(
-        "position",
-        events.MODE_LOCAL_POSITION,
+    _needed(
+        "attitude",
+        "No valid attitude estimate",
+        Need.ATTITUDE,
+        lambda c: c.attitude_invalid,
+        _L.CRITICAL,
+        "Wait until the estimator has initialized.",
+        component=_C.ATTITUDE_ESTIMATE,
+        estimate="attitude",
+    ),
+    _needed(
+        "local_pos",
+        "Navigation error: No valid position estimate",
         Need.LOCAL_POSITION | Need.LOCAL_POSITION_RELAXED,
         lambda c: c.local_position_invalid,
+        _L.ERROR,
+        _NOT_ENOUGH,
+        component=_ESTIMATE,
+        estimate="position",
     ),
-    _estimate(
-        "global position",
-        events.MODE_GLOBAL_POSITION,
+    _needed(
+        "global_pos",
+        "Navigation error: No valid global position estimate",
         Need.GLOBAL_POSITION,
         lambda c: c.global_position_invalid and not c.local_position_invalid,
+        _L.ERROR,
+        _NOT_ENOUGH,
+        component=_C.GLOBAL_POSITION_ESTIMATE,
+        estimate="global position",
     ),
-    _estimate("altitude", events.MODE_ALTITUDE, Need.ALTITUDE, lambda c: c.local_altitude_invalid),
-    PrearmCheck(
-        HealthComponent.SYSTEM,
+    _needed(
+        "local_alt",
+        "Navigation error: No valid altitude estimate",
+        Need.ALTITUDE,
+        lambda c: c.local_altitude_invalid,
+        _L.CRITICAL,
+        _NOT_ENOUGH,
+        estimate="altitude",
+    ),
+    _check(
+        _SYSTEM,
+        "modes_mission",
+        "No valid mission available",
         lambda r: (
             r.conditions.auto_mission_missing
             and (bool(r.settings.com_arm_mis_req) or _needs(r, Need.MISSION))
         ),
-        events.MODE_MISSION,
+        _L.INFO,
+        "Upload a mission first.",
         said=False,
     ),
-    PrearmCheck(
-        HealthComponent.SYSTEM,
-        lambda r: r.conditions.offboard_control_signal_lost and _needs(r, Need.OFFBOARD_SIGNAL),
-        events.MODE_OFFBOARD,
-        said=False,
+    _needed(
+        "offboard_signal",
+        "No offboard signal",
+        Need.OFFBOARD_SIGNAL,
+        lambda c: c.offboard_control_signal_lost,
+        _L.ERROR,
+        "Setpoints are not sent, or the commanded quantity is not estimated.",
     ),
-    PrearmCheck(
-        HealthComponent.SYSTEM,
-        lambda r: r.conditions.home_position_invalid and _needs(r, Need.HOME),
-        events.MODE_HOME,
-        said=False,
+    _needed(
+        "home_position",
+        "Home position not set",
+        Need.HOME,
+        lambda c: c.home_position_invalid,
+        _L.INFO,
     ),
-    PrearmCheck(
-        HealthComponent.MANUAL_CONTROL,
-        lambda r: r.conditions.manual_control_signal_lost and _needs(r, Need.MANUAL_CONTROL),
-        events.MODE_MANUAL,
-        said=False,
+    _needed(
+        "manual_control",
+        "No manual control input",
+        Need.MANUAL_CONTROL,
+        lambda c: c.manual_control_signal_lost,
+        _L.WARNING,
+        "Connect sticks, or choose a mode that needs none.",
+        component=_C.REMOTE_CONTROL,
         level=lambda r: Level.ERROR if _no_sticks_wanted(r) else Level.WARNING,
         shown=lambda r: Need.MANUAL_CONTROL if _no_sticks_wanted(r) else _ANYTHING,
     ),

@@ -403,7 +403,7 @@ class Travel:
 
     def launch(self, state: Vector, time_us: int, climb_m_s: float) -> None:
         """Start at a vehicle about to leave the ground with a climb rate [m/s]."""
-        self._trajectory.restart(_three(state, P), (0.0, 0.0, -climb_m_s))
+        self._trajectory.restart(triple(state, P), (0.0, 0.0, -climb_m_s))
         self._yaw, self._yaw_rate, self._wanted_yaw = quat_yaw(state[Q:RATES]), 0.0, None
         self._time_us = time_us
 
@@ -421,7 +421,7 @@ class Travel:
         `yaw`: heading [rad]; NaN = towards the target, constant near it. `limits`: None = limits of
         the parameters.
         """
-        position, velocity = _three(state, P), _three(state, V)
+        position, velocity = triple(state, P), triple(state, V)
         now = quat_yaw(state[Q:RATES])
         # After a pause the old trajectory is elsewhere.
         if self._time_us is None or time_us - self._time_us > PAUSE_US:
@@ -485,14 +485,15 @@ def stopping_place(state: Vector, value: Callable[[str], float]) -> Vec:
 
     Source: PX4 1.16, Navigator::preproject_stop_point.
     """
-    north, east, down = _three(state, P)
-    vn, ve, _ = _three(state, V)
+    north, east, down = triple(state, P)
+    vn, ve, _ = triple(state, V)
     speed = math.hypot(vn, ve)
     # Deceleration delay of 0.6 s, as PX4 passes 0.6 of the jerk as an acceleration.
     distance_per_speed = speed / (2.0 * value("MPC_ACC_HOR")) + 0.6
     return north + vn * distance_per_speed, east + ve * distance_per_speed, down
 
 
-def _three(state: Vector, start: int) -> Vec:
+def triple(state: Vector, start: int) -> Vec:
+    """Return three consecutive numbers of a state."""
     north, east, down = state[start : start + 3].tolist()
     return north, east, down

@@ -12,7 +12,6 @@ from airl_mav.control.demand import AnyDemand
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot.autopilot_state import (
     NO_MISSION,
-    Clearance,
     CommanderStatus,
     Health,
     MissionProgress,
@@ -143,18 +142,8 @@ class Snapshot:
     home_yaw = property(attrgetter("_parts.guidance.context.home_yaw"))
     sticks = property(attrgetter("_parts.guidance.context.sticks"))
     esc_outputs = property(attrgetter("_parts.newest.esc_outputs"))
-    odometry = property(attrgetter("_parts.estimator.odometry"))
-    odometry_us = property(attrgetter("_parts.estimator.odometry_us"))
-
-    distance = property(lambda self: getattr(self._parts.estimator.range, "reading", None))
-    distance_us = property(lambda self: getattr(self._parts.estimator.range, "reading_us", 0))
-    flow = property(lambda self: getattr(self._parts.estimator.flow, "reading", None))
-    flow_us = property(lambda self: getattr(self._parts.estimator.flow, "reading_us", 0))
-
-    @property
-    def clearance(self) -> Clearance | None:
-        finder = self._parts.estimator.range
-        return None if finder is None else finder.clearance()
+    readings = property(attrgetter("_parts.estimator.readings"))
+    clearance = property(attrgetter("_parts.estimator.aiding.ground"))
 
     @property
     def _sample(self) -> SensorSample:

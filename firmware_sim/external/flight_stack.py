@@ -18,8 +18,8 @@ from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import FirmwareObserver
 from firmware_sim.external.parameters import GROUND_LOSS, differences
 from firmware_sim.external.programs import firmware_kind
-from firmware_sim.flight_log.flight_log import ULOG_SUFFIX
 from firmware_sim.interfaces import (
+    ULOG_SUFFIX,
     ActuatorControls,
     FirmwareLostError,
     FirmwareMissingError,

@@ -23,6 +23,7 @@ import re
 import struct
 import sys
 import tempfile
+import zlib
 from collections.abc import Callable, Sequence
 from itertools import accumulate
 from operator import itemgetter
@@ -455,3 +456,14 @@ def _frame_end(buffer: bytes, start: int) -> int | None:
 
 
 # --- texts
+
+
+_ALL_ONES = 0xFFFF_FFFF
+
+
+def crc32part(data: bytes, crc: int = 0) -> int:
+    """Return the CRC-32 of preceding data (`crc`) and `data`.
+
+    zlib inverts before and after; PX4's crc32part() does not.
+    """
+    return zlib.crc32(data, crc ^ _ALL_ONES) ^ _ALL_ONES

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple
 
+from firmware_sim import sensor_table
 from firmware_sim.mavlink.endpoint import (
     Address,
     Endpoint,
@@ -130,14 +131,20 @@ class LinkConfig:
     tick. Keeps streams independent of the number of ticks per call. 0 = any tick."""
 
 
+def _rates(px4: Mapping[str, float], link: str) -> Mapping[str, float]:
+    """Return the default rates [Hz] of PX4's streams and of further sensors."""
+    further = {name: getattr(each, link) for name, each in sensor_table.streams().items()}
+    return {**px4, **{name: hz for name, hz in further.items() if name not in px4 and hz > 0.0}}
+
+
 def onboard_link(endpoint: SharedEndpoint, *, separate_replies: bool = False) -> LinkConfig:
     """Return the configuration of the companion's link (PX4: 14580 -> 14540)."""
-    return LinkConfig("onboard", endpoint, ONBOARD_HZ, separate_replies)
+    return LinkConfig("onboard", endpoint, _rates(ONBOARD_HZ, "onboard_hz"), separate_replies)
 
 
 def gcs_link(endpoint: SharedEndpoint, *, separate_replies: bool = False) -> LinkConfig:
     """Return the configuration of a ground station's link (PX4: 18570 -> 14550)."""
-    return LinkConfig("gcs", endpoint, GCS_HZ, separate_replies)
+    return LinkConfig("gcs", endpoint, _rates(GCS_HZ, "gcs_hz"), separate_replies)
 
 
 def payload_link(endpoint: SharedEndpoint) -> LinkConfig:

@@ -8,10 +8,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
+from typing import Any
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.signing import Signing, StoredSigning
+from firmware_sim import sensor_table
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.engine.record import Record
@@ -25,15 +27,19 @@ from firmware_sim.mavlink.endpoint import (
 )
 from firmware_sim.mavlink.link import Link, LinkCounters, Payloads
 from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, gcs_link, onboard_link
-from firmware_sim.mavlink.services import connection, handle, send_pending
+from firmware_sim.mavlink.services import connection, handle, send_pending, table
 from firmware_sim.mavlink.services.context import Context, sender
-from firmware_sim.mavlink.services.transfers import RunningCalibration
-from firmware_sim.mavlink.streams import BUILDERS, VEHICLE_BUILDERS, Builder, Vehicle
+from firmware_sim.mavlink.streams import (
+    BUILDERS,
+    VEHICLE_BUILDERS,
+    Builder,
+    Vehicle,
+    addon_builders,
+)
 from firmware_sim.mavlink.streams.sensors import Radio
 from firmware_sim.mavlink.telemetry import TickContext, flown_of
 from firmware_sim.mavlink.texts_and_events import REPLY_IDS, EventBuffer, EventSender, TextEncoder
 from firmware_sim.mavlink.traffic import Forwarder, Senders, TlogWriter, TrafficLog
-from firmware_sim.storage import Storage
 
 _DISCARD_CALLS = 16
 """Number of reads that empty a link: 16 times 256 datagrams exceed a socket's buffer."""
@@ -76,7 +82,6 @@ class MavlinkServer:
         boot_unix_us: int,
         clock: Clock | None = None,
         signing: StoredSigning | None = None,
-        storage: Storage | None = None,
     ) -> None:
         """Open the links. Each streams its default rates from the first `send`.
 
@@ -84,7 +89,6 @@ class MavlinkServer:
             links: Configurations of the links.
             port: Autopilot; None = attached later (`attach`).
             boot_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
-            storage: Vehicle files for MAVLink FTP; None = temporary files. Closed with the server.
             clock: Limits the time per tick for received messages and bulk transfers. None, or a
                 clock that stops during the tick: only their number is limited.
             signing: Stored key, required on all links; None = no key until a client sets one, which
@@ -98,8 +102,9 @@ class MavlinkServer:
         self._signing = (
             Signing(lambda: boot_unix_us + self._now_us) if signing is None else signing.signing
         )
-        self._storage = storage or Storage()
-        self._calibration = RunningCalibration()
+        self.vehicle_states: dict[type, Any] = {}
+        """States of services that all clients share, by class."""
+        table("HANDLERS")  # loads the services
         self._radio = Radio()
         self._now_us = 0
         self._forget_us = 0
@@ -119,7 +124,9 @@ class MavlinkServer:
         # All links share these builders, so each message is built once per tick.
         self._builders: dict[str, Builder | None] = {
             **BUILDERS,
+            **addon_builders(),
             **{name: partial(build, self._vehicle) for name, build in VEHICLE_BUILDERS.items()},
+            **{name: each.build for name, each in sensor_table.streams().items()},
             "TIMESYNC": None,
         }
         self._forwarder = Forwarder(self._all)
@@ -150,7 +157,8 @@ class MavlinkServer:
         self._senders.forget()
         self._complaints.restart()
         self._announced.renew()
-        self._calibration = RunningCalibration()
+        for state in self.vehicle_states.values():
+            state.restart()
         # A new boot restarts the event numbers.
         self._events = EventBuffer()
         for clients in self._links:
@@ -343,7 +351,8 @@ class MavlinkServer:
             self._stored.save()
         for clients in self._links:
             clients.close()
-        self._storage.close()
+        for state in self.vehicle_states.values():
+            state.close()
 
     def _open(self, config: LinkConfig, link_id: int) -> Clients:
         def welcome(peer: Peer, endpoint: Sender) -> Client:
@@ -383,8 +392,7 @@ class MavlinkServer:
             self._events,
             self._signing,
             self._system_id,
-            storage=self._storage,
-            calibration=self._calibration,
+            vehicle_states=self.vehicle_states,
             radio=self._radio,
         )
         self._is_transferring = True

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from airl_mav.arena.geometry import Arena
+from airl_mav.core.addons import load
 from airl_mav.core.constants import TICK_HZ, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.streams import sensors_and_gusts
@@ -50,8 +51,8 @@ from firmware_sim.engine.ticks import (
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, TrueState
 from firmware_sim.plant.body import FLOOR, PlantBody, Room, Touch
 from firmware_sim.plant.contacts.convex import BREAKING_SHARE
-from firmware_sim.plant.downward_sensors import PlantOpticalFlow, PlantRangefinder
-from firmware_sim.plant.sensors import SensorSuite
+from firmware_sim.plant.sensors import SensorSuite, SimulatedSensor, Site
+from firmware_sim.sensor_table import add_readings, fitted
 
 
 def new_body(
@@ -153,17 +154,13 @@ class Plant:
         """Source of wind; may be replaced between two ticks."""
         self._winds = np.zeros((0, 3))
         """Wind NED [m/s] of the coming ticks. A single row is constant wind."""
-        fitted, times = profile.sensors.rangefinder, asked.sensors.navigation_noise
-        self._rangefinder = None
-        if fitted is not None:
+        self._auxiliary: list[tuple[str, SimulatedSensor]] = []
+        """Sensors that measure in Python, with the names of their readings."""
+        for kind, settings in fitted(profile.sensors).values():
             # An additional child leaves the random streams of the other sensors unchanged.
-            self._rangefinder = PlantRangefinder(fitted, arena, noise.spawn(1)[0], times)
-        flow = profile.sensors.optical_flow
-        self._flow = None
-        if flow is not None:
-            self._flow = PlantOpticalFlow(flow, arena, noise.spawn(1)[0], times, tick_s)
-        # These sensors measure in Python, so every tick needs Python.
-        self._measures_compiled = fitted is None and flow is None and profile.sensors.vision is None
+            own = self._sensors.spare if kind.draws_always else noise.spawn(1)[0]
+            site = Site(arena, own, asked.sensors.navigation_noise, tick_s)
+            self._auxiliary.append((kind.reading, load(kind.simulation)(settings, site)))
         model = PowerModel.from_profile(profile)
         self.rotor_lag = lag(airframe, tick_s)
         """Fraction of a rotor speed error that remains after a tick."""
@@ -264,7 +261,7 @@ class Plant:
     @property
     def compiled(self) -> bool:
         """True if compiled ticks give the same motion and measurements as `step`."""
-        return self._measures_compiled and isinstance(self.wind, Wind)
+        return not self._auxiliary and isinstance(self.wind, Wind)
 
     def glide(
         self, controller: Record, ticks: int, truths: Record, flown: Record
@@ -428,16 +425,13 @@ class Plant:
 
     def sense(self) -> SensorSample:
         """Return a sensor sample of the current state."""
-        sample = self._sensors.sample(self.time_us, self._motion, self._battery)
-        finder, flow = self._rangefinder, self._flow
-        if finder is not None and finder.rate.due(self.time_us):
-            sample = sample._replace(distance=finder.read(self.motion, self._elapsed_us))
-        if flow is not None:
-            # Flow integrates every tick, also between its samples.
-            flow.pass_tick(self.motion)
-            if flow.rate.due(self.time_us):
-                sample = sample._replace(flow=flow.read(self.motion, self._elapsed_us))
-        return sample
+        time_us = self.time_us
+        sample, readings = self._sensors.sample(time_us, self._motion, self._battery), {}
+        for name, sensor in self._auxiliary:
+            reading = sensor.sense(time_us, self.motion, self._elapsed_us)
+            if reading is not None:
+                readings[name] = reading
+        return add_readings(sample, readings) if readings else sample
 
     def truth(self) -> TrueState:
         """Return the true state."""

@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import HOME, Vector, local_to_geodetic
-from airl_mav.profiles.vehicle import Sensors, Vision
-from airl_mav.vehicle.rotation import (
-    Quat,
-    conjugate,
-    exponential,
-    multiply,
-    rotate,
-    yaw_of,
-)
-from firmware_sim.engine.dynamics import POSITION, VELOCITY, quaternion
+from airl_mav.profiles.vehicle import Sensors
 from firmware_sim.engine.record import GPS, MAG, PRESSURE, Record, new_aircraft, new_sample
 from firmware_sim.engine.ticks import sense_record
-from firmware_sim.interfaces import BatterySample, GpsFix, Odometry, SensorSample
+from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 
 GPS_SATELLITES = 12
 
@@ -56,94 +48,57 @@ class Rate:
         return True
 
 
-class White:
-    """White noise of one sensor, standard deviation 1."""
+class Site(NamedTuple):
+    """Surroundings of a simulated sensor."""
 
-    def __init__(self, rng: np.random.Generator, width: int) -> None:
-        self._rng = rng
-        self._rows = np.zeros((0, width))
+    arena: Arena | None
+    """Arena; None = an endless floor."""
+    rng: np.random.Generator
+    """Random generator of this sensor only."""
+    times: float
+    """Factor of the noise; does not affect reported variances."""
+    tick_s: float
+    """Length of a tick [s]."""
+
+
+class SimulatedSensor:
+    """Simulation of a sensor in Python (`sensor_table.Sensor`): a rate and white noise."""
+
+    noises = 1
+    """Number of white noise values per reading."""
+
+    def __init__(self, profile: Any, site: Site) -> None:
+        """Store the sensor's model in a vehicle profile, with its `rate_hz`, and the site."""
+        self.profile, self.site = profile, site
+        self.rate = Rate(profile.rate_hz)
+        self._rows = np.zeros((0, self.noises))
         self._next = 0
 
-    def draw(self) -> Vector:
-        """Return new values (width,)."""
+    def white(self) -> Vector:
+        """Return new white noise (noises,), standard deviation 1."""
         if self._next == len(self._rows):
-            self._rows, self._next = self._rng.standard_normal((BLOCK, self._rows.shape[1])), 0
+            self._rows, self._next = self.site.rng.standard_normal((BLOCK, self.noises)), 0
         row: Vector = self._rows[self._next]
         self._next += 1
         return row
 
+    def sense(self, time_us: int, row: Vector, elapsed_us: int) -> Any:
+        """Return the reading that is delivered after a tick; None = none.
 
-class _Vision:
-    """Visual-inertial odometry: a pose in the start frame, with drift and latency."""
+        Args:
+            time_us: Time at the end of the tick [µs].
+            row: (16,) motion of the vehicle, see `engine.dynamics`.
+            elapsed_us: Time since the moving obstacles started [µs].
+        """
+        return self.read(row, elapsed_us) if self.rate.due(time_us) else None
 
-    def __init__(self, vision: Vision, rng: np.random.Generator, times: float) -> None:
-        self.rate = Rate(vision.rate_hz)
-        self._vision, self._times = vision, times
-        self._white = White(rng, 13)
-        self._start: tuple[Vector, Vector] | None = None
-        """Position, and attitude of the frame, at the first pose."""
-        self._last = np.zeros(3)
-        self._drift = np.zeros(3)
-        """Drift of the position, in the frame [m]."""
-        self._turned = 0.0
-        """Drift of the frame's heading [rad]."""
-        self._late: deque[tuple[float, Odometry]] = deque()
-        """Poses with their delivery times [µs], oldest first."""
-
-    def observe(self, time_us: int, row: Vector) -> None:
-        """Sample a pose at the current time."""
-        profile, white, times = self._vision, self._white.draw(), self._times
-        place, velocity, attitude = row[POSITION], row[VELOCITY], quaternion(row)
-        if self._start is None:
-            self._start, self._last = (place.copy(), frame_at(attitude)), place.copy()
-        start, frame = self._start
-        # Drift grows with the square root of the way: independent steps per metre.
-        way = float(np.linalg.norm(place - self._last))
-        self._last = place.copy()
-        self._drift += times * profile.position_drift_m_sqrt_m * math.sqrt(way) * white[0:3]
-        period_s = 1.0 / profile.rate_hz
-        # Heading drift grows with the square root of time.
-        walk = times * profile.yaw_drift_rad_sqrt_s * math.sqrt(period_s)
-        self._turned += walk * white.item(3)
-        half = 0.5 * self._turned
-        # From NED into the drifted start frame.
-        into = multiply((math.cos(half), 0.0, 0.0, math.sin(half)), conjugate(tuple(frame)))
-        seen = rotate(into, tuple(place - start))
-        moving = rotate(into, tuple(velocity))
-        # Attitude noise is a small rotation.
-        error = exponential(tuple(times * profile.angle_noise_rad * white[4:7]))
-        odometry = Odometry(
-            position=np.array(seen) + self._drift + times * profile.position_noise_m * white[7:10],
-            velocity=np.array(moving) + times * profile.velocity_noise_m_s * white[10:13],
-            quaternion=np.array(multiply(multiply(into, attitude), error)),
-            pose_frame="frd",
-            velocity_frame="frd",
-            # Reported variances are the profile's, without the factor `times`.
-            position_variance=np.full(3, profile.position_noise_m**2),
-            velocity_variance=np.full(3, profile.velocity_noise_m_s**2),
-            orientation_variance=np.full(3, profile.angle_noise_rad**2),
-        )
-        # Deliver later: the pose is measured now.
-        self._late.append((time_us + profile.delay_s * US_PER_S, odometry))
-
-    @property
-    def told_us(self) -> float:
-        """Delivery time of the next pose [µs]; inf = no pose pending."""
-        return self._late[0][0] if self._late else math.inf
-
-    def read(self) -> Odometry:
-        """Return the pose that is due."""
-        return self._late.popleft()[1]
-
-
-def frame_at(attitude: Quat) -> Vector:
-    """Return a level frame with the heading of an attitude (quaternion to NED)."""
-    half = 0.5 * yaw_of(attitude)
-    return np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+    def read(self, row: Vector, elapsed_us: int) -> Any:
+        """Return a reading in motion (16,), `elapsed_us` [µs] after the obstacles started."""
+        raise NotImplementedError
 
 
 class SensorSuite:
-    """All sensors of the vehicle, with one call per tick.
+    """IMU, compass, barometer and GPS, with one call per tick.
 
     Every sensor has a separate random stream, so its measurements do not depend on the rates of the
     others.
@@ -172,9 +127,11 @@ class SensorSuite:
         """Newest sample of the compiled sensors."""
         imu, gps, barometer = profile.imu, profile.gps, profile.barometer
         self._gps = gps
+        self.spare: np.random.Generator
+        """Random generator of the auxiliary sensor that draws always (`sensor_table`)."""
         # One stream per sensor, so that rates of one do not shift the noise of others.
-        streams = rng.spawn(5)
-        inertial, vision = streams[0], streams[4]
+        *self._streams, self.spare = rng.spawn(5)
+        inertial = self._streams[0]
         # Random walk: steps grow with the square root of the tick.
         walk = math.sqrt(tick_s)
         # The profile gives the noise at the base tick; the noise density is constant.
@@ -209,12 +166,8 @@ class SensorSuite:
             ("gps_rate", gps.rate_hz),
         ):
             record[name] = rate_hz, 0.0, 0.0
-        self._streams = streams[:4]
         self.noise = [np.zeros((0, width)) for width in _WIDTHS]
         """White noise of accelerometer and gyro, compass, barometer, GPS: blocks of rows."""
-        self._vision = None
-        if profile.vision is not None:
-            self._vision = _Vision(profile.vision, vision, times)
 
     def measure(self) -> None:
         """Sample the compiled sensors."""
@@ -233,8 +186,7 @@ class SensorSuite:
         record = self._record
         record["time_us"], record["motion"] = time_us, row
         self.measure()
-        odometry = None if self._vision is None else self._see(self._vision, time_us, row)
-        return self.newest(battery)._replace(odometry=odometry)
+        return self.newest(battery)
 
     def newest(self, battery: BatterySample) -> SensorSample:
         """Return the newest sample of the record."""
@@ -259,9 +211,3 @@ class SensorSuite:
             float(fields["pressure_hpa"]) if measured & PRESSURE else None,
             fix,
         )
-
-    @staticmethod
-    def _see(vision: _Vision, time_us: int, row: Vector) -> Odometry | None:
-        if vision.rate.due(time_us):
-            vision.observe(time_us, row)
-        return vision.read() if vision.told_us <= time_us else None

@@ -21,7 +21,7 @@ from airl_mav.experiments.experiment import load_run
 from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate
 from airl_mav.rehearsal.run_folder import RunInfo, load_info
 from airl_mav.report.comparison.comparison_model import Comparison, load_comparison
-from airl_mav.report.table import read_table
+from airl_mav.report.document import read_table
 from published.declared import Declared
 from published.record import (
     MEASURES,

@@ -27,7 +27,7 @@ from airl_mav.flight.statistics import bootstrap_mean
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.loading import list_profiles
-from airl_mav.report.measures import with_interval
+from airl_mav.report.document import with_interval
 from airl_mav.scenario.model import LevelName, Scenario
 from airl_mav.scenario.scenario_file import read_scenario_file
 

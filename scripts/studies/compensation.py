@@ -32,12 +32,19 @@ from airl_mav.core.progress import new_console
 from airl_mav.envs.evaluation import EpisodeResult, fly_seeds
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.experiments.gym_flier import navigation_of, pilots_of
-from airl_mav.flight.paired import relative_difference
-from airl_mav.flight.statistics import wilson
-from airl_mav.prediction import RECENT, Compensator, ExpectedLatency
+from airl_mav.flight.statistics import relative_difference, wilson
+from airl_mav.prediction.compensator import RECENT, Compensator, ExpectedLatency
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.report.measures import rate_with_interval, with_interval
-from airl_mav.report.table import NONE, Column, TableView, markdown_table, print_table, write_table
+from airl_mav.report.document import (
+    NONE,
+    Column,
+    TableView,
+    markdown_table,
+    print_table,
+    with_interval,
+    write_table,
+)
+from airl_mav.report.measures import rate_with_interval
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 

@@ -27,8 +27,8 @@ from airl_mav.experiments.experiment import Experiment, make_cell
 from airl_mav.flight.statistics import aggregate
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from airl_mav.report.measures import rate_with_interval, with_interval
-from airl_mav.report.table import Column, TableView, print_table
+from airl_mav.report.document import Column, TableView, print_table, with_interval
+from airl_mav.report.measures import rate_with_interval
 from airl_mav.training.config import TrainingConfig
 
 OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)

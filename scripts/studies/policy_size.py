@@ -40,9 +40,9 @@ from airl_mav.policy.layouts import boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import OnnxRuntime, outputs_of
 from airl_mav.profiles.loading import load_profile
+from airl_mav.report.document import TOO_FEW_CELL, Column, TableView, markdown_table, print_table
 from airl_mav.report.heatmap import Field as Cell
 from airl_mav.report.heatmap import HeatMap, draw_heat_map
-from airl_mav.report.table import TOO_FEW_CELL, Column, TableView, markdown_table, print_table
 from airl_mav.report.theme import PAPER, new_figure, render_png
 
 SCHEMA = 1

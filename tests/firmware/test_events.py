@@ -18,6 +18,8 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Geodetic
+from firmware_sim.addons.ground_station_services import component_metadata
+from firmware_sim.addons.ground_station_services.component_metadata import definitions
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events
 from firmware_sim.autopilot.events.definition import (
@@ -25,6 +27,8 @@ from firmware_sim.autopilot.events.definition import (
     FORMATS,
     ArmingReason,
     Component,
+    FailsafeAction,
+    FailsafeCause,
     Level,
     MavlinkEvent,
     ModeGroup,
@@ -33,8 +37,6 @@ from firmware_sim.autopilot.events.definition import (
 from firmware_sim.autopilot.events.health_report import ALL_MODES, HealthReport, health_report
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     Conditions,
-    FailsafeAction,
-    FailsafeReason,
 )
 from firmware_sim.autopilot.failsafes.framework import announcement
 from firmware_sim.autopilot.flight_modes import Mode, Need
@@ -42,8 +44,6 @@ from firmware_sim.autopilot.inputs import Source, Sticks
 from firmware_sim.autopilot.prearm import ArmingSettings, Readiness, can_arm
 from firmware_sim.autopilot.sensor_monitor import ACCEL, BARO, GPS, GYRO, MAG, SensorWatch
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services import component_metadata
-from firmware_sim.mavlink.services.component_metadata import definitions
 from firmware_sim.mavlink.texts_and_events import FIRST_SEQUENCE, KEPT
 from tests.support import flight_rig
 from tests.support.flown_by_mavsdk import Flown, flown
@@ -167,38 +167,38 @@ def test_levels_are_two_halves_of_a_byte() -> None:
     [
         (
             FailsafeAction.HOLD,
-            FailsafeAction.RETURN,
-            FailsafeReason.GCS_LOSS,
+            FailsafeAction.RTL,
+            FailsafeCause.GCS_CONNECTION_LOSS,
             "GCS connection loss: switching to Return in 5 seconds",
         ),
         (
             FailsafeAction.HOLD,
             FailsafeAction.LAND,
-            FailsafeReason.GENERIC,
+            FailsafeCause.GENERIC,
             "Failsafe activated: switching to Land in 5 seconds",
         ),
         (
             FailsafeAction.WARN,
             FailsafeAction.NONE,
-            FailsafeReason.BATTERY_LOW,
+            FailsafeCause.LOW_BATTERY_LEVEL,
             "Low battery level, return advised",
         ),
         (
             FailsafeAction.DESCEND,
             FailsafeAction.NONE,
-            FailsafeReason.GENERIC,
+            FailsafeCause.GENERIC,
             "Failsafe activated: Autopilot disengaged, switching to Descend",
         ),
         (
-            FailsafeAction.RETURN,
+            FailsafeAction.RTL,
             FailsafeAction.NONE,
-            FailsafeReason.BATTERY_CRITICAL,
+            FailsafeCause.CRITICAL_BATTERY_LEVEL,
             "Critical battery level: switching to Return",
         ),
     ],
 )
 def test_a_failsafes_event_names_its_cause_and_what_follows(
-    action: FailsafeAction, delayed: FailsafeAction, cause: FailsafeReason, expected: str
+    action: FailsafeAction, delayed: FailsafeAction, cause: FailsafeCause, expected: str
 ) -> None:
     told = announcement(action, delayed, cause, Mode.OFFBOARD, 5 * US_PER_S)
     assert told.event is not None

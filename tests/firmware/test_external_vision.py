@@ -12,29 +12,29 @@ from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
 from airl_mav.addons.fault_matrix.matrix import fly_fault
-from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.constants import TICK_S, TICK_US, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import HOME, Vector, geodetic_to_local, quat_wxyz_to_xyzw, quat_yaw
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
+from firmware_sim.addons.auxiliary_estimation.external_vision import Control, yaw_by_turn
+from firmware_sim.addons.auxiliary_estimation.simulated_sensors import PlantVision
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.autopilot.external_vision import Control, yaw_by_turn
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.external import hil_messages as hil
-from firmware_sim.interfaces import BatterySample, Odometry
+from firmware_sim.interfaces import Odometry
 from firmware_sim.mavlink.codec import Encoder
-from firmware_sim.plant.sensors import SensorSuite
+from firmware_sim.plant.sensors import Site
 from firmware_sim.simulation import TOUCHDOWN_M_S
 from tests.support import mavlink_clients
-from tests.support.flight_rig import Rig, quad, velocity_setpoint
+from tests.support.flight_rig import Rig, aids_of, quad, velocity_setpoint
 
 NAN = math.nan
 TRIANGLE = tuple(float(i) for i in range(21))
 DIAGONAL = [0.0, 6.0, 11.0, 15.0, 18.0, 20.0]
 """Diagonal of a matrix sent as TRIANGLE."""
 LEVEL = (1.0, 0.0, 0.0, 0.0)
-BATTERY = BatterySample(16.0, 1.0, 0.0, 1.0)
 
 # Which of our axes each axis of a frame is, as rotation matrices.
 ENU = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -70,7 +70,7 @@ def read(message: Any) -> list[Odometry]:
     rig = mavlink_clients.Rig()
     rig.client.send(message)
     rig.bench.tick()
-    return rig.autopilot.odometry
+    return rig.autopilot.received["odometry"]
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_motion_capture_has_no_effect_and_other_estimators_are_told_once() -> No
     for _ in range(3):
         rig.client.send(odometry_message(estimator_type=dialect.MAV_ESTIMATOR_TYPE_GPS))
         rig.bench.tick()
-    assert rig.autopilot.odometry == []
+    assert rig.autopilot.received["odometry"] == []
     told = mavlink_clients.text_of(rig.client.received())
     assert told == [(2, "ODOMETRY: estimator_type 4 unsupported")]
 
@@ -174,8 +174,8 @@ def test_mavsdk_s_mocap_plugin_is_understood() -> None:
                 1, mocap.PositionBody(4.0, 5.0, -6.0), mocap.AngleBody(0.0, 0.0, 1.5), unknown, 0
             )
         )
-        mavlink_clients.wait_for(lambda: len(autopilot.odometry) == 2)
-    odometry, estimate = autopilot.odometry
+        mavlink_clients.wait_for(lambda: len(autopilot.received["odometry"]) == 2)
+    odometry, estimate = autopilot.received["odometry"]
     assert odometry.position is not None and odometry.velocity is not None
     assert estimate.position is not None and estimate.quaternion is not None
     assert (odometry.pose_frame, odometry.velocity_frame) == ("frd", "body")
@@ -248,7 +248,7 @@ def off(rig: Rig) -> Vector:
 
 def test_it_flies_by_vision_alone() -> None:
     rig = without_gps()
-    assert rig.ap.estimator.vision.fused == Control.HORIZONTAL | Control.VERTICAL | Control.VELOCITY
+    assert aids_of(rig).vision.fused == Control.HORIZONTAL | Control.VERTICAL | Control.VELOCITY
     rig.take_off(4.0)
     errors: list[Vector] = []
     rig.go_offboard(velocity_setpoint(3.0, 1.0, 0.0, yaw=1.0))
@@ -298,7 +298,7 @@ def test_vision_that_falls_silent_ends_the_flight_as_without_gps() -> None:
     step = rig.ap.step
     rig.step_through(lambda sample: step(sample._replace(odometry=None)))
     rig.run(0.5)
-    assert rig.ap.estimator.vision.fused == Control(0)
+    assert aids_of(rig).vision.fused == Control(0)
     assert rig.mode is Mode.OFFBOARD
     rig.until(lambda: rig.ap.flight.failsafe, 8.0)
     # EKF2_NOAID_TOUT, 5 s, plus the commander's delay.
@@ -370,10 +370,10 @@ def test_a_heading_of_the_globe_has_to_agree_with_the_compass(
     rig.step_through(turned)
     rig.ap.parameters.set("EKF2_EV_CTRL", 15)
     rig.run(20.0)
-    assert bool(rig.ap.estimator.vision.fused & Control.YAW) is believed
+    assert bool(aids_of(rig).vision.fused & Control.YAW) is believed
     heading_deg = math.degrees(quat_yaw(rig.ap.state().estimate.quaternion))
     assert heading_deg == pytest.approx(wrong_deg if believed else 0.0, abs=1.5)
-    assert rig.ap.estimator.vision.is_north_known
+    assert rig.ap.estimator.is_north_known
 
 
 def test_gps_comes_first_where_there_is_both() -> None:
@@ -383,7 +383,7 @@ def test_gps_comes_first_where_there_is_both() -> None:
     rig = Rig(3, vehicle=quad(sensors=sensors), parameters=both)
     rig.run(3.0)
     rig.take_off(4.0)
-    vision = rig.ap.estimator.vision
+    vision = aids_of(rig).vision
     assert vision.fused == Control.VELOCITY
     step = rig.ap.step
     rig.step_through(lambda sample: step(sample._replace(gps=None)))
@@ -395,8 +395,8 @@ def test_gps_comes_first_where_there_is_both() -> None:
 
 def test_a_heading_of_its_own_frame_is_no_heading_of_the_globe() -> None:
     rig = without_gps(EKF2_EV_CTRL=15)
-    vision = rig.ap.estimator.vision
-    assert vision.fused & Control.YAW and not vision.is_north_known
+    vision = aids_of(rig).vision
+    assert vision.fused & Control.YAW and not rig.ap.estimator.is_north_known
     assert rig.ap.arm(force=False) is Result.TEMPORARILY_REJECTED
     assert not math.isnan(rig.said("No valid global position estimate"))
 
@@ -437,17 +437,17 @@ def test_what_the_sensor_tells_is_the_profile_s() -> None:
     assert profile.vision is not None
     ends, noises = [], []
     for seed in range(60):
-        suite = SensorSuite(profile, np.random.default_rng(seed))
+        own = np.random.default_rng(seed).spawn(5)[4]
+        sensor = PlantVision(profile.vision, Site(None, own, 1.0, TICK_S))
         row = np.zeros(16)
         row[6] = 1.0
         told: list[tuple[int, Odometry]] = []
         for tick in range(1500):
             time_us = tick * TICK_US
             row[0] = max(0.0, 10.0 * (tick - 250) / 1000) if tick < 1250 else 10.0
-            sample = suite.sample(time_us, row, BATTERY)
-            assert sample.gps is None
-            if sample.odometry is not None:
-                told.append((time_us, sample.odometry))
+            pose = sensor.sense(time_us, row, 0)
+            if pose is not None:
+                told.append((time_us, pose))
         times = np.array([t for t, _ in told])
         # The first pose is from the start, and arrives after the delay.
         assert times[0] == profile.vision.delay_s * US_PER_S
@@ -474,4 +474,4 @@ def test_a_sensor_that_a_vehicle_lacks_cannot_fail() -> None:
 
 def test_less_quality_than_asked_is_not_fused() -> None:
     rig = without_gps(EKF2_EV_QMIN=50)
-    assert rig.ap.estimator.vision.fused == Control(0)
+    assert aids_of(rig).vision.fused == Control(0)

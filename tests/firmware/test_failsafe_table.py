@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from firmware_sim.autopilot.events.definition import FailsafeAction
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
     Conditions,
-    FailsafeAction,
     FailsafeSettings,
     FenceBreach,
     can_run,
@@ -96,16 +96,16 @@ def test_manual_control_lost_holds_then_returns() -> None:
     m = flying(Mode.POSITION, nav_rcl_act=2)
     assert m.step(manual_control_signal_lost=True).state.action is FailsafeAction.HOLD
     assert m.texts == ["Failsafe activated: entering Hold for 5 seconds"]
-    assert m.last.delayed is FailsafeAction.RETURN
+    assert m.last.delayed is FailsafeAction.RTL
     assert m.last.mode is Mode.HOLD
     m.step(4900 * MS)
     assert m.action() is FailsafeAction.HOLD
     m.step(200 * MS)
-    assert m.action() is FailsafeAction.RETURN
+    assert m.action() is FailsafeAction.RTL
     assert m.texts[-1] == "Failsafe activated"
     # The signal is back: the return continues until the user chooses a mode.
     m.step(manual_control_signal_lost=False)
-    assert m.action() is FailsafeAction.RETURN
+    assert m.action() is FailsafeAction.RTL
     m.mode = Mode.ALTITUDE
     assert m.step().mode is Mode.ALTITUDE
     assert m.action() is FailsafeAction.NONE
@@ -115,7 +115,7 @@ def test_the_worse_of_two_is_taken_and_the_other_after_it() -> None:
     m = flying(Mode.POSITION, nav_rcl_act=2, nav_dll_act=3)
     m.step(manual_control_signal_lost=True)
     m.step(6 * S)
-    assert m.action() is FailsafeAction.RETURN
+    assert m.action() is FailsafeAction.RTL
     m.step(gcs_connection_lost=True)
     assert m.action() is FailsafeAction.LAND, "no second wait: it is in a failsafe already"
     m.mode = Mode.HOLD
@@ -130,7 +130,7 @@ def test_the_user_takes_over_with_the_sticks_only_after_the_wait() -> None:
     m.step(3 * S, Intervention(sticks_moved=True))
     assert m.action() is FailsafeAction.HOLD
     m.step(3 * S)
-    assert m.action() is FailsafeAction.RETURN
+    assert m.action() is FailsafeAction.RTL
     m.step(10 * MS, Intervention(sticks_moved=True))
     assert (m.action(), m.mode, m.state.taken_over) == (FailsafeAction.WARN, Mode.POSITION, True)
     m.step()
@@ -187,7 +187,7 @@ def test_a_condition_that_flaps_acts_in_the_end() -> None:
     m.step(mission_failure=True)
     assert m.texts[-1] == "Failsafe activated: entering Hold for 3 seconds"
     m.step(3500 * MS)
-    assert m.action() is FailsafeAction.RETURN
+    assert m.action() is FailsafeAction.RTL
 
 
 def test_the_battery_acts_only_when_worse_than_at_arming() -> None:
@@ -233,7 +233,7 @@ def test_attitude_failure(after_s: float, breaker: int, expected: FailsafeAction
 def test_an_orbit_that_a_failsafe_ended_is_not_resumed() -> None:
     m = flying(Mode.ORBIT, com_fail_act_t=0.0)
     m.step(flight_time_limit_exceeded=True)
-    assert m.action() is FailsafeAction.RETURN
+    assert m.action() is FailsafeAction.RTL
     m.step(flight_time_limit_exceeded=False)
     assert (m.action(), m.mode) == (FailsafeAction.NONE, Mode.HOLD)
 
@@ -241,7 +241,7 @@ def test_an_orbit_that_a_failsafe_ended_is_not_resumed() -> None:
 def test_offboard_lost_and_regained() -> None:
     m = flying(Mode.OFFBOARD, com_obl_rc_act=3)
     m.step(offboard_control_signal_lost=True)
-    assert (m.action(), m.last.mode, m.mode) == (FailsafeAction.RETURN, Mode.RETURN, Mode.OFFBOARD)
+    assert (m.action(), m.last.mode, m.mode) == (FailsafeAction.RTL, Mode.RETURN, Mode.OFFBOARD)
     assert m.texts == ["Failsafe activated"], "no wait in Hold for a mode that cannot fly on"
     m.step(offboard_control_signal_lost=False)
     assert (m.action(), m.last.mode) == (FailsafeAction.NONE, Mode.OFFBOARD)
@@ -321,14 +321,14 @@ def test_the_chain_of_fallbacks() -> None:
         conditions = FINE._replace(**lost)
         ends.append(
             (
-                possible(FailsafeAction.FALLBACK_POSITION, conditions),
+                possible(FailsafeAction.FALLBACK_POSCTRL, conditions),
                 possible(FailsafeAction.HOLD, conditions),
             )
         )
     assert ends == [
-        (FailsafeAction.FALLBACK_POSITION, FailsafeAction.LAND),
-        (FailsafeAction.FALLBACK_POSITION, FailsafeAction.LAND),
-        (FailsafeAction.FALLBACK_ALTITUDE, FailsafeAction.DESCEND),
+        (FailsafeAction.FALLBACK_POSCTRL, FailsafeAction.LAND),
+        (FailsafeAction.FALLBACK_POSCTRL, FailsafeAction.LAND),
+        (FailsafeAction.FALLBACK_ALTCTRL, FailsafeAction.DESCEND),
         (FailsafeAction.FALLBACK_STABILIZED, FailsafeAction.DESCEND),
         (FailsafeAction.TERMINATE, FailsafeAction.TERMINATE),
     ]
@@ -348,7 +348,7 @@ class Known(NamedTuple):
 _LINK = [
     FailsafeAction.NONE,
     FailsafeAction.HOLD,
-    FailsafeAction.RETURN,
+    FailsafeAction.RTL,
     FailsafeAction.LAND,
     None,
     FailsafeAction.TERMINATE,
@@ -358,7 +358,7 @@ _LIMIT = [
     FailsafeAction.NONE,
     FailsafeAction.WARN,
     FailsafeAction.HOLD,
-    FailsafeAction.RETURN,
+    FailsafeAction.RTL,
     FailsafeAction.TERMINATE,
     FailsafeAction.LAND,
 ]
@@ -385,7 +385,7 @@ def _low_battery(k: Known) -> FailsafeAction:
     if k.p.com_low_bat_act == 2:
         return FailsafeAction.LAND
     empty = k.c.battery_warning is BatteryWarning.EMERGENCY
-    return FailsafeAction.LAND if empty and k.p.com_low_bat_act == 3 else FailsafeAction.RETURN
+    return FailsafeAction.LAND if empty and k.p.com_low_bat_act == 3 else FailsafeAction.RTL
 
 
 def _unflyable(k: Known) -> FailsafeAction:
@@ -393,10 +393,10 @@ def _unflyable(k: Known) -> FailsafeAction:
     mode, action = k.mode, FailsafeAction.NONE
     if mode is Mode.OFFBOARD and k.c.offboard_control_signal_lost:
         losses = [
-            (FailsafeAction.FALLBACK_POSITION, Mode.POSITION),
-            (FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+            (FailsafeAction.FALLBACK_POSCTRL, Mode.POSITION),
+            (FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE),
             (FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
-            (FailsafeAction.RETURN, Mode.RETURN),
+            (FailsafeAction.RTL, Mode.RETURN),
             (FailsafeAction.LAND, Mode.LAND),
             (FailsafeAction.HOLD, Mode.HOLD),
             (FailsafeAction.TERMINATE, Mode.TERMINATION),
@@ -406,7 +406,7 @@ def _unflyable(k: Known) -> FailsafeAction:
         action, mode = losses[k.p.com_obl_rc_act]
     steps = {
         0: [
-            (Mode.POSITION, FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+            (Mode.POSITION, FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE),
             (Mode.ALTITUDE, FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
         ],
         1: [
@@ -418,7 +418,7 @@ def _unflyable(k: Known) -> FailsafeAction:
         for at, then, into in steps:
             if mode is at and not _flies(at, k.c):
                 action, mode = then, into
-    return action if _flies(mode, k.c) else FailsafeAction.RETURN
+    return action if _flies(mode, k.c) else FailsafeAction.RTL
 
 
 def _flies(mode: Mode, c: Conditions) -> bool:
@@ -459,7 +459,7 @@ RULES: list[Callable[[Known], FailsafeAction]] = [
         else FailsafeAction.NONE
     ),
     lambda k: (
-        FailsafeAction.RETURN
+        FailsafeAction.RTL
         if k.mode is Mode.MISSION and k.c.mission_failure
         else FailsafeAction.NONE
     ),
@@ -468,7 +468,7 @@ RULES: list[Callable[[Known], FailsafeAction]] = [
         if k.c.wind_limit_exceeded
         else FailsafeAction.NONE
     ),
-    lambda k: FailsafeAction.RETURN if k.c.flight_time_limit_exceeded else FailsafeAction.NONE,
+    lambda k: FailsafeAction.RTL if k.c.flight_time_limit_exceeded else FailsafeAction.NONE,
     lambda k: (
         _pick(list(_LIMIT), k.p.com_pos_low_act, FailsafeAction.WARN)
         if k.c.local_position_accuracy_low and k.mode in (Mode.HOLD, Mode.MISSION)
@@ -485,7 +485,7 @@ RULES: list[Callable[[Known], FailsafeAction]] = [
         else FailsafeAction.NONE
     ),
     lambda k: (
-        {1: FailsafeAction.WARN, 3: FailsafeAction.RETURN}.get(
+        {1: FailsafeAction.WARN, 3: FailsafeAction.RTL}.get(
             k.p.com_fltt_low_act, FailsafeAction.NONE
         )
         if k.c.battery_low_remaining_time
@@ -499,7 +499,7 @@ RULES: list[Callable[[Known], FailsafeAction]] = [
         else FailsafeAction.NONE
     ),
     lambda k: (
-        {0: FailsafeAction.WARN, 1: FailsafeAction.RETURN, 2: FailsafeAction.LAND}.get(
+        {0: FailsafeAction.WARN, 1: FailsafeAction.RTL, 2: FailsafeAction.LAND}.get(
             k.p.com_imb_prop_act, FailsafeAction.NONE
         )
         if k.c.fd_imbalanced_prop
@@ -509,7 +509,7 @@ RULES: list[Callable[[Known], FailsafeAction]] = [
         {
             1: FailsafeAction.HOLD,
             2: FailsafeAction.LAND,
-            3: FailsafeAction.RETURN,
+            3: FailsafeAction.RTL,
             4: FailsafeAction.TERMINATE,
         }.get(k.p.com_act_fail_act, FailsafeAction.WARN)
         if k.c.fd_motor_failure
@@ -519,11 +519,11 @@ RULES: list[Callable[[Known], FailsafeAction]] = [
 ]
 
 _CHAIN = [
-    (FailsafeAction.FALLBACK_POSITION, Mode.POSITION),
-    (FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+    (FailsafeAction.FALLBACK_POSCTRL, Mode.POSITION),
+    (FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE),
     (FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
     (FailsafeAction.HOLD, Mode.HOLD),
-    (FailsafeAction.RETURN, Mode.RETURN),
+    (FailsafeAction.RTL, Mode.RETURN),
     (FailsafeAction.LAND, Mode.LAND),
     (FailsafeAction.DESCEND, Mode.DESCEND),
 ]
@@ -536,13 +536,9 @@ def second_opinion(k: Known) -> FailsafeAction:
         worst = next(
             (a for a, mode in _CHAIN if a >= worst and _flies(mode, k.c)), FailsafeAction.TERMINATE
         )
-    if (
-        k.mode in (Mode.LAND, Mode.RETURN)
-        and worst is FailsafeAction.RETURN
-        and _flies(k.mode, k.c)
-    ):
+    if k.mode in (Mode.LAND, Mode.RETURN) and worst is FailsafeAction.RTL and _flies(k.mode, k.c):
         return FailsafeAction.WARN
-    needless = worst in (FailsafeAction.RETURN, FailsafeAction.LAND)
+    needless = worst in (FailsafeAction.RTL, FailsafeAction.LAND)
     if k.mode is Mode.PRECISION_LAND and needless and _flies(k.mode, k.c):
         return FailsafeAction.WARN
     return worst

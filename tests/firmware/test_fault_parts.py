@@ -16,10 +16,10 @@ from airl_mav.core.frames import HOME, geodetic_to_local
 from airl_mav.faults.fault import Fault
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
+from firmware_sim.addons.fault_injection.failing_link import FailingEndpoint
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.autopilot.commander import CommanderState
-from firmware_sim.faults.fault_timeline import FaultTimeline
-from firmware_sim.faults.faulty_link import FailingEndpoint
+from firmware_sim.fault_timeline import FaultTimeline
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from firmware_sim.mavlink.codec import Encoder, dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint

@@ -19,11 +19,11 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import parameter_values
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from firmware_sim.addons.flight_log.flight_log import GRID_US
+from firmware_sim.addons.flight_log.topics import TOPICS
+from firmware_sim.addons.flight_log.ulog_writer import Topic, UlogWriter
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
-from firmware_sim.flight_log.flight_log import GRID_US
-from firmware_sim.flight_log.topics import TOPICS
-from firmware_sim.flight_log.ulog_writer import Topic, UlogWriter
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -94,7 +94,7 @@ def test_a_killed_writer_leaves_a_readable_part(tmp_path: Path) -> None:
     script = (
         "import os, sys\n"
         "from pathlib import Path\n"
-        "from firmware_sim.flight_log.ulog_writer import Topic, UlogWriter\n"
+        "from firmware_sim.addons.flight_log.ulog_writer import Topic, UlogWriter\n"
         "log = UlogWriter(Path(sys.argv[1]), 0, [Topic('t', ('float x',))], [], [])\n"
         "for i in range(5_000):\n"
         "    log.sample(0, i * 4_000, (float(i),))\n"

@@ -16,15 +16,17 @@ from scipy.spatial.transform import Rotation
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Obstacles
 from airl_mav.arena.ground import Ground
+from airl_mav.core.constants import TICK_S
 from airl_mav.envs.arena_batch import NOTHING, touches
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
+from firmware_sim.addons.auxiliary_estimation.simulated_sensors import PlantRangefinder
 from firmware_sim.interfaces import ActuatorControls
 from firmware_sim.plant.bullet_body import BulletWorld
 from firmware_sim.plant.contacts.convex import BREAKING_SHARE, MOST, ROW
 from firmware_sim.plant.contacts.ground_contact import near_ground, touch_ground
-from firmware_sim.plant.downward_sensors import PlantRangefinder
 from firmware_sim.plant.plant import Plant
+from firmware_sim.plant.sensors import Site
 from tests.firmware.test_kernel_body import HALF, HEIGHT, both
 from tests.firmware.test_rangefinder_plant import QUIET
 from tests.firmware.test_world import OFF
@@ -238,7 +240,7 @@ def test_on_the_level_ground_around_the_start_it_moves_as_without_hills() -> Non
 @pytest.mark.nightly
 def test_a_rangefinder_sees_hills_as_pybullet_s_rays_do() -> None:
     arena, rng = hills(), np.random.default_rng(3)
-    finder = PlantRangefinder(QUIET, arena, rng, 1.0)
+    finder = PlantRangefinder(QUIET, Site(arena, rng, 1.0, TICK_S))
     world = BulletWorld(arena, RADIUS)
     offset = np.array([QUIET.forward_m, QUIET.right_m, QUIET.down_m])
     for north, east in places(6, 40):
@@ -262,7 +264,7 @@ def test_a_rangefinder_sees_hills_as_pybullet_s_rays_do() -> None:
 def test_a_rangefinder_on_a_slope_reads_its_height_above_it() -> None:
     arena = hills()
     for north, east in places(7, 3, steepest=0.25):
-        finder = PlantRangefinder(QUIET, arena, np.random.default_rng(0), 1.0)
+        finder = PlantRangefinder(QUIET, Site(arena, np.random.default_rng(0), 1.0, TICK_S))
         start = touching_height(north, east, Rotation.identity())
         with both(arena) as plants:
             for plant in plants:

@@ -14,13 +14,14 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.signing import StoredSigning
+from firmware_sim.addons.ground_station_services.files import Storage
+from firmware_sim.addons.ground_station_services.ftp import FtpClient
 from firmware_sim.autopilot.autopilot_state import Arming
 from firmware_sim.mavlink import clients, codec, server, traffic
 from firmware_sim.mavlink.codec import Decoder, WireMessage
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.traffic import TlogWriter
-from firmware_sim.storage import Storage
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import BOOT_UNIX_US, RawClient, Rig, text_of
 from tests.support.memory_hub import MemoryHub
@@ -48,8 +49,9 @@ class Field:
             boot_unix_us=BOOT_UNIX_US,
             clock=clock,
             signing=signing,
-            storage=storage,
         )
+        if storage is not None:
+            self.server.vehicle_states[Storage] = storage
         self.run(50)
 
     def run(self, ticks: int) -> None:
@@ -284,7 +286,8 @@ def test_sessions_end_with_their_clients(tmp_path: Path) -> None:
         ftp(field.hub.client(port), 1, 4, b"file")
     field.run(1)
     links = field.server._links[0]
-    sessions = [client.context.ftp.session for client in links if client.context is not None]
+    contexts = [client.context for client in links if client.context is not None]
+    sessions = [context.state(FtpClient).session for context in contexts]
     files = [session.file for session in sessions if session.file is not None]
     assert len(files) == clients.MAX_CLIENTS
     links.forget_silent(field.autopilot.time_us + clients.SILENT_US + US_PER_S)

@@ -20,13 +20,12 @@ from mavsdk.plugins.ftp import Ftp, FtpError, FtpResult
 from pymavlink import mavftp, mavutil
 
 from airl_mav.profiles.parameters import SPECS
-from firmware_sim.mavlink.codec import dialect
+from firmware_sim.addons.ground_station_services.files import DATA_BYTES, Storage
+from firmware_sim.addons.ground_station_services.ftp import BURST_MESSAGES
+from firmware_sim.mavlink.codec import crc32part, dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, UdpEndpoint
 from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
-from firmware_sim.mavlink.services.ftp import BURST_MESSAGES, DATA_BYTES
-from firmware_sim.mavlink.services.transfers import crc32part
-from firmware_sim.storage import Storage
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import Bench, Pacer, RawClient, mavsdk_over_memory
 
@@ -51,8 +50,8 @@ class Card:
             [onboard_link(self.endpoint)],
             self.autopilot,
             boot_unix_us=0,
-            storage=Storage(folder),
         )
+        self.server.vehicle_states[Storage] = Storage(folder)
         self.client = RawClient(self.endpoint)
         self.sequence = 0
 
@@ -301,7 +300,7 @@ def test_a_burst_is_paced_and_ends_at_the_end(card: Card) -> None:
 
 
 def test_nobody_fills_the_disk(card: Card, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("firmware_sim.storage.GREATEST_BYTES", 400_000)
+    monkeypatch.setattr("firmware_sim.addons.ground_station_services.files.GREATEST_BYTES", 400_000)
     card.ask(LIST, b"/")
     assert card.ask(CREATE, b"big")[0] == ACK
     assert card.ask(WRITE, b"x", offset=1_000_000) == (NAK, bytes([FAIL_ERRNO, errno.ENOSPC]))

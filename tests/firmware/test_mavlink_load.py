@@ -12,11 +12,11 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
-from firmware_sim.flight_log.flight_log import FlightLog, LogFolder
+from firmware_sim.addons.flight_log.flight_log import FlightLog
+from firmware_sim.addons.ground_station_services.logs import PACKETS_PER_TICK
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import LEAST_PIECES_PER_TICK, PIECES_PER_TICK, MavlinkServer
-from firmware_sim.mavlink.services.logs import PACKETS_PER_TICK
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.memory_hub import MemoryHub
 
@@ -80,7 +80,7 @@ def test_what_comes_piece_by_piece_is_shared_tick_by_tick(tmp_path: Path, late: 
     (tmp_path / "flight-000.ulg").write_bytes(bytes(range(1, 256)) * 2_000)
     hub, autopilot, clock = MemoryHub(), KinematicAutopilot(), SimClock()
     log = FlightLog(tmp_path / "flight-001.ulg", autopilot.parameters, 0, 0)
-    autopilot.logs = folder = LogFolder(tmp_path, log)
+    autopilot.logs = folder = log.folder
     server = MavlinkServer([gcs_link(hub)], autopilot, boot_unix_us=0, clock=clock)
     clients = [hub.client(port, (100 + port, 190)) for port in range(CLIENTS)]
     got = [0] * CLIENTS

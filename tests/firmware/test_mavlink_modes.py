@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from firmware_sim.addons.ground_station_services.information import AVAILABLE
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.streams.status import AVAILABLE
 from tests.support.mavlink_clients import Rig
 
 REQUEST_MESSAGE, SET_STANDARD_MODE = 512, 262

@@ -7,8 +7,8 @@ import time
 import pytest
 from mavsdk.plugins.shell import Device, Shell
 
+from firmware_sim.addons.ground_station_services.shell import DATA_BYTES, MESSAGES_PER_TICK
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.shell import DATA_BYTES, MESSAGES_PER_TICK
 from tests.support.kinematic_autopilot import DEFAULT_PARAMETERS
 from tests.support.mavlink_clients import Rig, mavsdk_over_memory
 

@@ -14,8 +14,7 @@ from typing import Any
 
 import pytest
 
-from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.transfers import crc32part
+from firmware_sim.mavlink.codec import crc32part, dialect
 from tests.support.mavlink_clients import Rig
 
 MISSION, FENCE, RALLY = 0, 1, 2

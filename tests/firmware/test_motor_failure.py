@@ -10,9 +10,9 @@ import pytest
 
 from airl_mav.core.constants import TICK_S
 from airl_mav.vehicle.airframe import Airframe, lag, settle, steady_speed
+from firmware_sim.addons.fault_injection.failing_parts import slowed, weakened
 from firmware_sim.autopilot.failsafes.detectors import MotorFailure, Undercurrent
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.faults.faulty_controller import slowed, weakened
 from firmware_sim.interfaces import ActuatorControls
 from firmware_sim.mavlink.telemetry import payload
 from tests.firmware.test_fault_parts import witnessed

@@ -8,9 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-from airl_mav.faults.kinds import PHASES
+import pytest
+
+from airl_mav.faults.fault import PHASES
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.flight_modes import BY_CUSTOM_MODE, Mode
 from firmware_sim.autopilot.modes import implementations
+from firmware_sim.autopilot.parameter_store import Parameters
 from tests.support.processes import ROOT
 
 AUTOPILOT = ROOT / "firmware_sim" / "autopilot"
@@ -119,6 +124,15 @@ def test_a_mode_is_added_with_two_files_and_flown(tmp_path: Path) -> None:
     assert found["unsupported"] == 0xFE << 23
     north, east, down = found["way"]
     assert 3.5 < east < 5.0 and abs(north) < 0.4 and abs(down) < 0.4
+
+
+def test_a_mode_of_a_missing_addon_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    left = {mode: new for mode, new in implementations().items() if mode is not Mode.ORBIT}
+    monkeypatch.setattr("firmware_sim.autopilot.guidance.implementations", lambda: left)
+    autopilot = BuiltinAutopilot(Parameters())
+    assert autopilot.set_mode(Mode.ORBIT) is Result.TEMPORARILY_REJECTED
+    texts = [message.text for message in autopilot.take_messages()]
+    assert texts == ["Switching to Orbit is currently not available"]
 
 
 def test_the_table_is_complete() -> None:

@@ -11,30 +11,37 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
-from airl_mav.addons.fault_matrix.matrix import fly_fault
+from airl_mav.addons.fault_matrix.matrix import FITTED_CASES, Case, fly_fault
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import HOME, Vector
-from airl_mav.faults.kinds import FITTED_CASES, Case
 from airl_mav.profiles.vehicle import OpticalFlow as Profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
+from firmware_sim.addons.auxiliary_estimation.optical_flow import (
+    STUCK,
+    OpticalFlowFusion,
+    flow_by_errors,
+)
+from firmware_sim.addons.auxiliary_estimation.sensors import OPTICAL_FLOW, optical_flow_rad
+from firmware_sim.addons.auxiliary_estimation.simulated_sensors import (
+    BEST,
+    INVALID,
+    PlantOpticalFlow,
+)
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.autopilot.optical_flow import STUCK, OpticalFlowFusion, flow_by_errors
 from firmware_sim.engine.dynamics import WIDTH
 from firmware_sim.external import hil_messages as hil
-from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import FlowReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder, layout
-from firmware_sim.mavlink.streams.sensors import optical_flow_rad
 from firmware_sim.mavlink.telemetry import payload
-from firmware_sim.plant.downward_sensors import BEST, INVALID, PlantOpticalFlow
+from firmware_sim.plant.sensors import Site
 from firmware_sim.simulation import TOUCHDOWN_M_S
 from tests.support import mavlink_clients
-from tests.support.flight_rig import Rig, velocity_setpoint
+from tests.support.flight_rig import Rig, aids_of, velocity_setpoint
 
 NAN = math.nan
 QUIET = Profile(
@@ -59,7 +66,7 @@ def row_of(
 
 def seen(profile: Profile, row: Vector, arena: Arena | None = None) -> FlowReading:
     """Return what is measured over an interval of the same motion."""
-    sensor = PlantOpticalFlow(profile, arena, np.random.default_rng(1), 1.0, TICK_S)
+    sensor = PlantOpticalFlow(profile, Site(arena, np.random.default_rng(1), 1.0, TICK_S))
     sensor.read(row, 0)
     for _ in range(round(INTERVAL_S / TICK_S)):
         sensor.pass_tick(row)
@@ -122,7 +129,7 @@ def test_out_of_its_limits_it_says_so(row: Vector) -> None:
 
 def test_its_noise_is_that_of_the_profile() -> None:
     profile = QUIET.model_copy(update={"noise_rad_s": 0.2})
-    sensor = PlantOpticalFlow(profile, None, np.random.default_rng(2), 1.0, TICK_S)
+    sensor = PlantOpticalFlow(profile, Site(None, np.random.default_rng(2), 1.0, TICK_S))
     row, found = row_of(2.0), []
     sensor.read(row, 0)
     for _ in range(2_000):
@@ -183,7 +190,7 @@ def flown_by_flow(**changes: float) -> Rig:
 
 
 def flow_of(rig: Rig) -> OpticalFlowFusion:
-    found = rig.ap.estimator.flow
+    found = aids_of(rig).flow
     assert found is not None
     return found
 
@@ -333,7 +340,7 @@ def read(message: Any) -> list[FlowReading]:
     rig = mavlink_clients.Rig()
     rig.client.send(message)
     rig.bench.tick()
-    return rig.autopilot.flows
+    return rig.autopilot.received["flow"]
 
 
 def test_what_a_client_s_sensor_says() -> None:
@@ -358,7 +365,7 @@ def test_what_is_no_measurement_is_not_taken(changes: dict[str, Any]) -> None:
     before = flow_of(rig).reading_us
     tampered(rig, lambda _: None)
     rig.run(0.1)
-    rig.ap.look_down(reading)
+    rig.ap.receive("flow", reading)
     assert flow_of(rig).reading_us == before
 
 
@@ -377,18 +384,17 @@ def test_what_clients_and_the_log_are_told() -> None:
     rig = flown_by_flow()
     rig.take_off(2.5)
     state = rig.ap.state()
-    told = state.flow
-    assert told is not None
+    told, time_us = state.readings["flow"]
     sent = optical_flow_rad(state)
     assert sent is not None
-    assert sent[:5] == (state.flow_us, 0, 20_000, *told.flow.tolist())
+    assert sent[:5] == (time_us, 0, 20_000, *told.flow.tolist())
     frame = Encoder().frame(layout("OPTICAL_FLOW_RAD"), layout("OPTICAL_FLOW_RAD").payload(sent))
     (message,) = dialect.MAVLink(None).parse_buffer(frame)
     assert message.integrated_x == pytest.approx(told.flow.item(0), rel=1e-6)
     assert (message.quality, message.distance) == (BEST, -1.0)
     # The sensor has no gyro: the vehicle's turn stands in.
     assert np.isfinite(sent[5:8]).all() and sent[5:8] == tuple(told.turned.tolist())
-    logged = topics.optical_flow(topics.Moment(state, rig.truth, 0))
+    logged = OPTICAL_FLOW.topics["vehicle_optical_flow"].values(state)
     assert logged is not None
     assert logged[2:4] == tuple(told.flow.tolist()) and logged[8] == 20_000
     tampered(rig, lambda _: None)

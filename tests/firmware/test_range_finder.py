@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from airl_mav.addons.fault_matrix.matrix import fly_fault
+from airl_mav.addons.fault_matrix.matrix import FITTED_CASES, STANDS, Case, fly_fault
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import HOME
-from airl_mav.faults.kinds import FITTED_CASES, STANDS, Case
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
+from firmware_sim.addons.auxiliary_estimation.range_finder import RangeFinder
+from firmware_sim.addons.auxiliary_estimation.sensors import distance_sensor
+from firmware_sim.addons.flight_log import topics
 from firmware_sim.autopilot.autopilot_state import Clearance, Result
 from firmware_sim.autopilot.error_state import V
 from firmware_sim.autopilot.flight_modes import Mode
@@ -26,17 +28,15 @@ from firmware_sim.autopilot.inputs import Source, Sticks
 from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.modes.automatic import landing_speed
 from firmware_sim.autopilot.modes.sticks import Piloting, TerrainHold
-from firmware_sim.autopilot.range_finder import RangeFinder
 from firmware_sim.engine.record import LANDING, new_controller
 from firmware_sim.engine.ticks import detect_record
 from firmware_sim.external import hil_messages as hil
-from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import DOWNWARD, DistanceReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.mavlink.streams import sensors, status
 from firmware_sim.simulation import TOUCHDOWN_M_S
 from tests.support import mavlink_clients
-from tests.support.flight_rig import Rig, velocity_setpoint
+from tests.support.flight_rig import Rig, aids_of, velocity_setpoint
 
 NAN = math.nan
 CENTRED = Sticks(0.0, 0.0, 0.0, 0.0)
@@ -79,7 +79,7 @@ def indoors(arena: Arena | None = None, *, gps: bool = False, **changes: float) 
 
 
 def finder(rig: Rig) -> RangeFinder:
-    found = rig.ap.estimator.range
+    found = aids_of(rig).range
     assert found is not None
     return found
 
@@ -131,11 +131,15 @@ def test_a_flight_over_a_box() -> None:
         assert np.mean(part) == pytest.approx(0.0, abs=0.02)
         assert np.std(part) < 0.04
     state = rig.ap.state()
-    ground, told, down = state.clearance, state.distance, float(state.estimate.position[2])
+    ground, told, down = (
+        state.clearance,
+        state.readings["distance"].reading,
+        float(state.estimate.position[2]),
+    )
     assert ground is not None and told is not None and ground.by_range
     terrain, bottom = sensors.clearance(state, float(state.estimate.position[2]))
     assert bottom == ground.dist_bottom_m and terrain == -down - ground.dist_bottom_m
-    sent = sensors.distance_sensor(state)
+    sent = distance_sensor(state)
     assert sent is not None
     assert sent[1:7] == (10, 1200, int(told.distance_m * 100.0), 0, 0, DOWNWARD)
     sent_status = status.estimator_status(state)
@@ -166,7 +170,7 @@ def test_ranges_that_are_not_fused_tell_no_ground() -> None:
     state = rig.ap.state()
     terrain, bottom = sensors.clearance(state, float(state.estimate.position[2]))
     assert math.isnan(terrain) and math.isnan(bottom)
-    assert sensors.distance_sensor(rig.ap.state()) is not None
+    assert distance_sensor(rig.ap.state()) is not None
 
 
 def test_the_ground_as_the_reference_of_height() -> None:
@@ -368,7 +372,7 @@ def read(message: Any) -> list[DistanceReading]:
     rig = mavlink_clients.Rig()
     rig.client.send(message)
     rig.bench.tick()
-    return rig.autopilot.distances
+    return rig.autopilot.received["distance"]
 
 
 def distance_message(**changes: Any) -> Any:
@@ -417,11 +421,11 @@ def test_a_client_s_rangefinder_tells_the_ground_and_another_direction_does_not(
     def tell(reading: Callable[[], DistanceReading]) -> None:
         every[0] += 1
         if every[0] % 10 == 0:
-            rig.ap.measure_distance(reading())
+            rig.ap.receive("distance", reading())
 
     forward = DistanceReading(4.0, 0.1, 12.0, quality=100, orientation=0)
     rig.run(2.0, lambda: tell(lambda: forward))
-    assert rig.ap.state().distance == forward
+    assert rig.ap.state().readings["distance"].reading == forward
     assert not clearance(rig).valid
     down = DistanceReading(0.3, 0.1, 12.0, quality=100)
     rig.run(2.0, lambda: tell(lambda: down))
@@ -429,7 +433,7 @@ def test_a_client_s_rangefinder_tells_the_ground_and_another_direction_does_not(
     assert clearance(rig).dist_bottom_m == pytest.approx(0.3, abs=0.02)
     # Without new ranges, the message stops and fusion ends.
     rig.run(1.0)
-    assert sensors.distance_sensor(rig.ap.state()) is None
+    assert distance_sensor(rig.ap.state()) is None
     assert not finder(rig).tells_ground
 
 
@@ -466,12 +470,12 @@ def test_arming_waits_for_a_sensor_that_is_asked_for() -> None:
     assert not math.isnan(rig.said("Preflight Fail: Distance Sensor 0 missing"))
     assert not status.sensor_bits(rig.ap.state())[0] & bit
     reading = DistanceReading(0.3, 0.1, 12.0, quality=100)
-    rig.run(0.5, lambda: rig.ap.measure_distance(reading))
+    rig.run(0.5, lambda: rig.ap.receive("distance", reading))
     assert all(field & bit for field in status.sensor_bits(rig.ap.state()))
     rig.run(1.5)
     present, enabled, healthy = status.sensor_bits(rig.ap.state())
     assert present & bit and enabled & bit and not healthy & bit
     assert rig.ap.arm(force=False) is Result.TEMPORARILY_REJECTED
     assert not math.isnan(rig.said("Preflight Fail: no valid data from distance sensor 0"))
-    rig.run(0.5, lambda: rig.ap.measure_distance(reading))
+    rig.run(0.5, lambda: rig.ap.receive("distance", reading))
     assert rig.ap.arm(force=False) is Result.ACCEPTED

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.range_finder import RangeConsistency, RangeSensor
+from firmware_sim.addons.auxiliary_estimation.range_finder import RangeConsistency, RangeSensor
 from firmware_sim.interfaces import DistanceReading
 
 LEAST_M, GREATEST_M = 0.5, 10.0

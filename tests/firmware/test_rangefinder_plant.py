@@ -11,21 +11,22 @@ from scipy.spatial.transform import Rotation
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.projection import MIN_DEPTH_M
-from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.constants import TICK_S, TICK_US, US_PER_S
 from airl_mav.core.frames import Vector, ned_to_enu
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import Rangefinder, load_vehicle
+from firmware_sim.addons.auxiliary_estimation.simulated_sensors import PlantRangefinder
 from firmware_sim.engine.dynamics import POSITION, QUATERNION
 from firmware_sim.interfaces import ActuatorControls
-from firmware_sim.plant.downward_sensors import PlantRangefinder
 from firmware_sim.plant.plant import Plant
+from firmware_sim.plant.sensors import Site
 
 QUIET = Rangefinder(rate_hz=50.0, least_m=0.1, greatest_m=30.0, noise_m=0.0)
 
 
 def finder(arena: Arena | None, profile: Rangefinder = QUIET, seed: int = 1) -> PlantRangefinder:
-    return PlantRangefinder(profile, arena, np.random.default_rng(seed), 1.0)
+    return PlantRangefinder(profile, Site(arena, np.random.default_rng(seed), 1.0, TICK_S))
 
 
 def row_at(position: Vector, attitude: Rotation) -> Vector:

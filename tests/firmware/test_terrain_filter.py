@@ -7,10 +7,10 @@ import pytest
 
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.frames import Vector
+from firmware_sim.addons.auxiliary_estimation.terrain_filter import STEP_S, TerrainFilter
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.error_state import KernelFilter, selecting
 from firmware_sim.autopilot.filter_filterpy import FilterpyFilter
-from firmware_sim.autopilot.terrain_filter import STEP_S, TerrainFilter
 
 N = es.N_STATES + 1
 Z = es.POS + 2

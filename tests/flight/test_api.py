@@ -18,7 +18,7 @@ from airl_mav.experiments.campaign import EpisodeSaver
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import FlownEpisode
-from airl_mav.report import shown_flights
+from airl_mav.report import run_report
 from airl_mav.report.comparison import show
 from tests.support.campaign_kit import same_runs
 from tests.support.command_line import airl, option_words
@@ -78,7 +78,7 @@ def test_a_run_is_read_again(flown: Run, tmp_path: Path) -> None:
 def test_its_report_is_a_page(
     flown: Run, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(shown_flights, "MAX_PICTURED", 0)
+    monkeypatch.setattr(run_report, "MAX_PICTURED", 0)
     with page_alone():
         page = flown.report()
     assert page == flown.path / "report.html"
@@ -200,7 +200,7 @@ def test_a_run_that_was_broken_off_is_an_error(
 def test_a_run_of_an_earlier_version_is_read_but_not_gone_on_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shown_flights, "MAX_PICTURED", 0)
+    monkeypatch.setattr(run_report, "MAX_PICTURED", 0)
     out = tmp_path / "run"
     shutil.copytree(EARLIER_RUN, out)
     run = load_run(out)

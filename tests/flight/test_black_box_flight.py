@@ -12,6 +12,7 @@ from pydantic import TypeAdapter
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from airl_mav.addons.recordings.recorded_flight import episode_of, take_in
 from airl_mav.addons.refit.refly import FLOWN, REHEARSED, from_its_start, refly
 from airl_mav.black_box.mcap_file import BlackBoxFile, read_black_box
 from airl_mav.black_box.messages import (
@@ -34,9 +35,7 @@ from airl_mav.flight.episode_record import Setup
 from airl_mav.flight.judge import Outcome
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.lockstep.stage import LockstepStage
-from airl_mav.report.comparison.runs import compare_folders
-from airl_mav.report.recorded_flight import episode_of
-from airl_mav.report.recording_folder import take_in
+from airl_mav.report.comparison.show import compare_folders
 from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.model import PilotSettings
 from airl_mav.scenario.stand_alone import StandAloneCompanion

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from airl_mav import Scenario, rehearse
+from airl_mav.addons.recordings.recorded_flight import path_of, stamps_of
 from airl_mav.black_box.mcap_file import read_black_box
 from airl_mav.core.frames import quat_to_euler
 from airl_mav.flight.judge import Outcome
@@ -19,7 +20,6 @@ from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.actions import Attitude, BodyRates
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import FlownEpisode, load
-from airl_mav.report.recorded_flight import path_of, stamps_of
 from airl_mav.scenario.resolve import resolve
 from airl_mav.vehicle_log import align, read_vehicle_log
 from tests.support.processes import ROOT

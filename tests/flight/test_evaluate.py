@@ -31,12 +31,12 @@ from airl_mav.experiments import campaign, gym_flier
 from airl_mav.experiments.campaign import EpisodeSaver
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.policy.card import load_card
-from airl_mav.policy.observation_spec import Encoded
+from airl_mav.policy.layouts import Encoded
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profiles_dir
 from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, load
-from airl_mav.report import shown_flights
+from airl_mav.report import run_report
 from airl_mav.report.comparison import show
 from airl_mav.report.run_arenas import arena_of
 from airl_mav.report.run_report import write_report
@@ -71,7 +71,7 @@ def evaluate(*policies: str | Path, page: bool = False, **options: Any) -> tuple
 @pytest.fixture(scope="module", autouse=True)
 def _few_pictures() -> Iterator[None]:
     """Pictures take longer than flights."""
-    with patch.object(shown_flights, "MAX_PICTURED", 2):
+    with patch.object(run_report, "MAX_PICTURED", 2):
         yield
 
 
@@ -378,9 +378,9 @@ def test_the_page_says_what_is_modelled_and_shows_no_real_time(
         assert absent not in text
     # The four stages that vary from decision to decision and their timeline, energy, all flights;
     # a map and a figure over time for each flight that is pictured.
-    assert shown_flights.MAX_PICTURED < EPISODES
-    assert page.images == 4 + 3 + 2 * shown_flights.MAX_PICTURED
-    assert f"Pictures of {shown_flights.MAX_PICTURED} of {EPISODES} flights" in page.words
+    assert run_report.MAX_PICTURED < EPISODES
+    assert page.images == 4 + 3 + 2 * run_report.MAX_PICTURED
+    assert f"Pictures of {run_report.MAX_PICTURED} of {EPISODES} flights" in page.words
     pictured = {int(p.name[7:10]) for p in run_.path.glob("flight-*-map.png")}
     assert pictured <= {e.index for e in run_.episodes if e.outcome is not Outcome.SUCCESS}
 
@@ -411,8 +411,8 @@ def test_a_long_table_is_cut_short_and_says_so(
 ) -> None:
     run_, text = greedy
     assert f"25 of {EPISODES} flights, those that failed first; all: episodes.jsonl." in text
-    monkeypatch.setattr(shown_flights, "MAX_FLIGHTS", 5)
-    monkeypatch.setattr(shown_flights, "MAX_PICTURED", 1)
+    monkeypatch.setattr(run_report, "MAX_FLIGHTS", 5)
+    monkeypatch.setattr(run_report, "MAX_PICTURED", 1)
     shutil.copytree(run_.path, tmp_path / "copy")
     path = write_report(tmp_path / "copy")
     page = Page(path.read_text(encoding="utf-8"))
@@ -583,7 +583,7 @@ def test_what_is_finished_is_shown_again_and_not_flown(
 def test_a_page_says_what_was_required_last(
     greedy: tuple[LoadedRun, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shown_flights, "MAX_PICTURED", 0)
+    monkeypatch.setattr(run_report, "MAX_PICTURED", 0)
     shutil.copytree(greedy[0].path, tmp_path / "run")
     code, _ = evaluate("greedy", require="success >= 99 %", out=tmp_path / "run", **DENSE)
     assert code == 3
@@ -729,7 +729,7 @@ def test_seeds_of_the_training_are_pointed_out(tmp_path: Path) -> None:
 def test_a_table_of_policies_and_arenas(
     linear: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shown_flights, "MAX_PICTURED", 0)
+    monkeypatch.setattr(run_report, "MAX_PICTURED", 0)
     out, arenas = tmp_path / "matrix", ("no-obstacles", "static-obstacles")
     code, text = evaluate("greedy", linear, arena=arenas, episodes=8, seed=3, page=True, out=out)
     assert code == 0

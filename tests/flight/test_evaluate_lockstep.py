@@ -26,7 +26,7 @@ from airl_mav.experiments.live import fly_live
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy.card import load_card
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, load
-from airl_mav.report import shown_flights
+from airl_mav.report import run_report
 from airl_mav.report.comparison import show
 from airl_mav.report.run_report import write_report
 from airl_mav.scenario.model import Scenario
@@ -59,7 +59,7 @@ def evaluate(*policies: str | Path, page: bool = False, **options: Any) -> tuple
 @pytest.fixture(scope="module", autouse=True)
 def _few_pictures() -> Iterator[None]:
     """Pictures take longer than flights."""
-    with patch.object(shown_flights, "MAX_PICTURED", 1):
+    with patch.object(run_report, "MAX_PICTURED", 1):
         yield
 
 

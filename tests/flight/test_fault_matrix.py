@@ -11,6 +11,10 @@ from rich.console import Console
 from airl_mav.addons.fault_matrix import command as faults
 from airl_mav.addons.fault_matrix import matrix as fault_matrix
 from airl_mav.addons.fault_matrix.matrix import (
+    CASES,
+    FALLS,
+    MATRIX_PHASES,
+    End,
     FaultFlight,
     MatrixCell,
     cell_text,
@@ -20,9 +24,9 @@ from airl_mav.addons.fault_matrix.matrix import (
 )
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.faults.fault import Fault
-from airl_mav.faults.kinds import CASES, FALLS, MATRIX_PHASES, End, Phase
+from airl_mav.faults.kinds import Phase
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.report.table import print_table
+from airl_mav.report.document import print_table
 from tests.support.flight_rig import quad
 
 

@@ -14,7 +14,7 @@ from airl_mav import load_run
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments.campaign import EpisodeSaver
 from airl_mav.rehearsal.run_folder import FlownEpisode
-from airl_mav.report import shown_flights
+from airl_mav.report import run_report
 from airl_mav.report.comparison.comparison_model import load_comparison
 from airl_mav.report.run_report import write_report
 from tests.support.command_line import airl, option_words
@@ -25,7 +25,7 @@ GREEDY = ("greedy", *option_words(arena="no-obstacles", seed=20))
 
 @pytest.fixture(autouse=True)
 def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(shown_flights, "MAX_PICTURED", 0)
+    monkeypatch.setattr(run_report, "MAX_PICTURED", 0)
     with page_alone():
         yield
 

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from airl_mav import Scenario, load_run, rehearse
+from airl_mav.addons.notebook.notebook import run_html
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.notebook import run_html
 from tests.support.processes import ROOT
 
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
@@ -92,7 +92,7 @@ def test_a_run_shows_itself(episodes: int, tmp_path: Path) -> None:
     asked: dict[str, Any] = {"policy": "greedy", "arena": "no-obstacles", "level": "gym"}
     run = rehearse(Scenario(episodes=episodes, seed=20, **asked), out=tmp_path / "run")
     before = sorted(tmp_path.rglob("*"))
-    html = run._repr_html_()
+    html = run._repr_html_() or ""
     assert sorted(tmp_path.rglob("*")) == before, "to show it writes nothing"
     check_picture(html)
     rate = run.quality.success_rate
@@ -110,7 +110,7 @@ def test_a_run_without_flights_or_profiles_shows_itself(tmp_path: Path) -> None:
     arena.write_text(shipped.read_text(encoding="utf-8"), encoding="utf-8")
     run = rehearse(Scenario(arena=str(arena), **asked), out=tmp_path / "run")
     arena.unlink()
-    check_picture(load_run(run.path)._repr_html_())
+    check_picture(load_run(run.path)._repr_html_() or "")
     (tmp_path / "run" / "episodes.jsonl").write_bytes(b"")
     html = run_html(load(run.path))
     assert "no flight was finished" in html

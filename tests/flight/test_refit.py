@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from airl_mav.addons.recordings.recorded_flight import take_in
 from airl_mav.addons.refit.flown import flown_of
 from airl_mav.addons.refit.refit import Refit, refit, refit_together
 from airl_mav.addons.refit.refit_command import RefitOptions
@@ -36,7 +37,6 @@ from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.recording_folder import take_in
 from airl_mav.report.tracking import track
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.scenario_file import read_scenario_file

@@ -44,7 +44,7 @@ from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load, open_folder
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
-from firmware_sim.faults.fault_timeline import Acted
+from firmware_sim.fault_timeline import Acted
 from firmware_sim.recording import fault_arrays
 from tests.support.run_demo import demo_arena, demo_episode
 

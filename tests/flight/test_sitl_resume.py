@@ -24,12 +24,12 @@ from airl_mav.core.errors import UsageError
 from airl_mav.experiments import live
 from airl_mav.experiments.live import FlownRun
 from airl_mav.rehearsal import run_folder
+from airl_mav.rehearsal.live_view import ViewEnds
 from airl_mav.rehearsal.observer import LiveObserver
 from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load
 from airl_mav.scenario.aircraft import Ports
 from airl_mav.scenario.resolve import ResolvedScenario
-from airl_mav.view.ends import ViewEnds
 from tests.support.processes import write_arena
 from tests.support.run_demo import demo_arena, demo_episode
 

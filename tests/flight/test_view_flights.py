@@ -10,26 +10,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from airl_mav.flight.validity import BY_HAND
-from airl_mav.lockstep.lockstep_flight import fly
-from airl_mav.rehearsal.observer import Observer
-from airl_mav.rehearsal.rehearsal import Rehearsal
-from airl_mav.rehearsal.run_folder import FlownEpisode, load, open_folder
-from airl_mav.rehearsal.view_observer import ViewObserver
-from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.resolve import resolve
-from airl_mav.view.ends import ViewEnds
-from airl_mav.view.feed import Ends
-from airl_mav.view.shown import Shown
-from airl_mav.view.view_messages import (
+from airl_mav.addons.view.taps import ViewObserver
+from airl_mav.addons.view.view_messages import (
     CameraImage,
     Decided,
     Episode,
     Flight,
     PhaseStart,
+    Shown,
     Steering,
     VehicleState,
 )
+from airl_mav.addons.view.viewer import Ends
+from airl_mav.flight.judge import BY_HAND
+from airl_mav.lockstep.lockstep_flight import fly
+from airl_mav.rehearsal.live_view import ViewEnds
+from airl_mav.rehearsal.observer import Observer
+from airl_mav.rehearsal.rehearsal import Rehearsal
+from airl_mav.rehearsal.run_folder import FlownEpisode, load, open_folder
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
 from tests.support.browser import CHROMIUM, Page, browser
 from tests.support.lockstep_kit import SEED, demo_scenario
 from tests.support.ports import choose_ports

@@ -27,7 +27,7 @@ import numpy as np
 from airl_mav.arena.generate import local_bounds
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.policy.layouts import boxes, encode_layout
-from airl_mav.policy.observation_spec import Box
+from airl_mav.policy.layouts import Box
 
 
 class Tilted:

@@ -25,8 +25,8 @@ from airl_mav.rehearsal.run_folder import RunFolder
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from firmware_sim.faults.fault_timeline import Acting
-from firmware_sim.faults.faulty_controller import gust_at
+from firmware_sim.addons.fault_injection.failing_parts import gust_at
+from firmware_sim.fault_timeline import Acting
 from tests.learning.test_fleet import ENDLESS, OPEN, VEHICLE, PlantPilot, command
 from tests.support.blown import fly_blown
 
@@ -86,7 +86,7 @@ def test_a_gust_rises_and_falls_as_one_minus_the_cosine() -> None:
 
 @pytest.mark.parametrize("words", ["at offboard+1s for 1s", "at offboard+700ms", ""])
 def test_late_frames_come_in_order(words: str) -> None:
-    """Check that frames never overtake, as in a queue (`firmware_sim.faults.faulty_camera`)."""
+    """Check that frames never overtake, as with `failing_parts.FailingCamera`."""
     cameras = navigation(f"camera delay 250ms {words}").cameras
     cameras.begin(0, 5)
     failing = cameras._late[0]

@@ -14,29 +14,29 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from airl_mav.envs.sb3 import NavigationVecEnv
-from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.envs.vector import NavigationVectorEnv
-from airl_mav.profiles.loading import load_profile
-from airl_mav.training import training_run
-from airl_mav.training.config import TrainingConfig
-from airl_mav.training.training_folder import TrainingProgress
-from airl_mav.training.watched_training import EpisodeReplay, Taped, WatchedTraining
-from airl_mav.view.ends import ViewEnds
-from airl_mav.view.feed import Ends
-from airl_mav.view.shown import Shown
-from airl_mav.view.view_messages import (
+from airl_mav.addons.view.view_messages import (
     CameraImage,
     Decided,
     Episode,
     Flight,
     PhaseStart,
     Said,
+    Shown,
     Steering,
     Told,
     Trained,
     VehicleState,
 )
+from airl_mav.addons.view.viewer import Ends
+from airl_mav.addons.view.watched_training import EpisodeReplay, Taped, WatchedTraining
+from airl_mav.envs.sb3 import NavigationVecEnv
+from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.envs.vector import NavigationVectorEnv
+from airl_mav.profiles.loading import load_profile
+from airl_mav.rehearsal.live_view import ViewEnds
+from airl_mav.training import training_run
+from airl_mav.training.config import TrainingConfig
+from airl_mav.training.training_folder import TrainingProgress
 from tests.support.browser import CHROMIUM, browser
 from tests.support.processes import running, wait_until
 from tests.support.scene import has_drawn

@@ -17,19 +17,18 @@ from rich.console import Console
 from airl_mav import Scenario, rehearse
 from airl_mav.cli import report_command
 from airl_mav.core.errors import UsageError
-from airl_mav.flight.paired import tango
+from airl_mav.flight.statistics import tango
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder
 from airl_mav.report.comparison.comparison_model import Comparison
 from airl_mav.report.comparison.figures import cumulated, flight_panels
-from airl_mav.report.comparison.runs import compare_folders
-from airl_mav.report.comparison.show import write_comparison
+from airl_mav.report.comparison.show import compare_folders, write_comparison
 from airl_mav.report.comparison.tables import (
     facts_table,
     pair_sentences,
     runs_table,
     stages_table,
 )
-from airl_mav.report.flights_above import flight_pictures
+from airl_mav.report.run_figures import flight_pictures
 from airl_mav.report.theme import line_style
 from tests.report.test_report import Page
 from tests.support.page_alone import page_alone

@@ -17,9 +17,11 @@ from pyulog import ULog
 from scipy.spatial.transform import Rotation, Slerp
 
 from airl_mav import Scenario, rehearse
-from airl_mav.addons.export_log.files import flight_of
+from airl_mav.addons.export_log.command import flight_of
 from airl_mav.addons.export_log.recorded import RecordedFlight
 from airl_mav.addons.export_log.ulog_log import row, samples, write_ulog
+from airl_mav.addons.recordings.recorded_flight import episode_of
+from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.arena.generate import generate
 from airl_mav.black_box.mcap_file import BlackBoxFile, read_black_box
 from airl_mav.black_box.messages import Decision, End, Latency, Phase, Telemetry
@@ -31,8 +33,6 @@ from airl_mav.latency.stamps import STAMPS
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.report.recorded_flight import episode_of
-from airl_mav.report.replay.replayed_flight import ReplayedRun
 from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here
 from tests.support.lenses import angles

@@ -13,16 +13,18 @@ from scipy import stats
 
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.paired import (
+from airl_mav.flight.statistics import (
+    BOOTSTRAP_SEED,
+    RESAMPLES,
     Change,
+    Estimate,
     PairedComparison,
     compare_means,
     compare_pairs,
     median_ratio,
     percent_change,
 )
-from airl_mav.flight.quality import Leg, Quality
-from airl_mav.flight.statistics import BOOTSTRAP_SEED, RESAMPLES, Estimate
+from airl_mav.flight.trajectory import Leg, Quality
 from airl_mav.profiles.published import PublishedRun, load_published, published_gap
 
 # --- one gap

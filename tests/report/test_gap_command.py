@@ -31,7 +31,7 @@ from airl_mav.experiments.gap import (
     TRAINING_LATENCY_SEED,
     declare_gap,
 )
-from airl_mav.flight.paired import tango
+from airl_mav.flight.statistics import tango
 from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.rehearsal.run_folder import FlownEpisode

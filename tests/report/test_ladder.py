@@ -28,7 +28,7 @@ from airl_mav.experiments.campaign import Cell, EpisodeSaver
 from airl_mav.experiments.evaluate import declare_ladder
 from airl_mav.experiments.experiment import make_cell
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.paired import tango
+from airl_mav.flight.statistics import tango
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load
 from airl_mav.report.comparison import show
 from airl_mav.report.comparison.comparison_model import Comparison, RunEntry, load_comparison
@@ -36,8 +36,8 @@ from airl_mav.report.comparison.figures import contrast_pictures
 from airl_mav.report.comparison.ladder_page import other_differences, split_table
 from airl_mav.report.comparison.show import build_comparison, write_comparison
 from airl_mav.report.comparison.tables import contrast_table, runs_table
+from airl_mav.report.document import TableView
 from airl_mav.report.measures import MEASURES
-from airl_mav.report.table import TableView
 from airl_mav.scenario.model import Scenario
 from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here

@@ -15,8 +15,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report import run_report, theme
 from airl_mav.report.document import Section
-from airl_mav.report.run_report import SECTIONS, PageSection, build_page
-from airl_mav.report.shown_flights import ReportInput
+from airl_mav.report.run_report import SECTIONS, PageSection, ReportInput, build_page
 from tests.support.page_alone import unpacked
 from tests.support.run_demo import write_demo_run
 

@@ -15,7 +15,7 @@ from airl_mav.experiments.evaluate import evaluate
 from airl_mav.experiments.experiment import rehearse
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.card import load_card
-from airl_mav.report.table import Column, TableView, write_table
+from airl_mav.report.document import Column, TableView, write_table
 from airl_mav.scenario.model import DEFAULT_POLICY, Scenario
 from published import coverage, flying, pages, record, tables_policies
 from published.behaviour import read_behaviour

@@ -11,6 +11,7 @@ from PIL import Image, ImageSequence
 from rich.console import Console
 
 from airl_mav.addons.render.camera_pictures import CameraMotion, _rates, optical_flow, velocities_of
+from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.arena.generate import generate
 from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
@@ -22,7 +23,6 @@ from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.report.replay.replayed_flight import ReplayedRun
 from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.run_demo import write_demo_run
 

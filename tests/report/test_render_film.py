@@ -11,13 +11,13 @@ from PIL import Image, ImageSequence
 from rich.console import Console
 
 from airl_mav.addons.render.camera_pictures import Drawn, Shown, film, moments, still, write_film
+from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
 from airl_mav.camera.render import camera_pose
 from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
 from airl_mav.report.forensics.camera_view import PolicyCamera
-from airl_mav.report.replay.replayed_flight import ReplayedRun
 from tests.support.run_demo import write_demo_run
 
 

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.flight.judge import Outcome
-from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE
-from airl_mav.report.replay.replayed_flight import (
+from airl_mav.addons.view.replayed_flight import (
     ReplayedFlight,
     ReplayedRun,
     ReplayedRuns,
     parting_s,
     run_folders,
 )
-from airl_mav.view.shown import Shown
+from airl_mav.addons.view.view_messages import Shown
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.flight.judge import Outcome
+from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE
 from tests.support.processes import PATIENCE_S, running
 from tests.support.run_demo import write_demo_run
 
@@ -107,7 +107,7 @@ def test_flights_part_at_the_first_other_decision(flight: ReplayedFlight) -> Non
 
 def test_a_flight_outside_of_all_arenas_has_its_goal(flight: ReplayedFlight) -> None:
     viser = pytest.importorskip("viser")
-    from airl_mav.view.viser_scene import FlightScene
+    from airl_mav.addons.view.viser_scene import FlightScene
 
     outside, shown = replace(flight, arena=None), Shown()
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
@@ -153,7 +153,7 @@ class Watched:
 
     def __init__(self, folder: Path, beside: Path | None = None) -> None:
         viser = pytest.importorskip("viser")
-        from airl_mav.report.replay.page import ReplayPage
+        from airl_mav.addons.view.replay_page import ReplayPage
 
         self.server = viser.ViserServer("127.0.0.1", 0, verbose=False)
         other = None if beside is None else ReplayedRun(beside)
@@ -251,7 +251,7 @@ def test_runs_are_named_by_their_folders_or_paths(campaign: Path, folder: Path) 
 
 def test_any_two_runs_of_a_campaign_can_be_chosen(campaign: Path) -> None:
     viser = pytest.importorskip("viser")
-    from airl_mav.report.replay.page import ALONE, ReplayPage
+    from airl_mav.addons.view.replay_page import ALONE, ReplayPage
 
     server, told = viser.ViserServer("127.0.0.1", 0, verbose=False), list[str]()
     try:

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
+from airl_mav.addons.view.replayed_flight import ReplayedFlight, ReplayedRun
 from airl_mav.cli.main import main
 from airl_mav.flight.episode_record import EpisodeRecord
-from airl_mav.report.replay.replayed_flight import ReplayedFlight, ReplayedRun
 from tests.support.processes import ROOT
 from tests.support.run_demo import write_demo_run
 
@@ -23,7 +23,7 @@ pytest.importorskip("viser")
 TOLD = """
 import sys
 from airl_mav.core.progress import new_console
-from airl_mav.cli import view_command
+from airl_mav.addons.view import command
 
 class Told:
     encoding = "utf-8"
@@ -38,7 +38,7 @@ class Told:
 
 console = new_console()
 console.file = Told()
-sys.exit(view_command.run(view_command.ViewOptions(run=sys.argv[1]), console))
+sys.exit(command.run(command.ViewOptions(run=sys.argv[1]), console))
 """
 
 
@@ -143,7 +143,7 @@ def refused(
     def serve(_port: int) -> None:
         raise AssertionError("it is served")
 
-    monkeypatch.setattr("airl_mav.view.view_server.LocalServer", serve)
+    monkeypatch.setattr("airl_mav.addons.view.view_server.LocalServer", serve)
     with pytest.raises(SystemExit) as end:
         main(["view", str(folder), *words])
     out, err = capsys.readouterr()
@@ -156,8 +156,8 @@ def refused(
 def test_the_flight_is_shown_before_its_arena_and_before_anyone_looks(
     flown: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from airl_mav.report.replay.page import ReplayPage
-    from airl_mav.view.view_server import LocalServer
+    from airl_mav.addons.view.replay_page import ReplayPage
+    from airl_mav.addons.view.view_server import LocalServer
 
     run = ReplayedRun(flown)
     server = LocalServer(0)

@@ -20,11 +20,12 @@ from airl_mav.latency.injection import NOTHING_INJECTED
 from airl_mav.latency.stages import SHOWN_STAGES
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder, load
+from airl_mav.report.document import TableView
 from airl_mav.report.energy_section import energy_flights_table, energy_table, flight_energies
 from airl_mav.report.forensics.worst import examine_worst
 from airl_mav.report.measures import conduct_table, summarize_run
 from airl_mav.report.plotly_scene import plotly_script
-from airl_mav.report.run_report import build_page
+from airl_mav.report.run_report import MAX_PICTURED, build_page
 from airl_mav.report.run_tables import (
     ages_table,
     episodes_table,
@@ -35,8 +36,6 @@ from airl_mav.report.run_tables import (
     run_ages,
 )
 from airl_mav.report.run_verdict import verdict_of
-from airl_mav.report.shown_flights import MAX_PICTURED
-from airl_mav.report.table import TableView
 from airl_mav.report.theme import DARK
 from airl_mav.report.timeline import slowest_table, timeline_of
 from tests.support.page_alone import page_alone, unpacked

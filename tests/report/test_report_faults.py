@@ -12,7 +12,7 @@ from airl_mav.cli import main
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.episode_record import Part
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.comparison.runs import compare_folders
+from airl_mav.report.comparison.show import compare_folders
 from airl_mav.report.run_report import write_report
 from tests.support.run_demo import write_demo_run
 

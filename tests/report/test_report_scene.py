@@ -20,6 +20,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report import plotly_scene
+from airl_mav.report.document import OUTCOME_LABELS
 from airl_mav.report.plotly_scene import (
     POINTS,
     SceneFlight,
@@ -29,7 +30,6 @@ from airl_mav.report.plotly_scene import (
     scene_json,
 )
 from airl_mav.report.run_figures import coloured_pieces
-from airl_mav.report.table import OUTCOME_LABELS
 from tests.support.run_demo import demo_arena, write_demo_run
 
 Demo = tuple[LoadedRun, dict[int, Arena]]

@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from airl_mav.core.frames import quat_wxyz_to_xyzw
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun, load
+from airl_mav.report.run_report import chosen, flight_data, packed, steps_of
 from airl_mav.report.run_tables import estimation_table
-from airl_mav.report.shown_flights import chosen, flight_data, packed, steps_of
-from airl_mav.report.tracking import track
-from airl_mav.report.tracking_figure import held
+from airl_mav.report.tracking import held, track
 from tests.support.page_alone import unpacked
 from tests.support.run_demo import write_demo_run
 

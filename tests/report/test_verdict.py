@@ -11,10 +11,9 @@ import pytest
 
 from airl_mav.flight.episode_record import EpisodeRecord, Part, Setup
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.paired import compare_pairs
-from airl_mav.flight.quality import Leg, Quality
 from airl_mav.flight.requirements import parse_requirement
-from airl_mav.flight.statistics import aggregate
+from airl_mav.flight.statistics import aggregate, compare_pairs
+from airl_mav.flight.trajectory import Leg, Quality
 from airl_mav.latency.injection import NOTHING_INJECTED
 from airl_mav.report.run_verdict import (
     OverallVerdict,

@@ -16,7 +16,7 @@ from scipy import stats
 
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments.campaign import EpisodeSaver
-from airl_mav.flight.sequential import LOOKS
+from airl_mav.flight.requirements import LOOKS
 from airl_mav.rehearsal.run_folder import FlownEpisode, load
 from airl_mav.report.comparison import show
 from tests.support.campaign_kit import same_runs

@@ -21,7 +21,7 @@ from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.link import Link
 from firmware_sim.mavlink.px4_links import LinkConfig
-from firmware_sim.mavlink.services import commands, handle
+from firmware_sim.mavlink.services import handle, table
 from firmware_sim.mavlink.services.context import Context, VehicleCommand, for_vehicle, sender
 from firmware_sim.mavlink.streams import BUILDERS, Builder, status
 from firmware_sim.mavlink.telemetry import PARTS, TickContext, flown_of
@@ -171,7 +171,7 @@ class Manners:
             dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
         ):
             a, b, c, d, e, f, g = params
-            result = commands.ACTIONS[number](
+            result = table("ACTIONS")[number](
                 VehicleCommand(number, (a, b, c, d, e, f, g)), context
             )
             assert result is not None

@@ -17,6 +17,7 @@ from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
+from firmware_sim.addons.auxiliary_estimation.auxiliary_aids import AuxiliaryAids
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Result, Setpoint
 from firmware_sim.autopilot.flight_modes import Mode
@@ -170,6 +171,13 @@ class Rig:
 
     def close(self) -> None:
         self.sim.close()
+
+
+def aids_of(rig: Rig) -> AuxiliaryAids:
+    """Return the fusion of vision, ranges and flow in a rig's autopilot."""
+    aiding = rig.ap.estimator.aiding
+    assert isinstance(aiding, AuxiliaryAids)
+    return aiding
 
 
 @contextmanager

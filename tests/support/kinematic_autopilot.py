@@ -7,8 +7,10 @@ tested without an estimator, a controller or a plant.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,14 +49,7 @@ from firmware_sim.autopilot.inputs import (
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs, ParameterValue
 from firmware_sim.autopilot.snapshot import progress
-from firmware_sim.interfaces import (
-    BatterySample,
-    DistanceReading,
-    FlowReading,
-    GpsFix,
-    Odometry,
-    SensorSample,
-)
+from firmware_sim.interfaces import BatterySample, GpsFix, Received, SensorSample
 
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
 READY_US = 100_000
@@ -107,12 +102,7 @@ class KnownState(NamedTuple):
     home_yaw: float = 0.0
     sticks: Sticks | None = None
     esc_outputs: tuple[float, float, float, float] | None = None
-    odometry: Odometry | None = None
-    odometry_us: int = 0
-    distance: DistanceReading | None = None
-    distance_us: int = 0
-    flow: FlowReading | None = None
-    flow_us: int = 0
+    readings: Mapping[str, Received] = MappingProxyType({})
     clearance: Clearance | None = None
     revision: None = None
 
@@ -192,9 +182,7 @@ class KinematicAutopilot:
         self.accel = np.array([0.1, -0.2, -GRAVITY_M_S2])
         self.gyro = np.zeros(3)
         self.setpoints: list[tuple[Setpoint, int]] = []
-        self.odometry: list[Odometry] = []
-        self.distances: list[DistanceReading] = []
-        self.flows: list[FlowReading] = []
+        self.received: defaultdict[str, list[Any]] = defaultdict(list)
         self.obstacles: list[ObstacleBins] = []
         self.gcs_heartbeats: list[int] = []
         self.takeoffs: list[float | None] = []
@@ -318,14 +306,8 @@ class KinematicAutopilot:
     def see_obstacles(self, obstacles: ObstacleBins) -> None:
         self.obstacles.append(obstacles)
 
-    def see(self, odometry: Odometry) -> None:
-        self.odometry.append(odometry)
-
-    def measure_distance(self, reading: DistanceReading) -> None:
-        self.distances.append(reading)
-
-    def look_down(self, reading: FlowReading) -> None:
-        self.flows.append(reading)
+    def receive(self, name: str, reading: Any) -> None:
+        self.received[name].append(reading)
 
     def landing_target(self, target: LandingTarget) -> None:
         self.landing_targets.append(target)

@@ -18,8 +18,8 @@ from torch import nn
 
 from airl_mav.policy.actions import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
-from airl_mav.policy.layouts import boxes, image_key
-from airl_mav.policy.observation_spec import Encoded, ObservationSpec
+from airl_mav.policy.layouts import Encoded, boxes, image_key
+from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.training.algorithms import ImageExtractor, dense_units
 from airl_mav.training.config import NetworkSpec
 from airl_mav.training.export import export_sb3

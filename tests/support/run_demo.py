@@ -11,8 +11,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.resource_use import ProcessUse
 from airl_mav.flight.episode_record import EpisodeRecord, Part, Setup
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
-from airl_mav.flight.quality import measure_quality
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.trajectory import Trajectory, measure_quality
 from airl_mav.latency.injection import choose_injection
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.profiles.arena import ArenaSpec

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from airl_mav.policy.actions import Action, ActionSpec, commands, discrete_actions, limited
+from airl_mav.policy.actions import Action, ActionSpec, commands, discrete_actions
 from airl_mav.policy.actions import command as any_command
 
 DISCRETE = ["arc-25", "paper-25"]
@@ -138,7 +138,7 @@ def test_left_and_right_mirror_each_other(forward: float, right: float) -> None:
 
 @pytest.mark.parametrize("bad", [(math.nan, 0.0), (0.0, math.nan), (math.inf, -math.inf)])
 def test_what_is_no_number_never_leaves_as_a_command(bad: tuple[float, float]) -> None:
-    action = limited(command(spec("velocity"), np.array(bad)), 5.0)
+    action = command(spec("velocity"), np.array(bad)).within(5.0)
     assert all(map(math.isfinite, (action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s)))
     assert math.hypot(action.forward_m_s, action.right_m_s) <= 5.0 + 1e-9
 
@@ -214,4 +214,4 @@ def test_an_action_says_how_fast_it_sinks_only_where_its_set_does() -> None:
     ("down", "wanted"), [(-9.0, -1.5), (9.0, 1.5), (0.4, 0.4), (math.nan, 0.0), (None, None)]
 )
 def test_a_vertical_speed_is_limited(down: float | None, wanted: float | None) -> None:
-    assert limited(Action(1.0, 0.0, 0.0, down), 5.0).down_m_s == wanted
+    assert Action(1.0, 0.0, 0.0, down).within(5.0).down_m_s == wanted

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from airl_mav.addons.recordings.recorded_flight import episode_of
 from airl_mav.black_box.mcap_file import BlackBoxFile, read_black_box
 from airl_mav.black_box.messages import (
     SCHEMAS,
@@ -37,7 +38,6 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.report.recorded_flight import episode_of
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.addons.black_box.recorder import BlackBoxRecorder, run_of
 from companion.frame_source import ReceivedFrame

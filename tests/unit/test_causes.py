@@ -15,8 +15,7 @@ from airl_mav.core.frames import quat_to_matrix
 from airl_mav.envs.stopping import braking_of
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.quality import measure_quality
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.trajectory import Trajectory, measure_quality
 from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.forensics.camera_view import (

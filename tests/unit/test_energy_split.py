@@ -5,8 +5,7 @@ import pytest
 
 from airl_mav.core.constants import TICK_US
 from airl_mav.flight.energy import add_up, split_energy
-from airl_mav.flight.quality import measure_leg
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.trajectory import Trajectory, measure_leg
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import PowerModel, flight_power_w, level_power_w

@@ -11,7 +11,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import append_lines, read_lines
 from airl_mav.flight.episode_record import SCHEMA, EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.quality import Quality
+from airl_mav.flight.trajectory import Quality
 from tests.support.run_demo import demo_arena, demo_episode
 
 QUALITY_DEFAULTS = {field.name for field in fields(Quality) if field.default is None}

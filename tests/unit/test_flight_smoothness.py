@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from airl_mav.flight.quality import (
+from airl_mav.flight.trajectory import (
     BANDWIDTH_HZ,
+    Trajectory,
     command_steps,
     commanded_velocity,
     flown_velocity,
@@ -15,7 +16,6 @@ from airl_mav.flight.quality import (
     measure_quality,
     sample_times,
 )
-from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP
 
 STEP_S = 0.02

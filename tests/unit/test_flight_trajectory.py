@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from airl_mav.flight.quality import measure_leg, measure_quality
-from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
+from airl_mav.flight.trajectory import SAMPLE_US, Trajectory, measure_leg, measure_quality
 from tests.support.recording import TestRecorder, record_tick
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])

@@ -18,7 +18,7 @@ from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
-from airl_mav.policy.actions import Action, limited
+from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Kinematics, Observation, encode
 from airl_mav.policy.registry import (
     POLICIES,
@@ -394,7 +394,7 @@ NUMBER = st.floats(-1e6, 1e6)
 def test_limited_keeps_the_direction_and_the_turn(
     forward: float, right: float, turn: float, limit: float
 ) -> None:
-    action = limited(Action(forward, right, turn), limit)
+    action = Action(forward, right, turn).within(limit)
     speed = math.hypot(forward, right)
     assert math.hypot(action.forward_m_s, action.right_m_s) == pytest.approx(
         min(speed, limit), rel=1e-9, abs=1e-12
@@ -408,10 +408,10 @@ def test_limited_keeps_the_direction_and_the_turn(
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_limited_zeroes_what_is_not_finite(bad: float) -> None:
-    assert limited(Action(bad, 1.0, 0.2), 4.0) == Action(0.0, 1.0, 0.2)
-    assert limited(Action(1.0, bad, 0.2), 4.0) == Action(1.0, 0.0, 0.2)
-    assert limited(Action(1.0, 2.0, bad), 4.0) == Action(1.0, 2.0, 0.0)
-    assert limited(Action(bad, bad, bad), 4.0) == Action(0.0, 0.0, 0.0)
+    assert Action(bad, 1.0, 0.2).within(4.0) == Action(0.0, 1.0, 0.2)
+    assert Action(1.0, bad, 0.2).within(4.0) == Action(1.0, 0.0, 0.2)
+    assert Action(1.0, 2.0, bad).within(4.0) == Action(1.0, 2.0, 0.0)
+    assert Action(bad, bad, bad).within(4.0) == Action(0.0, 0.0, 0.0)
 
 
 def test_policies_are_found_by_name() -> None:

@@ -20,9 +20,9 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs import observations
 from airl_mav.policy.images import NUMPY, Bytes, shrink_depth
-from airl_mav.policy.layouts import ablated, boxes, encode_layout, newest_frame
+from airl_mav.policy.layouts import STRIP_ROWS, Encoded, ablated, boxes, encode_layout, newest_frame
 from airl_mav.policy.observation import Kinematics, Observation, observe
-from airl_mav.policy.observation_spec import STRIP_ROWS, Encoded, ObservationSpec, camera_mismatch
+from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
 from airl_mav.profiles.projections import CHANNELS, KINDS, CameraKind
 
 FAR_MM = 65_535

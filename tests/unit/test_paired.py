@@ -13,7 +13,7 @@ from scipy import optimize, stats
 
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.paired import (
+from airl_mav.flight.statistics import (
     Agreement,
     common_successes,
     compare_pairs,

@@ -20,8 +20,8 @@ from airl_mav.core.errors import UsageError
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.vehicle_log import Series, VehicleLog, empty, marzullo, read_vehicle_log
-from firmware_sim.flight_log.topics import TOPICS
-from firmware_sim.flight_log.ulog_writer import UlogWriter
+from firmware_sim.addons.flight_log.topics import TOPICS
+from firmware_sim.addons.flight_log.ulog_writer import UlogWriter
 
 QUAD = load_vehicle("quad")
 STILL = np.zeros(0, np.int64)

@@ -8,15 +8,22 @@ import pytest
 
 from airl_mav.core.errors import FieldError
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.paired import Agreement, Change, PairedComparison
 from airl_mav.flight.requirements import (
     MEASURES,
     Requirement,
+    RequirementDecision,
     find,
     parse_requirement,
 )
-from airl_mav.flight.sequential import RequirementDecision
-from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate, Estimate, wilson
+from airl_mav.flight.statistics import (
+    NO_ESTIMATE,
+    Aggregate,
+    Agreement,
+    Change,
+    Estimate,
+    PairedComparison,
+    wilson,
+)
 
 QUALITY = Aggregate(
     success_rate=wilson(87, 100),

@@ -72,8 +72,8 @@ def test_what_keeps_pace_with_the_wall_clock_runs_soon_after_it_was_woken() -> N
 
 
 def test_a_view_gives_way() -> None:
-    from airl_mav.view.ends import ViewSettings
-    from airl_mav.view.viewer import Viewer
+    from airl_mav.addons.view.view_messages import ViewSettings
+    from airl_mav.addons.view.viewer import Viewer
 
     request = ViewSettings(run="t", port=None, paced=False, speed=None, steerable=False,
                       compensable=False, compensated=False)  # fmt: skip
@@ -82,7 +82,7 @@ def test_a_view_gives_way() -> None:
         (view,) = (
             child
             for child in psutil.Process().children()
-            if "airl_mav.view.view_server" in child.cmdline()
+            if "airl_mav.addons.view.view_server" in child.cmdline()
         )
         assert os.getsid(view.pid) == view.pid
         assert view.nice() > psutil.Process().nice()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from airl_mav.flight.sequential import (
+from airl_mav.flight.requirements import (
     ALPHA,
     LOOKS,
     InterimAnalysis,

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from airl_mav.flight.validity import RULES, HostFigures, Rule, host_faults, host_figures
+from airl_mav.flight.judge import RULES, HostFigures, Rule, host_faults, host_figures
 from airl_mav.latency.stamps import NO_STAMP
 
 GOOD = HostFigures(

@@ -17,6 +17,23 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 
+from airl_mav.addons.view.panel import NO_RETURN, VIRIDIS, camera_picture, numbers_html, texts_html
+from airl_mav.addons.view.taps import Hand, HandCompensator, HandLatency
+from airl_mav.addons.view.view_messages import (
+    STRIP_S,
+    CameraImage,
+    Decided,
+    Episode,
+    Flight,
+    Said,
+    Shown,
+    Steering,
+    VehicleShape,
+    VehicleState,
+    from_parts,
+    to_parts,
+)
+from airl_mav.addons.view.viewer import QUEUED, Asked, Ends, Feed, Pace, Viewer, request_of
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
 from airl_mav.cli.evaluate_command import EvaluateOptions
@@ -33,23 +50,6 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from airl_mav.view.feed import QUEUED, Asked, Ends, Feed
-from airl_mav.view.panel import NO_RETURN, VIRIDIS, camera_picture, numbers_html, texts_html
-from airl_mav.view.shown import STRIP_S, Shown
-from airl_mav.view.taps import Hand, HandCompensator, HandLatency
-from airl_mav.view.view_messages import (
-    CameraImage,
-    Decided,
-    Episode,
-    Flight,
-    Said,
-    Steering,
-    VehicleShape,
-    VehicleState,
-    from_parts,
-    to_parts,
-)
-from airl_mav.view.viewer import Pace, Viewer, request_of
 from tests.support.ports import free_ports
 from tests.support.processes import run_alone, wait_until
 
@@ -392,7 +392,7 @@ def test_pages_of_other_sites_are_turned_away(origin: str | None, taken: bool) -
     viser = pytest.importorskip("viser")
     from websockets.exceptions import InvalidStatus
 
-    from airl_mav.view.view_server import LocalServer
+    from airl_mav.addons.view.view_server import LocalServer
 
     server = LocalServer(0)
     port = server.get_port()
@@ -414,7 +414,7 @@ def test_pages_of_other_sites_are_turned_away(origin: str | None, taken: bool) -
 @pytest.mark.parametrize("headers", [{}, {"Accept-Encoding": "gzip, br"}])
 def test_the_page_is_not_compressed_once_more(headers: dict[str, str]) -> None:
     pytest.importorskip("viser")
-    from airl_mav.view.view_server import LocalServer
+    from airl_mav.addons.view.view_server import LocalServer
 
     server = LocalServer(0)
     try:
@@ -433,7 +433,7 @@ def test_no_tunnel_is_opened_whoever_asks(monkeypatch: pytest.MonkeyPatch) -> No
     import msgspec
     from viser import _messages, _viser
 
-    from airl_mav.view.view_server import LocalServer
+    from airl_mav.addons.view.view_server import LocalServer
 
     opened, answered = threading.Event(), threading.Event()
     answer = LocalServer.request_share_url
@@ -475,7 +475,7 @@ def test_no_tunnel_is_opened_whoever_asks(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_an_image_of_all_sides_hangs_unrolled_above_the_vehicle() -> None:
     viser = pytest.importorskip("viser")
-    from airl_mav.view.viser_scene import UNROLLED_M, FlightScene
+    from airl_mav.addons.view.viser_scene import UNROLLED_M, FlightScene
 
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     try:
@@ -494,7 +494,7 @@ def test_an_image_of_all_sides_hangs_unrolled_above_the_vehicle() -> None:
 
 def test_the_scene_holds_arena_vehicle_and_trail() -> None:
     viser = pytest.importorskip("viser")
-    from airl_mav.view.viser_scene import CHUNK, FlightScene
+    from airl_mav.addons.view.viser_scene import CHUNK, FlightScene
 
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     try:
@@ -538,8 +538,8 @@ def test_the_scene_holds_arena_vehicle_and_trail() -> None:
 def test_the_scene_holds_meshes_or_where_their_file_is_gone_their_boxes(tmp_path: Path) -> None:
     viser = pytest.importorskip("viser")
     pytest.importorskip("trimesh")
+    from airl_mav.addons.view.viser_scene import FlightScene
     from airl_mav.arena.triangles import standing
-    from airl_mav.view.viser_scene import FlightScene
     from tests.support.meshes import kept, ring, scene_of, triangles
 
     file = kept(triangles(ring()), tmp_path / "ring.npz")
@@ -582,7 +582,7 @@ def test_meshes_are_told_by_their_file(tmp_path: Path) -> None:
 
 def test_hills_are_told_and_shown_as_they_are() -> None:
     viser = pytest.importorskip("viser")
-    from airl_mav.view.viser_scene import FlightScene
+    from airl_mav.addons.view.viser_scene import FlightScene
 
     spec = load_profile("arenas", "hills", ArenaSpec)
     arena = generate(spec, 3, name="hills", vehicle_width_m=0.6)
@@ -613,7 +613,7 @@ def test_hills_are_told_and_shown_as_they_are() -> None:
 
 def test_walls_are_seen_from_inside() -> None:
     pytest.importorskip("viser")
-    from airl_mav.view.style import walls
+    from airl_mav.report.scene import walls
 
     inside = np.array([10.0, 0.0, -2.0])
     for ceiling, count in ((False, 8), (True, 10)):
@@ -668,7 +668,8 @@ def test_who_is_not_watched_loads_nothing(tmp_path: Path) -> None:
         "import sys\n"
         "import airl_mav.rehearsal.firmware_process, airl_mav.rehearsal.companion_process\n"
         "import airl_mav.lockstep.lockstep_flight, airl_mav.cli.sitl_command\n"
-        "print(sorted(n for n in sys.modules if n.startswith(('airl_mav.view', 'viser'))))\n",
+        "views = 'airl_mav.addons.view', 'viser'\n"
+        "print(sorted(name for name in sys.modules if name.startswith(views)))\n",
         tmp_path,
     )
-    assert done.stdout.strip() == "['airl_mav.view', 'airl_mav.view.ends']", done.stderr
+    assert done.stdout.strip() == "[]", done.stderr

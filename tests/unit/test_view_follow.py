@@ -12,9 +12,9 @@ import pytest
 import viser
 from numpy.typing import NDArray
 
+from airl_mav.addons.view.view_messages import Shown
+from airl_mav.addons.view.view_server import CHASE, KEPT, NEAREST_M, Watchers, unhidden
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
-from airl_mav.view.shown import Shown
-from airl_mav.view.watchers import CHASE, KEPT, NEAREST_M, Watchers, unhidden
 
 AT = np.array([0.0, 0.0, -2.5])
 BACK = np.array([-6.0, 0.0, 0.0])

@@ -2,7 +2,7 @@
 
 Writes the flights of a run as files, or sends the flights of a run in progress.
 Command: `airl export-log`.
-Depends on: `airl_mav.black_box`, `airl_mav.report.replay`, `firmware_sim.flight_log`.
+Depends on: `airl_mav.black_box`, the add-ons `view` and `firmware_sim.addons.flight_log`.
 Guide: docs/how-to/export-log.md.
 """
 

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.addons.export_log.files import Format, flight_of, write_flight
+from airl_mav.addons.export_log.recorded import RecordedFlight
+from airl_mav.addons.export_log.ulog_log import write_ulog
+from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.shared_options import TrustArenas, folder_of
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.files import replacing
 from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.replay.replayed_flight import ReplayedRun
 from airl_mav.report.run_arenas import trust_arenas
 from airl_mav.scenario.aircraft import GREATEST_PORT
+from firmware_sim.interfaces import ULOG_SUFFIX
+
+Format = Literal["mcap", "ulog"]
 
 FOXGLOVE_PORT = 8765
 """Default port of Foxglove's connections."""
@@ -112,3 +118,27 @@ def _stream(run: ReplayedRun, numbers: tuple[int, ...], port: int, console: Cons
     finally:
         live.close()
     return 0
+
+
+def flight_of(run: ReplayedRun, index: int) -> RecordedFlight:
+    """Return a flight of a run; raise UsageError if the flight or its arena is missing."""
+    return RecordedFlight(run.flight(run.record(index)), run.info)
+
+
+def write_flight(flight: RecordedFlight, run: Path, out: Path, kind: Format) -> Path:
+    """Write a flight to a folder and return the file's path; a recorded ULog is copied."""
+    name = f"flight-{flight.replayed.record.index:03d}"
+    if kind == "mcap":
+        # Imported here: MCAP and Foxglove's messages are extras.
+        from airl_mav.addons.export_log.mcap_export import write_mcap
+
+        path = out / f"{name}.mcap"
+        write_mcap(flight, path)
+        return path
+    path, own = out / f"{name}{ULOG_SUFFIX}", run / f"{name}{ULOG_SUFFIX}"
+    if not own.exists():
+        write_ulog(flight, path)
+    elif not (path.exists() and path.samefile(own)):
+        with replacing(path) as partial:
+            shutil.copyfile(own, partial)
+    return path

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.addons.view.replayed_flight import ReplayedFlight
 from airl_mav.black_box.messages import Decision
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import goal_distance_m
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, SETPOINTS, STAMPS, setpoint_column
 from airl_mav.rehearsal.run_folder import RunInfo
-from airl_mav.report.replay.replayed_flight import ReplayedFlight
 from airl_mav.vehicle.power import drain, open_circuit, terminal_voltage
 
 RECORDED_LEVEL = "flight"

@@ -13,6 +13,7 @@ import numpy as np
 from foxglove import messages
 from numpy.typing import NDArray
 
+from airl_mav.addons.view.view_messages import VehicleShape
 from airl_mav.arena.geometry import Arena, Bounds, Shape
 from airl_mav.arena.triangles import drawn, standing
 from airl_mav.black_box.messages import Channel
@@ -21,8 +22,7 @@ from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Goal, goal_height_m
 from airl_mav.profiles.vehicle import CORNERS
-from airl_mav.view import style
-from airl_mav.view.view_messages import VehicleShape
+from airl_mav.report import scene
 
 Floats = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ def points(ned: Floats) -> list[messages.Point3]:
     return [messages.Point3(x=x, y=y, z=z) for x, y, z in frames.ned_to_enu(ned).tolist()]
 
 
-def colour(rgb: style.Colour, opacity: float = 1.0) -> messages.Color:
+def colour(rgb: scene.Colour, opacity: float = 1.0) -> messages.Color:
     """Convert a colour with an opacity, 0 to 1."""
     red, green, blue = (part / 255.0 for part in rgb)
     return messages.Color(r=red, g=green, b=blue, a=opacity)
@@ -108,7 +108,7 @@ def arena_scene(
     arena: Arena | None, goal: Goal, goal_radius_m: float, at: messages.Timestamp
 ) -> messages.SceneUpdate:
     """Return the static scene: floor, hills, walls, obstacles, goal and start."""
-    bounds = style.OPEN if arena is None else arena.bounds
+    bounds = scene.OPEN if arena is None else arena.bounds
     ground = None if arena is None else arena.ground
     base_m = 0.0 if ground is None else ground.height_at(goal[0], goal[1])
     top_m = goal_height_m(goal) or base_m + 0.6 * bounds.height
@@ -117,18 +117,18 @@ def arena_scene(
         _ends(goal, goal_radius_m, (base_m, top_m), at),
     ]
     if ground is not None:
-        entities.append(_surface("ground", ground.points, ground.faces, style.HILLS, at))
+        entities.append(_surface("ground", ground.points, ground.faces, scene.HILLS, at))
     if arena is not None:
         entities.append(_entity("walls", at, cubes=_walls(bounds, arena.wall_colour)))
         centers = arena.obstacles.center
         shown = drawn(arena.meshes)
         entities += [
-            obstacle(arena, i, centers[i], style.STILL, f"obstacle/{i}", at)
+            obstacle(arena, i, centers[i], scene.STILL, f"obstacle/{i}", at)
             for i in range(arena.n_static)
             if arena.mesh_of(i) not in shown
         ]
         entities += [
-            _surface(f"mesh/{each.first}", *standing(each), style.STILL, at) for each in shown
+            _surface(f"mesh/{each.first}", *standing(each), scene.STILL, at) for each in shown
         ]
     return messages.SceneUpdate(entities=entities)
 
@@ -138,7 +138,7 @@ def movers_scene(arena: Arena, from_us: int, at: messages.Timestamp) -> messages
     centers = arena.centers_at(from_us)
     moving = range(arena.n_static, len(arena.obstacles))
     return messages.SceneUpdate(
-        entities=[obstacle(arena, i, centers[i], style.MOVING, f"mover/{i}", at) for i in moving]
+        entities=[obstacle(arena, i, centers[i], scene.MOVING, f"mover/{i}", at) for i in moving]
     )
 
 
@@ -150,7 +150,7 @@ def path_scene(way: Floats, at: messages.Timestamp) -> messages.SceneUpdate:
         thickness=2.0,  # pixels
         scale_invariant=True,
         points=points(way),
-        color=colour(style.FIRST.trail),
+        color=colour(scene.FIRST.trail),
     )
     return messages.SceneUpdate(entities=[_entity("path", at, lines=[line])])
 
@@ -159,15 +159,15 @@ def velocity_scene(
     position: Floats, flown: Floats, commanded: Floats | None, at: messages.Timestamp
 ) -> messages.SceneUpdate:
     """Return velocities (3,) NED [m/s] as arrows from the vehicle's position (3,) NED [m]."""
-    arrows = [_arrow(position, flown, style.FLOWN)]
+    arrows = [_arrow(position, flown, scene.FLOWN)]
     if commanded is not None:
-        arrows.append(_arrow(position, commanded, style.COMMANDED))
+        arrows.append(_arrow(position, commanded, scene.COMMANDED))
     shown = [arrow for arrow in arrows if arrow is not None]
     return messages.SceneUpdate(entities=[_entity("velocity", at, arrows=shown)])
 
 
 def vehicle_scene(
-    shape: VehicleShape, frame: str, look: style.FlightColours, at: messages.Timestamp
+    shape: VehicleShape, frame: str, look: scene.FlightColours, at: messages.Timestamp
 ) -> messages.SceneUpdate:
     """Return a vehicle built from primitives that move with its frame."""
     forward, right = shape.arm_forward_m, shape.arm_right_m
@@ -176,7 +176,7 @@ def vehicle_scene(
     nose = _in_body(np.array([2.0 * size, 0.0, 0.0]))
     cubes = [
         _cube(_in_body(np.zeros(3)), (3.4 * size, 2.2 * size, height), look.body, opacity),
-        _cube(nose, (0.9 * size, size, 0.6 * height), style.NOSE, opacity),
+        _cube(nose, (0.9 * size, size, 0.6 * height), scene.NOSE, opacity),
     ]
     rotors = []
     for corner in CORNERS:
@@ -196,7 +196,7 @@ def vehicle_scene(
 
 
 def obstacle(
-    arena: Arena, i: int, center: Floats, rgb: style.Colour, name: str, at: messages.Timestamp
+    arena: Arena, i: int, center: Floats, rgb: scene.Colour, name: str, at: messages.Timestamp
 ) -> messages.SceneEntity:
     """Return obstacle i with its current centre (3,) NED [m]."""
     half_size = arena.obstacles.half_size[i]
@@ -205,7 +205,7 @@ def obstacle(
     look: dict[str, Any] = {
         "pose": pose(center, yaw),
         "size": vector(2.0 * half_size),
-        "color": colour(rgb, style.GLASS_OPACITY if glass else 1.0),
+        "color": colour(rgb, scene.GLASS_OPACITY if glass else 1.0),
     }
     if arena.obstacles.shape[i] == Shape.BOX:
         return _entity(name, at, cubes=[messages.CubePrimitive(**look)])
@@ -216,7 +216,7 @@ def obstacle(
 
 
 def _surface(
-    name: str, places: Floats, faces: NDArray[np.int32], rgb: style.Colour, at: messages.Timestamp
+    name: str, places: Floats, faces: NDArray[np.int32], rgb: scene.Colour, at: messages.Timestamp
 ) -> messages.SceneEntity:
     surface = messages.TriangleListPrimitive(
         pose=_ORIGIN,
@@ -230,10 +230,10 @@ def _surface(
 def _floor(b: Bounds) -> messages.CubePrimitive:
     north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
     size = (b.north_max - b.north_min, b.east_max - b.east_min, THIN_M)
-    return _cube(pose(np.array([north, east, 0.5 * THIN_M])), size, style.FLOOR)
+    return _cube(pose(np.array([north, east, 0.5 * THIN_M])), size, scene.FLOOR)
 
 
-def _walls(b: Bounds, rgb: style.Colour) -> list[messages.CubePrimitive]:
+def _walls(b: Bounds, rgb: scene.Colour) -> list[messages.CubePrimitive]:
     north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
     along_east = (THIN_M, b.east_max - b.east_min, b.height)
     along_north = (b.north_max - b.north_min, THIN_M, b.height)
@@ -244,7 +244,7 @@ def _walls(b: Bounds, rgb: style.Colour) -> list[messages.CubePrimitive]:
         (north, b.east_max, along_north),
     ]
     return [
-        _cube(pose(np.array([x, y, -0.5 * b.height])), size, rgb, style.WALL_OPACITY)
+        _cube(pose(np.array([x, y, -0.5 * b.height])), size, rgb, scene.WALL_OPACITY)
         for x, y, size in sides
     ]
 
@@ -254,28 +254,28 @@ def _ends(
 ) -> messages.SceneEntity:
     """Return start and goal; `pole_m` are the lower and upper height of the goal's pole."""
 
-    def disc(place: Size, radius: float, rgb: style.Colour) -> messages.CylinderPrimitive:
+    def disc(place: Size, radius: float, rgb: scene.Colour) -> messages.CylinderPrimitive:
         return _cylinder(pose(np.array(place) - [0.0, 0.0, THIN_M]), radius, THIN_M, rgb, 0.45)
 
     (north, east), (base, top) = goal[:2], pole_m
     middle = pose(np.array([north, east, -0.5 * (base + top)]))
-    pole = _cylinder(middle, 0.04, top - base, style.GOAL)
+    pole = _cylinder(middle, 0.04, top - base, scene.GOAL)
     name = messages.TextPrimitive(
         pose=pose(np.array([north, east, -top - 0.4])),
         billboard=True,
         font_size=0.6,
-        color=colour(style.GOAL),
+        color=colour(scene.GOAL),
         text="goal",
     )
     discs = (
-        disc((north, east, -base), radius_m, style.GOAL),
-        disc((0.0, 0.0, 0.0), 0.4, style.START),
+        disc((north, east, -base), radius_m, scene.GOAL),
+        disc((0.0, 0.0, 0.0), 0.4, scene.START),
     )
     return _entity("goal", at, cylinders=[discs[0], pole, discs[1]], texts=[name])
 
 
 def _cylinder(
-    at: messages.Pose, radius: float, height: float, rgb: style.Colour, opacity: float = 1.0
+    at: messages.Pose, radius: float, height: float, rgb: scene.Colour, opacity: float = 1.0
 ) -> messages.CylinderPrimitive:
     return messages.CylinderPrimitive(
         pose=at,
@@ -287,7 +287,7 @@ def _cylinder(
 
 
 def _cube(
-    at: messages.Pose, size: Size, rgb: style.Colour, opacity: float = 1.0
+    at: messages.Pose, size: Size, rgb: scene.Colour, opacity: float = 1.0
 ) -> messages.CubePrimitive:
     return messages.CubePrimitive(pose=at, size=vector(np.array(size)), color=colour(rgb, opacity))
 
@@ -298,10 +298,10 @@ def _in_body(frd: Floats, yaw: float = 0.0) -> messages.Pose:
     return messages.Pose(position=vector(frames.frd_to_flu(frd)), orientation=quaternion(turned))
 
 
-def _arrow(position: Floats, velocity: Floats, rgb: style.Colour) -> messages.ArrowPrimitive | None:
+def _arrow(position: Floats, velocity: Floats, rgb: scene.Colour) -> messages.ArrowPrimitive | None:
     """Return the arrow of a velocity NED [m/s]; None if too short."""
-    length = style.ARROW_S * float(np.linalg.norm(velocity))
-    if length < style.LEAST_ARROW_M:
+    length = scene.ARROW_S * float(np.linalg.norm(velocity))
+    if length < scene.LEAST_ARROW_M:
         return None
     head = min(0.16, 0.5 * length)
     return messages.ArrowPrimitive(

@@ -30,6 +30,9 @@ from airl_mav.addons.export_log.scene import (
     vehicle_scene,
     velocity_scene,
 )
+from airl_mav.addons.recordings.recorded_flight import NAVIGATING
+from airl_mav.addons.view.replayed_flight import STANDING_M
+from airl_mav.addons.view.view_messages import OFFBOARD, VehicleShape
 from airl_mav.black_box.messages import (
     INFO,
     WARNING,
@@ -48,17 +51,12 @@ from airl_mav.black_box.messages import (
 from airl_mav.core.clock import since_1970_us
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.frames import frd_to_flu, quat_flu_from_optical
-from airl_mav.flight.quality import commanded_velocity
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.trajectory import Trajectory, commanded_velocity
 from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT
 from airl_mav.profiles.projections import CameraKind
 from airl_mav.report.forensics.camera_view import PolicyCamera
-from airl_mav.report.recorded_flight import NAVIGATING
-from airl_mav.report.replay.replayed_flight import STANDING_M
-from airl_mav.view.shown import OFFBOARD
-from airl_mav.view.style import FIRST, OTHER
-from airl_mav.view.view_messages import VehicleShape
+from airl_mav.report.scene import FIRST, OTHER
 
 ENDED = "ended"
 """Phase after navigation."""

@@ -12,15 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.addons.export_log.recorded import RecordedFlight, charge_of
+from airl_mav.addons.view.replayed_flight import INFO, STANDING_M, WARNING
 from airl_mav.core.frames import quat_from_euler, quats_to_euler
-from airl_mav.flight.quality import commanded_velocity
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.trajectory import Trajectory, commanded_velocity
 from airl_mav.latency.stamps import ATTITUDE, RATES, SETPOINT
-from airl_mav.report.replay.replayed_flight import INFO, STANDING_M, WARNING
+from firmware_sim.addons.flight_log.flight_log import DESCRIBED
+from firmware_sim.addons.flight_log.topics import ARMED, DISARMED, ON_CHANGE_US, ROTARY_WING, TOPICS
+from firmware_sim.addons.flight_log.ulog_writer import Topic, UlogWriter, Values
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.flight_log.flight_log import DESCRIBED
-from firmware_sim.flight_log.topics import ARMED, DISARMED, ON_CHANGE_US, ROTARY_WING, TOPICS
-from firmware_sim.flight_log.ulog_writer import Topic, UlogWriter, Values
 
 _LOGGED = {logged.topic.name: logged for logged in TOPICS}
 

@@ -10,6 +10,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.addons.fault_matrix import matrix as fault_matrix
+from airl_mav.addons.fault_matrix.matrix import CASES, MATRIX_PHASES
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import EXIT_NOT_MET, FieldError
 from airl_mav.core.fields import ProfileModel, quantity
@@ -17,9 +18,9 @@ from airl_mav.core.files import replace_file
 from airl_mav.core.machine import provenance, usable_cores
 from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.faults.fault import Fault
-from airl_mav.faults.kinds import CASES, LINKS, MATRIX_PHASES, PROCESSES, Phase
+from airl_mav.faults.kinds import LINKS, PROCESSES, Phase
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.report.table import Column, TableView, print_table
+from airl_mav.report.document import Column, TableView, print_table
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, IN_WORDS, VehicleName
 from airl_mav.scenario.model import GREATEST_SEED, GREATEST_WORKERS
 

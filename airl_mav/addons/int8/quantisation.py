@@ -31,10 +31,9 @@ from airl_mav.policy.card import (
     read_model,
 )
 from airl_mav.policy.card_writing import write_card
-from airl_mav.policy.layouts import encode_layout
+from airl_mav.policy.layouts import Encoded, encode_layout
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
-from airl_mav.policy.observation_spec import Encoded
 from airl_mav.policy.runtime import OnnxRuntime, first_line
 from airl_mav.scenario.checks import action_generator
 from airl_mav.scenario.model import DEFAULT_ARENA, Scenario

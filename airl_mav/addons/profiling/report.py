@@ -21,7 +21,7 @@ from airl_mav.latency.stages import (
 )
 from airl_mav.policy.card import PolicyCard
 from airl_mav.profiles.computer import load_computer
-from airl_mav.report.table import TOO_FEW_CELL, Column, TableView, print_table
+from airl_mav.report.document import TOO_FEW_CELL, Column, TableView, print_table
 from airl_mav.scenario.model import DEFAULT_POLICY
 
 PERCENTILES = (50.0, 90.0, 99.0, 99.9)

@@ -15,7 +15,7 @@ from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.machine import MachineState, package_versions, throttled_since
 from airl_mav.latency.stages import Samples, percentile, summarize
-from airl_mav.report.table import DURATION_COLUMNS, Column, TableView, duration_cells
+from airl_mav.report.document import DURATION_COLUMNS, Column, TableView, duration_cells
 
 if TYPE_CHECKING:
     from airl_mav.report.theme import FigureImage

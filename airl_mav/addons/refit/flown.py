@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import bootstrap, t
 
+from airl_mav.addons.recordings.recorded_flight import NAVIGATING, path_of, stamps_of
 from airl_mav.black_box.mcap_file import BlackBox
 from airl_mav.black_box.messages import Decision, Phase
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import SETPOINT, commanded
-from airl_mav.report.recorded_flight import NAVIGATING, path_of, stamps_of
 from airl_mav.vehicle_log import MOTORS, ClockAlignment, VehicleLog, align
 
 AIRBORNE_M = 0.8

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import bootstrap
 
+from airl_mav.addons.recordings.recorded_flight import stamps_of
 from airl_mav.addons.refit import files
 from airl_mav.addons.refit.air import WIND, Air, Known, Thrust, fit_air, fit_thrust, thrust_of
 from airl_mav.addons.refit.files import overrides_of, refitted, vehicle_toml, write_refit
@@ -35,7 +36,6 @@ from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.computer import ComputerProfile, load_computer
 from airl_mav.profiles.conditions import Payload, loaded
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from airl_mav.report.recorded_flight import stamps_of
 from airl_mav.vehicle_log import ClockAlignment, read_vehicle_log
 
 LEAST = 5

@@ -13,7 +13,7 @@ from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
 from airl_mav.core.progress import new_console
-from airl_mav.report.table import NONE, Column, TableView, columns_of, print_table
+from airl_mav.report.document import NONE, Column, TableView, columns_of, print_table
 
 if TYPE_CHECKING:
     from airl_mav.addons.refit.flown import FittedQuantity

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter
 from scipy.spatial.transform import Rotation
 
+from airl_mav.addons.recordings.recorded_flight import episode_of, info_of, settings_of
 from airl_mav.addons.refit.files import REFIT_FILE, VEHICLE_FILE
 from airl_mav.addons.refit.refit import SCHEMA
 from airl_mav.black_box.mcap_file import BlackBox, read_black_box
@@ -29,7 +30,6 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.arena import ArenaSpec, Size
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
-from airl_mav.report.recorded_flight import episode_of, info_of, settings_of
 from airl_mav.scenario.model import Decisions, Scenario
 from airl_mav.scenario.resolve import resolve
 

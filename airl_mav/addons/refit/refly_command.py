@@ -15,9 +15,8 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.progress import new_console
-from airl_mav.report.comparison.runs import compare_folders
-from airl_mav.report.comparison.show import show_comparison
-from airl_mav.report.table import NONE, TableView, columns_of, print_table
+from airl_mav.report.comparison.show import compare_folders, show_comparison
+from airl_mav.report.document import NONE, TableView, columns_of, print_table
 from airl_mav.scenario.model import GREATEST_SEED
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 Renders depth, segmentation, optical flow and colour, in real time or path traced.
 Command: `airl render`.
-Depends on: `airl_mav.camera`, `airl_mav.report.replay`; the extra `render` for path tracing.
+Depends on: `airl_mav.camera`, the add-on `view`; the extra `render` for path tracing.
 Guide: docs/how-to/camera.md.
 """
 

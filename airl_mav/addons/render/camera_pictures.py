@@ -21,6 +21,7 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 from PIL import Image
 
+from airl_mav.addons.view.replayed_flight import ReplayedFlight
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera import primitives
 from airl_mav.camera.exposure import expose
@@ -38,7 +39,6 @@ from airl_mav.flight.trajectory import pose_at
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.projections import distorted, steepness
 from airl_mav.report.forensics.camera_view import PolicyCamera
-from airl_mav.report.replay.replayed_flight import ReplayedFlight
 from airl_mav.report.theme import coloured
 
 ROOM = {

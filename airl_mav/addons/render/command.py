@@ -14,6 +14,7 @@ from rich.console import Console
 
 from airl_mav.addons.render import camera_pictures
 from airl_mav.addons.render.camera_pictures import CameraMotion
+from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.arena.generate import generate
 from airl_mav.black_box.messages import SUFFIX
 from airl_mav.camera.intrinsics import Intrinsics
@@ -37,7 +38,6 @@ from airl_mav.profiles.projections import (
 )
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.replay.replayed_flight import ReplayedRun
 from airl_mav.report.run_arenas import trust_arenas
 from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED
 

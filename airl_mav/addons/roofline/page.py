@@ -11,8 +11,14 @@ import numpy as np
 from airl_mav.addons.roofline.points import Bound, Roofline, RooflinePoint
 from airl_mav.latency.stages import f1_velocity
 from airl_mav.report import theme
-from airl_mav.report.document import Document, Facts, Section, provenance_facts
-from airl_mav.report.table import TableView, columns_of
+from airl_mav.report.document import (
+    Document,
+    Facts,
+    Section,
+    TableView,
+    columns_of,
+    provenance_facts,
+)
 
 BINDS: dict[Bound, str] = {
     "body": "body: beyond the knee, deciding sooner gains little",

@@ -25,9 +25,19 @@ from airl_mav.addons.sweep.summary import (
     summarize,
 )
 from airl_mav.report import theme
-from airl_mav.report.document import Document, Facts, Headline, Section, provenance_facts
+from airl_mav.report.document import (
+    NONE,
+    Column,
+    Document,
+    Facts,
+    Headline,
+    Section,
+    TableView,
+    print_facts,
+    print_table,
+    provenance_facts,
+)
 from airl_mav.report.heatmap import Field, HeatMap, heat_picture
-from airl_mav.report.table import NONE, Column, TableView, print_facts, print_table
 from airl_mav.report.theme import FigureImage
 
 Described = tuple[Column, Callable[[NetworkSummary], str]]

@@ -14,8 +14,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import Goal
 from airl_mav.flight.episode_record import EpisodeRecord, run_sha256
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.paired import compare_pairs, pair_by_seed, percent_change
-from airl_mav.flight.statistics import aggregate
+from airl_mav.flight.statistics import aggregate, compare_pairs, pair_by_seed, percent_change
 from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples, summarize
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison import comparison_model

@@ -10,8 +10,7 @@ from pydantic import TypeAdapter
 
 from airl_mav.core.files import read_typed, write_json
 from airl_mav.flight.episode_record import Setup
-from airl_mav.flight.paired import PairedComparison
-from airl_mav.flight.statistics import Aggregate
+from airl_mav.flight.statistics import Aggregate, PairedComparison
 from airl_mav.latency.stages import SETPOINT_TO_MOTOR, Stage, Summary
 from airl_mav.profiles.published import PublishedGap, PublishedRun
 

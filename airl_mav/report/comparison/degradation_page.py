@@ -23,9 +23,8 @@ from airl_mav.report.comparison.comparison_model import (
     RunEntry,
 )
 from airl_mav.report.comparison.tables import common_rules, contrasts_table, plain_facts, signed
-from airl_mav.report.document import Document, Section
+from airl_mav.report.document import Column, Document, Section, TableView, ms
 from airl_mav.report.measures import DISTANCE, ENERGY, FLIGHT_TIME, MEASURES, QualityMeasure
-from airl_mav.report.table import Column, TableView, ms
 from airl_mav.report.theme import FigureImage
 
 

@@ -30,10 +30,9 @@ from airl_mav.report.comparison.tables import (
     plain_facts,
     published_value,
 )
-from airl_mav.report.document import Document, Section
-from airl_mav.report.flights_above import flight_pictures
+from airl_mav.report.document import NONE, Column, Document, Section, TableView, interval_of, ms
+from airl_mav.report.run_figures import flight_pictures
 from airl_mav.report.run_tables import computer_power
-from airl_mav.report.table import NONE, Column, TableView, ms
 
 WITHOUT, WITH = "without-mitigation", "with-mitigation"
 WITH_TRAINED, WITHOUT_TRAINED = "with-mitigation-trained", "without-mitigation-trained"
@@ -90,7 +89,7 @@ def _longer(contrast: Contrast) -> str:
 
 
 def _interval(difference: Estimate) -> str:
-    text = measures.interval_of(difference, 1, "+")
+    text = interval_of(difference, 1, "+")
     return f" ({text})" if text else ""
 
 

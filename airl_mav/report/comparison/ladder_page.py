@@ -13,9 +13,18 @@ from airl_mav.report.comparison import tables
 from airl_mav.report.comparison.build import compare, comparison_document, split_seeds, widest_seeds
 from airl_mav.report.comparison.comparison_model import ComparedRun, Comparison, Contrast, RunEntry
 from airl_mav.report.comparison.figures import contrast_pictures
-from airl_mav.report.document import Document, Section, tables_section
+from airl_mav.report.document import (
+    NONE,
+    OUTCOME_LABELS,
+    Column,
+    Document,
+    Section,
+    TableView,
+    columns_of,
+    ms,
+    tables_section,
+)
 from airl_mav.report.measures import MEASURES, count_successes
-from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView, columns_of, ms
 
 MAX_SPLIT = 50
 """Maximum number of seeds in the table of different outcomes."""

@@ -1,4 +1,4 @@
-"""Building, writing and printing of comparisons of every kind."""
+"""Comparisons of every kind: building, writing, printing; of any runs, of policies x arenas."""
 
 from __future__ import annotations
 
@@ -17,12 +17,33 @@ from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.comparison import (
     comparison_model,
     degradation_page,
+    figures,
     gap_page,
     ladder_page,
-    matrix_page,
-    runs,
+    tables,
 )
-from airl_mav.report.document import Document, print_document, print_place, write_document
+from airl_mav.report.comparison.build import compare, comparison_document
+from airl_mav.report.comparison.comparison_model import (
+    ComparedRun,
+    Comparison,
+    RunEntry,
+    kind_of,
+    load_entries,
+)
+from airl_mav.report.comparison.tables import plain_facts
+from airl_mav.report.document import (
+    NONE,
+    Column,
+    Document,
+    Section,
+    TableView,
+    print_document,
+    print_place,
+    write_document,
+)
+from airl_mav.report.heatmap import Field, HeatMap, heat_picture
+from airl_mav.report.measures import MEASURES, SUCCESS_RATE, QualityMeasure
+from airl_mav.report.run_figures import flight_pictures
 from airl_mav.report.run_verdict import (
     OverallVerdict,
     invalid_flights,
@@ -39,29 +60,6 @@ FLOWN_UNTIL = "flown_until"
 """Fact of a comparison with a sequential test, which stops once the success rate is decided. The
 same test judges the rate."""
 
-_BUILD: dict[
-    comparison_model.Kind,
-    Callable[
-        [Mapping[str, Any], Sequence[comparison_model.RunEntry], Runs], comparison_model.Comparison
-    ],
-] = {
-    "compare": runs.build_runs,
-    "gap": gap_page.build_gap,
-    "ladder": ladder_page.build_ladder,
-    "matrix": matrix_page.build_matrix,
-    "degradation": degradation_page.build_degradation,
-}
-
-_DOCUMENT: dict[
-    comparison_model.Kind, Callable[[comparison_model.Comparison, Runs, Path], Document]
-] = {
-    "compare": runs.document_of,
-    "gap": gap_page.document_of,
-    "ladder": ladder_page.document_of,
-    "matrix": matrix_page.document_of,
-    "degradation": degradation_page.document_of,
-}
-
 
 def build_comparison(
     folder: Path,
@@ -71,7 +69,7 @@ def build_comparison(
 ) -> tuple[comparison_model.Comparison, dict[str, LoadedRun]]:
     """Read the runs of a folder and compare them; the kind's module documents its facts."""
     loaded = {entry.name: load(folder / entry.folder) for entry in entries}
-    return _BUILD[kind](facts, entries, loaded), loaded
+    return _KINDS[kind][0](facts, entries, loaded), loaded
 
 
 def rebuild_comparison(folder: Path) -> tuple[comparison_model.Comparison, dict[str, LoadedRun]]:
@@ -161,7 +159,7 @@ def comparison_to_document(
     comparison: comparison_model.Comparison, loaded: Runs, folder: Path, verdict: OverallVerdict
 ) -> Document:
     """Return the document of a comparison without drawing its pictures."""
-    document = _DOCUMENT[comparison.kind](comparison, loaded, folder)
+    document = _KINDS[comparison.kind][1](comparison, loaded, folder)
     return replace(document, answers=verdict.lines, status=verdict.status)
 
 
@@ -182,3 +180,256 @@ def show_comparison(
     progress.status(None)
     print_place(document.name, page, console)
     return page
+
+
+NAMING = ("policy", "arena", "computer", "level", "vehicle")
+"""Parts of a setup used to distinguish runs."""
+
+LONGEST_NAME = 48
+"""Maximum length of a name derived from differences; longer names are replaced by folders."""
+
+
+def compare_folders(
+    paths: Sequence[Path], names: Sequence[str] = ()
+) -> tuple[Comparison, dict[str, LoadedRun]]:
+    """Read runs and compare all others with the first.
+
+    Args:
+        paths: Run folders; the folder of a comparison selects its runs.
+        names: Names of the runs in the same order; empty = derived from setups or folders.
+
+    Raises:
+        UsageError: A folder is no run or has no flights; fewer than two runs; a duplicate run;
+            invalid names.
+    """
+    folders = [folder for path in paths for folder in run_folders(path)]
+    if len(folders) < 2:
+        raise UsageError(f"{len(folders)} run: accepted: two or more to compare")
+    resolved = [folder.resolve() for folder in folders]
+    if twice := [f for f, r in zip(folders, resolved, strict=True) if resolved.count(r) > 1]:
+        raise UsageError(f"{twice[0]}: twice; accepted: each run once")
+    loaded = [load(folder) for folder in folders]
+    runs = dict(zip(_checked(names, loaded), loaded, strict=True))
+    entries = [RunEntry(name, str(run.path.resolve())) for name, run in runs.items()]
+    return build_runs({}, entries, runs), runs
+
+
+def build_runs(
+    facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
+) -> Comparison:
+    """Compare all other runs with the first; see `show.build_comparison`."""
+    return compare(runs, title=f"{len(runs)} runs compared", facts=facts, entries=entries)
+
+
+def run_folders(path: Path) -> list[Path]:
+    """Return the run folders for a path: the folder itself, or its comparison's run folders."""
+    kind = kind_of(path)
+    if kind is None:
+        return [path]
+    return [path / entry.folder for entry in load_entries(path, kind)[1]]
+
+
+def runs_document(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
+    """Return the document of a comparison of runs."""
+    paired = [contrast for contrast in comparison.contrasts if contrast.pairs]
+    reference = comparison.runs[0].mark
+    facts = tables.facts_table(comparison)
+    sections = [
+        Section(facts.title, tables=(facts,))
+        if comparison.different
+        else Section(facts.title, sentences=("Nothing in what was flown on what.",)),
+        Section(
+            "Quality of flight",
+            tables=(tables.runs_table(comparison.runs), *tables.conduct_table(comparison.runs)),
+        ),
+        Section(
+            "Paired differences",
+            sentences=tables.pair_sentences(comparison),
+            tables=tuple(tables.contrast_table(comparison, contrast) for contrast in paired),
+            draw=lambda: figures.contrast_pictures("compare", comparison, paired) if paired else [],
+            sheet="compare-differences.png",
+            note="Dots: differences on the same seeds. Bars: 95 % intervals. The line of zero: "
+            f"{reference}.",
+        ),
+        Section(
+            "Decision latency",
+            tables=(tables.stages_table(comparison.runs),),
+            draw=lambda: figures.latency_pictures(comparison, runs),
+            sheet="compare-latency.png",
+        ),
+        Section(
+            "Flights from above",
+            draw=lambda: flight_pictures(
+                "compare-flights", figures.flight_panels(comparison.runs, runs)
+            ),
+            sheet="compare-trajectories.png",
+            note="All on the same axes. Triangle: start; stars: goals; crosses and squares: where "
+            "flights failed.",
+            in_terminal=False,
+        ),
+        Section(
+            "Energy of airframe and computer",
+            draw=lambda: [figures.energy_picture(comparison)],
+            in_terminal=False,
+        ),
+    ]
+    return comparison_document(
+        comparison,
+        runs,
+        folder,
+        kicker=f"Comparison of {len(comparison.runs)} runs",
+        lead="; ".join(run.heading for run in comparison.runs) + f". The reference: {reference}.",
+        sections=sections,
+        facts=tuple(comparison.same.items()),
+        facts_title="The same in all",
+    )
+
+
+def _checked(names: Sequence[str], runs: Sequence[LoadedRun]) -> list[str]:
+    """Return the given names of runs, or names from their differences."""
+    if not names:
+        return _names(runs)
+    if len(names) != len(runs):
+        raise UsageError(f"--names: {len(names)} for {len(runs)} runs; accepted: one a run")
+    for name in names:
+        if not name.strip() or list(names).count(name) > 1:
+            raise UsageError(f"--names {name!r}: accepted: not empty, each name once")
+    return list(names)
+
+
+def _names(runs: Sequence[LoadedRun]) -> list[str]:
+    rows = [_traits(run) for run in runs]
+    telling = [key for key in rows[0] if len({row[key] for row in rows}) > 1]
+    names = [", ".join(row[key] for key in telling if row[key]) for row in rows]
+    if len(set(names)) == len(runs) and all(0 < len(name) <= LONGEST_NAME for name in names):
+        return names
+    folders = [run.path.resolve().name for run in runs]
+    return folders if len(set(folders)) == len(runs) else [str(run.path) for run in runs]
+
+
+def _traits(run: LoadedRun) -> dict[str, str]:
+    setup, config = run.info.setup, run.info.config
+    parts = {kind: getattr(setup, kind) for kind in NAMING}
+    traits = {
+        k: part if isinstance(part, str) else Path(part.name).stem for k, part in parts.items()
+    }
+    traits["t2"] = ""
+    if (latency := setup.injection.latency) is not None:
+        samples = latency.samples_ms
+        mean_ms = latency.mean_ms if samples is None else sum(samples) / len(samples)
+        traits["t2"] = f"{mean_ms:.4g} ms" if samples is None else f"{mean_ms:.0f} ms"
+    traits["ablate"] = f"no {config['ablate']}" if config.get("ablate") else ""
+    return traits
+
+
+def build_matrix(
+    facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
+) -> Comparison:
+    """Compare policies (`label`) across arenas (`group`); see `show.build_comparison`."""
+    title = "Policies by arenas"
+    return compare(runs, (), kind="matrix", title=title, facts=facts, entries=entries)
+
+
+def matrix_tables(runs: Sequence[ComparedRun]) -> list[TableView]:
+    """Return a table per measure with policies in rows and arenas in columns."""
+    policies = list(dict.fromkeys(run.label for run in runs))
+    arenas = list(dict.fromkeys(run.entry.group for run in runs))
+    at = {(run.label, run.entry.group): run for run in runs}
+    views = []
+    for measure in MEASURES:
+        columns = (
+            Column("policy", number=False),
+            *(Column(arena, measure.unit) for arena in arenas),
+        )
+        rows = tuple(
+            (policy, *(_cell(at.get((policy, arena)), measure) for arena in arenas))
+            for policy in policies
+        )
+        title = measure.title.capitalize()
+        views.append(TableView(measure.key, title, columns, rows, _notes(runs, measure)))
+    return views
+
+
+def _cell(run: ComparedRun | None, measure: QualityMeasure) -> str:
+    if run is None:
+        return NONE
+    text = measure.with_interval(run.quality)
+    return f"{text} *" if text != NONE and trained_here(run) else text
+
+
+def trained_here(run: ComparedRun) -> bool:
+    """Return True if a policy was trained in the arena of its run."""
+    return run.entry.group == run.entry.trained_in
+
+
+def _notes(runs: Sequence[ComparedRun], measure: QualityMeasure) -> tuple[str, ...]:
+    if measure is not SUCCESS_RATE:
+        return ("Means over the flights that reached the goal, 95 % bootstrap intervals.",)
+    notes = ["Of all flights; 95 % intervals after Wilson. The same seeds in every cell."]
+    if any(trained_here(run) for run in runs):
+        notes.append("* the arena that the policy was trained in")
+    rules = list(dict.fromkeys(run.entry.rules for run in runs))
+    start = "Rules" if len(rules) == 1 else "Not all by the same rules"
+    return (*notes, f"{start}: {'; '.join(rules)}.")
+
+
+def success_map(runs: Sequence[ComparedRun]) -> HeatMap:
+    """Return the success rates as a heat map with the first policy at the top."""
+    policies = list(dict.fromkeys(run.label for run in runs))[::-1]
+    return HeatMap(
+        title="success; a star: trained there",
+        rows=policies,
+        row_title="",
+        columns=list(dict.fromkeys(run.entry.group for run in runs)),
+        column_title="",
+        fields={
+            (run.label, run.entry.group): Field(
+                100.0 * rate, f"{100.0 * rate:.1f}{'*' if trained_here(run) else ''}"
+            )
+            for run in runs
+            if (rate := run.quality.success_rate.value) is not None
+        },
+        unit="success [%]",
+        limits=(0.0, 100.0),
+    )
+
+
+def matrix_document(
+    comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path
+) -> Document:
+    """Return the document of a table of policies x arenas."""
+    alt = "Success rate of every policy in every arena"
+    return comparison_document(
+        comparison,
+        runs,
+        folder,
+        kicker="Evaluation",
+        sections=[
+            *(Section(view.title, tables=(view,)) for view in matrix_tables(comparison.runs)),
+            Section(
+                "Success at a glance",
+                draw=lambda: [heat_picture("matrix", alt, success_map(comparison.runs))],
+                in_terminal=False,
+            ),
+        ],
+        facts=plain_facts(comparison),
+    )
+
+
+_KINDS: dict[
+    comparison_model.Kind,
+    tuple[
+        Callable[
+            [Mapping[str, Any], Sequence[comparison_model.RunEntry], Runs],
+            comparison_model.Comparison,
+        ],
+        Callable[[comparison_model.Comparison, Runs, Path], Document],
+    ],
+] = {
+    "compare": (build_runs, runs_document),
+    "gap": (gap_page.build_gap, gap_page.document_of),
+    "ladder": (ladder_page.build_ladder, ladder_page.document_of),
+    "matrix": (build_matrix, matrix_document),
+    "degradation": (degradation_page.build_degradation, degradation_page.document_of),
+}
+"""Functions that build the comparison and its document, by kind."""

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from airl_mav.latency.stages import SETPOINT_TO_MOTOR, SHOWN_STAGES
-from airl_mav.report import table
+from airl_mav.report import document
 from airl_mav.report.comparison.comparison_model import ComparedRun, Comparison, Contrast
-from airl_mav.report.document import Facts, Headline, estimate_headline
+from airl_mav.report.document import Facts, Headline, estimate_headline, interval_of, with_interval
 from airl_mav.report.measures import (
     COMPUTER_ENERGY,
     CONDUCT,
@@ -17,8 +17,6 @@ from airl_mav.report.measures import (
     MEASURES,
     QualityMeasure,
     count_successes,
-    interval_of,
-    with_interval,
 )
 
 SIDE_BY_SIDE = 4
@@ -58,7 +56,7 @@ def published_change(contrast: Contrast, measure: QualityMeasure) -> float | Non
 
 def signed(value: float | None, digits: int = 1) -> str:
     """Return a difference with its sign, never as -0."""
-    return table.NONE if value is None else f"{round(value, digits) + 0.0:+,.{digits}f}"
+    return document.NONE if value is None else f"{round(value, digits) + 0.0:+,.{digits}f}"
 
 
 def versus(comparison: Comparison, contrast: Contrast) -> str:
@@ -84,12 +82,12 @@ def runs_table(
     title: str = "Quality of flight",
     head: str = "run",
     measures: Sequence[QualityMeasure] = (*MEASURES, COMPUTER_ENERGY),
-) -> table.TableView:
+) -> document.TableView:
     """Return the results of each run, one per row."""
     columns = (
-        table.Column(head, number=False),
-        table.Column("flights"),
-        *(table.Column(measure.title, measure.unit) for measure in measures),
+        document.Column(head, number=False),
+        document.Column("flights"),
+        *(document.Column(measure.title, measure.unit) for measure in measures),
     )
     rows = tuple(
         (
@@ -107,10 +105,10 @@ def runs_table(
         notes.append(_NARROW.format(FEW_FLIGHTS, "flights"))
     if len({run.quality.success_rate.n for run in runs}) > 1:
         notes.append("Not the same number of flights in all runs: compare on the same seeds.")
-    return table.TableView("quality", title, columns, rows, tuple(notes), in_terminal="stacked")
+    return document.TableView("quality", title, columns, rows, tuple(notes), in_terminal="stacked")
 
 
-def conduct_table(runs: Sequence[ComparedRun]) -> tuple[table.TableView, ...]:
+def conduct_table(runs: Sequence[ComparedRun]) -> tuple[document.TableView, ...]:
     """Return deadlines and smoothness of each run; empty if no run recorded them."""
     if not any(measure.of(run.quality).n for run in runs for measure in CONDUCT):
         return ()
@@ -118,34 +116,34 @@ def conduct_table(runs: Sequence[ComparedRun]) -> tuple[table.TableView, ...]:
     return (replace(view, key="conduct", notes=(CONDUCT_NOTE,)),)
 
 
-def facts_table(comparison: Comparison) -> table.TableView:
+def facts_table(comparison: Comparison) -> document.TableView:
     """Return only the differences between the setups; many runs are listed in rows."""
     terms, runs = comparison.different, comparison.runs
     note = f"Only what differs. The reference: {runs[0].heading}."
     if len(runs) > SIDE_BY_SIDE:
-        columns: tuple[table.Column, ...] = tuple(
-            table.Column(title, number=False) for title in ("run", "what", "")
+        columns: tuple[document.Column, ...] = tuple(
+            document.Column(title, number=False) for title in ("run", "what", "")
         )
         rows: tuple[tuple[str, ...], ...] = tuple(
-            (run.heading if number == 0 else "", term, run.facts.get(term, table.NONE))
+            (run.heading if number == 0 else "", term, run.facts.get(term, document.NONE))
             for run in runs
             for number, term in enumerate(terms)
         )
     else:
         columns = (
-            table.Column("", number=False),
-            *(table.Column(r.heading, number=False) for r in runs),
+            document.Column("", number=False),
+            *(document.Column(r.heading, number=False) for r in runs),
         )
-        rows = tuple((term, *(r.facts.get(term, table.NONE) for r in runs)) for term in terms)
-    return table.TableView("facts", "What differs", columns, rows, (note,))
+        rows = tuple((term, *(r.facts.get(term, document.NONE) for r in runs)) for term in terms)
+    return document.TableView("facts", "What differs", columns, rows, (note,))
 
 
-def stages_table(runs: Sequence[ComparedRun]) -> table.TableView:
+def stages_table(runs: Sequence[ComparedRun]) -> document.TableView:
     """Return the latencies of all runs, stage by stage."""
     columns = (
-        table.Column("stage", number=False),
-        table.Column("run", number=False),
-        *table.DURATION_COLUMNS,
+        document.Column("stage", number=False),
+        document.Column("run", number=False),
+        *document.DURATION_COLUMNS,
     )
     rows: list[tuple[str, ...]] = []
     mixed = any(run.modelled for run in runs)
@@ -155,7 +153,7 @@ def stages_table(runs: Sequence[ComparedRun]) -> table.TableView:
         having = [r for r in runs if r.has_stage(stage) or (joint and r.stages[stage.key].n)]
         for number, run in enumerate(having):
             title = stage.title if number == 0 else ""
-            rows.append((title, run.mark, *table.duration_cells(run.stages[stage.key])))
+            rows.append((title, run.mark, *document.duration_cells(run.stages[stage.key])))
     notes = ["Milliseconds of simulated time."]
     labels = {run.mark: run.setup.injection.label for run in runs}
     if len(set(labels.values())) == 1:
@@ -168,9 +166,9 @@ def stages_table(runs: Sequence[ComparedRun]) -> table.TableView:
             f"Level gym measures no time: transport and link are constants of its model, t2 is "
             f"drawn ({listed})."
         )
-    if any(table.TOO_FEW_CELL in row for row in rows):
-        notes.append(table.TOO_FEW_NOTE)
-    return table.TableView("latency", "Decision latency", columns, tuple(rows), tuple(notes))
+    if any(document.TOO_FEW_CELL in row for row in rows):
+        notes.append(document.TOO_FEW_NOTE)
+    return document.TableView("latency", "Decision latency", columns, tuple(rows), tuple(notes))
 
 
 # --- contrasts
@@ -178,22 +176,22 @@ def stages_table(runs: Sequence[ComparedRun]) -> table.TableView:
 
 def contrast_table(
     comparison: Comparison, contrast: Contrast, measures: Sequence[QualityMeasure] = MEASURES
-) -> table.TableView:
+) -> document.TableView:
     """Return a contrast with one row per measure."""
     target, reference = comparison.pair(contrast)
     columns = [
-        table.Column("same seeds", number=False),
-        table.Column(reference.mark),
-        table.Column(target.mark),
-        table.Column("difference"),
-        table.Column("95 % interval"),
-        table.Column("median of pairs", page_only=True),
-        table.Column("pairs"),
+        document.Column("same seeds", number=False),
+        document.Column(reference.mark),
+        document.Column(target.mark),
+        document.Column("difference"),
+        document.Column("95 % interval"),
+        document.Column("median of pairs", page_only=True),
+        document.Column("pairs"),
     ]
     if contrast.published is not None:
         marks = (reference.mark, target.mark)
-        columns += [table.Column(f"paper {mark}", page_only=True) for mark in marks]
-        columns.append(table.Column("paper difference", page_only=True))
+        columns += [document.Column(f"paper {mark}", page_only=True) for mark in marks]
+        columns.append(document.Column("paper difference", page_only=True))
     rows = tuple(_contrast_row(contrast, m, reference, target) for m in measures)
     a = contrast.paired.agreement
     n = contrast.successes
@@ -210,7 +208,7 @@ def contrast_table(
     if contrast.entry.short:
         title += f": {contrast.entry.title}"
     key = f"{contrast.entry.target}-against-{contrast.entry.reference}"
-    return table.TableView(key, title, tuple(columns), rows, tuple(notes))
+    return document.TableView(key, title, tuple(columns), rows, tuple(notes))
 
 
 def _contrast_row(
@@ -223,9 +221,9 @@ def _contrast_row(
         measure.title,
         measure.plain(change.reference, unit=True),
         measure.plain(change.other, unit=True),
-        table.NONE if d.value is None else f"{d.value:+.2f} {unit}",
-        interval_of(d, 2, "+") or table.NONE,
-        table.NONE if change.median is None else with_interval(change.median, 1, "+"),
+        document.NONE if d.value is None else f"{d.value:+.2f} {unit}",
+        interval_of(d, 2, "+") or document.NONE,
+        document.NONE if change.median is None else with_interval(change.median, 1, "+"),
         f"{d.n:,}",
     )
     if contrast.published is None:
@@ -234,20 +232,20 @@ def _contrast_row(
     told = published_change(contrast, measure)
     return (
         *row,
-        *(table.NONE if value is None else f"{value:.4g} {measure.unit}" for value in figures),
-        table.NONE if told is None else f"{told:+.2f} {unit}",
+        *(document.NONE if value is None else f"{value:.4g} {measure.unit}" for value in figures),
+        document.NONE if told is None else f"{told:+.2f} {unit}",
     )
 
 
 def contrasts_table(
     comparison: Comparison, contrasts: Sequence[Contrast], title: str, notes: Sequence[str] = ()
-) -> table.TableView:
+) -> document.TableView:
     """Return contrasts with intervals, one per row, each followed by the published values."""
     columns = (
-        table.Column("", number=False),
-        *(table.Column(measure.title, measure.difference_unit) for measure in MEASURES),
-        table.Column("t2", "%", page_only=True),
-        table.Column("pairs", page_only=True),
+        document.Column("", number=False),
+        *(document.Column(measure.title, measure.difference_unit) for measure in MEASURES),
+        document.Column("t2", "%", page_only=True),
+        document.Column("pairs", page_only=True),
     )
     rows: list[tuple[str, ...]] = []
     for contrast in contrasts:
@@ -258,7 +256,7 @@ def contrasts_table(
         if contrast.published is not None:
             figures = (signed(published_change(contrast, measure)) for measure in MEASURES)
             t2 = signed(contrast.published.latency_percent, 0)
-            rows.append((f"  {THE_PAPER}", *figures, t2, table.NONE))
+            rows.append((f"  {THE_PAPER}", *figures, t2, document.NONE))
     notes = [
         *(
             f"{versus(comparison, c)}: {c.entry.title}, {c.successes:,} pairs."
@@ -273,7 +271,7 @@ def contrasts_table(
     ]
     if min((c.successes for c in contrasts), default=FEW_FLIGHTS) < FEW_FLIGHTS:
         notes.append(_NARROW.format(FEW_FLIGHTS, "pairs"))
-    return table.TableView(
+    return document.TableView(
         "contrasts",
         title,
         columns,

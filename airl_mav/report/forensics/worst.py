@@ -18,11 +18,11 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.envs.stopping import braking_of
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.quality import measure_leg
-from airl_mav.flight.trajectory import Trajectory, pose_at
+from airl_mav.flight.trajectory import Trajectory, measure_leg, pose_at
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.document import NONE, OUTCOME_LABELS, TableView, columns_of
 from airl_mav.report.forensics import evidence
 from airl_mav.report.forensics.camera_view import (
     ObstacleView,
@@ -33,7 +33,6 @@ from airl_mav.report.forensics.camera_view import (
     view_wall,
 )
 from airl_mav.report.forensics.long_flights import cause_of_long_flight
-from airl_mav.report.table import NONE, OUTCOME_LABELS, TableView, columns_of
 
 LOOK_BACK = 5
 """Number of decisions before a collision with examined frames."""

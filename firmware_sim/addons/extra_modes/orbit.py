@@ -27,10 +27,9 @@ from firmware_sim.autopilot.modes.interface import (
     FlightContext,
     FlightMode,
     since,
-    triple,
 )
 from firmware_sim.autopilot.modes.sticks import IDLE_THROTTLE, RELEASED, superexpo
-from firmware_sim.autopilot.smooth_trajectory import PathSegment
+from firmware_sim.autopilot.smooth_trajectory import PathSegment, triple
 
 LEAST_RADIUS_M = 1.0
 FASTEST_M_S = 10.0

@@ -16,8 +16,8 @@ from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import LandingTarget, ModeRequest, PrecisionRequest
 from firmware_sim.autopilot.modes.automatic import landing_speed
-from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
-from firmware_sim.autopilot.smooth_trajectory import PathSegment
+from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode
+from firmware_sim.autopilot.smooth_trajectory import PathSegment, triple
 
 PERIOD_US = 50_000
 """Period of target checks [µs]: PX4's navigator runs at 20 Hz."""

@@ -40,44 +40,30 @@ _MODE_LOCATION = 3
 """MAV_ROI_LOCATION."""
 
 
-class _Look(Enum):
-    NOWHERE = auto()
-    PLACE = auto()
-    WAYPOINT = auto()
-
-
 class VehicleRoi:
-    """Region of interest."""
+    """Region of interest: a place, or the next waypoint with an offset of the heading."""
 
     def __init__(self) -> None:
-        self._look = _Look.NOWHERE
-        self._place = Geodetic(0.0, 0.0, 0.0)
-        self._offset = 0.0
+        self._at: Geodetic | float | None = None
+        """Place, or offset from the direction of the waypoint [rad]; None = nowhere."""
 
-    def reset(self) -> None:
-        """Clear the region of interest."""
-        self._look = _Look.NOWHERE
-
-    def look_at(self, place: Geodetic) -> None:
-        """Set the region of interest to a place (MAV_CMD_DO_SET_ROI_LOCATION)."""
-        self._look, self._place = _Look.PLACE, place
+    def look_at(self, place: Geodetic | None) -> None:
+        """Set the region of interest to a place (MAV_CMD_DO_SET_ROI_LOCATION); None = clear it."""
+        self._at = place
 
     def command(self, item: PlanItem) -> None:
         """Execute a mission item about the region of interest; others are ignored."""
+        place = Geodetic(item.x, item.y, item.z)
         if item.command == NavCommand.DO_SET_ROI_NONE:
-            self.reset()
+            self._at = None
         elif item.command == NavCommand.DO_SET_ROI_LOCATION:
-            self.look_at(Geodetic(item.x, item.y, item.z))
+            self._at = place
         elif item.command == NavCommand.DO_SET_ROI_WPNEXT_OFFSET:
             offset = math.radians(item.z)
-            self._look = _Look.WAYPOINT
-            self._offset = offset if math.isfinite(offset) else 0.0
+            self._at = offset if math.isfinite(offset) else 0.0
         elif item.command == NavCommand.DO_SET_ROI:
             located = item.frame != PlanFrame.MISSION and item.params[0] == _MODE_LOCATION
-            if located:
-                self.look_at(Geodetic(item.x, item.y, item.z))
-            else:
-                self.reset()
+            self._at = place if located else None
 
     def heading(
         self, position: Vec, target: Vec, local: Callable[[Geodetic], Vec], nearest_m: float
@@ -86,13 +72,16 @@ class VehicleRoi:
 
         `position` and the destination `target` are local NED [m]; `local` converts a place to it.
         """
-        if self._look is _Look.NOWHERE:
+        if self._at is None:
             return None
-        at = local(self._place) if self._look is _Look.PLACE else target
-        north, east = at[0] - position[0], at[1] - position[1]
+        offset, there = 0.0, target
+        if isinstance(self._at, Geodetic):
+            there = local(self._at)
+        else:
+            offset = self._at
+        north, east = there[0] - position[0], there[1] - position[1]
         if math.hypot(north, east) <= nearest_m:
             return None
-        offset = self._offset if self._look is _Look.WAYPOINT else 0.0
         return wrap_pi(math.atan2(east, north) + offset)
 
 
@@ -261,7 +250,7 @@ class MissionExecutor:
 
     def _begin(self, landed: bool) -> None:
         """Start, or report the reason against it."""
-        self.roi.reset()
+        self.roi.look_at(None)
         self.finished = False
         if not self.valid:
             self._running = False

@@ -249,11 +249,7 @@ class MissionManager(Missions):
 
     def look_at(self, place: Geodetic | None, /) -> None:
         """Set the region of interest; None = clear it."""
-        roi = self.executor.roi
-        if place is None:
-            roi.reset()
-        else:
-            roi.look_at(place)
+        self.executor.roi.look_at(place)
 
     def destination(self, now: NavigationState, /) -> Geodetic | None:
         """Return the destination of Return by RTL_TYPE; None = along mission items."""

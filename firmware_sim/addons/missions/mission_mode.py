@@ -14,8 +14,8 @@ from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import ModeRequest, PrecisionRequest
 from firmware_sim.autopilot.modes.automatic import gentle, landing_speed, leave_ground
-from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, optional_mode, triple
-from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment
+from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, optional_mode
+from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment, triple
 
 _TAKEOFF, _LAND, _IDLE = TripletKind.TAKEOFF, TripletKind.LAND, TripletKind.IDLE
 

@@ -16,7 +16,7 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events.definition import Definition, Level, define
 from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem
 from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
-from firmware_sim.mavlink.services.context import ANY, Context, sender
+from firmware_sim.mavlink.services.context import ANY, Context, ServiceState, sender
 
 RETRY_US = 250_000
 """Time without an item after which the request is repeated [µs] (PX4)."""
@@ -81,7 +81,7 @@ REPEAT_US = 1_000_000
 
 
 @dataclass(slots=True)
-class MissionTransfer:
+class MissionTransfer(ServiceState):
     """State of one link's mission transfers."""
 
     activity: Activity = Activity.IDLE

@@ -13,8 +13,7 @@ from types import MappingProxyType
 
 from firmware_sim.addons.missions.items import NOT_IN_MISSIONS, NavCommand, PlanFrame
 from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem
-from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.transfers import crc32part
+from firmware_sim.mavlink.codec import WireMessage, crc32part, dialect
 
 _N = NavCommand
 

@@ -115,13 +115,23 @@ class NavigationMode(IntEnum):
     UNKNOWN = 255
 
 
-FailsafeAction = IntEnum(
-    "FailsafeAction",
-    "NONE WARN FALLBACK_POSCTRL FALLBACK_ALTCTRL FALLBACK_STABILIZED HOLD RTL LAND DESCEND "
-    "DISARM TERMINATE",
-    start=0,
-)
-"""Actions of a failsafe, numbered as in `failsafe_actions.FailsafeAction`."""
+class FailsafeAction(IntEnum):
+    """Action of a failsafe. The highest of several takes effect."""
+
+    NONE = 0
+    WARN = 1
+    FALLBACK_POSCTRL = 2
+    """Fall back to Position mode, flown by the pilot."""
+    FALLBACK_ALTCTRL = 3
+    FALLBACK_STABILIZED = 4
+    HOLD = 5
+    RTL = 6
+    LAND = 7
+    DESCEND = 8
+    """Descend level without a position estimate."""
+    DISARM = 9
+    TERMINATE = 10
+    """Stop the motors permanently: only a restart ends it."""
 
 
 SensorType = IntEnum("SensorType", "ACCEL GYRO MAG", start=0)
@@ -144,7 +154,7 @@ FailsafeCause = IntEnum(
     "EMERGENCY_BATTERY_LEVEL LOW_REMAINING_FLIGHT_TIME",
     start=0,
 )
-"""Causes in a failsafe's text, in the order of `failsafe_actions.FailsafeReason`."""
+"""Cause of a failsafe, named in texts."""
 
 
 class Enumeration(NamedTuple):
@@ -170,59 +180,49 @@ ENUMERATIONS: Mapping[str, Enumeration] = {
     "failsafe_cause_t": Enumeration("uint8_t", FailsafeCause, "Why a failsafe acts"),
 }
 
-_WORDS: Mapping[tuple[type[IntEnum], int], str] = {
-    (type(member), member.value): words
-    for member, words in (
-        (ModeGroup.ALTCTL, "Altitude"),
-        (ModeGroup.POSCTL, "Position"),
-        (ModeGroup.LOITER, "Hold"),
-        (ModeGroup.RTL, "Return"),
-        (ModeGroup.STAB, "Stabilized"),
-        (ModeGroup.PRECLAND, "Precision land"),
-        (ModeGroup.VTOL_TAKEOFF, "VTOL takeoff"),
-        (Component.GPS, "GPS"),
-        (SensorType.ACCEL, "Accelerometer"),
-        (SensorType.GYRO, "Gyroscope"),
-        (SensorType.MAG, "Magnetometer"),
-        (Component.MOTORS_ESCS, "Motors and ESCs"),
-        (Component.UTM, "UTM"),
-        (Component.ACCEL, "Accelerometer"),
-        (Component.GYRO, "Gyroscope"),
-        (ArmingReason.LOCKDOWN, "lockdown"),
-        (ArmingReason.FAILSAFE, "failsafe"),
-        (ArmingReason.COMMAND_INTERNAL, "internal command"),
-        (ArmingReason.COMMAND_EXTERNAL, "external command"),
-        (ArmingReason.AUTO_DISARM_LAND, "landing"),
-        (ArmingReason.AUTO_DISARM_PREFLIGHT, "auto preflight disarming"),
-        (NavigationMode.ALTCTL, "Altitude"),
-        (NavigationMode.POSCTL, "Position"),
-        (NavigationMode.AUTO_MISSION, "Mission"),
-        (NavigationMode.AUTO_LOITER, "Hold"),
-        (NavigationMode.AUTO_RTL, "Return"),
-        (NavigationMode.STAB, "Stabilized"),
-        (NavigationMode.AUTO_TAKEOFF, "Takeoff"),
-        (NavigationMode.AUTO_LAND, "Land"),
-        (NavigationMode.AUTO_FOLLOW_TARGET, "Follow Target"),
-        (NavigationMode.AUTO_PRECLAND, "Precision Landing"),
-        (NavigationMode.AUTO_VTOL_TAKEOFF, "VTOL Takeoff"),
-        *((NavigationMode[f"EXTERNAL{n}"], f"External {n}") for n in range(1, 9)),
-        (FailsafeAction.FALLBACK_POSCTRL, "Position mode"),
-        (FailsafeAction.FALLBACK_ALTCTRL, "Altitude mode"),
-        (FailsafeAction.FALLBACK_STABILIZED, "Stabilized mode"),
-        (FailsafeAction.RTL, "Return"),
-        (FailsafeAction.WARN, "warning"),
-        (FailsafeAction.DISARM, "disarming"),
-        (FailsafeAction.TERMINATE, "termination"),
-        (FailsafeCause.GCS_CONNECTION_LOSS, "GCS connection loss"),
-    )
+_WORDS: Mapping[str, str] = {
+    "ACCEL": "Accelerometer",
+    "ALTCTL": "Altitude",
+    "AUTO_DISARM_LAND": "landing",
+    "AUTO_DISARM_PREFLIGHT": "auto preflight disarming",
+    "AUTO_FOLLOW_TARGET": "Follow Target",
+    "AUTO_LAND": "Land",
+    "AUTO_LOITER": "Hold",
+    "AUTO_MISSION": "Mission",
+    "AUTO_PRECLAND": "Precision Landing",
+    "AUTO_RTL": "Return",
+    "AUTO_TAKEOFF": "Takeoff",
+    "AUTO_VTOL_TAKEOFF": "VTOL Takeoff",
+    "COMMAND_EXTERNAL": "external command",
+    "COMMAND_INTERNAL": "internal command",
+    "DISARM": "disarming",
+    "FAILSAFE": "failsafe",
+    "FALLBACK_ALTCTRL": "Altitude mode",
+    "FALLBACK_POSCTRL": "Position mode",
+    "FALLBACK_STABILIZED": "Stabilized mode",
+    "GCS_CONNECTION_LOSS": "GCS connection loss",
+    "GPS": "GPS",
+    "GYRO": "Gyroscope",
+    "LOCKDOWN": "lockdown",
+    "LOITER": "Hold",
+    "MAG": "Magnetometer",
+    "MOTORS_ESCS": "Motors and ESCs",
+    "POSCTL": "Position",
+    "PRECLAND": "Precision land",
+    "RTL": "Return",
+    "STAB": "Stabilized",
+    "TERMINATE": "termination",
+    "UTM": "UTM",
+    "VTOL_TAKEOFF": "VTOL takeoff",
+    "WARN": "warning",
+    **{f"EXTERNAL{n}": f"External {n}" for n in range(1, 9)},
 }
-"""Texts that differ from the member's name; keyed by type, as numbers are not unique."""
+"""Texts that differ from the member's name."""
 
 
 def words(member: IntEnum) -> str:
     """Return the operator text of an enumeration member."""
-    named = member.name.replace("_", " ").capitalize()
-    return _WORDS.get((type(member), member.value), named)
+    return _WORDS.get(member.name, member.name.replace("_", " ").capitalize())
 
 
 _AUTOPILOT = 1

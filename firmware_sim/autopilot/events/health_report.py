@@ -11,8 +11,13 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.events.check_events import ARMING_SUMMARY, HEALTH_SUMMARY
-from firmware_sim.autopilot.events.definition import Component, Level, MavlinkEvent
+from firmware_sim.autopilot.events.definition import (
+    Component,
+    Definition,
+    Level,
+    MavlinkEvent,
+    arguments,
+)
 from firmware_sim.autopilot.failsafes.failsafe_conditions import lacking
 from firmware_sim.autopilot.flight_modes import Mode, Need
 from firmware_sim.autopilot.prearm import CHECKS, SUPPLY_CHECK_OFF, PrearmCheck, Readiness
@@ -27,6 +32,26 @@ REPORT_US = 2 * US_PER_S
 
 MAX_CHECKS = 14
 """Maximum number of checks in a report, as in PX4."""
+
+
+def _summary(name: str, message: str, group: str, listed: str) -> Definition:
+    return Definition(name, message, arguments(listed), Level.PROTOCOL, None, "", group, "summary")
+
+
+ARMING_SUMMARY = _summary(
+    "commander_arming_check_summary",
+    "Arming check summary event",
+    "arming_check",
+    "uint8_t chunk_idx, health_component_t error, health_component_t warning, "
+    "navigation_mode_group_t can_arm, navigation_mode_group_t can_run",
+)
+HEALTH_SUMMARY = _summary(
+    "commander_health_summary",
+    "Health report summary event",
+    "health",
+    "uint8_t chunk_idx, health_component_t is_present, health_component_t error, "
+    "health_component_t warning",
+)
 
 
 class HealthReport(NamedTuple):
@@ -68,18 +93,18 @@ def health_report(readiness: Readiness) -> HealthReport:
         if modes is None:
             continue
         blocked |= modes
-        about, bit = check.event, check.event.component.value
-        level = about.definition.level if check.level is None else check.level(readiness)
+        bit = check.component.value
+        level = check.event.level if check.level is None else check.level(readiness)
         error, warning = level <= Level.ERROR, level is Level.WARNING
-        if about.is_health:
+        if check.is_health:
             health_error |= bit * error
             health_warning |= bit * warning
         else:
             arming_error |= bit * error
             arming_warning |= bit * warning
         shown = modes if check.shown is None else modes | _modes_needing(check.shown(readiness))
-        values = (shown or ALL_MODES, about.component.place, *about.values)
-        told.append(about.definition.event(*values, level=level))
+        values = (shown or ALL_MODES, check.component.place, *check.values)
+        told.append(check.event.event(*values, level=level))
     return HealthReport(
         ALL_MODES & ~EXTERNAL_MODES & ~blocked,
         ALL_MODES & ~EXTERNAL_MODES & ~_cannot_run(readiness),

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from enum import Enum, IntEnum, auto
 from typing import NamedTuple
 
+from firmware_sim.autopilot.events.definition import FailsafeAction, FailsafeCause
 from firmware_sim.autopilot.flight_modes import Mode, Need
 
 LONGEST_S = 1e6
@@ -112,7 +113,6 @@ class Conditions(NamedTuple):
     flight_time_limit_exceeded: bool = False
     fd_critical_failure: bool = False
     """Attitude or altitude outside the flight envelope, from the failure detector."""
-    fd_esc_arming_failure: bool = False
     fd_imbalanced_prop: bool = False
     fd_motor_failure: bool = False
 
@@ -156,25 +156,6 @@ def lacking(mode: Mode, conditions: Conditions) -> Need:
     return Need(_NEEDS[mode] & missing(conditions))
 
 
-class FailsafeAction(IntEnum):
-    """Action of a failsafe. The highest of several takes effect."""
-
-    NONE = 0
-    WARN = 1
-    FALLBACK_POSITION = 2
-    """Fall back to Position mode, flown by the pilot."""
-    FALLBACK_ALTITUDE = 3
-    FALLBACK_STABILIZED = 4
-    HOLD = 5
-    RETURN = 6
-    LAND = 7
-    DESCEND = 8
-    """Descend level without a position estimate."""
-    DISARM = 9
-    TERMINATE = 10
-    """Stop the motors permanently: only a restart ends it."""
-
-
 class Clear(Enum):
     """End of an action after its condition has cleared."""
 
@@ -196,22 +177,10 @@ class Takeover(IntEnum):
     NEVER = 3
 
 
-class FailsafeReason(Enum):
-    """Cause in operator texts."""
-
-    GENERIC = auto()
-    MANUAL_CONTROL_LOSS = auto()
-    GCS_LOSS = auto()
-    BATTERY_LOW = auto()
-    BATTERY_CRITICAL = auto()
-    BATTERY_EMERGENCY = auto()
-    FLIGHT_TIME_LOW = auto()
-
-
 class Options(NamedTuple):
     """Response of a failsafe to its condition."""
 
     action: FailsafeAction
     clear: Clear = Clear.WITH_CONDITION
     takeover: Takeover = Takeover.AUTO
-    cause: FailsafeReason = FailsafeReason.GENERIC
+    cause: FailsafeCause = FailsafeCause.GENERIC

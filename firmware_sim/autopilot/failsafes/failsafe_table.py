@@ -12,13 +12,12 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.events.definition import FailsafeAction, FailsafeCause
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     FLIGHT_TERMINATION_OFF,
     BatteryWarning,
     Clear,
     Conditions,
-    FailsafeAction,
-    FailsafeReason,
     FailsafeSettings,
     Options,
     Takeover,
@@ -27,11 +26,11 @@ from firmware_sim.autopilot.failsafes.failsafe_conditions import (
 from firmware_sim.autopilot.flight_modes import Mode, Need
 
 MODE_OF_ACTION = {
-    FailsafeAction.FALLBACK_POSITION: Mode.POSITION,
-    FailsafeAction.FALLBACK_ALTITUDE: Mode.ALTITUDE,
+    FailsafeAction.FALLBACK_POSCTRL: Mode.POSITION,
+    FailsafeAction.FALLBACK_ALTCTRL: Mode.ALTITUDE,
     FailsafeAction.FALLBACK_STABILIZED: Mode.STABILIZED,
     FailsafeAction.HOLD: Mode.HOLD,
-    FailsafeAction.RETURN: Mode.RETURN,
+    FailsafeAction.RTL: Mode.RETURN,
     FailsafeAction.LAND: Mode.LAND,
     FailsafeAction.DESCEND: Mode.DESCEND,
     FailsafeAction.TERMINATE: Mode.TERMINATION,
@@ -40,10 +39,10 @@ MODE_OF_ACTION = {
 run, the next action replaces it."""
 
 OFFBOARD_LOSS: dict[int, tuple[FailsafeAction, Mode | None]] = {
-    0: (FailsafeAction.FALLBACK_POSITION, Mode.POSITION),
-    1: (FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+    0: (FailsafeAction.FALLBACK_POSCTRL, Mode.POSITION),
+    1: (FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE),
     2: (FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
-    3: (FailsafeAction.RETURN, Mode.RETURN),
+    3: (FailsafeAction.RTL, Mode.RETURN),
     4: (FailsafeAction.LAND, Mode.LAND),
     5: (FailsafeAction.HOLD, Mode.HOLD),
     6: (FailsafeAction.TERMINATE, Mode.TERMINATION),
@@ -81,7 +80,7 @@ def mode_fallback(
         mode = next_mode
     if settings.com_posctl_navl == 0:
         if mode is Mode.POSITION and not can_run(mode, conditions):
-            action, mode = FailsafeAction.FALLBACK_ALTITUDE, Mode.ALTITUDE
+            action, mode = FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE
         # The replacement itself may be impossible: continue to the next one.
         if mode is Mode.ALTITUDE and not can_run(mode, conditions):
             action, mode = FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED
@@ -89,7 +88,7 @@ def mode_fallback(
         action, mode = FailsafeAction.LAND, Mode.LAND
         if not can_run(mode, conditions):
             action, mode = FailsafeAction.DESCEND, Mode.DESCEND
-    return action if can_run(mode, conditions) else FailsafeAction.RETURN
+    return action if can_run(mode, conditions) else FailsafeAction.RTL
 
 
 NOTHING = Options(FailsafeAction.NONE)
@@ -170,14 +169,14 @@ _EXCEPT_MISSION, _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 1, 2, 4
 """Bits of COM_RCL_EXCEPT."""
 
 _NONE, _WARN, _HOLD = NOTHING, Options(FailsafeAction.WARN), Options(FailsafeAction.HOLD)
-_RETURN = Options(FailsafeAction.RETURN, Clear.ON_MODE_CHANGE)
+_RETURN = Options(FailsafeAction.RTL, Clear.ON_MODE_CHANGE)
 _LAND = Options(FailsafeAction.LAND, Clear.ON_MODE_CHANGE)
 _LASTING_HOLD = Options(FailsafeAction.HOLD, Clear.ON_MODE_CHANGE)
 _TERMINATE = Options(FailsafeAction.TERMINATE, Clear.NEVER, Takeover.NEVER)
 _DISARM = Options(FailsafeAction.DISARM, takeover=Takeover.NEVER)
 
 
-def _caused(answers: Mapping[int, Options], cause: FailsafeReason) -> dict[int, Options]:
+def _caused(answers: Mapping[int, Options], cause: FailsafeCause) -> dict[int, Options]:
     return {value: options._replace(cause=cause) for value, options in answers.items()}
 
 
@@ -196,7 +195,7 @@ _POSITION_LOW = {
             FailsafeAction.NONE,
             FailsafeAction.WARN,
             FailsafeAction.HOLD,
-            FailsafeAction.RETURN,
+            FailsafeAction.RTL,
             FailsafeAction.TERMINATE,
             FailsafeAction.LAND,
         )
@@ -270,7 +269,7 @@ def _battery_row(
     trigger: Trigger,
     level: BatteryWarning,
     title: str,
-    cause: FailsafeReason,
+    cause: FailsafeCause,
     actions: tuple[FailsafeAction, ...],
 ) -> Row:
     threshold = ("", "BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")[level]
@@ -287,7 +286,7 @@ def _battery_row(
     )
 
 
-_W, _R, _L = FailsafeAction.WARN, FailsafeAction.RETURN, FailsafeAction.LAND
+_W, _R, _L = FailsafeAction.WARN, FailsafeAction.RTL, FailsafeAction.LAND
 
 TABLE: tuple[Row, ...] = (
     Row(
@@ -295,7 +294,7 @@ TABLE: tuple[Row, ...] = (
         "Manual control lost",
         "no pilot's input for so long, unless there was none at arming",
         _manual_control,
-        _caused(_LINK_LOSS, FailsafeReason.MANUAL_CONTROL_LOSS),
+        _caused(_LINK_LOSS, FailsafeCause.MANUAL_CONTROL_LOSS),
         "NAV_RCL_ACT",
         related=("COM_RC_LOSS_T", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
     ),
@@ -304,7 +303,7 @@ TABLE: tuple[Row, ...] = (
         "Ground station lost",
         "no ground station's HEARTBEAT for so long; not in Land or Precision Landing",
         lambda s: s.conditions.gcs_connection_lost and s.intended not in _LANDING,
-        _caused(_LINK_LOSS, FailsafeReason.GCS_LOSS),
+        _caused(_LINK_LOSS, FailsafeCause.GCS_CONNECTION_LOSS),
         "NAV_DLL_ACT",
         related=("COM_DL_LOSS_T",),
     ),
@@ -313,14 +312,14 @@ TABLE: tuple[Row, ...] = (
         "Mission cannot be completed",
         "the mission has become infeasible, in Mission",
         lambda s: s.intended is Mode.MISSION and s.conditions.mission_failure,
-        {0: Options(FailsafeAction.RETURN)},
+        {0: Options(FailsafeAction.RTL)},
     ),
     Row(
         Trigger.MISSION_WITHOUT_LINKS,
         "No link after the mission",
         "the mission is finished, the ground station lost and NAV_DLL_ACT 0, manual control unused",
         _links_lost_after_mission,
-        {0: Options(FailsafeAction.RETURN)},
+        {0: Options(FailsafeAction.RTL)},
         related=("NAV_DLL_ACT", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
     ),
     Row(
@@ -338,7 +337,7 @@ TABLE: tuple[Row, ...] = (
         "Flight time over",
         "so long since take-off",
         lambda s: s.conditions.flight_time_limit_exceeded,
-        {0: Options(FailsafeAction.RETURN)},
+        {0: Options(FailsafeAction.RTL)},
         related=("COM_FLT_TIME_MAX",),
     ),
     Row(
@@ -382,7 +381,7 @@ TABLE: tuple[Row, ...] = (
         "Remaining flight time low",
         "the battery lasts no longer than a return takes",
         lambda s: s.conditions.battery_low_remaining_time,
-        _caused({0: _NONE, 1: _WARN, 3: _RETURN}, FailsafeReason.FLIGHT_TIME_LOW),
+        _caused({0: _NONE, 1: _WARN, 3: _RETURN}, FailsafeCause.LOW_REMAINING_FLIGHT_TIME),
         "COM_FLTT_LOW_ACT",
         related=("BAT1_CAPACITY", "RTL_TIME_FACTOR", "RTL_TIME_MARGIN"),
     ),
@@ -404,21 +403,21 @@ TABLE: tuple[Row, ...] = (
         Trigger.BATTERY_LOW,
         BatteryWarning.LOW,
         "Battery low",
-        FailsafeReason.BATTERY_LOW,
+        FailsafeCause.LOW_BATTERY_LEVEL,
         (_W, _W, _W, _W),
     ),
     _battery_row(
         Trigger.BATTERY_CRITICAL,
         BatteryWarning.CRITICAL,
         "Battery critical",
-        FailsafeReason.BATTERY_CRITICAL,
+        FailsafeCause.CRITICAL_BATTERY_LEVEL,
         (_W, _R, _L, _R),
     ),
     _battery_row(
         Trigger.BATTERY_EMERGENCY,
         BatteryWarning.EMERGENCY,
         "Battery empty",
-        FailsafeReason.BATTERY_EMERGENCY,
+        FailsafeCause.EMERGENCY_BATTERY_LEVEL,
         (_W, _R, _L, _L),
     ),
     Row(

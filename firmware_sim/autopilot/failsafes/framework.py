@@ -12,13 +12,11 @@ from typing import NamedTuple
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import FailsafeCause, MavlinkEvent
+from firmware_sim.autopilot.events.definition import FailsafeAction, FailsafeCause
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
     Clear,
     Conditions,
-    FailsafeAction,
-    FailsafeReason,
     FailsafeSettings,
     Options,
     Takeover,
@@ -34,27 +32,27 @@ from firmware_sim.autopilot.failsafes.failsafe_table import (
 )
 from firmware_sim.autopilot.flight_modes import Mode
 
+_GENERIC = FailsafeCause.GENERIC
+
 _WARNINGS = {
-    FailsafeReason.BATTERY_LOW: events.FAILSAFE_BATTERY_LOW,
-    FailsafeReason.BATTERY_CRITICAL: events.FAILSAFE_BATTERY_CRITICAL,
-    FailsafeReason.BATTERY_EMERGENCY: events.FAILSAFE_BATTERY_EMERGENCY,
-    FailsafeReason.FLIGHT_TIME_LOW: events.FAILSAFE_TIME_LOW,
+    FailsafeCause.LOW_BATTERY_LEVEL: events.FAILSAFE_BATTERY_LOW,
+    FailsafeCause.CRITICAL_BATTERY_LEVEL: events.FAILSAFE_BATTERY_CRITICAL,
+    FailsafeCause.EMERGENCY_BATTERY_LEVEL: events.FAILSAFE_BATTERY_EMERGENCY,
+    FailsafeCause.LOW_REMAINING_FLIGHT_TIME: events.FAILSAFE_TIME_LOW,
 }
 """Warnings with a specific text."""
 
 _DISENGAGING = (
     FailsafeAction.DESCEND,
-    FailsafeAction.FALLBACK_ALTITUDE,
+    FailsafeAction.FALLBACK_ALTCTRL,
     FailsafeAction.FALLBACK_STABILIZED,
 )
-
-_CAUSES = dict(zip(FailsafeReason, FailsafeCause, strict=True))
 
 
 def announcement(
     action: FailsafeAction,
     delayed: FailsafeAction,
-    cause: FailsafeReason,
+    cause: FailsafeCause,
     intended: Mode,
     delay_us: int,
 ) -> OperatorText:
@@ -67,40 +65,29 @@ def announcement(
         intended: Mode requested by the user.
         delay_us: Remaining delay [µs].
     """
+    text, mode, generic = "Failsafe activated", intended.spec.custom_mode, cause is _GENERIC
     # The text counts the delay only while Hold precedes another action.
-    waits = action is FailsafeAction.HOLD and delayed is not FailsafeAction.NONE
-    # Rounded to whole seconds.
-    seconds = (delay_us + US_PER_S // 2) // US_PER_S
-    text = "Failsafe activated"
-    if waits:
+    if action is FailsafeAction.HOLD and delayed is not FailsafeAction.NONE:
+        # Rounded to whole seconds.
+        seconds = (delay_us + US_PER_S // 2) // US_PER_S
         text = f"{text}: entering Hold for {seconds} seconds"
-        event = _wait(delayed, cause, intended.spec.custom_mode, seconds)
+        if generic:
+            event = events.FAILSAFE_HOLD_GENERIC.event(mode, delayed, seconds)
+        else:
+            event = events.FAILSAFE_HOLD.event(mode, delayed, seconds, cause)
+    elif action is FailsafeAction.WARN and cause in _WARNINGS:
+        event = _WARNINGS[cause].event()
+    elif action is FailsafeAction.WARN and generic:
+        event = events.FAILSAFE_WARN_GENERIC.event(mode)
     elif action is FailsafeAction.WARN:
-        event = _warning(cause, intended.spec.custom_mode)
+        event = events.FAILSAFE_WARN.event(mode, cause)
+    elif not generic:
+        event = events.FAILSAFE.event(mode, action, cause)
+    elif action in _DISENGAGING:
+        event = events.FAILSAFE_DISENGAGED.event(mode, action)
     else:
-        event = _beginning(action, cause, intended.spec.custom_mode)
+        event = events.FAILSAFE_GENERIC.event(mode, action)
     return OperatorText(Severity.CRITICAL, text, event)
-
-
-def _wait(delayed: FailsafeAction, cause: FailsafeReason, mode: int, seconds: int) -> MavlinkEvent:
-    if cause is FailsafeReason.GENERIC:
-        return events.FAILSAFE_HOLD_GENERIC.event(mode, delayed, seconds)
-    return events.FAILSAFE_HOLD.event(mode, delayed, seconds, _CAUSES[cause])
-
-
-def _warning(cause: FailsafeReason, mode: int) -> MavlinkEvent:
-    if cause is FailsafeReason.GENERIC:
-        return events.FAILSAFE_WARN_GENERIC.event(mode)
-    named = _WARNINGS.get(cause)
-    return named.event() if named else events.FAILSAFE_WARN.event(mode, _CAUSES[cause])
-
-
-def _beginning(action: FailsafeAction, cause: FailsafeReason, mode: int) -> MavlinkEvent:
-    if cause is not FailsafeReason.GENERIC:
-        return events.FAILSAFE.event(mode, action, _CAUSES[cause])
-    if action in _DISENGAGING:
-        return events.FAILSAFE_DISENGAGED.event(mode, action)
-    return events.FAILSAFE_GENERIC.event(mode, action)
 
 
 class FailsafeInput(NamedTuple):
@@ -170,7 +157,7 @@ class FailsafeResult(NamedTuple):
     """New message for the operator; None = no change."""
     delayed: FailsafeAction = FailsafeAction.NONE
     """Action after the delay in Hold."""
-    cause: FailsafeReason = FailsafeReason.GENERIC
+    cause: FailsafeCause = _GENERIC
 
 
 class _Choice(NamedTuple):
@@ -179,7 +166,7 @@ class _Choice(NamedTuple):
     action: FailsafeAction
     intended: Mode
     delayed: FailsafeAction = FailsafeAction.NONE
-    cause: FailsafeReason = FailsafeReason.GENERIC
+    cause: FailsafeCause = _GENERIC
     taken_over: bool = False
 
 
@@ -380,7 +367,7 @@ def _select(
         action = max(action, mode_fallback(conditions, settings, intended))
     possible_now = possible(action, conditions)
     if possible_now is not action:
-        action, cause = possible_now, FailsafeReason.GENERIC
+        action, cause = possible_now, _GENERIC
     if _already_on_the_way(intended, action, delayed, conditions):
         action, delayed = FailsafeAction.WARN, FailsafeAction.NONE
     return _Choice(action, intended, delayed, cause, taken_over)
@@ -393,7 +380,7 @@ def _already_on_the_way(
 
     A precision landing also continues instead of an ordinary landing.
     """
-    needless = {FailsafeAction.RETURN}
+    needless = {FailsafeAction.RTL}
     if intended is Mode.PRECISION_LAND:
         needless.add(FailsafeAction.LAND)
     return (

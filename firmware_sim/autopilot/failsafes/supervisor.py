@@ -16,12 +16,11 @@ from firmware_sim.autopilot.autopilot_state import Health, OperatorText, Setpoin
 from firmware_sim.autopilot.commander import CommanderState, FlightPhase
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import MavlinkEvent
+from firmware_sim.autopilot.events.definition import FailsafeAction, MavlinkEvent
 from firmware_sim.autopilot.events.health_report import REPORT_US, HealthReporter
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
     Conditions,
-    FailsafeAction,
     FailsafeSettings,
     lacking,
 )
@@ -217,8 +216,10 @@ class Supervisor:
 
     def _ranges(self, now_us: int) -> bool | None:
         """Return whether a distance sensor delivers data; None: it never has."""
-        finder = self._estimator.range
-        return None if finder is None else now_us - finder.reading_us < NO_DATA_US
+        if self._estimator.aiding.ground is None:
+            return None
+        newest = self._estimator.readings.get("distance")
+        return now_us - (0 if newest is None else newest.time_us) < NO_DATA_US
 
     def _report(self, now_us: int, flight: CommanderState) -> list[OperatorText]:
         """Return the newly failing checks once the vehicle has been ready."""

@@ -355,7 +355,7 @@ class Watch:
                 texts.append(OperatorText.of(Severity.INFO, events.GNSS_STARTED))
             elif phase >= _GROUND:
                 texts.append(OperatorText.of(Severity.WARNING, events.GNSS_STOPPED))
-        seen = bool(self._estimator.vision.fused)
+        seen = self._estimator.aiding.sees_vision
         if seen is not self._vision_fused:
             self._vision_fused = seen
             if phase >= _GROUND:

@@ -31,9 +31,8 @@ from firmware_sim.autopilot.modes.interface import (
     OffboardSetpoint,
     here,
     over,
-    triple,
 )
-from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment, stopping_place
+from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment, stopping_place, triple
 from firmware_sim.engine.record import RISING, SETTLING
 
 LEAST_CLIMB_M = 0.1
@@ -154,7 +153,7 @@ def aim(context: FlightContext) -> None:
 
 
 STANDING_M_S = 0.3
-"""Speed below which the vehicle counts as stopped, and Hold keeps the position [m/s]."""
+"""Speed below which a vehicle counts as stopped: Hold and Land then keep the position [m/s]."""
 
 
 class Hold(FlightMode, modes=(Mode.HOLD,)):
@@ -243,10 +242,6 @@ class Hold(FlightMode, modes=(Mode.HOLD,)):
         )
 
 
-LANDING_STILL_M_S = 0.3
-"""Horizontal speed below which the descent holds a position [m/s]."""
-
-
 SLOW_BELOW_M = 0.5
 """Margin below MPC_LAND_ALT2 that exceeds the estimate's error [m]."""
 
@@ -285,7 +280,7 @@ class Land(FlightMode, modes=(Mode.LAND,)):
         self._is_slow = math.isnan(ground_m) and height_m < low_m
         if self._stopping:
             north, east, _ = triple(state, V)
-            if math.hypot(north, east) > LANDING_STILL_M_S:
+            if math.hypot(north, east) > STANDING_M_S:
                 self._place = self._place._replace(position=triple(state, P))
                 return Demand(FREE, (0.0, 0.0, speed), self._place.yaw, NAN)
             self._stopping = False

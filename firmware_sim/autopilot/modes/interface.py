@@ -24,7 +24,7 @@ from firmware_sim.autopilot.inputs import (
     Sticks,
 )
 from firmware_sim.autopilot.navigation.plan import Missions
-from firmware_sim.autopilot.smooth_trajectory import Travel
+from firmware_sim.autopilot.smooth_trajectory import Travel, triple
 
 NAN: float = math.nan
 FREE: Vec = (NAN, NAN, NAN)
@@ -177,12 +177,6 @@ def descend(yaw: float) -> Demand:
 def since(before_us: int | None, now_us: int) -> float:
     """Return the time since the last tick [s]; 0 at the first."""
     return 0.0 if before_us is None else (now_us - before_us) / US_PER_S
-
-
-def triple(state: Vector, start: int) -> Vec:
-    """Return three consecutive numbers of a state."""
-    north, east, down = state[start : start + 3].tolist()
-    return north, east, down
 
 
 def here(state: Vector) -> PositionYaw:

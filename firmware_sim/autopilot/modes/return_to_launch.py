@@ -25,9 +25,8 @@ from firmware_sim.autopilot.modes.interface import (
     FlightMode,
     here,
     optional_mode,
-    triple,
 )
-from firmware_sim.autopilot.smooth_trajectory import PathSegment
+from firmware_sim.autopilot.smooth_trajectory import PathSegment, triple
 
 _REQUIRED = 2
 """RTL_PLD_MD: 1 lands on a target that is visible at once, 2 searches for the target."""

@@ -25,9 +25,8 @@ from firmware_sim.autopilot.modes.interface import (
     FlightMode,
     descend,
     since,
-    triple,
 )
-from firmware_sim.autopilot.smooth_trajectory import Axis
+from firmware_sim.autopilot.smooth_trajectory import Axis, triple
 
 _TURNS_RAD_S = 1e-3
 """Yaw rate above which no heading is held [rad/s]."""

@@ -19,11 +19,12 @@ from firmware_sim.autopilot.failsafes.watch import Reports
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.guidance import Home
 from firmware_sim.autopilot.inputs import ModeRequest, PositionYaw, Reposition
-from firmware_sim.autopilot.modes.interface import FlightContext, here, triple
+from firmware_sim.autopilot.modes.interface import FlightContext, here
 from firmware_sim.autopilot.modes.return_to_launch import return_time_s
 from firmware_sim.autopilot.navigation.fence import FenceMonitor
 from firmware_sim.autopilot.navigation.plan import Crew, Missions, NavigationState, Plans
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
+from firmware_sim.autopilot.smooth_trajectory import triple
 
 PERIOD_US = 50_000
 """Period in Mission and Return: 20 Hz [µs]."""

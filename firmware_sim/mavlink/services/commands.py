@@ -2,12 +2,7 @@
 
 Replies and rejections follow PX4's Commander.cpp and mavlink_receiver.cpp, checked against a
 running PX4 1.16. A command to the vehicle is acknowledged to its sender, on the same link. Clients
-repeat commands, so actions are idempotent. Services with commands have a table `ACTIONS`, which is
-merged into the table here.
-
-MAV_CMD_INJECT_FAILURE injects a fault into the simulated part, as a scenario does. Known units and
-types, and those without a reply, match PX4 (SimulatorMavlink, FailureInjector, BatterySimulator;
-1.16).
+repeat commands, so actions are idempotent. The actions are those of all services (`ACTIONS`).
 """
 
 from __future__ import annotations
@@ -17,8 +12,6 @@ from dataclasses import replace
 from operator import attrgetter
 
 from airl_mav.core.frames import Geodetic, geodetic_to_local
-from airl_mav.faults.fault import Fault
-from airl_mav.faults.kinds import MOTORS, Part
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events
@@ -27,12 +20,14 @@ from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, M
 from firmware_sim.autopilot.flight_modes import MAIN_AUTO, MAIN_POSCTL, Mode
 from firmware_sim.autopilot.inputs import OrbitRequest, PositionYaw, Reposition
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services import calibration, connection, logs, params
+from firmware_sim.mavlink.services import table
 from firmware_sim.mavlink.services.context import (
     ANY,
     Action,
     Context,
+    Handlers,
     VehicleCommand,
+    for_anyone,
     for_vehicle,
     sender,
 )
@@ -183,80 +178,6 @@ _NAVIGATION: dict[int, Action] = {
 }
 
 
-ENABLED = "SYS_FAILURE_EN"
-
-OK, OFF = dialect.FAILURE_TYPE_OK, dialect.FAILURE_TYPE_OFF
-STUCK, WRONG = dialect.FAILURE_TYPE_STUCK, dialect.FAILURE_TYPE_WRONG
-
-SENSORS: dict[int, tuple[Part | None, tuple[int, ...]]] = {
-    dialect.FAILURE_UNIT_SENSOR_GYRO: ("gyro", (OK, OFF, STUCK)),
-    dialect.FAILURE_UNIT_SENSOR_ACCEL: ("accel", (OK, OFF, STUCK)),
-    dialect.FAILURE_UNIT_SENSOR_MAG: ("mag", (OK, OFF, STUCK)),
-    dialect.FAILURE_UNIT_SENSOR_BARO: ("baro", (OK, OFF, STUCK)),
-    dialect.FAILURE_UNIT_SENSOR_GPS: ("gps", (OK, OFF)),
-    dialect.FAILURE_UNIT_SENSOR_VIO: ("vision", (OK, OFF)),
-    # The vehicle has no such sensor, but PX4 accepts the command.
-    dialect.FAILURE_UNIT_SENSOR_AIRSPEED: (None, (OK, OFF, WRONG)),
-}
-"""Part and accepted types of each sensor; other types are UNSUPPORTED."""
-
-WITHOUT_INSTANCE: tuple[Part, ...] = ("baro", "gps", "vision")
-"""Sensors that PX4 has once, for any requested instance."""
-
-KINDS = {OFF: "off", STUCK: "stuck"}
-
-GREATEST_MOTOR = 8
-"""Maximum number of ESCs in PX4."""
-
-
-def _inject(command: VehicleCommand, context: Context) -> Result | None:
-    """Handle INJECT_FAILURE, parameters: unit, type, instance (0 = all)."""
-    enabled = context.port.parameters.by_name(ENABLED)
-    # PX4 requires SYS_FAILURE_EN against accidental failures in flight.
-    if enabled is None or not enabled.value:
-        return Result.DENIED
-    unit, kind, instance = command.integer(1), command.integer(2), command.integer(3) or 0
-    if unit is None or kind is None:
-        return None
-    if unit in SENSORS:
-        part, known = SENSORS[unit]
-        if kind not in known:
-            return Result.UNSUPPORTED
-        # The vehicle has one of each sensor: another instance has no effect.
-        meant = part is not None and (part in WITHOUT_INSTANCE or instance in (0, 1))
-        _act(context, (part,) if part is not None and meant else (), kind)
-        return Result.ACCEPTED
-    if unit == dialect.FAILURE_UNIT_SYSTEM_BATTERY and kind in (OK, OFF):
-        if instance:
-            return Result.UNSUPPORTED
-        _act(context, ("battery",), kind)
-        return Result.ACCEPTED
-    if unit == dialect.FAILURE_UNIT_SYSTEM_MOTOR:
-        return _motor(context, kind, instance)
-    return None  # PX4 sends no reply
-
-
-def _motor(context: Context, kind: int, instance: int) -> Result:
-    if kind not in (OK, OFF, WRONG) or (kind == OK and not 0 <= instance <= GREATEST_MOTOR):
-        return Result.UNSUPPORTED
-    if kind != WRONG:  # WRONG would affect the readings alone
-        # Instances start at 1; a number above the motors gives an empty slice.
-        motors = MOTORS if instance == 0 else MOTORS[instance - 1 : instance]
-        _act(context, motors if instance >= 0 else (), kind)
-    return Result.ACCEPTED
-
-
-def _act(context: Context, parts: tuple[Part, ...], kind: int) -> None:
-    failures = context.port.failures
-    if failures is None:
-        return
-    # A new fault replaces the old one of the same part.
-    for part in parts:
-        failures.clear(part)
-        if kind != OK:
-            failures.inject(Fault(part=part, kind=KINDS[kind]))
-
-
 # Commands without effect here are answered as by a running PX4 1.16 SITL.
 
 ACCEPTED = (
@@ -315,7 +236,7 @@ _RELATIVE_FRAMES = (
 def _arm_disarm(command: VehicleCommand, context: Context) -> Result | None:
     force = command.integer(2) == FORCE_MAGIC
     if command.integer(1) == 1:
-        if context.calibration.forbids_arming:
+        if any(state.forbids_arming for state in context.vehicle_states.values()):
             context.announce(OperatorText.of(Severity.CRITICAL, events.ARM_WHILE_CALIBRATING))
             return Result.TEMPORARILY_REJECTED
         return context.port.arm(force=force)
@@ -407,12 +328,7 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
     dialect.MAV_CMD_RUN_PREARM_CHECKS: _run_checks,
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
-    dialect.MAV_CMD_INJECT_FAILURE: _inject,
-    **logs.ACTIONS,
-    **connection.ACTIONS,
-    **calibration.ACTIONS,
     **_NAVIGATION,
-    **params.ACTIONS,
     **dict.fromkeys(ACCEPTED, _answer(Result.ACCEPTED)),
     **dict.fromkeys(NOT_ACKNOWLEDGED, _answer(None)),
     dialect.MAV_CMD_ACTUATOR_TEST: _actuator_test,
@@ -420,7 +336,7 @@ ACTIONS: dict[int, Action] = {
     # The estimator accepts an external position only while it has none.
     dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE: _answer(Result.TEMPORARILY_REJECTED),
 }
-"""Actions by command. Other commands are UNSUPPORTED."""
+"""Actions by command. Commands without an action in any service are UNSUPPORTED."""
 
 
 def handle_command_long(message: WireMessage, context: Context) -> bool:
@@ -450,7 +366,7 @@ def handle_set_mode(message: WireMessage, context: Context) -> bool:
 
 def _handle(command: VehicleCommand, context: Context) -> bool:
     # None means no COMMAND_ACK at all: PX4 leaves some commands unanswered.
-    action = ACTIONS.get(command.number)
+    action = table("ACTIONS").get(command.number)
     result = Result.UNSUPPORTED if action is None else action(command, context)
     if result is not None:
         context.link.send(
@@ -516,3 +432,11 @@ def _from_base_mode(base: int) -> Mode | None:
     if base & dialect.MAV_MODE_FLAG_GUIDED_ENABLED:
         return Mode.POSITION
     return Mode.STABILIZED if base & dialect.MAV_MODE_FLAG_STABILIZE_ENABLED else Mode.MANUAL
+
+
+HANDLERS: Handlers = {
+    "COMMAND_LONG": (is_addressed, handle_command_long),
+    "COMMAND_INT": (is_addressed, handle_command_int),
+    "SET_MODE": (for_anyone, handle_set_mode),
+    "SET_GPS_GLOBAL_ORIGIN": (for_anyone, handle_set_origin),
+}

@@ -7,25 +7,30 @@ message that is not a stream is FAILED.
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable, Mapping
-from dataclasses import replace
 from itertools import count
 
 from airl_mav.core.clock import NS_PER_US
-from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect, message_name
 from firmware_sim.mavlink.link import OFF
-from firmware_sim.mavlink.services import component_metadata
-from firmware_sim.mavlink.services.context import ANY, Action, Context, VehicleCommand, sender
-from firmware_sim.mavlink.streams import Builder, status
-from firmware_sim.mavlink.streams.units import INT32_MAX, boot_ms
+from firmware_sim.mavlink.services import table
+from firmware_sim.mavlink.services.context import (
+    ANY,
+    Action,
+    Context,
+    Handlers,
+    VehicleCommand,
+    for_anyone,
+    for_vehicle,
+    for_vehicle_or_all,
+    sender,
+)
+from firmware_sim.mavlink.streams import Builder
+from firmware_sim.mavlink.streams.units import INT32_MAX
 from firmware_sim.mavlink.texts_and_events import KEPT, NUMBERS, message
 
 _INTERVAL_UNAVAILABLE = 0
 """Reported interval of a stream that is off. PX4 reports the same for an unknown stream."""
-_MIB = 1024.0 * 1024.0
 
 FIXED_RATE = frozenset(("HEARTBEAT", "MISSION_CURRENT"))
 """Messages with fixed rates in PX4, which clients cannot change."""
@@ -33,24 +38,6 @@ FIXED_RATE = frozenset(("HEARTBEAT", "MISSION_CURRENT"))
 OF_MISSING_DEVICES = frozenset((370, 371))
 """Ids of BATTERY_INFO and FUEL_STATUS, which the definitions here lack. PX4 accepts a rate but
 sends nothing, because it lacks the devices. PX4 also accepts a NaN id."""
-
-
-GROUPS: dict[int, tuple[str, ...]] = {
-    dialect.MAV_DATA_STREAM_RAW_SENSORS: ("HIGHRES_IMU", "SCALED_PRESSURE", "GPS_RAW_INT"),
-    dialect.MAV_DATA_STREAM_EXTENDED_STATUS: (
-        "SYS_STATUS",
-        "EXTENDED_SYS_STATE",
-        "MISSION_CURRENT",
-        "BATTERY_STATUS",
-    ),
-    dialect.MAV_DATA_STREAM_RC_CHANNELS: ("SERVO_OUTPUT_RAW",),
-    dialect.MAV_DATA_STREAM_RAW_CONTROLLER: ("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED"),
-    dialect.MAV_DATA_STREAM_POSITION: ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT"),
-    dialect.MAV_DATA_STREAM_EXTRA1: ("ATTITUDE",),
-    dialect.MAV_DATA_STREAM_EXTRA2: ("VFR_HUD",),
-    dialect.MAV_DATA_STREAM_EXTRA3: ("SYSTEM_TIME", "ESTIMATOR_STATUS", "VIBRATION"),
-}
-"""Streams of the groups of REQUEST_DATA_STREAM."""
 
 
 def _set_message_interval(command: VehicleCommand, context: Context) -> Result:
@@ -84,9 +71,10 @@ def _request_message(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 1: message id; 2: parameter of the message."""
     number = command.integer(1) or 0
     # Some messages take a parameter or are not streams.
-    special = _SPECIAL.get(number)
+    special = table("REQUESTS").get(number)
     if special is not None:
-        return special(command, context)
+        result: Result = special(command, context)
+        return result
     name = _stream_name(number, context)
     return Result.DENIED if name is None else send_stream(name, context)
 
@@ -96,47 +84,8 @@ def _request_interval(command: VehicleCommand, context: Context) -> Result:
     return Result.DENIED if asked is None else _send_interval(asked & 0xFFFF, context)
 
 
-def _request_modes(command: VehicleCommand, context: Context) -> Result:
-    """Handle parameter 2: number of the mode, starting at 1; 0 = all."""
-    asked = command.integer(2) or 0
-    modes = status.available_modes()
-    if not 0 <= asked <= len(modes):
-        return Result.DENIED
-    # Modes are numbered from 1.
-    for fields in modes if asked == 0 else modes[asked - 1 : asked]:
-        context.link.send(dialect.MAVLink_available_modes_message(*fields))
-    return Result.ACCEPTED
-
-
-def _request_storage(command: VehicleCommand, context: Context) -> Result:
-    """Handle parameter 2: storage number; 0 = all. The only storage has number 1."""
-    number, count, empty = 1, 1, b""
-    if command.integer(2) not in (None, 0, number):
-        return Result.DENIED
-    disk = shutil.disk_usage(context.storage.folder)
-    # STORAGE_INFORMATION has mebibytes.
-    sizes = (size / _MIB for size in (disk.total, disk.used, disk.free))
-    no_speed = 0.0
-    context.link.send(
-        dialect.MAVLink_storage_information_message(
-            *(boot_ms(context.now_us), number, count, dialect.STORAGE_STATUS_READY),
-            *(*sizes, no_speed, no_speed, dialect.STORAGE_TYPE_UNKNOWN, empty),
-        )
-    )
-    return Result.ACCEPTED
-
-
-def _first_as_second(command: VehicleCommand) -> VehicleCommand:
-    first = command.params[0]
-    return replace(command, params=(first, first, *command.params[2:]))
-
-
-_SPECIAL: Mapping[int, Callable[[VehicleCommand, Context], Result]] = {
+REQUESTS: dict[int, Action] = {
     dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL: _request_interval,
-    dialect.MAVLINK_MSG_ID_AVAILABLE_MODES: _request_modes,
-    dialect.MAVLINK_MSG_ID_COMPONENT_METADATA: component_metadata.request_metadata,
-    dialect.MAVLINK_MSG_ID_COMPONENT_INFORMATION: component_metadata.request_information,
-    dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION: _request_storage,
 }
 """Messages that are not streams, or whose request has parameters."""
 
@@ -162,31 +111,6 @@ def _send_interval(number: int, context: Context) -> Result:
         interval = _INTERVAL_UNAVAILABLE if interval == OFF else interval
     context.link.send(dialect.MAVLink_message_interval_message(number, interval))
     return Result.ACCEPTED
-
-
-def handle_data_stream(message: WireMessage, context: Context) -> bool:
-    """Handle REQUEST_DATA_STREAM: raise the rates of a stream group, or restore the defaults.
-
-    A real PX4 ignores this deprecated message. Here it can only raise rates: MAVProxy requests all
-    streams at 4 Hz when it connects, and another client on the same link must keep its 100 Hz
-    attitude.
-    """
-    if message.req_stream_id == dialect.MAV_DATA_STREAM_ALL:
-        names = tuple(name for group in GROUPS.values() for name in group)
-    else:
-        names = GROUPS.get(message.req_stream_id, ())
-    scheduler = context.link.scheduler
-    start = message.start_stop == 1 and message.req_message_rate > 0
-    for name in names:
-        if not start:
-            scheduler.set_interval(name, scheduler.default_us(name), context.now_us)
-            continue
-        asked_us = US_PER_S // message.req_message_rate
-        present_us = scheduler.interval_us(name)
-        # Only a shorter interval is set: a request must not slow another client's stream.
-        if present_us == OFF or max(asked_us, 1) < present_us:
-            scheduler.set_interval(name, max(asked_us, 1), context.now_us)
-    return bool(names)
 
 
 def handle_event(request: WireMessage, context: Context) -> bool:
@@ -223,9 +147,6 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: _sends("AUTOPILOT_VERSION"),
     dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION: _sends("PROTOCOL_VERSION"),
     dialect.MAV_CMD_REQUEST_FLIGHT_INFORMATION: _sends("FLIGHT_INFORMATION"),
-    dialect.MAV_CMD_REQUEST_STORAGE_INFORMATION: (
-        lambda command, context: _request_storage(_first_as_second(command), context)
-    ),
 }
 
 
@@ -284,3 +205,12 @@ def handle_setup(message: WireMessage, context: Context) -> bool:
         text = f"Signing key {what} by system {system} component {component}"
         context.announce(OperatorText(Severity.NOTICE, text))
     return True
+
+
+HANDLERS: Handlers = {
+    "REQUEST_EVENT": (for_vehicle, handle_event),
+    "HEARTBEAT": (for_anyone, handle_heartbeat),
+    "SETUP_SIGNING": (for_vehicle_or_all, handle_setup),
+    "PING": (for_anyone, handle_ping),
+    "TIMESYNC": (for_anyone, handle_timesync),
+}

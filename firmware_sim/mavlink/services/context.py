@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any, TypeVar
 
 from airl_mav.core.signing import Signing
@@ -12,29 +13,49 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Result
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
 from firmware_sim.mavlink.link import Link
-from firmware_sim.mavlink.services.transfers import (
-    FtpClient,
-    LogDownload,
-    LogListing,
-    LogStream,
-    RunningCalibration,
-    Shell,
-)
 from firmware_sim.mavlink.streams.sensors import Radio
 from firmware_sim.mavlink.texts_and_events import EventBuffer
-from firmware_sim.storage import Storage
 
-S = TypeVar("S")
+State = TypeVar("State", bound="ServiceState")
+
+Handler = Callable[[WireMessage, "Context"], bool]
+"""Handles one message for this vehicle; returns False if it had no effect."""
+
+Addressee = Callable[[WireMessage, "Context"], bool]
+"""Returns True if a message is addressed to this vehicle."""
+
+Handlers = dict[str, tuple[Addressee, Handler]]
+"""Check of the addressee and handler, by message name."""
 
 ANY = 0
 """System or component id of a broadcast."""
+
+
+class ServiceState:
+    """State of a service: of one client, or of the vehicle and common to all its clients."""
+
+    @property
+    def is_running(self) -> bool:
+        """True if `send_pending` has something to send, now or later."""
+        return False
+
+    @property
+    def forbids_arming(self) -> bool:
+        """True if PX4 rejects arming meanwhile."""
+        return False
+
+    def restart(self) -> None:
+        """Reset a state of the vehicle, because the autopilot changes."""
+
+    def close(self) -> None:
+        """Release the resources when the client leaves or the server closes."""
 
 
 @dataclass(slots=True)
 class Context:
     """State of one client for its handlers. The server updates `now_us` for every message.
 
-    All clients of a vehicle share events, signing, storage, calibration and radio.
+    All clients of a vehicle share events, signing, radio and `vehicle_states`.
     """
 
     link: Link
@@ -54,44 +75,33 @@ class Context:
     next_parameter: int | None = None
     """Next index of a running parameter list; -1 = the hash; None = no list is running."""
     states: dict[type, Any] = field(default_factory=dict)
-    """States of the services of add-ons, by class; each has `is_running`."""
-    storage: Storage = field(default_factory=Storage)
-    ftp: FtpClient = field(default_factory=FtpClient)
-    shell: Shell = field(default_factory=Shell)
-    calibration: RunningCalibration = field(default_factory=RunningCalibration)
+    """States of services for this client, by class."""
+    vehicle_states: dict[type, Any] = field(default_factory=dict)
+    """States of services that all clients share, by class."""
     radio: Radio = field(default_factory=Radio)
     """Newest RC channels."""
-    log_listing: LogListing | None = None
-    log_download: LogDownload | None = None
-    log_stream: LogStream | None = None
     refusals: set[str] = field(default_factory=set)
     """Rejections of setpoints reported since the last accepted setpoint."""
 
     @property
-    def is_getting(self) -> bool:
-        """True if any transfer of the core is in progress."""
-        ftp = self.ftp
-        return (
-            self.next_parameter is not None
-            or ftp.burst is not None
-            or ftp.summing is not None
-            or self.calibration.active
-            or bool(self.shell.output)
-            or self.log_listing is not None
-            or self.log_download is not None
-            or self.log_stream is not None
-        )
-
-    @property
     def is_busy(self) -> bool:
         """True if any transfer or repetition is in progress."""
-        return self.is_getting or any(state.is_running for state in self.states.values())
+        return self.next_parameter is not None or any(
+            state.is_running for state in chain(self.states.values(), self.vehicle_states.values())
+        )
 
-    def state(self, kind: type[S]) -> S:
-        """Return the state of an add-on's service for this client; new at the first call."""
+    def state(self, kind: type[State]) -> State:
+        """Return the state of a service for this client; new at the first call."""
         if kind not in self.states:
             self.states[kind] = kind()
-        found: S = self.states[kind]
+        found: State = self.states[kind]
+        return found
+
+    def vehicle_state(self, kind: type[State]) -> State:
+        """Return the state of a service that all clients share; new at the first call."""
+        if kind not in self.vehicle_states:
+            self.vehicle_states[kind] = kind()
+        found: State = self.vehicle_states[kind]
         return found
 
     def announce_once(self, refusal: OperatorText) -> None:
@@ -102,7 +112,13 @@ class Context:
 
     def close(self) -> None:
         """Release the client's resources when the client leaves or the autopilot changes."""
-        self.ftp.close()
+        for state in self.states.values():
+            state.close()
+
+
+def for_anyone(_message: WireMessage, _context: Context) -> bool:
+    """Return True for every message."""
+    return True
 
 
 def for_vehicle(message: WireMessage, context: Context) -> bool:

@@ -8,9 +8,15 @@ import struct
 
 from firmware_sim.autopilot.autopilot_state import Arming, Result
 from firmware_sim.autopilot.port import ParameterStore, ParameterValue
-from firmware_sim.mavlink.codec import WireMessage, dialect, param_value, payload
-from firmware_sim.mavlink.services.context import Action, Context, VehicleCommand, sender
-from firmware_sim.mavlink.services.transfers import crc32part
+from firmware_sim.mavlink.codec import WireMessage, crc32part, dialect, param_value, payload
+from firmware_sim.mavlink.services.context import (
+    Action,
+    Context,
+    Handlers,
+    VehicleCommand,
+    for_vehicle,
+    sender,
+)
 
 HASH_NAME = "_HASH_CHECK"
 """Name of a pseudo parameter: checksum with which ground stations validate cached values."""
@@ -161,3 +167,9 @@ def _store(command: VehicleCommand, context: Context) -> Result | None:
 
 
 ACTIONS: dict[int, Action] = {dialect.MAV_CMD_PREFLIGHT_STORAGE: _store}
+
+HANDLERS: Handlers = {
+    "PARAM_REQUEST_LIST": (for_vehicle, handle_list),
+    "PARAM_REQUEST_READ": (for_vehicle, handle_read),
+    "PARAM_SET": (for_vehicle, handle_set),
+}

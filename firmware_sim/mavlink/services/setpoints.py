@@ -23,7 +23,7 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Setpoint, Sever
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.inputs import FollowedTarget, Source, Sticks
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services.context import Context, Handlers, for_anyone, for_vehicle_or_all
 
 _CRITICAL = Severity.CRITICAL
 _POSITION_SHIFT, _VELOCITY_SHIFT, _ACCELERATION_SHIFT = 0, 3, 6
@@ -246,13 +246,11 @@ _HAS_VELOCITY = 1 << 1
 # --- sticks and Follow Me
 
 
-def is_for_pilot(message: WireMessage, context: Context) -> bool:
-    """Return True if a MANUAL_CONTROL is addressed to this vehicle."""
+def _is_for_pilot(message: WireMessage, context: Context) -> bool:
     return bool(message.target in (0, context.system_id))
 
 
-def is_for_radio(message: WireMessage, context: Context) -> bool:
-    """Return True if an RC_CHANNELS_OVERRIDE is addressed to this vehicle."""
+def _is_for_radio(message: WireMessage, context: Context) -> bool:
     return bool(message.target_system in (0, context.system_id))
 
 
@@ -304,3 +302,13 @@ def handle_follow_target(message: WireMessage, context: Context) -> bool:
 
 def _share(raw: int) -> float:
     return raw / 1000.0 if -1000 <= raw <= 1000 else 0.0
+
+
+HANDLERS: Handlers = {
+    "SET_POSITION_TARGET_LOCAL_NED": (for_vehicle_or_all, handle_local),
+    "SET_POSITION_TARGET_GLOBAL_INT": (for_vehicle_or_all, handle_global),
+    "SET_ATTITUDE_TARGET": (for_vehicle_or_all, handle_attitude),
+    "MANUAL_CONTROL": (_is_for_pilot, handle_manual_control),
+    "RC_CHANNELS_OVERRIDE": (_is_for_radio, handle_channels),
+    "FOLLOW_TARGET": (for_anyone, handle_follow_target),
+}

@@ -1,6 +1,7 @@
 """Streamed messages: tables of message names with their builder functions.
 
-A new message is a builder function and a line in `BUILDERS` or `VEHICLE_BUILDERS`.
+A new message is a builder function and a line in `BUILDERS` or `VEHICLE_BUILDERS`, or in a module
+of an add-on's table STREAMS.
 
 Sources of fields, units and "unknown" values: MAVLink common.xml and PX4
 src/modules/mavlink/streams/*.hpp.
@@ -9,8 +10,10 @@ src/modules/mavlink/streams/*.hpp.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from types import MappingProxyType
 
+from airl_mav.core.addons import entries, load
 from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.interfaces import TrueState
@@ -61,10 +64,7 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "SYS_STATUS": None,
         "ESTIMATOR_STATUS": status.estimator_status,
         "SCALED_PRESSURE": sensors.scaled_pressure,
-        # PX4's simulator sends one measurement to two barometers.
-        "SCALED_PRESSURE2": sensors.scaled_pressure,
         "MISSION_CURRENT": status.mission_current,
-        "FENCE_STATUS": status.fence_status,
         "HOME_POSITION": status.home_position,
         "GPS_GLOBAL_ORIGIN": status.gps_global_origin,
         "AUTOPILOT_VERSION": status.autopilot_version,
@@ -73,18 +73,18 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "CURRENT_MODE": status.current_mode,
         "ESC_INFO": None,
         "ESC_STATUS": None,
-        "ACTUATOR_OUTPUT_STATUS": sensors.actuator_output_status,
-        "HIL_ACTUATOR_CONTROLS": sensors.hil_actuator_controls,
-        "SCALED_IMU": sensors.scaled_imu,
-        "FLIGHT_INFORMATION": status.flight_information,
-        "PROTOCOL_VERSION": status.protocol_version,
-        "HIGH_LATENCY2": status.high_latency2,
-        # Last, because start times of streams depend on their order.
-        "DISTANCE_SENSOR": sensors.distance_sensor,
-        "OPTICAL_FLOW_RAD": sensors.optical_flow_rad,
+        **dict.fromkeys(("DISTANCE_SENSOR", "OPTICAL_FLOW_RAD"), _nothing),
     }
 )
-"""Streams that need only the snapshot. None = packed by compiled code (`telemetry`)."""
+"""Streams that need only the snapshot. None = packed by compiled code (`telemetry`). The server
+adds the streams of further sensors (`sensor_table`)."""
+
+
+@cache
+def addon_builders() -> dict[str, Builder]:
+    """Return the streams of add-ons (table STREAMS: modules with BUILDERS)."""
+    modules = map(load, entries("firmware_sim", "STREAMS").values())
+    return {name: build for module in modules for name, build in module.BUILDERS.items()}
 
 
 class Vehicle:

@@ -10,12 +10,11 @@ import numpy as np
 
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.kernels import kernel
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Vector
+from firmware_sim.autopilot.autopilot_state import AutopilotState, Vector
 from firmware_sim.autopilot.port import ParameterStore
 from firmware_sim.engine.record import Record
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.streams import units
-from firmware_sim.mavlink.streams.status import base_mode
 from firmware_sim.mavlink.streams.units import UINT16_MAX, boot_ms, percent
 
 if TYPE_CHECKING:
@@ -33,22 +32,6 @@ _CHARGE_WARNINGS = (
     ("BAT_EMERGEN_THR", dialect.MAV_BATTERY_CHARGE_STATE_EMERGENCY),
 )
 """Threshold parameters, from the highest to the lowest."""
-
-
-def scaled_imu(state: AutopilotState) -> Values:
-    """Return the newest IMU sample without biases [mG, mrad/s], and magnetic field [mGauss]."""
-    estimate = state.estimate
-    return (
-        units.boot_ms(state.time_us),
-        *(
-            # m/s² to milli-g, rad/s to mrad/s, gauss to milligauss.
-            units.int16(a * 1e3 / GRAVITY_M_S2)
-            for a in (state.accel - estimate.accel_bias).tolist()
-        ),
-        *(units.int16(w * 1e3) for w in (state.gyro - estimate.gyro_bias).tolist()),
-        *(units.int16(m * 1e3) for m in state.mag.tolist()),
-        units.int16(state.temperature_c * 100.0),
-    )
 
 
 def scaled_pressure(state: AutopilotState) -> Values:
@@ -113,47 +96,6 @@ def _charge_state(remaining: float, parameters: ParameterStore) -> int:
 
 
 # --- outputs
-
-_PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900, 1_000, 1_000
-"""Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
-
-_OUTPUTS = 16
-"""Number of outputs in PX4's simulation. Outputs without a motor stay at the disarmed pulse."""
-
-_OUTPUT_FIELDS = 32
-"""Number of slots in ACTUATOR_OUTPUT_STATUS."""
-
-
-def actuator_output_status(state: AutopilotState) -> Values:
-    """Return the pulse widths [µs] as an array with 16 active outputs."""
-    return state.time_us, _OUTPUTS, *_outputs(state), *(0,) * (_OUTPUT_FIELDS - _OUTPUTS)
-
-
-def hil_actuator_controls(state: AutopilotState) -> Values:
-    """Return motor commands 0..1, zero while disarmed; 16 controls."""
-    commands, flags = _commands(state), 0
-    unused = (0.0,) * (_OUTPUTS - len(commands))
-    return state.time_us, *commands, *unused, base_mode(state.status), flags
-
-
-def _outputs(state: AutopilotState) -> Values:
-    """Return the pulse widths of all outputs [µs]."""
-    pulses = _pulses(state)
-    return *pulses, *(_PWM_DISARMED,) * (_OUTPUTS - len(pulses))
-
-
-def _armed(state: AutopilotState) -> bool:
-    return state.status.arming is Arming.ARMED
-
-
-def _commands(state: AutopilotState) -> tuple[float, ...]:
-    return state.motors if _armed(state) else (0.0,) * len(state.motors)
-
-
-def _pulses(state: AutopilotState) -> list[int]:
-    if not _armed(state):
-        return [_PWM_DISARMED] * len(state.motors)
-    return [_PWM_MIN + units.saturate(_PWM_SPAN * u, 0, _PWM_SPAN, 0) for u in state.motors]
 
 
 # --- vibration
@@ -223,70 +165,12 @@ def _filter(memory: Vector, time_us: int, gyro: Vector, accel: Vector) -> None:
     memory[_CLIPPED] += clipped
 
 
-NEW_US = 200_000
-"""Maximum age of a sent measurement [µs]: the longest time that PX4's estimator waits for the next.
-PX4 sends a measurement once."""
-
-_CM, _CM2 = 1e2, 1e4
-_FIRST = 0
-_LASER, _KINDS = 0, (0, 1, 2)
-"""MAV_DISTANCE_SENSOR values: laser, ultrasound, infrared. Other types are sent as laser."""
-_NO_FIELD_OF_VIEW = (0.0, 0.0)
-_NO_QUATERNION = (0.0, 0.0, 0.0, 0.0)
-_QUALITY_NOT_TOLD = 0
-_TEMPERATURE, _NO_DISTANCE_US, _NO_DISTANCE_M = 0, 0, -1.0
-
-
-def distance_sensor(state: AutopilotState) -> Values | None:
-    """Return the newest distance [cm]; None if outdated. PX4 does not send its quality."""
-    told = state.distance
-    if told is None or state.time_us - state.distance_us > NEW_US:
-        return None
-    return (
-        units.boot_ms(state.distance_us),
-        _whole(told.least_m * _CM),
-        _whole(told.greatest_m * _CM),
-        _whole(told.distance_m * _CM),
-        told.kind if told.kind in _KINDS else _LASER,
-        _FIRST,
-        told.orientation,
-        # The variance [cm²] is one byte on the wire and saturates.
-        units.saturate(math.floor(told.variance_m2 * _CM2), 0, 255, 0),
-        *_NO_FIELD_OF_VIEW,
-        *_NO_QUATERNION,
-        _QUALITY_NOT_TOLD,
-    )
-
-
 def clearance(state: AutopilotState, down: float) -> tuple[float, float]:
     """Return the local terrain altitude and the height above it [m]; NaN = unknown."""
     ground = state.clearance
     if ground is None or not ground.valid:
         return math.nan, math.nan
     return -down - ground.dist_bottom_m, ground.dist_bottom_m
-
-
-def _whole(value: float) -> int:
-    """Return a number for a uint16 field, truncated as in C."""
-    return units.uint16(math.floor(value + 1e-9), unknown=0)
-
-
-def optical_flow_rad(state: AutopilotState) -> Values | None:
-    """Return the newest flow and rotation [rad]; None if outdated."""
-    told = state.flow
-    if told is None or state.time_us - state.flow_us > NEW_US:
-        return None
-    return (
-        state.flow_us,
-        _FIRST,
-        round(told.interval_s * US_PER_S),
-        *told.flow.tolist(),
-        *told.turned.tolist(),
-        _TEMPERATURE,
-        told.quality,
-        _NO_DISTANCE_US,
-        _NO_DISTANCE_M,
-    )
 
 
 # RC_CHANNELS echoes the newest RC_CHANNELS_OVERRIDE. Source: PX4 1.16, streams/RC_CHANNELS.hpp and

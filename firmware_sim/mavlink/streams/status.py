@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Final
 
 import numpy as np
 
-from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local, local_to_geodetic, quat_yaw
+from airl_mav.core.addons import entries
+from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local, local_to_geodetic
 from firmware_sim.autopilot.autopilot_state import (
     Arming,
     AutopilotState,
@@ -21,17 +21,14 @@ from firmware_sim.autopilot.autopilot_state import (
     Landed,
 )
 from firmware_sim.autopilot.flight_modes import (
-    BY_CUSTOM_MODE,
     MAIN_AUTO,
     WITH_STICKS,
     Mode,
-    ModeSpec,
 )
 from firmware_sim.autopilot.modes.return_to_launch import return_time_s
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams import units
-from firmware_sim.mavlink.streams.units import boot_ms, percent
 
 CAPABILITIES: int = (
     dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
@@ -45,9 +42,9 @@ CAPABILITIES: int = (
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
-    | dialect.MAV_PROTOCOL_CAPABILITY_FTP
+    | sum(entries("firmware_sim", "CAPABILITIES").values())
 )
-"""Capabilities, equal to a real PX4's 0xE8FF."""
+"""Capabilities, with all add-ons equal to a real PX4's 0xE8FF."""
 
 _FIRMWARE_VERSION = 1 << 24 | 16 << 16 | 0 << 8 | 255
 """Emulated PX4 release: 1.16.0, FIRMWARE_VERSION_TYPE_OFFICIAL."""
@@ -64,7 +61,7 @@ _UID = 0x4149_524C_4D41_5601
 _MAVLINK_VERSION = 3
 """HEARTBEAT.mavlink_version of all MAVLink 1 and 2 systems."""
 
-_NO_MISSION = 0xFFFF
+NO_MISSION = 0xFFFF
 """MISSION_CURRENT.total and HIGH_LATENCY2.wp_num without a stored mission."""
 
 _UNKNOWN_STATE = 0
@@ -253,22 +250,9 @@ def _estimator_flags(state: AutopilotState) -> int:
 def mission_current(state: AutopilotState) -> Values:
     """Return the current item, the number of items, and the ids of stored lists, as in PX4."""
     mission = state.mission
-    total = mission.total or _NO_MISSION
+    total = mission.total or NO_MISSION
     ids = (mission.mission_id, mission.fence_id, mission.rally_points_id)
     return mission.current, total, _UNKNOWN_STATE, _UNKNOWN_STATE, *ids
-
-
-def fence_status(state: AutopilotState) -> Values:
-    """Return geofence breaches. PX4 has no such stream; sent on request only."""
-    fence = state.fence
-    kind = dialect.FENCE_BREACH_NONE
-    # Distance and custom fences are boundaries; MAVLink has no separate type for a custom fence.
-    if fence.distance or fence.custom:
-        kind = dialect.FENCE_BREACH_BOUNDARY
-    elif fence.altitude:
-        kind = dialect.FENCE_BREACH_MAXALT
-    breached = int(any(fence.breached))
-    return breached, units.uint16(fence.breaches), kind, units.boot_ms(fence.time_us)
 
 
 def autopilot_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder
@@ -315,115 +299,7 @@ def autopilot_state_for_gimbal_device(state: AutopilotState) -> Values:
     )
 
 
-# --- summary of the vehicle in 42 bytes, for satellite links; sent on request here
-
-# Source: PX4 1.16, streams/HIGH_LATENCY2.hpp. PX4 sends the mean or the maximum since the last
-# message; here it is the current value.
-
-_UINT8_MAX: Final = 255
-_INT8_MIN: Final = -128
-_NO_TARGET = (0, 0)
-"""Altitude and distance of a target: PX4 sends them for fixed-wing vehicles only."""
 _NO_AIRSPEEDS = (0, 0)
-_NO_WIND = (0, 0)
-_CUSTOM = (_INT8_MIN, _INT8_MIN, _INT8_MIN)
-
-
-def high_latency2(state: AutopilotState) -> Values:
-    """Return position, headings, speeds, charge and failures for HIGH_LATENCY2.
-
-    Units: [1e-7 deg, m], [2 deg], [0.2 m/s, 0.1 m/s], [%].
-    """
-    estimate, gps = state.estimate, state.gps
-    north, east, down = estimate.velocity.tolist()
-    armed = state.status.arming is Arming.ARMED
-    return (
-        units.boot_ms(state.time_us),
-        dialect.MAV_TYPE_QUADROTOR,
-        dialect.MAV_AUTOPILOT_PX4,
-        # The message has room for main and sub mode only: the upper 16 bits of custom_mode.
-        state.status.mode.spec.custom_mode >> 16,
-        *_place(state),
-        _NO_TARGET[0],
-        _heading(quat_yaw(estimate.quaternion)),
-        _heading(quat_yaw(state.attitude_setpoint)),
-        _NO_TARGET[1],
-        percent(state.thrust_setpoint) if armed else 0,
-        *_NO_AIRSPEEDS,
-        # The unit of speed is 0.2 m/s, hence the factor 5.
-        _uint8(math.hypot(north, east) * 5.0),
-        *_NO_WIND,
-        _UINT8_MAX if gps is None else _uint8(gps.eph_m * 10.0),
-        _UINT8_MAX if gps is None else _uint8(gps.epv_m * 10.0),
-        # -128 marks the unknown temperature.
-        _INT8_MIN,
-        # The climb rate has no sign here: [0.1 m/s] in one byte.
-        units.saturate(abs(down) * 10.0, 0, 127, 0),
-        percent(state.battery.remaining),
-        state.mission.current if state.mission.total else _NO_MISSION,
-        _failures(state),
-        *_CUSTOM,
-    )
-
-
-def _place(state: AutopilotState) -> tuple[int, int, int]:
-    """Return latitude, longitude [1e-7 deg] and altitude [m]; zeros if unknown."""
-    position = state.estimate.position
-    if state.origin is None or not all(map(math.isfinite, position.tolist())):
-        return 0, 0, 0
-    place = local_to_geodetic(position, state.origin)
-    return (
-        units.deg_e7(place.latitude_deg),
-        units.deg_e7(place.longitude_deg),
-        units.int16(place.altitude_m),
-    )
-
-
-def _heading(yaw_rad: float) -> int:
-    """Return a heading in units of 2 deg."""
-    return int(math.degrees(yaw_rad % units.TWO_PI) / 2.0) if math.isfinite(yaw_rad) else 0
-
-
-def _uint8(value: float) -> int:
-    return units.saturate(value, 0, _UINT8_MAX, _UINT8_MAX)
-
-
-def _failures(state: AutopilotState) -> int:
-    """Return the HL_FAILURE_FLAG bits of failed parts."""
-    health, status = state.health, state.status
-    # Offboard counts as lost when the failsafe replaces the intended mode.
-    offboard_lost = status.failsafe and status.intended_mode is Mode.OFFBOARD
-    failed = {
-        dialect.HL_FAILURE_FLAG_GPS: not health.gps,
-        dialect.HL_FAILURE_FLAG_ABSOLUTE_PRESSURE: not health.baro,
-        dialect.HL_FAILURE_FLAG_3D_ACCEL: not health.accel,
-        dialect.HL_FAILURE_FLAG_3D_GYRO: not health.gyro,
-        dialect.HL_FAILURE_FLAG_3D_MAG: not health.mag,
-        dialect.HL_FAILURE_FLAG_BATTERY: not health.battery,
-        dialect.HL_FAILURE_FLAG_RC_RECEIVER: state.sticks is None,
-        dialect.HL_FAILURE_FLAG_OFFBOARD_LINK: offboard_lost,
-        dialect.HL_FAILURE_FLAG_GEOFENCE: any(state.fence.breached),
-        dialect.HL_FAILURE_FLAG_ESTIMATOR: not (health.attitude and health.position),
-    }
-    return sum(bit for bit, has_failed in failed.items() if has_failed)
-
-
-_VERSION, _LEAST_VERSION, _GREATEST_VERSION = 200, 100, 200
-"""Sent, minimum and maximum version: MAVLink 2.0 is sent, 1.0 is accepted, as in PX4."""
-
-_NO_HASH = (0,) * 8
-
-
-def flight_information(state: AutopilotState) -> Values:
-    """Return the times of arming and takeoff [µs since boot]; 0 while disarmed."""
-    flight_uuid = landing_time = 0
-    armed, took_off = state.armed_us, state.takeoff_us
-    return boot_ms(state.time_us), armed, took_off, flight_uuid, landing_time
-
-
-def protocol_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder
-    """Return the supported MAVLink versions."""
-    return _VERSION, _LEAST_VERSION, _GREATEST_VERSION, *_NO_HASH, *_NO_HASH
 
 
 _UNKNOWN_TIME = -1
@@ -448,28 +324,6 @@ def time_estimate_to_target(state: AutopilotState, value: Callable[[str], float]
         took = return_time_s(value, -down, math.hypot(north, east))
     unknown = (_UNKNOWN_TIME,) * 4
     return int(took) if math.isfinite(took) else _UNKNOWN_TIME, *unknown
-
-
-AVAILABLE = tuple(sorted(BY_CUSTOM_MODE.values(), key=lambda mode: mode.spec.state))
-"""Modes as clients distinguish them, in the order of AVAILABLE_MODES."""
-
-
-def available_modes() -> list[tuple[int, int, int, int, int, bytes]]:
-    """Return the fields of AVAILABLE_MODES for each mode, in order."""
-    # The count and the number of each mode, starting at 1, in every message.
-    return [
-        (len(AVAILABLE), number, spec.standard, spec.custom_mode, _properties(spec), name)
-        for number, spec in enumerate((mode.spec for mode in AVAILABLE), start=1)
-        # A standard mode implies its name.
-        for name in (b"" if spec.standard else spec.title.encode("ascii"),)
-    ]
-
-
-def _properties(spec: ModeSpec) -> int:
-    """Return the bits of MAV_MODE_PROPERTY."""
-    advanced: int = dialect.MAV_MODE_PROPERTY_ADVANCED if spec.advanced else 0
-    hidden: int = 0 if spec.requestable else dialect.MAV_MODE_PROPERTY_NOT_USER_SELECTABLE
-    return advanced | hidden
 
 
 def current_mode(state: AutopilotState) -> Values:

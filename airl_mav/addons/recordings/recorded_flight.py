@@ -1,0 +1,251 @@
+"""Conversion of a black box to an episode for reports and comparisons."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, TypeAdapter
+
+from airl_mav.black_box.mcap_file import BlackBox, read_black_box
+from airl_mav.black_box.messages import Decision, End, Phase, Resources, Status, Telemetry
+from airl_mav.core.constants import UNMEASURED_A, US_PER_S, CommandKind
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import sha256_of, typed
+from airl_mav.core.frames import Goal, goal_distance_m
+from airl_mav.core.resource_use import ProcessUse
+from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.trajectory import Trajectory, measure_quality
+from airl_mav.latency.stamps import NO_STAMP, SETPOINTS, STAMPS
+from airl_mav.rehearsal.run_folder import (
+    RUN_FILE,
+    FlownEpisode,
+    RunFolder,
+    RunInfo,
+    load_info,
+    run_info,
+)
+from companion.limits import OUT_OF_TIME
+
+NAVIGATING = "navigating"
+"""Phase in which the policy flies (`companion.offboard_mission`)."""
+
+LEAST_NORM = 0.5
+"""Minimum norm of a valid quaternion."""
+
+DIGEST = "recording_sha256"
+"""Setting of the run with the checksum of its source file."""
+
+
+@dataclass(frozen=True)
+class FlownPilot:
+    """Pilot settings of the flight."""
+
+    hold_s: float
+    goal_radius_m: float
+    commands: CommandKind = "velocity"
+
+
+@dataclass(frozen=True)
+class FlownLimits:
+    """Limits of the flight."""
+
+    flight_s: float
+
+
+@dataclass(frozen=True)
+class FlownSettings:
+    """Settings of a flight that its page requires."""
+
+    goal: Goal
+    seed: int
+    speed: Annotated[float, Field(gt=0.0)]
+    pilot: FlownPilot
+    limits: FlownLimits
+
+
+_SETTINGS = TypeAdapter(FlownSettings)
+
+
+def settings_of(box: BlackBox) -> FlownSettings:
+    """Return the flight's settings. Raises UsageError if the black box lacks them."""
+    return typed(_SETTINGS, box.run.get("config", {}), box.path)
+
+
+def info_of(box: BlackBox, digest: str = "") -> RunInfo:
+    """Return the description of the run. Raises UsageError if the black box lacks it."""
+    run = box.run
+    info = run_info(run, box.path)
+    return replace(info, config={**info.config, DIGEST: digest})
+
+
+def episode_of(
+    box: BlackBox, path: Trajectory | None = None, remarks: tuple[str, ...] = ()
+) -> FlownEpisode:
+    """Return the flight of a black box, or raise UsageError; `path` replaces its telemetry."""
+    asked = settings_of(box)
+    path = path_of(box) if path is None else path
+    stamps = stamps_of(box)
+    started_us = int(path.time_us[0]) if len(path) else 0
+    phases = box.all_of(Phase)
+    begun = [phase.time_us for phase in phases if phase.phase == NAVIGATING]
+    navigation_us = begun[0] if begun else None
+    ended_us = _ended_us(box, path, navigation_us)
+    ends = box.all_of(End)
+    reason, notes = (ends[-1].reason, ends[-1].notes) if ends else _cut(box, ended_us)
+    if box.damaged:
+        notes = (*notes, "the recording is damaged: its checksum is wrong")
+    outcome = Outcome.TIMEOUT if reason == OUT_OF_TIME else Outcome.ABORTED
+    arrived_us = _arrived_us(path, navigation_us, ended_us, asked)
+    if arrived_us is not None:
+        outcome, ended_us = Outcome.SUCCESS, arrived_us
+    quality = None
+    if navigation_us is not None and len(path):
+        quality = measure_quality(
+            *(path, navigation_us, ended_us, 0.0),
+            decisions=stamps,
+            hold_s=asked.pilot.hold_s,
+        )
+    batteries = [status.battery_remaining for status in box.all_of(Status)]
+    record = EpisodeRecord(
+        index=0,
+        seed=asked.seed,
+        arena=NO_ARENA,
+        arena_seed=0,
+        outcome=outcome,
+        reason=reason,
+        goal=asked.goal,
+        goal_radius_m=asked.pilot.goal_radius_m,
+        time_limit_s=asked.limits.flight_s,
+        started_us=started_us,
+        navigation_us=navigation_us,
+        ended_us=ended_us,
+        wall_s=(ended_us - started_us) / US_PER_S / asked.speed,
+        slipped_us=0,
+        battery_remaining=next((b for b in reversed(batteries) if b is not None), None),
+        quality=quality,
+        notes=(*remarks, *notes),
+        companion_use=_use(box.all_of(Resources)),
+    )
+    return FlownEpisode(record, path, stamps)
+
+
+def path_of(box: BlackBox) -> Trajectory:
+    """Return the path and power [W] of the telemetry; NaN power if never measured."""
+    told = box.all_of(Telemetry)
+    rows = [(*each.position, *each.velocity, *each.quaternion) for each in told]
+    states = np.array(rows, np.float64).reshape(len(rows), 10)  # None becomes NaN
+    times = np.array([each.time_us for each in told], np.int64)
+    # Before the first telemetry, all values are NaN or 0; a zero quaternion is invalid.
+    known = np.isfinite(states).all(axis=1) & (np.linalg.norm(states[:, 6:], axis=1) > LEAST_NORM)
+    times, states = times[known], states[known]
+    later = np.diff(times, prepend=NO_STAMP) > 0
+    times, states = times[later], states[later]
+    power_w = _power_w(box.all_of(Status), times)
+    return Trajectory(times, states[:, :3], states[:, 3:6], states[:, 6:], power_w)
+
+
+def stamps_of(box: BlackBox) -> dict[str, NDArray[Any]]:
+    """Return the columns of the decisions as in `latency.stamps.DecisionLog.columns`."""
+    decisions, commands = box.all_of(Decision), settings_of(box).pilot.commands
+    columns: dict[str, NDArray[Any]] = {
+        name: np.array([getattr(each, name) for each in decisions], np.int64) for name in STAMPS
+    }
+    # The next decision records the actual end of the hold; the last has only its planned end.
+    columns["held_until_us"][:-1] = [each.held_before_us for each in decisions[1:]]
+    rows = [each.setpoint for each in decisions]
+    columns[SETPOINTS[commands]] = np.array(rows, np.float32).reshape(len(rows), 4)
+    return columns
+
+
+def _power_w(statuses: list[Status], times_us: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the newest power (n,) at times (n,); NaN if never measured (old PX4 sends -1 A)."""
+    told = [
+        (status.time_us, status.voltage_v * status.current_a)
+        for status in statuses
+        if status.voltage_v is not None
+        and status.current_a is not None
+        and status.current_a != UNMEASURED_A
+    ]
+    if not told:
+        return np.full(len(times_us), np.nan)
+    at_us, power_w = np.array(told).T
+    newest = np.searchsorted(at_us, times_us, side="right") - 1
+    return np.asarray(power_w[np.maximum(newest, 0)], np.float64)
+
+
+def _ended_us(box: BlackBox, path: Trajectory, navigation_us: int | None) -> int:
+    """Return the end of navigation, or of the recording [µs]."""
+    if navigation_us is not None:
+        for phase in box.all_of(Phase):
+            if phase.time_us >= navigation_us and phase.phase != NAVIGATING:
+                return phase.time_us
+    sent_us = [decision.sent_us for decision in box.all_of(Decision)]
+    return max([navigation_us or 0, *sent_us, *map(int, path.time_us[-1:])])
+
+
+def _cut(box: BlackBox, ended_us: int) -> tuple[str, tuple[str, ...]]:
+    """Return the reason and the notes of a flight with a truncated recording."""
+    phases = box.all_of(Phase)
+    where = f" while {phases[-1].phase}" if phases else ""
+    note = "the companion, its computer or the power failed, or the file was damaged there"
+    return f"the recording ends{where}", (f"the recording ends at {ended_us / 1e6:.2f} s: {note}",)
+
+
+def _arrived_us(
+    path: Trajectory, navigation_us: int | None, ended_us: int, asked: FlownSettings
+) -> int | None:
+    """Return the arrival by the referee's rule [µs], before the companion's; None = no arrival."""
+    if navigation_us is None:
+        return None
+    flown = path.between(navigation_us, ended_us)
+    away = np.array([goal_distance_m(asked.goal, here) for here in flown.position])
+    there = np.flatnonzero(away < asked.pilot.goal_radius_m)
+    return int(flown.time_us[there[0]]) if len(there) else None
+
+
+def _use(resources: list[Resources]) -> ProcessUse | None:
+    if len(resources) < 2:
+        return None
+    times_s = np.array([each.time_us for each in resources]) / US_PER_S
+    cores = np.array([each.process_cores for each in resources[1:]])
+    return ProcessUse(
+        wall_s=float(times_s[-1] - times_s[0]),
+        cpu_s=float(np.sum(cores * np.diff(times_s))),
+        peak_memory_bytes=max(each.memory_bytes for each in resources),
+        peak_since="begin",
+        power_w=None,
+        power_source="not measured by the black box",
+    )
+
+
+WITH_LOG = "-with-log"
+"""Suffix of the run folder's name for a flight with a vehicle log."""
+
+
+def take_in(path: Path, ulg: Path | None = None) -> Path:
+    """Return the run folder of a black box and its vehicle's log, created beside it if missing."""
+    box = read_black_box(path)
+    folder = path.with_suffix("") if ulg is None else path.with_name(f"{path.stem}{WITH_LOG}")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if ulg is not None:
+        # Imported here: pyulog is an extra.
+        from airl_mav.addons.recordings.logged_episode import logged_episode_of
+        from airl_mav.vehicle_log import read_vehicle_log
+
+        log = read_vehicle_log(ulg)
+        digest = hashlib.sha256(f"{digest} {sha256_of(ulg)}".encode()).hexdigest()
+    if (folder / RUN_FILE).exists():
+        if load_info(folder).config.get(DIGEST) != digest:
+            raise UsageError(
+                f"{folder}: holds another run; accepted: that of {path.name}, or no such folder"
+            )
+        return folder
+    episode = episode_of(box) if ulg is None else logged_episode_of(box, log)
+    RunFolder.adopt(folder, info_of(box, digest)).save_episodes([episode])
+    return folder

@@ -1,1 +1,0 @@
-"""Replay of a recorded run in the scene of the live view."""

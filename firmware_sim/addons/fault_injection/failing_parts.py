@@ -1,0 +1,486 @@
+"""Sensor, motor, battery and wind faults, inserted only in episodes with faults.
+
+A sensor that is off has None in the sample. Accelerometer and gyro are never None: flight
+controllers count time by their samples. If one is off, it repeats its last sample like a stuck
+sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.frame import Frame
+from airl_mav.camera.noise import DepthNoise, noisy_frame
+from airl_mav.camera.render import Motion
+from airl_mav.core.constants import TICK_S, US_PER_S
+from airl_mav.core.frames import Vector, local_to_geodetic
+from airl_mav.faults.fault import Fault, gust_share
+from airl_mav.faults.kinds import MOTORS, NOISE_SEED, SENSORS
+from airl_mav.profiles.conditions import SensorNoise
+from airl_mav.profiles.vehicle import Battery, Sensors, VehicleProfile
+from airl_mav.vehicle.airframe import Airframe, command_for, steady_speed
+from firmware_sim.engine.dynamics import Speeds
+from firmware_sim.engine.ticks import PA_PER_HPA
+from firmware_sim.fault_timeline import Acting, FaultTimeline
+from firmware_sim.interfaces import (
+    ActuatorControls,
+    BatterySample,
+    DistanceReading,
+    FlightController,
+    FlowReading,
+    GpsFix,
+    Odometry,
+    SensorSample,
+)
+from firmware_sim.plant.camera import OnboardCamera
+from firmware_sim.plant.plant import Blowing, Plant
+
+
+def thrust_left(acting: Sequence[Acting]) -> dict[int, float]:
+    """Return the remaining share of thrust of each failing motor, by index from 0."""
+    left: dict[int, float] = {}
+    for _, fault, *_ in acting:
+        if fault.kind == "slow":
+            continue
+        motor = MOTORS.index(fault.part)
+        left[motor] = left.get(motor, 1.0) * _share(fault)
+    return left
+
+
+def _share(fault: Fault) -> float:
+    if fault.kind == "off":
+        return 0.0
+    return 1.0 + fault.amount if fault.kind == "mismatch" else fault.amount
+
+
+def slowness(acting: Sequence[Acting]) -> dict[int, float]:
+    """Return the factor on the time constant of each slow motor, by index from 0."""
+    slow: dict[int, float] = {}
+    for _, fault, *_ in acting:
+        if fault.kind == "slow":
+            motor = MOTORS.index(fault.part)
+            slow[motor] = slow.get(motor, 1.0) * fault.amount
+    return slow
+
+
+def weakened(
+    controls: ActuatorControls, left: Mapping[int, float], thrust_curve: float
+) -> ActuatorControls:
+    """Return commands that give healthy motors the thrust of failing motors.
+
+    `left` is the remaining share of thrust of each failing motor, by index. A share above 1 raises
+    the thrust, up to the motor's maximum.
+    """
+    motors = list(controls.motors)
+    for index, share in left.items():
+        thrust = min(1.0, share * steady_speed(motors[index], thrust_curve) ** 2)
+        motors[index] = command_for(thrust, thrust_curve)
+    first, second, third, fourth = motors
+    return controls._replace(motors=(first, second, third, fourth))
+
+
+def slowed(
+    controls: ActuatorControls,
+    slow: Mapping[int, float],
+    speeds: Sequence[float],
+    lag: float,
+    thrust_curve: float,
+) -> ActuatorControls:
+    """Return commands that give healthy motors the speeds of slow motors.
+
+    Over a tick, a motor of time constant `k tau` keeps the share `lag^(1/k)` of its speed error, a
+    healthy motor `lag` = exp(-dt / tau). The healthy motor reaches the same speed when commanded
+    exactly the share (1 - lag^(1/k)) / (1 - lag) of the change. `slow` is the factor k of each slow
+    motor by index; `speeds` are the present rotor speeds as shares of the speed at full command.
+    """
+    motors = list(controls.motors)
+    for index, factor in slow.items():
+        now, asked = speeds[index], steady_speed(motors[index], thrust_curve)
+        reached = now + (asked - now) * (1.0 - lag ** (1.0 / factor)) / (1.0 - lag)
+        motors[index] = command_for(reached * reached, thrust_curve)
+    first, second, third, fourth = motors
+    return controls._replace(motors=(first, second, third, fourth))
+
+
+def misread(reading: BatterySample, acting: Sequence[Acting], battery: Battery) -> BatterySample:
+    """Return the reading of a failing battery: empty if `off`, a lower voltage by `sag`."""
+    for _, fault, *_ in acting:
+        if fault.kind == "off":
+            empty_v = battery.cells * battery.cell_empty_v
+            reading = reading._replace(voltage_v=empty_v, remaining=0.0)
+        elif fault.kind == "sag":
+            voltage_v = max(0.0, reading.voltage_v - battery.cells * fault.amount)
+            reading = reading._replace(voltage_v=voltage_v)
+    return reading
+
+
+FIELDS = {
+    "accel": "accel",
+    "gyro": "gyro",
+    "mag": "mag",
+    "baro": "pressure_hpa",
+    "gps": "gps",
+    "vision": "odometry",
+    "rangefinder": "distance",
+    "flow": "flow",
+}
+"""Fields of `SensorSample` by sensor name."""
+
+INERTIAL = ("accel", "gyro")
+
+
+Effect = Callable[[Any, int], Any]
+"""Effect of a fault on one sensor: maps value and time [µs] to the measured value; None = no sample
+in this tick. May be stateful."""
+
+
+def _off(value: Any, time_us: int) -> None:
+    """Return no sample."""
+
+
+class Stuck:
+    """Stuck sensor: repeats the first sample of the fault at the sensor's rate."""
+
+    def __init__(self) -> None:
+        self._held: Any = None
+
+    def __call__(self, value: Any, time_us: int) -> Any:
+        """Return the held sample, or None without a sample in this tick."""
+        del time_us
+        if self._held is None:
+            self._held = value
+        return None if value is None else self._held
+
+
+class Late:
+    """Delay of samples. With `always`, the newest delivered sample is repeated in between."""
+
+    def __init__(self, delay_s: float, *, always: bool) -> None:
+        self._delay_us = round(delay_s * US_PER_S)
+        self._always = always
+        self._queue: deque[tuple[int, Any]] = deque()
+        self._newest: Any = None
+
+    def __call__(self, value: Any, time_us: int) -> Any:
+        """Return the sample that is due now."""
+        queue = self._queue
+        if value is not None:
+            queue.append((time_us + self._delay_us, value))
+            if self._newest is None:
+                self._newest = value
+        arrived = None
+        while queue and queue[0][0] <= time_us:
+            arrived = self._newest = queue.popleft()[1]
+        return self._newest if self._always else arrived
+
+
+class Biased:
+    """Constant error."""
+
+    def __init__(self, offset: Vector) -> None:
+        self._offset = offset
+
+    def __call__(self, value: Any, time_us: int) -> Any:
+        """Return the value with the error."""
+        del time_us
+        return None if value is None else shifted(value, self._offset)
+
+
+class Drifting:
+    """Position error that grows at a constant velocity."""
+
+    def __init__(self, velocity: Vector, since_us: int) -> None:
+        self._velocity, self._since_us = velocity, since_us
+
+    def __call__(self, value: Any, time_us: int) -> Any:
+        """Return the fix with the error."""
+        if value is None:
+            return None
+        return shifted(value, self._velocity * ((time_us - self._since_us) / US_PER_S))
+
+
+class Noisy:
+    """White noise in addition to the sensor's noise."""
+
+    def __init__(self, sd: Vector, rng: np.random.Generator) -> None:
+        self._sd, self._rng = sd, rng
+
+    def __call__(self, value: Any, time_us: int) -> Any:
+        """Return the value with additional noise."""
+        del time_us
+        if value is None:
+            return None
+        error = self._sd * self._rng.standard_normal(len(self._sd))
+        moved = shifted(value, error[:3])
+        if isinstance(moved, GpsFix):
+            return moved._replace(velocity_ned=moved.velocity_ned + error[3:])
+        if isinstance(moved, Odometry) and moved.velocity is not None:
+            return moved._replace(velocity=moved.velocity + error[3:])
+        return moved
+
+
+def shifted(value: Any, offset: Vector) -> Any:
+    """Return a measured value with an error: NED for a fix, the pose's frame for a pose."""
+    if isinstance(value, GpsFix):
+        return value._replace(position=local_to_geodetic(offset, value.position))
+    if isinstance(value, Odometry):
+        return value if value.position is None else value._replace(position=value.position + offset)
+    if isinstance(value, DistanceReading):
+        return farther(value, offset.item(0))
+    if isinstance(value, FlowReading):
+        error = offset * value.interval_s if value.quality > 0 else 0.0
+        return value._replace(flow=value.flow + error)
+    if isinstance(value, float):
+        return value + offset.item(0)
+    return value + offset
+
+
+def farther(told: DistanceReading, error_m: float) -> DistanceReading:
+    """Return a range with an error, with quality 0 if it is outside the sensor's limits."""
+    if told.quality == 0:
+        return told
+    distance_m = max(0.0, told.distance_m + error_m)
+    within = told.least_m <= distance_m <= told.greatest_m
+    return told._replace(distance_m=distance_m, quality=told.quality if within else 0)
+
+
+def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
+    """Return the sd of a sensor's noise; for a fix or a pose, position (3) and velocity (3)."""
+    white = math.sqrt(TICK_S / tick_s)
+    gps = profile.gps
+    horizontal, speed = gps.horizontal_noise_m, gps.velocity_noise_m_s
+    vision = profile.vision
+    seen = (0.0, 0.0) if vision is None else (vision.position_noise_m, vision.velocity_noise_m_s)
+    ranges, flow = profile.rangefinder, profile.optical_flow
+    known: dict[str, list[float]] = {
+        "accel": [profile.imu.accel_noise_m_s2 * white] * 3,
+        "gyro": [profile.imu.gyro_noise_rad_s * white] * 3,
+        "mag": [profile.magnetometer.noise_gauss] * 3,
+        "baro": [profile.barometer.noise_pa / PA_PER_HPA],
+        "gps": [horizontal, horizontal, gps.vertical_noise_m, speed, speed, speed],
+        "vision": [seen[0]] * 3 + [seen[1]] * 3,
+        "rangefinder": [0.0 if ranges is None else ranges.noise_m],
+        "flow": [0.0 if flow is None else flow.noise_rad_s] * 2,
+    }
+    return np.array(known[part])
+
+
+def effect_of(acting: Acting, profile: Sensors, tick_s: float, rng: np.random.Generator) -> Effect:
+    """Return the effect of a sensor fault; `rng` is used by this fault only."""
+    fault = acting.fault
+    part, kind = fault.part, fault.kind
+    if kind == "off" and part not in INERTIAL:
+        return _off
+    if kind in ("off", "stuck"):
+        return Stuck()
+    if kind == "delay":
+        return Late(fault.amount, always=part in INERTIAL)
+    if kind == "bias":
+        return Biased(np.array(fault.value))
+    if kind == "drift":
+        return Drifting(np.array(fault.value), acting.since_us)
+    # `amount` is the ratio of total noise to the sensor's noise; their variances add.
+    more = math.sqrt(max(0.0, fault.amount**2 - 1.0))
+    return Noisy(more * noise_sd(part, profile, tick_s), rng)
+
+
+def failed(sample: SensorSample, effects: list[tuple[str, Effect]]) -> SensorSample:
+    """Return a sample with all effects, given with sensor names, applied in order."""
+    changed: dict[str, Any] = {}
+    for part, effect in effects:
+        name = FIELDS[part]
+        value = changed[name] if name in changed else getattr(sample, name)
+        changed[name] = effect(value, sample.time_us)
+    return sample._replace(**changed)
+
+
+def gust_at(acting: Sequence[Acting], time_us: int) -> Vector:
+    """Return the wind (3,) NED [m/s] added by faults at a time [µs]."""
+    total = np.zeros(3)
+    for each in acting:
+        share = 1.0
+        if each.fault.kind == "gust":
+            elapsed_us, whole_us = time_us - each.since_us, each.until_us - each.since_us
+            share = gust_share(elapsed_us / US_PER_S, whole_us / US_PER_S)
+        total += share * np.array(each.fault.value)
+    return total
+
+
+class Gusts:
+    """Wind with the additional wind of faults."""
+
+    def __init__(self, wind: Blowing) -> None:
+        """Wrap the wind of the episode."""
+        self.more: Vector | None = None
+        """Additional wind (3,) NED [m/s] in the next tick; None = no additional wind."""
+        self._wind = wind
+
+    def step(self) -> Vector:
+        """Advance one tick and return the wind (3,) NED [m/s]."""
+        wind = self._wind.step()
+        return wind if self.more is None else wind + self.more
+
+
+class FailingParts:
+    """Fault layer between the plant and the flight controller.
+
+    Works with any flight controller: the built-in autopilot, or real firmware behind its simulator
+    interface.
+    """
+
+    def __init__(
+        self,
+        controller: FlightController,
+        plant: Plant,
+        vehicle: VehicleProfile,
+        timeline: FaultTimeline,
+    ) -> None:
+        """Insert the layer between controller and plant, without active faults.
+
+        Faults add gusts to the plant's wind and reduce its battery charge. The vehicle profile
+        contains the sensor noise, the battery and the motors' thrust curve.
+        """
+        self._controller = controller
+        self._plant = plant
+        self._vehicle = vehicle
+        self._curve = Airframe.from_profile(vehicle).thrust_curve
+        self._tick_s = 1.0 / controller.rate_hz
+        self._timeline = timeline
+        self._memories: dict[int, Effect] = {}
+        self._effects: list[tuple[str, Effect]] = []
+        self._battery: list[Acting] = []
+        self._left: dict[int, float] = {}
+        self._slow: dict[int, float] = {}
+        self._turning: Speeds | None = None
+        """Latest effective motor commands; None = those of the flight controller."""
+        self._gusts = Gusts(plant.wind)
+        plant.wind = self._gusts
+        self._wind: list[Acting] = []
+        self._dropped: set[int] = set()
+        timeline.on_change(self._rearrange)
+
+    def step(self, sample: SensorSample) -> ActuatorControls:
+        """Advance the flight controller by the altered sample; return effective motor commands."""
+        self._timeline.update(sample.time_us, self._controller.flight)
+        if self._effects:
+            sample = failed(sample, self._effects)
+        if self._battery:
+            reading = misread(sample.battery, self._battery, self._vehicle.battery)
+            sample = sample._replace(battery=reading)
+        if self._wind:
+            self._gusts.more = gust_at(self._wind, sample.time_us)
+        if self._turning is not None:
+            sample = sample._replace(esc_outputs=self._turning)
+        controls = self._controller.step(sample)
+        if not (self._left or self._slow):
+            self._turning = None
+            return controls
+        if self._left:
+            controls = weakened(controls, self._left, self._curve)
+        if self._slow:
+            plant = self._plant
+            controls = slowed(
+                controls, self._slow, plant.rotor_speeds, plant.rotor_lag, self._curve
+            )
+        self._turning = controls.motors
+        return controls
+
+    def _rearrange(self) -> None:
+        timeline, before = self._timeline, self._memories
+        sensors = timeline.acting(*SENSORS)
+        self._memories = {
+            each.number: before.get(each.number) or self._effect_of(each) for each in sensors
+        }
+        self._effects = [(each.fault.part, self._memories[each.number]) for each in sensors]
+        motors = timeline.acting(*MOTORS)
+        self._left, self._slow = thrust_left(motors), slowness(motors)
+        battery = timeline.acting("battery")
+        for each in battery:
+            if each.fault.kind == "drop" and each.number not in self._dropped:
+                self._dropped.add(each.number)
+                left = self._plant.battery_remaining - each.fault.amount
+                self._plant.battery_remaining = max(0.0, left)
+        self._battery = [each for each in battery if each.fault.kind != "drop"]
+        self._wind = timeline.acting("wind")
+        if not self._wind:
+            self._gusts.more = None
+
+    def _effect_of(self, acting: Acting) -> Effect:
+        rng = self._timeline.generator(acting.number)
+        return effect_of(acting, self._vehicle.sensors, self._tick_s, rng)
+
+
+class FailingCamera:
+    """Camera with faults, inserted only in episodes with faults."""
+
+    def __init__(self, camera: OnboardCamera, timeline: FaultTimeline, seed: int) -> None:
+        """Wrap a healthy camera, with the faults and the seed of the episode."""
+        self._camera = camera
+        self._timeline = timeline
+        self._seed = seed
+        self._acting: list[Acting] = []
+        self._frozen: Frame | None = None
+        self._late: deque[tuple[int, Frame]] = deque()
+        timeline.on_change(self._rearrange)
+
+    @property
+    def next_us(self) -> int:
+        """Simulated time of the next exposure or delayed frame [µs]."""
+        next_us = self._camera.next_us
+        return min(next_us, self._late[0][0]) if self._late else next_us
+
+    def restart(self, time_us: int) -> None:
+        """Begin an episode at `time_us` [µs]."""
+        self._late.clear()
+        self._camera.restart(time_us)
+
+    def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
+        """Pass due frames to `publish`; see `OnboardCamera.offer`."""
+        if time_us >= self._camera.next_us:
+            self._camera.offer(time_us, motion, lambda frame: self._take(frame, publish))
+        while self._late and self._late[0][0] <= time_us:
+            publish(self._late.popleft()[1])
+
+    def skip_unread(self, read_us: int) -> None:
+        """Skip nothing: a delayed or frozen frame may be read later."""
+
+    def _take(self, frame: Frame, publish: Callable[[Frame], None]) -> None:
+        delay_us = 0
+        for each in self._acting:
+            kind = each.fault.kind
+            if kind == "off":
+                return
+            if kind == "delay":
+                delay_us += round(each.fault.amount * US_PER_S)
+            elif kind == "noise":
+                noise = DepthNoise(None, SensorNoise(depth_noise=each.fault.amount))
+                seed = NOISE_SEED * (each.number + 1) + self._seed
+                depth = noisy_frame(frame.depth_mm, noise, seed, frame.sequence)
+                frame = _showing(frame, depth, frame.jpeg)
+            else:  # stuck
+                if self._frozen is None:
+                    self._frozen = frame
+                frame = _showing(frame, self._frozen.image, self._frozen.jpeg)
+        if delay_us or self._late:
+            # A camera's frames arrive in order: a later frame must not overtake.
+            due_us = frame.capture_time_us + delay_us
+            self._late.append((max(due_us, self._late[-1][0]) if self._late else due_us, frame))
+        else:
+            publish(frame)
+
+    def _rearrange(self) -> None:
+        self._acting = self._timeline.acting("camera")
+        if all(each.fault.kind != "stuck" for each in self._acting):
+            self._frozen = None
+
+
+def _showing(frame: Frame, image: NDArray[Any], jpeg: bytes | None) -> Frame:
+    """Return a copy of a frame with another image of the main camera."""
+    shown = image, frame.intrinsics, jpeg, frame.further
+    return Frame(frame.sequence, frame.capture_time_us, *shown)

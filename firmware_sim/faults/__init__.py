@@ -1,1 +1,0 @@
-"""Fault injection between plant and flight controller, in the camera and on the links."""

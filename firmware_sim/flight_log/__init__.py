@@ -1,1 +1,0 @@
-"""Flight log of the vehicle: ULog (.ulg), PX4's log format."""
