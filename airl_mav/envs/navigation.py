@@ -51,7 +51,7 @@ from airl_mav.policy.images import Bytes, body_bytes
 from airl_mav.policy.layouts import GOAL, VELOCITY, Encoded, encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, Rows, observe
 from airl_mav.policy.observation_spec import ObservationSpec
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction import Compensator
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.conditions import Payload, check_spread, equipped

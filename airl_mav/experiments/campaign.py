@@ -40,8 +40,7 @@ from airl_mav.rehearsal.run_folder import (
     check_folder,
     locked,
 )
-from airl_mav.scenario.resolve import plan_of
-from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
+from airl_mav.scenario.resolve import PlannedEpisode, ResolvedScenario, plan_of
 
 INTERVAL_S = 2.0
 """Interval between two saves of a small run [wall s]."""

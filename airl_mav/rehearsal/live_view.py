@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from airl_mav.arena.geometry import Arena
     from airl_mav.camera.frame import Frame
     from airl_mav.latency.injection import LatencySampler
-    from airl_mav.prediction.compensator import Compensator
+    from airl_mav.prediction import Compensator
     from companion.pilot import SentDecision
     from firmware_sim.simulation import Simulation
 

@@ -28,7 +28,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.policy.card import ONNX_FILE, TORCH_FILE, PolicyCard, PolicyFacts, digest
 from airl_mav.policy.card_writing import write_card
-from airl_mav.policy.layouts import GOAL, VELOCITY, Encoded, boxes
+from airl_mav.policy.layouts import Encoded, boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import (
     ACTION,

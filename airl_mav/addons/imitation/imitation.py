@@ -47,7 +47,7 @@ from airl_mav.policy.actions import (
     discrete_actions,
     fastest_climb,
 )
-from airl_mav.policy.observation_spec import Encoded
+from airl_mav.policy.layouts import Encoded
 from airl_mav.policy.registry import GreedyPolicy, GreedySettings
 from airl_mav.training.config import ExpertName
 from airl_mav.training.dqn import Ring, Shapes, shapes_of
