@@ -20,12 +20,11 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.addons.int8.quantisation import export_int8, quantised
-from airl_mav.policy.card import ONNX_FILE, PolicyFacts, load_card, read_card
+from airl_mav.policy.card import ONNX_FILE, OnnxRuntime, PolicyFacts, load_card, read_card
 from airl_mav.policy.card_writing import write_template
 from airl_mav.policy.layouts import Encoded, boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.registry import find_policy
-from airl_mav.policy.runtime import OnnxRuntime
 
 DEFAULT = ("static-obstacles", "5x32")
 LONGEST_S = 10.0

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from airl_mav.addons.refit.refit import refit
-from airl_mav.addons.refit.refly import PartFlown, refly_parts
+from airl_mav.addons.refit.refly import PartFlown, Rehearsals, refly_parts
 from airl_mav.scenario.model import DEFAULT_ARENA
 from tests.support.recorded_flights import RecordedFlight
 from tests.support.refit_truths import RefitErrors, drawn_truth, errors_of, true_dead_time_s
@@ -80,9 +80,8 @@ def _rehearse(
     """Fly again on the refit, and keep the figures of each part."""
     out = folder / "refit"
     refit(flight.black_box, ulg=flight.ulg, out=out)
-    _, flown = refly_parts(
-        flight.black_box, folder / "flown", out, arena=DEFAULT_ARENA, episodes=episodes
-    )
+    asked = Rehearsals(arena=DEFAULT_ARENA, episodes=episodes)
+    _, flown = refly_parts(flight.black_box, folder / "flown", out, asked)
     for each in flown:
         parts.setdefault(each.part, []).append(each)
 

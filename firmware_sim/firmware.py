@@ -46,20 +46,16 @@ class FrameServer(Protocol):
     @property
     def awaited(self) -> bool:
         """True if a client waits for the next frame, which must then be on time."""
-        ...
 
     @property
     def transport_us(self) -> int | None:
         """Time from exposure to a client that reads between ticks [µs]; None = read at any time."""
-        ...
 
     def publish(self, frame: Frame) -> None:
         """Offer a frame without blocking."""
-        ...
 
     def close(self) -> None:
         """Release the resources."""
-        ...
 
 
 class FlightLog(Protocol):
@@ -92,7 +88,6 @@ class FlightStack(Protocol):
             UsageError: The vehicle's parameters are invalid, or the firmware does not exist.
             FirmwareLostError: External firmware died while it booted.
         """
-        ...
 
     def connect(self, tick: Callable[[], int], truth: Callable[[], TrueState]) -> None:
         """Open MAVLink after the flight controller's first tick.
@@ -106,36 +101,27 @@ class FlightStack(Protocol):
             UsageError: External firmware is silent, or configured for another vehicle.
             FirmwareLostError: External firmware died.
         """
-        ...
 
     def filenos(self) -> Sequence[int]:
         """Return the descriptors that become readable when MAVLink arrives."""
-        ...
 
     def receive(self, now_us: int) -> int:
         """Handle messages received by simulated `now_us` [µs]; return how many took effect."""
-        ...
 
     def next_send_us(self) -> float:
         """Return the latest simulated time for the next call of `send` [µs]."""
-        ...
 
     def send(self, now_us: int, flown: Record) -> None:
-        """Send the messages that are due.
+        """Send the messages due at simulated `now_us` [µs], after the newest tick.
 
-        Args:
-            now_us: Simulated time after the newest tick [µs].
-            flown: (n,) logs of the ticks since the last call; empty for external firmware.
+        `flown` is (n,) logs of the ticks since the last call; empty for external firmware.
         """
-        ...
 
     def log_to(self, tlog: TlogWriter | None) -> None:
         """Start to log the onboard link to a tlog; None stops logging."""
-        ...
 
     def counters(self) -> dict[str, LinkCounters]:
         """Return traffic counters by link name."""
-        ...
 
     def strangers(self) -> Sequence[str]:
         """Return a line for each unidentified client that commanded the vehicle in this episode.
@@ -143,11 +129,9 @@ class FlightStack(Protocol):
         The heartbeat of such a client is neither a companion's nor a ground station's. Empty for
         external firmware, whose MAVLink is not inspected here.
         """
-        ...
 
     def close(self) -> None:
         """Release everything."""
-        ...
 
 
 class BuiltinFlightStack:

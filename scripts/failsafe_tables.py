@@ -100,7 +100,7 @@ def offboard_loss() -> str:
     default = int(SPEC_BY_NAME["COM_OBL_RC_ACT"].default)
     rows = (
         (f"**{value}**" if value == default else f"{value}", ACTION_NAMES[action])
-        for value, (action, _) in OFFBOARD_LOSS.items()
+        for value, action in OFFBOARD_LOSS.items()
     )
     return _table(("`COM_OBL_RC_ACT`", "action"), rows)
 
@@ -127,7 +127,7 @@ def checks() -> str:
 
 
 def _told(check: prearm.PrearmCheck) -> str:
-    if check.said:
+    if check.announced:
         return "by itself"
     return "by an event alone" if check.blocks is prearm.never else "when arming is refused"
 

@@ -35,9 +35,9 @@ from airl_mav.core.fields import range_of, validated
 from airl_mav.core.first_start import shown_by
 from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.faults.fault import Fault
+from airl_mav.profiles.loading import read_toml
 from airl_mav.scenario.aircraft import IN_WORDS
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.scenario_file import read_scenario_file
 
 Options = TypeVar("Options", bound=BaseModel)
 
@@ -67,7 +67,7 @@ def read_options(model: type[Options], prog: str, words: Sequence[str]) -> Optio
     file = _scenario_file(model, words)
     if file is not None:
         words = words[1:]
-        held = read_scenario_file(file)
+        held = read_toml(file)
         validated(model, held, file)
     # Without comments, as tyro would read this file's source for each table.
     kind: Any = Annotated[(_arguments(model, held), tyro.conf.HelptextFromCommentsOff)]

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import errno
 import reprlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import PurePath
 
 EXIT_BROKEN = 1
@@ -85,6 +87,15 @@ class UnexpectedArgumentError(UsageError, TypeError):
     Also a TypeError, Python's error for this case: callers with optional arguments (TorchRL with
     `frameskip`) catch it and retry without them.
     """
+
+
+@contextmanager
+def usage_errors(where: object) -> Iterator[None]:
+    """Raise UsageError, with a file or an option, for a system error within the context."""
+    try:
+        yield
+    except OSError as error:
+        raise UsageError(f"{where}: {error.strerror}") from None
 
 
 MACHINE_ERRORS = frozenset(

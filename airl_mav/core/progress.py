@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from types import TracebackType
-from typing import IO, Any, ClassVar
+from typing import IO, Any, ClassVar, TypedDict
 
 from rich.console import Console, RenderableType
 from rich.progress import (
@@ -27,6 +27,7 @@ from rich.progress import Progress as RichBars
 from rich.spinner import Spinner
 from rich.table import Column
 from rich.text import Text
+from typing_extensions import Unpack
 
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
@@ -53,24 +54,27 @@ class Event:
     """Type of the event."""
 
 
+class BarChanges(TypedDict, total=False):
+    """Changes of a bar."""
+
+    completed: float
+    """Completed amount."""
+    total: float
+    """Total amount."""
+    postfix: str
+    """Text after the bar, for people."""
+    figures: Mapping[str, Any]
+    """Values for programs."""
+
+
 class Bar:
     """Countable task; this base class shows nothing."""
 
     def advance(self, amount: float = 1.0) -> None:
         """Increase the completed amount."""
 
-    def update(
-        self,
-        *,
-        completed: float | None = None,
-        total: float | None = None,
-        postfix: str | None = None,
-        figures: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Set the completed and total amount, the text after the bar, or its values for programs.
-
-        None leaves a value unchanged.
-        """
+    def update(self, **changes: Unpack[BarChanges]) -> None:
+        """Set amounts, text or values."""
 
     def close(self) -> None:
         """Remove the bar."""
@@ -210,18 +214,10 @@ class _RichBar(Bar):
         """Increase the completed amount."""
         self._bars.advance(self._task, amount)
 
-    def update(
-        self,
-        *,
-        completed: float | None = None,
-        total: float | None = None,
-        postfix: str | None = None,
-        figures: Mapping[str, Any] | None = None,  # noqa: ARG002 (the text says them)
-    ) -> None:
-        """Set the completed and total amount, or the text after the bar."""
-        self._bars.update(self._task, completed=completed, total=total)
-        if postfix is not None:
-            self._bars.update(self._task, postfix=postfix)
+    def update(self, **changes: Unpack[BarChanges]) -> None:
+        """Set amounts or the text after the bar."""
+        changes.pop("figures", None)  # The text contains them.
+        self._bars.update(self._task, **changes)
 
     def close(self) -> None:
         """Remove the bar."""
@@ -304,14 +300,14 @@ class JsonProgress(Progress):
     def __init__(self, out: IO[str], clock: Clock | None = None) -> None:
         """Write to a stream; `clock` measures the pace, by default in wall time."""
         self._out = out
-        self._clock = clock or WallClock()
+        self.clock = clock or WallClock()
         self._status: str | None = None
 
     def bar(
         self, label: str, total: float, *, completed: float = 0.0, unit: str | None = None
     ) -> Bar:
         """Begin a task; see `Progress`."""
-        return _JsonBar(self, self._clock, label, total, completed, unit)
+        return _JsonBar(self, label, total, completed, unit)
 
     def status(self, text: str | None) -> None:
         """Write the status if it has changed."""
@@ -334,18 +330,12 @@ class _JsonBar(Bar):
     """Task that is reported to programs."""
 
     def __init__(
-        self,
-        progress: JsonProgress,
-        clock: Clock,
-        label: str,
-        total: float,
-        completed: float,
-        unit: str | None,
+        self, progress: JsonProgress, label: str, total: float, completed: float, unit: str | None
     ) -> None:
-        self._progress, self._clock = progress, clock
+        self._progress, self._clock = progress, progress.clock
         self._label, self._total, self._unit = label, total, unit
         self._before = self._completed = completed
-        self._began_us = clock.time_us()
+        self._began_us = self._clock.time_us()
         self._first: tuple[int, float] | None = None
         """Time and number of the first completed units; None = no unit completed."""
         self._told_us: int | None = None
@@ -356,17 +346,11 @@ class _JsonBar(Bar):
         """Increase the completed amount."""
         self.update(completed=self._completed + amount)
 
-    def update(
-        self,
-        *,
-        completed: float | None = None,
-        total: float | None = None,
-        postfix: str | None = None,  # noqa: ARG002 (the figures contain it)
-        figures: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Set the completed and total amount, or additional values of the event."""
-        self._figures.update(figures or {})
-        self._total = self._total if total is None else total
+    def update(self, **changes: Unpack[BarChanges]) -> None:
+        """Set amounts, or additional values of the event."""
+        self._figures.update(changes.get("figures", {}))
+        self._total = changes.get("total", self._total)
+        completed = changes.get("completed")
         if completed is None:
             return
         now_us = self._clock.time_us()

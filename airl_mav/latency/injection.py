@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,37 +50,16 @@ class FixedSampler:
         return self._latency_us
 
 
-class LognormalSampler:
-    """Minimum latency plus a log-normal; mean and standard deviation apply to the sum."""
+class RandomSampler:
+    """Independent latencies from a distribution."""
 
-    def __init__(
-        self, mean_us: float, std_us: float, min_us: float, rng: np.random.Generator
-    ) -> None:
-        """Take the moments [µs]: 0 <= min_us < mean_us, std_us > 0."""
-        self._mu, self._sigma = lognormal_parameters(mean_us - min_us, std_us)
-        self._min_us = min_us
-        self._rng = rng
+    def __init__(self, draw_us: Callable[[], float]) -> None:
+        """Take the function that draws a latency [µs]."""
+        self._draw_us = draw_us
 
     def sample_us(self) -> int:
         """Return the next latency [µs]."""
-        return round(self._min_us + self._rng.lognormal(self._mu, self._sigma))
-
-
-class TruncatedNormalSampler:
-    """Normal distribution, redrawn below the minimum latency."""
-
-    def __init__(
-        self, mean_us: float, std_us: float, min_us: float, rng: np.random.Generator
-    ) -> None:
-        """Take the moments of the untruncated normal [µs]; min_us < mean_us keeps redraws rare."""
-        self._mean_us, self._std_us, self._min_us = mean_us, std_us, min_us
-        self._rng = rng
-
-    def sample_us(self) -> int:
-        """Return the next latency [µs]."""
-        while (latency_us := self._rng.normal(self._mean_us, self._std_us)) < self._min_us:
-            pass
-        return round(latency_us)
+        return round(self._draw_us())
 
 
 class ReplaySampler:
@@ -126,9 +106,19 @@ def build_sampler(latency: LatencyDistribution, rng: np.random.Generator) -> Lat
     std_us = (latency.std_ms or 0.0) * US_PER_MS
     if not std_us:
         return FixedSampler(round(mean_us))
+    min_us = latency.min_ms * US_PER_MS
     if latency.distribution == "lognormal":
-        return LognormalSampler(mean_us, std_us, latency.min_ms * US_PER_MS, rng)
-    return TruncatedNormalSampler(mean_us, std_us, latency.min_ms * US_PER_MS, rng)
+        # Mean and standard deviation are of the sum.
+        mu, sigma = lognormal_parameters(mean_us - min_us, std_us)
+        return RandomSampler(lambda: min_us + rng.lognormal(mu, sigma))
+
+    def truncated_us() -> float:
+        # Redraws are rare: the minimum is below the mean.
+        while (latency_us := rng.normal(mean_us, std_us)) < min_us:
+            pass
+        return latency_us
+
+    return RandomSampler(truncated_us)
 
 
 Origin = Literal["measured", "injected", "estimated"]
@@ -219,16 +209,11 @@ def _estimate(computer: ComputerProfile, macs: int | None) -> Injection:
 def _scaled(work: Workload, factor: float) -> LatencyDistribution:
     """Return a workload's latency with every time multiplied by `factor`."""
     latency = work.latency
-    return latency.model_copy(
-        update={
-            "mean_ms": None if latency.mean_ms is None else latency.mean_ms * factor,
-            "std_ms": None if latency.std_ms is None else latency.std_ms * factor,
-            "min_ms": latency.min_ms * factor,
-            "samples_ms": None
-            if latency.samples_ms is None
-            else tuple(sample * factor for sample in latency.samples_ms),
-        }
-    )
+    times = latency.model_dump(include={"mean_ms", "std_ms", "min_ms"}, exclude_none=True)
+    scaled: dict[str, Any] = {name: value * factor for name, value in times.items()}
+    if latency.samples_ms is not None:
+        scaled["samples_ms"] = tuple(sample * factor for sample in latency.samples_ms)
+    return latency.model_copy(update=scaled)
 
 
 def moments(latency: LatencyDistribution) -> str:

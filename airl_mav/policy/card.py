@@ -1,27 +1,40 @@
-"""Policy card: inputs, outputs, training and measured quality of a policy file.
+"""Policy card: inputs, outputs, training and measured quality of a policy file; its runtimes.
 
 A policy is a folder with `policy.onnx` and `card.json`. The card contains the file's SHA-256
 digest, which binds the card to this file.
+
+Runtimes are ONNX Runtime, or torch if installed. Both are imported only when a network is opened: a
+classical policy needs neither. A network with memory takes its memory as additional inputs, and
+returns the next memory as additional outputs, whose names begin with `next_`. A runtime is
+stateless: one serves any number of flights.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, Strict, model_validator
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import UsageError, usage_errors
 from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
 from airl_mav.core.files import read_json
-from airl_mav.policy.actions import ACTION_SETS, ActionSpec, DecisionTiming
-from airl_mav.policy.layouts import LAYOUTS, layout_of
+from airl_mav.policy.actions import (
+    ACTION_SETS,
+    ActionSpec,
+    DecisionTiming,
+    continuous_numbers,
+    discrete_actions,
+)
+from airl_mav.policy.layouts import LAYOUTS, boxes, layout_of
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch, further_mismatch
-from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.profiles.camera import Camera
 
 SCHEMA = 1
@@ -51,46 +64,6 @@ class Training(ProfileModel):
     date_utc: str | None = optional("when it was exported, ISO 8601")
 
 
-class Measured(Protocol):
-    """A figure with its 95 % interval: `flight.statistics.Estimate`, or a published one."""
-
-    @property
-    def value(self) -> float | None:
-        """Estimate; None = no data."""
-
-    @property
-    def low(self) -> float | None:
-        """Lower end of the interval."""
-
-    @property
-    def high(self) -> float | None:
-        """Upper end of the interval."""
-
-    @property
-    def n(self) -> int:
-        """Number of flights."""
-
-
-class MeasuredQuality(Protocol):
-    """Figures of flown episodes: `flight.statistics.Aggregate`, or a published run."""
-
-    @property
-    def success_rate(self) -> Measured:
-        """Fraction, 0 to 1."""
-
-    @property
-    def flight_time_s(self) -> Measured:
-        """Mean over the successful flights, as are the following properties."""
-
-    @property
-    def distance_m(self) -> Measured:
-        """Flown distance [m]."""
-
-    @property
-    def energy_j(self) -> Measured:
-        """Energy of the vehicle without its computer [J]."""
-
-
 class MeasuredResult(ProfileModel):
     """Measured quality over a set of episodes; means over the successful ones."""
 
@@ -115,8 +88,11 @@ class MeasuredResult(ProfileModel):
     behaviour: str | None = optional("fingerprint of the flight behaviour that it was flown with")
 
     @classmethod
-    def of(cls, quality: MeasuredQuality, **conditions: Any) -> MeasuredResult:
-        """Return a result with the figures of a quality; `conditions` are the other fields."""
+    def of(cls, quality: Any, **conditions: Any) -> MeasuredResult:
+        """Return a result with the figures of a quality; `conditions` are the other fields.
+
+        `quality` is a `flight.statistics.Aggregate`, or a published run with the same estimates.
+        """
         rate = quality.success_rate
         return cls(
             episodes=rate.n,
@@ -314,12 +290,186 @@ def vehicle_mismatch(
 
 def _read_bound(path: Path, sha256: str) -> bytes:
     """Return a file's bytes if they match the digest. Raises UsageError."""
-    try:
+    with usage_errors(path):
         data = path.read_bytes()
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from None
     if (found := digest(data)) != sha256:
         raise UsageError(
             f"{path}: SHA-256 {found[:12]}...; accepted: {sha256[:12]}..., that of {CARD_FILE}"
         )
     return data
+
+
+RuntimeName = Literal["onnx", "torch"]
+
+ACTION = "action"
+"""Name of the action output, the only output of a network without memory."""
+
+NEXT = "next_"
+"""Prefix of a memory's output; the rest is the name of its input."""
+
+Shapes = Mapping[str, tuple[int, ...]]
+"""Memory of a network: the shape of each array by name, without the leading axis."""
+
+Memory = dict[str, NDArray[np.float32]]
+"""Memory of n flights: arrays of n rows by name."""
+
+_ERRORS_ONLY = 3
+"""ONNX Runtime's log severity "error": hides warnings about the machine."""
+
+_ONNX_TYPES: dict[type[np.generic], str] = {
+    np.uint8: "tensor(uint8)",
+    np.float32: "tensor(float)",
+}
+
+
+class Runtime:
+    """A network ready for inference; base class."""
+
+    def step(
+        self, encoded: Mapping[str, NDArray[Any]], memory: Memory
+    ) -> tuple[NDArray[np.float32], Memory]:
+        """Return the outputs (n, k) for the arrays of a layout, each with n rows; next memory."""
+        raise NotImplementedError(f"{type(self).__name__} runs no network with a memory")
+
+    def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+        """Return the outputs (n, k) of a network without memory."""
+        return self.step(encoded, {})[0]
+
+
+def blank_memory(shapes: Shapes, n: int) -> Memory:
+    """Return the memory of n flights before their first decision: zeros."""
+    return {name: np.zeros((n, *shape), np.float32) for name, shape in shapes.items()}
+
+
+def outputs_of(actions: ActionSpec) -> int:
+    """Return the number of outputs: a score for each discrete action, or the action itself."""
+    return discrete_actions(actions) or continuous_numbers(actions)
+
+
+class OnnxRuntime(Runtime):
+    """A network in ONNX Runtime, on the CPU."""
+
+    def __init__(
+        self,
+        model: bytes,
+        observation: ObservationSpec,
+        actions: ActionSpec,
+        threads: int = 1,
+        state: Shapes | None = None,
+    ) -> None:
+        """Open the bytes of an .onnx file with weights. Small networks need one thread.
+
+        The network must take the observation, return the actions, and keep `state` between
+        decisions; None = no memory. Raises ValueError if it is not ONNX, or inputs or outputs
+        differ.
+        """
+        import onnxruntime
+
+        onnxruntime.set_default_logger_severity(_ERRORS_ONLY)
+        onnxruntime.disable_telemetry_events()
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        options.log_severity_level = _ERRORS_ONLY
+        # A spinning thread must not take a core from telemetry.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        try:
+            self._session = onnxruntime.InferenceSession(
+                model, options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # ONNX Runtime's errors share no other base class.
+            raise ValueError(f"not a model that ONNX Runtime loads: {first_line(error)}") from None
+        self._state = tuple(state or {})
+        _check_signature(self._session, observation, actions, state or {})
+
+    def step(
+        self, encoded: Mapping[str, NDArray[Any]], memory: Memory
+    ) -> tuple[NDArray[np.float32], Memory]:
+        """Return the outputs and the next memory; see `Runtime`."""
+        names = [ACTION, *(f"{NEXT}{name}" for name in self._state)]
+        found, *after = self._session.run(names, {**encoded, **memory})
+        return found, dict(zip(self._state, after, strict=True))
+
+
+class TorchRuntime(Runtime):
+    """A network as a torch program (`torch.export`), on the CPU."""
+
+    def __init__(
+        self,
+        program: bytes,
+        observation: ObservationSpec,
+        threads: int = 1,
+        state: Shapes | None = None,
+    ) -> None:
+        """Open the bytes of a .pt2 file; `threads` applies to the whole process.
+
+        `state` is the memory between decisions; None = no memory. Raises ValueError if torch is not
+        installed, or cannot load the program.
+        """
+        try:
+            import torch
+        except ImportError:
+            raise ValueError("torch is not installed; pip install 'airl-mav[train]'") from None
+        torch.set_num_threads(threads)
+        try:
+            self._module = torch.export.load(io.BytesIO(program)).module()
+        except Exception as error:  # Any type, from a bad archive to an unknown operator.
+            raise ValueError(f"not a program that torch loads: {first_line(error)}") from None
+        self._torch = torch
+        self._keys, self._state = tuple(boxes(observation)), tuple(state or {})
+
+    def step(
+        self, encoded: Mapping[str, NDArray[Any]], memory: Memory
+    ) -> tuple[NDArray[np.float32], Memory]:
+        """Return the outputs and the next memory; see `Runtime`."""
+        with self._torch.inference_mode():
+            tensors = self._tensors(encoded, self._keys) + self._tensors(memory, self._state)
+            outputs = self._module(*tensors)
+            outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+            found, *after = (each.numpy() for each in outputs)
+        return found, dict(zip(self._state, after, strict=True))
+
+    def _tensors(self, arrays: Mapping[str, NDArray[Any]], keys: tuple[str, ...]) -> list[Any]:
+        return [self._torch.from_numpy(np.ascontiguousarray(arrays[key])) for key in keys]
+
+
+def _check_signature(
+    session: Any, observation: ObservationSpec, actions: ActionSpec, state: Shapes
+) -> None:
+    """Raise ValueError if a session's inputs or outputs differ from its card."""
+    takes = {name: (_ONNX_TYPES[box.dtype], box.shape) for name, box in boxes(observation).items()}
+    gives: dict[str, tuple[str, tuple[int, ...]]] = {
+        ACTION: (_ONNX_TYPES[np.float32], (outputs_of(actions),))
+    }
+    for name, shape in state.items():
+        takes[name] = gives[f"{NEXT}{name}"] = _ONNX_TYPES[np.float32], shape
+    _compare("inputs", session.get_inputs(), takes)
+    _compare("outputs", session.get_outputs(), gives)
+
+
+def _compare(
+    what: str, nodes: list[Any], wanted: Mapping[str, tuple[str, tuple[int, ...]]]
+) -> None:
+    """Compare inputs or outputs by name, type and shape; the first axis must be free."""
+    found = {node.name: (node.type, tuple(node.shape)) for node in nodes}
+    fits = found.keys() == wanted.keys() and all(
+        found[name][0] == kind
+        and found[name][1][1:] == shape
+        and not isinstance(found[name][1][0], int)
+        for name, (kind, shape) in wanted.items()
+    )
+    if not fits:
+        accepted = {name: (kind, ("n", *shape)) for name, (kind, shape) in wanted.items()}
+        raise ValueError(f"{what} {_signature(found)}; accepted: {_signature(accepted)}")
+
+
+def _signature(nodes: Mapping[str, tuple[str, tuple[Any, ...]]]) -> str:
+    return ", ".join(
+        f"{name} {kind} ({', '.join(str(axis) for axis in shape)})"
+        for name, (kind, shape) in nodes.items()
+    )
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of an error."""
+    return (str(error) or type(error).__name__).splitlines()[0]

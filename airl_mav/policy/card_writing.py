@@ -17,11 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import UsageError, usage_errors
 from airl_mav.core.fields import validated
 from airl_mav.core.files import replace_file, write_json
 from airl_mav.policy.actions import ActionSpec
 from airl_mav.policy.card import (
+    ACTION,
     CARD_FILE,
     ONNX_FILE,
     SCHEMA,
@@ -31,13 +32,13 @@ from airl_mav.policy.card import (
     PolicyFacts,
     digest,
     load_card,
+    outputs_of,
     read_card,
     read_model,
     read_torch_program,
 )
 from airl_mav.policy.layouts import GOAL, VELOCITY
 from airl_mav.policy.observation_spec import ObservationSpec
-from airl_mav.policy.runtime import ACTION, outputs_of
 
 MODEL_CARD_FILE = "README.md"
 
@@ -195,7 +196,7 @@ def copy_policy(
         raise UsageError(f"{out}: not a folder")
     plain = card.model_dump(mode="json") | {"results": ()} | changes
     copied = validated(PolicyCard, plain)
-    try:
+    with usage_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         replace_file(out / ONNX_FILE, read_model(source, card))
         if card.torch_sha256 is not None:
@@ -203,8 +204,6 @@ def copy_policy(
         write_card(out, copied)
         if card.torch_sha256 is None:
             (out / TORCH_FILE).unlink(missing_ok=True)
-    except OSError as error:
-        raise UsageError(f"{out}: {error.strerror}") from None
     return copied
 
 

@@ -15,24 +15,21 @@ from airl_mav.core.errors import UsageError
 from airl_mav.policy.actions import ActionSpec, AnyAction, command, discrete_actions
 from airl_mav.policy.card import (
     TORCH_FILE,
+    Memory,
     PolicyCard,
+    Runtime,
+    RuntimeName,
+    TorchRuntime,
+    blank_memory,
     check_trust,
     open_model,
+    outputs_of,
     read_card,
     read_torch_program,
 )
 from airl_mav.policy.layouts import ablated, boxes, encode_layout
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import camera_mismatch, further_mismatch
-from airl_mav.policy.runtime import (
-    Memory,
-    RecurrentRuntime,
-    Runtime,
-    RuntimeName,
-    TorchRuntime,
-    blank_memory,
-    outputs_of,
-)
 from airl_mav.profiles.loading import profiles_dir
 
 
@@ -131,8 +128,6 @@ class LearnedPolicy:
 
     def _remembering(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
         """Return the outputs of a network with memory, and update the memory."""
-        if not isinstance(self._runtime, RecurrentRuntime):
-            raise ValueError(f"{type(self._runtime).__name__} runs no network with a memory")
         n = len(next(iter(encoded.values())))
         memory = blank_memory(self.card.state, n) if self._memory is None else self._memory
         known = len(next(iter(memory.values())))
@@ -202,7 +197,7 @@ def load_learned(
 
 def open_network(
     folder: Path, card: PolicyCard, runtime: RuntimeName, threads: int, *, trust: bool = False
-) -> RecurrentRuntime:
+) -> Runtime:
     """Return the network of a card, ready for its first inference; `torch` takes `policy.pt2`.
 
     `trust` permits the folder's author to run code on this machine: `torch.export.load` falls back

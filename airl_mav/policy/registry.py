@@ -23,10 +23,16 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.plugins import POLICIES as DOOR
 from airl_mav.core.plugins import announced, digest_of, load_part, names_code, reference
 from airl_mav.policy.actions import Action, Policy, command_kind
-from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, load_card, vehicle_mismatch
+from airl_mav.policy.card import (
+    CARD_FILE,
+    ONNX_FILE,
+    PolicyCard,
+    RuntimeName,
+    load_card,
+    vehicle_mismatch,
+)
 from airl_mav.policy.learned import load_learned
 from airl_mav.policy.observation import Observation
-from airl_mav.policy.runtime import RuntimeName
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.profiles.vehicle import VehicleProfile
 

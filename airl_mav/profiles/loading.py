@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel
 
-from airl_mav.core.errors import UsageError, shown
+from airl_mav.core.errors import UsageError, shown, usage_errors
 from airl_mav.core.fields import validated
 from airl_mav.core.files import DEEPEST, deeper_than
 from airl_mav.profiles.assets import CONTENT, CheckedFile, read_checked
@@ -112,11 +112,8 @@ def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the content of a TOML file. Raises UsageError."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from None
+    with usage_errors(path), path.open("rb") as file:
+        data = file.read(MOST_BYTES + 1)
     if len(data) > MOST_BYTES:
         raise UsageError(f"{path}: accepted: a profile of at most {MOST_BYTES:,} bytes")
     try:

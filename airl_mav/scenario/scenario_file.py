@@ -2,34 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
-from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.core.plugins import names_file
 from airl_mav.scenario.model import Scenario
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 SCENARIO_FILE = "scenario.toml"
 """Scenario file in a run folder."""
-
-
-def read_scenario_file(path: Path) -> dict[str, Any]:
-    """Return the contents of a scenario file. Raises UsageError if unreadable or invalid TOML."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise UsageError(f"{path}: not valid TOML: {error}") from None
 
 
 def save_scenario(scenario: Scenario, path: Path) -> None:

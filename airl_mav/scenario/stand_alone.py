@@ -286,20 +286,21 @@ def check_companion(asked: StandAloneCompanion) -> None:
     for metres in asked.goal:
         if not abs(metres) <= FARTHEST_M:
             raise FieldError("goal", metres, f"{-FARTHEST_M:g} <= value <= {FARTHEST_M:g} m")
-    if asked.lockstep and "://" not in asked.camera:
-        accepted = "in lockstep the address of the simulator's camera: tcp://HOST:PORT, ipc://PATH"
-        raise FieldError("camera", asked.camera, accepted)
-    if asked.lockstep and asked.black_box is not None:
-        raise FieldError("black_box", f"{asked.black_box}", "without lockstep, which paces nothing")
     if asked.black_box is not None and find_spec("mcap") is None:
         accepted = "with MCAP installed: pip install 'airl-mav[black-box]'"
         raise FieldError("black_box", f"{asked.black_box}", accepted)
-    if asked.lockstep and asked.tell_obstacles:
-        raise FieldError("tell_obstacles", asked.tell_obstacles, "without lockstep")
-    if asked.lockstep and asked.check:
-        raise FieldError("check", asked.check, "without lockstep")
-    if asked.lockstep and asked.start != "arm":
-        raise FieldError("start", asked.start, "arm in lockstep, where nobody else flies")
+    if asked.lockstep:
+        address = "in lockstep the address of the simulator's camera: tcp://HOST:PORT, ipc://PATH"
+        for field, bad, accepted in (
+            ("camera", "://" not in asked.camera, address),
+            ("black_box", asked.black_box is not None, "without lockstep, which paces nothing"),
+            ("tell_obstacles", asked.tell_obstacles, "without lockstep"),
+            ("check", asked.check, "without lockstep"),
+            ("start", asked.start != "arm", "arm in lockstep, where nobody else flies"),
+        ):
+            if bad:
+                value = getattr(asked, field)
+                raise FieldError(field, f"{value}" if isinstance(value, Path) else value, accepted)
     _check_folder("log", asked.log)
 
 

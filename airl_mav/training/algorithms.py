@@ -21,8 +21,8 @@ from torch import nn
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.plugins import NETWORKS, load_part
+from airl_mav.policy.card import first_line
 from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, image_key
-from airl_mav.policy.runtime import first_line
 from airl_mav.training import config
 from airl_mav.training.algorithm_table import Algorithm
 from airl_mav.training.config import ALGORITHMS, NetworkSpec

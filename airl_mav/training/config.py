@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from airl_mav.core.addons import addon_algorithms, load
+from airl_mav.core.addons import entries, load
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
 from airl_mav.core.plugins import NETWORKS, part_name
@@ -21,7 +21,7 @@ SELECTION_SEED = 500_000
 """First seed of the selection episodes; training starts at a million, evaluation at one."""
 
 ALGORITHMS: dict[str, Algorithm] = CORE_ALGORITHMS | {
-    name: load(place) for name, place in addon_algorithms().items()
+    name: load(place) for name, place in entries("airl_mav", "ALGORITHMS").items()
 }
 """Learning algorithms of the core and of add-ons."""
 

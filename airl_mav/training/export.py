@@ -26,10 +26,9 @@ from airl_mav.policy.actions import (
     continuous_numbers,
     discrete_actions,
 )
-from airl_mav.policy.card import PolicyCard, PolicyFacts
+from airl_mav.policy.card import PolicyCard, PolicyFacts, first_line
 from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, boxes
 from airl_mav.policy.observation_spec import ObservationSpec
-from airl_mav.policy.runtime import first_line
 from airl_mav.profiles.projections import CHANNELS, KINDS
 from airl_mav.training import export_request, onnx_export
 from airl_mav.training.onnx_export import RecurrentNetwork

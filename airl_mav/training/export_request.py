@@ -28,9 +28,8 @@ from airl_mav.policy.actions import (
     ActionSpec,
     DecisionTiming,
 )
-from airl_mav.policy.card import PolicyFacts, Training
+from airl_mav.policy.card import PolicyFacts, Training, first_line
 from airl_mav.policy.observation_spec import LayoutName, ObservationSpec
-from airl_mav.policy.runtime import first_line
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projections import UNDISTORTED, CameraKind, Projection
 from airl_mav.profiles.vehicle import load_vehicle

@@ -26,20 +26,24 @@ from torch.nn import functional
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
-from airl_mav.policy.card import ONNX_FILE, TORCH_FILE, PolicyCard, PolicyFacts, digest
+from airl_mav.policy.card import (
+    ACTION,
+    NEXT,
+    ONNX_FILE,
+    TORCH_FILE,
+    Memory,
+    OnnxRuntime,
+    PolicyCard,
+    PolicyFacts,
+    Runtime,
+    Shapes,
+    TorchRuntime,
+    digest,
+    first_line,
+)
 from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.layouts import Encoded, boxes
 from airl_mav.policy.observation_spec import ObservationSpec
-from airl_mav.policy.runtime import (
-    ACTION,
-    NEXT,
-    Memory,
-    OnnxRuntime,
-    RecurrentRuntime,
-    Shapes,
-    TorchRuntime,
-    first_line,
-)
 
 OPSET = 18
 """ONNX operator set: the newest that torch writes without a conversion."""
@@ -162,9 +166,7 @@ def memory_of(module: nn.Module) -> Shapes:
     return module.state if isinstance(module, RecurrentNetwork) else {}
 
 
-def _compare(
-    module: nn.Module, runtime: RecurrentRuntime, spec: ObservationSpec, name: str
-) -> None:
+def _compare(module: nn.Module, runtime: Runtime, spec: ObservationSpec, name: str) -> None:
     """Raise ValueError unless a runtime and the network have the same outputs."""
     rng = np.random.default_rng(1)
     for n in CHECKED_ROWS:

@@ -73,10 +73,12 @@ def move_on(c: Fields, now_us: int) -> None:
     own[HEIGHT] += own[SPEED] * elapsed_s
     left_m = own[TARGET] - own[HEIGHT]
     # Maximum speed from which braking is still possible.
-    wanted = math.copysign(min(speed, _braking_speed(abs(left_m), acceleration, jerk)), left_m)
+    target_speed = math.copysign(
+        min(speed, _braking_speed(abs(left_m), acceleration, jerk)), left_m
+    )
     # Acceleration limit: bounds the change of speed in this step.
     most = acceleration * elapsed_s
-    own[SPEED] += min(most, max(-most, wanted - own[SPEED]))
+    own[SPEED] += min(most, max(-most, target_speed - own[SPEED]))
 
 
 @kernel

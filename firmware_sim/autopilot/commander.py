@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, auto
+from functools import partial
 from typing import NamedTuple
 
 from firmware_sim.autopilot.autopilot_state import (
@@ -20,7 +21,7 @@ from firmware_sim.autopilot.autopilot_state import (
     Severity,
 )
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import ArmingReason, MavlinkEvent, words
+from firmware_sim.autopilot.events.definition import ArmingReason, words
 from firmware_sim.autopilot.flight_modes import Mode
 
 
@@ -89,128 +90,91 @@ class CommanderState:
     """True if a failsafe selected the mode."""
 
 
-class Choice(Enum):
-    """Rule for the next mode in a table row."""
-
-    KEEP = auto()
-    """No change."""
-    ASK = auto()
-    """Switch to `TransitionCell.mode`, requested by the user."""
-    RESTORE = auto()
-    """Disarmed: return to the last lasting mode."""
-
-
 @dataclass(frozen=True, slots=True)
 class TransitionCell:
     """Cell of the transition table."""
 
     phase: FlightPhase | None = None
     """Next phase; None = unchanged."""
-    choice: Choice = Choice.KEEP
-    mode: Mode = Mode.HOLD
+    mode: Mode | None = None
+    """Next mode, requested by the user; None = unchanged."""
+    restores_mode: bool = False
+    """True if the vehicle is disarmed and returns to the last lasting mode."""
     result: Result = Result.ACCEPTED
     text: OperatorText | None = None
 
 
-def _info(text: str, event: MavlinkEvent) -> OperatorText:
-    return OperatorText(Severity.INFO, text, event)
+Row = dict[FlightPhase, TransitionCell]
+"""Effects of an event by phase; without effect in other phases."""
 
-
-def _critical(text: str, event: MavlinkEvent) -> OperatorText:
-    return OperatorText(Severity.CRITICAL, text, event)
-
-
-_BY_COMMAND = events.ARMED_BY.event(ArmingReason.COMMAND_EXTERNAL)
-_IGNORE = TransitionCell()
+_info = partial(OperatorText.of, Severity.INFO)
+_critical = partial(OperatorText.of, Severity.CRITICAL)
 _TEMP = Result.TEMPORARILY_REJECTED
-_NO_ARM = TransitionCell(result=_TEMP, text=OperatorText.of(Severity.CRITICAL, events.ARM_DENIED))
-_NOT_LANDED = TransitionCell(
-    result=_TEMP, text=OperatorText.of(Severity.CRITICAL, events.DISARM_DENIED)
-)
 _B, _S, _G, _A = FlightPhase
-_ARMED = TransitionCell(phase=_G, text=_info("Armed by external command", _BY_COMMAND))
-_LIFTED = TransitionCell(phase=_A, text=OperatorText.of(Severity.INFO, events.TAKEOFF_DETECTED))
-_LANDED = TransitionCell(phase=_G, text=OperatorText.of(Severity.INFO, events.LANDING_DETECTED))
-
-
-def _ask(mode: Mode) -> TransitionCell:
-    return TransitionCell(choice=Choice.ASK, mode=mode)
+_NO_ARM = TransitionCell(result=_TEMP, text=_critical(events.ARM_DENIED))
 
 
 def unavailable(mode: Mode) -> OperatorText:
     """Return the text for the rejection of a mode."""
     text = f"Switching to {mode.spec.title} is currently not available"
-    event = events.MODE_NOT_AVAILABLE.event(mode.spec.custom_mode, mode.spec.event)
-    return _critical(text, event)
+    return _critical(events.MODE_NOT_AVAILABLE, mode.spec.custom_mode, mode.spec.event, text=text)
 
 
-def _asked(mode: Mode) -> tuple[TransitionCell, TransitionCell, TransitionCell, TransitionCell]:
+def _available(mode: Mode) -> Row:
     # PX4 also accepts the mode on the ground and disarmed; the vehicle stays.
-    return (_ask(mode),) * 4
+    return dict.fromkeys(FlightPhase, TransitionCell(mode=mode))
 
 
-def _asked_in_vain(
-    mode: Mode,
-) -> tuple[TransitionCell, TransitionCell, TransitionCell, TransitionCell]:
+def _not_available(mode: Mode) -> Row:
     # Disarmed, PX4 accepts any mode and rejects arming if its requirements are unmet.
     rejected = TransitionCell(result=_TEMP, text=unavailable(mode))
-    return (_ask(mode), _ask(mode), rejected, rejected)
+    return _available(mode) | {_G: rejected, _A: rejected}
 
 
 def _disarm(reason: ArmingReason) -> TransitionCell:
-    text = _info(f"Disarmed by {words(reason)}", events.DISARMED_BY.event(reason))
-    return TransitionCell(phase=_S, choice=Choice.RESTORE, text=text)
+    text = _info(events.DISARMED_BY, reason, text=f"Disarmed by {words(reason)}")
+    return TransitionCell(phase=_S, restores_mode=True, text=text)
 
 
 COMMANDED = {
-    mode: OperatorText.of(Severity.INFO, mode.spec.command_event, text=mode.spec.command_text)
+    mode: _info(mode.spec.command_event, text=mode.spec.command_text)
     for mode in Mode
     if mode.spec.command_event is not None
 }
 """Texts for modes with a separate MAVLink command, armed or not; DO_SET_MODE has no text."""
 
-_DISARMED = _disarm(ArmingReason.COMMAND_EXTERNAL)
-_UNUSED = _disarm(ArmingReason.AUTO_DISARM_PREFLIGHT)
-_LOCKED, _CUT = _disarm(ArmingReason.LOCKDOWN), _disarm(ArmingReason.FAILSAFE)
-_DENIED = TransitionCell(result=Result.DENIED)
+_ARMED = _info(events.ARMED_BY, ArmingReason.COMMAND_EXTERNAL, text="Armed by external command")
+_DISARMED, _LOCKED = _disarm(ArmingReason.COMMAND_EXTERNAL), _disarm(ArmingReason.LOCKDOWN)
+_CUT, _DENIED = _disarm(ArmingReason.FAILSAFE), TransitionCell(result=Result.DENIED)
+_NOT_LANDED = TransitionCell(result=_TEMP, text=_critical(events.DISARM_DENIED))
 
-TABLE: dict[
-    Ask | CommanderEvent, tuple[TransitionCell, TransitionCell, TransitionCell, TransitionCell]
-] = {
-    CommanderEvent.READY: (TransitionCell(phase=_S), _IGNORE, _IGNORE, _IGNORE),
+TABLE: dict[Ask | CommanderEvent, Row] = {
+    CommanderEvent.READY: {_B: TransitionCell(_S)},
     # No transition from air back to boot: the vehicle continues with the estimate as is.
-    CommanderEvent.NOT_READY: (_IGNORE, TransitionCell(phase=_B), _IGNORE, _IGNORE),
-    CommanderEvent.ARM: (_NO_ARM, _ARMED, _IGNORE, _IGNORE),
-    CommanderEvent.ARM_UNREADY: (_NO_ARM, _NO_ARM, _IGNORE, _IGNORE),
-    CommanderEvent.DISARM: (_IGNORE, _IGNORE, _DISARMED, _NOT_LANDED),
-    CommanderEvent.KILL: (_IGNORE, _IGNORE, _DISARMED, _DISARMED),
-    CommanderEvent.LIFTED: (_IGNORE, _IGNORE, _LIFTED, _IGNORE),
-    CommanderEvent.LANDED: (_IGNORE, _IGNORE, _IGNORE, _LANDED),
-    CommanderEvent.MODE_DONE: (_IGNORE, _IGNORE, _IGNORE, _ask(Mode.HOLD)),
-    CommanderEvent.DISARM_TIMEOUT: (_IGNORE, _IGNORE, _UNUSED, _IGNORE),
-    CommanderEvent.LANDED_TIMEOUT: (
-        _IGNORE,
-        _IGNORE,
-        _disarm(ArmingReason.AUTO_DISARM_LAND),
-        _IGNORE,
-    ),
-    CommanderEvent.LOCKDOWN_TIMEOUT: (_IGNORE, _IGNORE, _LOCKED, _LOCKED),
-    CommanderEvent.FAILSAFE_DISARM: (_IGNORE, _IGNORE, _CUT, _CUT),
-    **{Ask(mode): _asked(mode) for mode in Mode},
-    **{Ask(mode, available=False): _asked_in_vain(mode) for mode in Mode},
+    CommanderEvent.NOT_READY: {_S: TransitionCell(_B)},
+    CommanderEvent.ARM: {_B: _NO_ARM, _S: TransitionCell(_G, text=_ARMED)},
+    CommanderEvent.ARM_UNREADY: {_B: _NO_ARM, _S: _NO_ARM},
+    CommanderEvent.DISARM: {_G: _DISARMED, _A: _NOT_LANDED},
+    CommanderEvent.KILL: {_G: _DISARMED, _A: _DISARMED},
+    CommanderEvent.LIFTED: {_G: TransitionCell(_A, text=_info(events.TAKEOFF_DETECTED))},
+    CommanderEvent.LANDED: {_A: TransitionCell(_G, text=_info(events.LANDING_DETECTED))},
+    CommanderEvent.MODE_DONE: {_A: TransitionCell(mode=Mode.HOLD)},
+    CommanderEvent.DISARM_TIMEOUT: {_G: _disarm(ArmingReason.AUTO_DISARM_PREFLIGHT)},
+    CommanderEvent.LANDED_TIMEOUT: {_G: _disarm(ArmingReason.AUTO_DISARM_LAND)},
+    CommanderEvent.LOCKDOWN_TIMEOUT: {_G: _LOCKED, _A: _LOCKED},
+    CommanderEvent.FAILSAFE_DISARM: {_G: _CUT, _A: _CUT},
+    **{Ask(mode): _available(mode) for mode in Mode},
+    **{Ask(mode, available=False): _not_available(mode) for mode in Mode},
     # There is nothing to terminate while disarmed.
-    Ask(Mode.TERMINATION): (_DENIED, _DENIED, _ask(Mode.TERMINATION), _ask(Mode.TERMINATION)),
+    Ask(Mode.TERMINATION): _available(Mode.TERMINATION) | {_B: _DENIED, _S: _DENIED},
 }
-"""[event][phase]: effect of an event in BOOT, STANDBY, GROUND and AIR; tests cover every pair."""
-
-
-def _unless_ignored(event: CommanderEvent, phase: FlightPhase) -> CommanderEvent | None:
-    # `is`: only the shared cell of an event without effect counts.
-    return None if TABLE[event][phase] is _IGNORE else event
-
+"""[event][phase]: effect of an event; tests cover every pair."""
 
 READINESS = tuple(
-    (_unless_ignored(CommanderEvent.NOT_READY, phase), _unless_ignored(CommanderEvent.READY, phase))
+    tuple(
+        event if phase in TABLE[event] else None
+        for event in (CommanderEvent.NOT_READY, CommanderEvent.READY)
+    )
     for phase in FlightPhase
 )
 """[phase][estimator healthy]: event to handle, None if the table ignores it. Looked up in every
@@ -234,18 +198,13 @@ def transition(flight: CommanderState, event: Ask | CommanderEvent) -> EventOutc
             return EventOutcome(flight, _TEMP, unavailable(event.mode))
         if event is CommanderEvent.MODE_DONE:
             return EventOutcome(flight, Result.ACCEPTED, None)
-    row = TABLE[event][flight.phase]
-    phase = flight.phase if row.phase is None else row.phase
-    moved = replace(flight, phase=phase)
-    if row.choice is Choice.ASK:
-        lasting = row.mode if row.mode.spec.lasting else flight.after_disarm
-        moved = replace(
-            moved, mode=row.mode, intended=row.mode, after_disarm=lasting, failsafe=False
-        )
-    elif row.choice is Choice.RESTORE:
-        mode = flight.after_disarm
-        moved = replace(moved, mode=mode, intended=mode, failsafe=False)
-    return EventOutcome(moved, row.result, row.text)
+    cell = TABLE[event].get(flight.phase, TransitionCell())
+    after = replace(flight, phase=flight.phase if cell.phase is None else cell.phase)
+    mode = flight.after_disarm if cell.restores_mode else cell.mode
+    if mode is not None:
+        lasting = mode if mode.spec.lasting else flight.after_disarm
+        after = replace(after, mode=mode, intended=mode, after_disarm=lasting, failsafe=False)
+    return EventOutcome(after, cell.result, cell.text)
 
 
 def status_of(flight: CommanderState) -> CommanderStatus:

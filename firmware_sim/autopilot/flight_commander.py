@@ -148,13 +148,13 @@ class FlightCommander:
         if text is not None:
             self._say(text)
         flown = self.flight.mode
-        asked = isinstance(event, Ask) and step.result is Result.ACCEPTED
-        if asked and step.flight.phase >= _GROUND:
+        requested = isinstance(event, Ask) and step.result is Result.ACCEPTED
+        if requested and step.flight.phase >= _GROUND:
             # A failsafe may persist, or yield to the user.
             self._become(step.flight, step.flight.mode)
             self.obey(Intervention(mode_chosen=True), flown, request)
         else:
-            self._become(step.flight, flown, request if asked else None)
+            self._become(step.flight, flown, request if requested else None)
         return step.result
 
     def _become(
@@ -189,7 +189,7 @@ class FlightCommander:
         request: ModeRequest | None = None,
     ) -> None:
         """Apply the failsafes' decision; see `_become`."""
-        flown, asked = self.flight.mode if flown is None else flown, self.flight.mode
+        flown, requested = self.flight.mode if flown is None else flown, self.flight.mode
         decision = self._commanded.supervisor.decide(self._now_us, self.flight, intervention)
         if decision is None:
             return
@@ -197,7 +197,7 @@ class FlightCommander:
             self._say(decision.text)
         flight = decision.flight
         # A request belongs to its mode: another mode must not receive it.
-        request = request if flight.mode is asked else None
+        request = request if flight.mode is requested else None
         if flight != self.flight or flight.mode is not flown or request is not None:
             self._become(flight, flown, request)
         if decision.disarm:

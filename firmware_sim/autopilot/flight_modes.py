@@ -194,9 +194,7 @@ class Mode(IntEnum):
     )
     """Level descent without a position estimate. PX4 reports it as Land."""
     TERMINATION = ModeSpec(
-        *(14, "Termination", 10, 0, 13, NavigationMode.UNKNOWN),
-        Need.NOT_ARMING,
-        requestable=False,
+        *(14, "Termination", 10, 0, 13, NavigationMode.UNKNOWN), Need.NOT_ARMING, requestable=False
     )
     """The motors are stopped permanently."""
     PRECISION_LAND = ModeSpec(

@@ -35,17 +35,6 @@ class ArmingSettings(NamedTuple):
     sys_has_mag: int = 1
     sys_has_num_dist: int = 0
 
-    @classmethod
-    def read(cls, value: Callable[[str], float]) -> ArmingSettings:
-        """Read the parameters with a look-up by PX4 name."""
-        defaults = cls._field_defaults.values()
-        return cls(
-            *(
-                type(default)(value(name.upper()))
-                for name, default in zip(cls._fields, defaults, strict=True)
-            )
-        )
-
 
 class Readiness(NamedTuple):
     """Input of the checks, without measured values, so that equal inputs can be cached."""
@@ -83,10 +72,10 @@ class PrearmCheck(NamedTuple):
     """Event for ground stations; its first arguments are the affected modes and the component."""
     component: Component
     fails: Callable[[Readiness], bool]
-    told: str = ""
+    operator_text: str = ""
     """Text for the operator; "" = `prefix` and the event's message."""
     prefix: str = "Preflight Fail: "
-    said: bool = True
+    announced: bool = True
     """True if PX4 reports the check as soon as it fails; False: only when arming is rejected."""
     blocks: Callable[[Readiness], bool] | None = None
     """Condition under which the check prevents arming; None = always."""
@@ -104,7 +93,7 @@ class PrearmCheck(NamedTuple):
     @property
     def text(self) -> str:
         """Text for the operator."""
-        return self.told or self.prefix + self.event.message
+        return self.operator_text or self.prefix + self.event.message
 
     @property
     def is_health(self) -> bool:
@@ -152,16 +141,20 @@ def _health(
     *,
     numbered: bool = False,
     event_level: Level = Level.ERROR,
-    told: str = "",
+    operator_text: str = "",
 ) -> PrearmCheck:
     """Return a check of hardware; `numbered`: the event has the number of the sensor, 0."""
     extra = _INSTANCE if numbered else ()
     event = Definition(f"check_{name}", message, _ABOUT + extra, event_level, group="health")
-    return PrearmCheck(event, component, fails, told, values=(0,) * len(extra))
+    return PrearmCheck(event, component, fails, operator_text, values=(0,) * len(extra))
 
 
 def _no_data(
-    component: Component, name: str, sensor: str, told: str, fails: Callable[[Readiness], bool]
+    component: Component,
+    name: str,
+    sensor: str,
+    short: str,
+    fails: Callable[[Readiness], bool],
 ) -> PrearmCheck:
     return _health(
         component,
@@ -169,7 +162,7 @@ def _no_data(
         f"No valid data from {sensor} {{3}}",
         fails,
         numbered=True,
-        told=f"Preflight Fail: No valid data from {told} 0",
+        operator_text=f"Preflight Fail: No valid data from {short} 0",
     )
 
 
@@ -191,7 +184,7 @@ def _needed(
 
     An `estimate` fails in every mode, and blocks the modes that need it.
     """
-    told = f"Preflight Fail: No valid {estimate} estimate" if estimate else ""
+    operator_text = f"Preflight Fail: No valid {estimate} estimate" if estimate else ""
     if estimate:
         rest["blocks"] = lambda r: _needs(r, need)
     return _check(
@@ -200,8 +193,8 @@ def _needed(
         message,
         lambda r: fails(r.conditions) and (bool(estimate) or _needs(r, need)),
         *event,
-        told=told,
-        said=False,
+        operator_text=operator_text,
+        announced=False,
         **rest,
     )
 
@@ -351,7 +344,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         "Distance sensor {3} missing",
         lambda r: r.settings.sys_has_num_dist > 0 and r.distance is None,
         numbered=True,
-        told="Preflight Fail: Distance Sensor 0 missing",
+        operator_text="Preflight Fail: Distance Sensor 0 missing",
     ),
     _health(
         _C.DISTANCE_SENSOR,
@@ -359,15 +352,11 @@ CHECKS: tuple[PrearmCheck, ...] = (
         "No valid data from distance sensor {3}",
         lambda r: r.settings.sys_has_num_dist > 0 and r.distance is False,
         numbered=True,
-        told="Preflight Fail: no valid data from distance sensor 0",
+        operator_text="Preflight Fail: no valid data from distance sensor 0",
     ),
     _battery(BatteryWarning.LOW, "battery_low", "Low battery", _L.WARNING, "BAT_LOW_THR"),
     _battery(
-        BatteryWarning.CRITICAL,
-        "battery_critical",
-        "Critical battery",
-        _L.CRITICAL,
-        "BAT_CRIT_THR",
+        BatteryWarning.CRITICAL, "battery_critical", "Critical battery", _L.CRITICAL, "BAT_CRIT_THR"
     ),
     _battery(
         BatteryWarning.EMERGENCY,
@@ -376,19 +365,13 @@ CHECKS: tuple[PrearmCheck, ...] = (
         _L.CRITICAL,
         "BAT_EMERGEN_THR",
     ),
-    _health(
-        _C.BATTERY,
-        "battery_unhealthy",
-        "Battery unhealthy",
-        lambda r: _supply_checked(r) and r.conditions.battery_unhealthy,
-    ),
     _check(
         _C.BATTERY,
         "battery_rem_flight_time_low",
         "Remaining flight time low",
         lambda r: _supply_checked(r) and r.conditions.battery_low_remaining_time,
         prefix="",
-        said=False,
+        announced=False,
     ),
     _check(
         _ESTIMATE,
@@ -396,15 +379,15 @@ CHECKS: tuple[PrearmCheck, ...] = (
         "Waiting for estimator to initialize",
         lambda r: not r.converged and not r.armed,
         _L.INFO,
-        told="Preflight Fail: ekf2 missing data",
-        said=False,
+        operator_text="Preflight Fail: ekf2 missing data",
+        announced=False,
     ),
     _check(
         _ESTIMATE,
         "estimator_heading_not_stable",
         "Heading estimate not stable",
         lambda r: not r.compass_agrees and not r.armed,
-        told="Preflight Fail: heading estimate not stable",
+        operator_text="Preflight Fail: heading estimate not stable",
     ),
     _mag_interference(lambda r: _field_fails(r, _FIELD_REQUIRED)),
     _mag_interference(
@@ -421,7 +404,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         lambda r: r.rolled,
         _L.CRITICAL,
         "Roll exceeds <param>FD_FAIL_R</param>.",
-        told="Preflight Fail: Attitude failure (roll)",
+        operator_text="Preflight Fail: Attitude failure (roll)",
     ),
     _check(
         _SYSTEM,
@@ -430,7 +413,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         lambda r: r.pitched and not r.rolled,
         _L.CRITICAL,
         "Pitch exceeds <param>FD_FAIL_P</param>.",
-        told="Preflight Fail: Attitude failure (pitch)",
+        operator_text="Preflight Fail: Attitude failure (pitch)",
     ),
     _health(
         _C.MOTORS_ESCS,
@@ -446,10 +429,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         "GF_ACTION GF_MAX_HOR_DIST",
     ),
     _fence(
-        "altitude",
-        "max_alt",
-        "exceeding maximum altitude above Home",
-        "GF_ACTION GF_MAX_VER_DIST",
+        "altitude", "max_alt", "exceeding maximum altitude above Home", "GF_ACTION GF_MAX_VER_DIST"
     ),
     _fence("custom", "custom_gf", "approaching or outside geofence", "GF_ACTION"),
     _check(
@@ -461,13 +441,6 @@ CHECKS: tuple[PrearmCheck, ...] = (
             and r.conditions.home_position_invalid
             and r.converged
         ),
-    ),
-    _check(
-        _SYSTEM,
-        "mission_failure",
-        "Mission cannot be completed",
-        lambda r: r.conditions.mission_failure,
-        prefix="",
     ),
     _check(
         _SYSTEM,
@@ -484,7 +457,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
     _no_gcs(
         lambda r: r.conditions.gcs_connection_lost and r.settings.nav_dll_act <= 0,
         prefix="",
-        said=False,
+        announced=False,
         blocks=never,
         level=lambda _: Level.INFO,
     ),
@@ -517,7 +490,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         lambda r: _needs(r, Need.NOT_ARMING) and not r.terminated and not r.armed,
         _L.INFO,
         "Switch to another mode first.",
-        said=False,
+        announced=False,
         of_present_mode=True,
     ),
     _needed(
@@ -569,7 +542,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         ),
         _L.INFO,
         "Upload a mission first.",
-        said=False,
+        announced=False,
     ),
     _needed(
         "offboard_signal",

@@ -38,7 +38,7 @@ class Axis:
         self.position = 0.0
         self.velocity = 0.0
         self.acceleration = 0.0
-        self._wanted = 0.0
+        self._target_velocity = 0.0
         self._jerk = 0.0
         """Jerk of the first phase, signed."""
         self._limit = 0.0
@@ -62,7 +62,7 @@ class Axis:
         # Velocity after the present acceleration has ended at the maximum jerk.
         coasting = self.velocity + 0.5 * a0 * abs(a0) / jerk
         sign = _sign(velocity - coasting) or _sign(a0)
-        self._wanted, self._jerk, self._limit = velocity, sign * jerk, limit
+        self._target_velocity, self._jerk, self._limit = velocity, sign * jerk, limit
         if sign == 0.0:
             self._phases = (0.0, 0.0, 0.0)
             return
@@ -77,7 +77,7 @@ class Axis:
         a0, jerk = self.acceleration, self._jerk
         # The peak p solves p² - (jerk T + a0) p + a0²/2 + jerk dv = 0.
         b = jerk * duration_s + a0
-        rest = b * b - 2.0 * a0 * a0 - 4.0 * jerk * (self._wanted - self.velocity)
+        rest = b * b - 2.0 * a0 * a0 - 4.0 * jerk * (self._target_velocity - self.velocity)
         root = math.copysign(math.sqrt(max(0.0, rest)), jerk)
         self._ramp_to(0.5 * (b - root), duration_s)
 
@@ -94,25 +94,25 @@ class Axis:
         elif abs(peak) > _TINY:
             # Speed gained by both ramps; the rest comes from the constant phase.
             gained = 0.5 * (a0 + peak) * up + 0.5 * peak * down
-            flat = max(0.0, (self._wanted - self.velocity - gained) / peak)
+            flat = max(0.0, (self._target_velocity - self.velocity - gained) / peak)
         else:
             flat = 0.0
         self._phases = (up, flat, down)
 
     def advance(self, seconds: float) -> None:
         """Advance along the plan, and beyond its end at constant velocity."""
-        left, rests = seconds, []
+        remaining, rests = seconds, []
         for duration, jerk in zip(self._phases, (self._jerk, 0.0, -self._jerk), strict=True):
-            step = min(left, duration)
+            step = min(remaining, duration)
             self._move(step, jerk)
             rests.append(duration - step)
-            left -= step
+            remaining -= step
         up, flat, down = rests
         self._phases = (up, flat, down)
         # Beyond the plan the acceleration is exactly zero, without rounding errors.
-        if left > 0.0:
+        if remaining > 0.0:
             self.acceleration = 0.0
-            self._move(left, 0.0)
+            self._move(remaining, 0.0)
 
     def _move(self, t: float, jerk: float) -> None:
         a, v = self.acceleration, self.velocity
@@ -201,12 +201,12 @@ class SmoothTrajectory:
 
     def advance(self, vehicle: Vec, leg: PathSegment, limits: PathLimits, seconds: float) -> None:
         """Advance by a time [s] with the vehicle at a position NED [m]."""
-        wanted = self._wanted(leg, limits)
+        target_velocity = self._target_velocity(leg, limits)
         # The trajectory slows down in time, so its shape stays.
         share = self._waiting(vehicle, limits.error_m)
         for axis in self.axes:
             axis.advance(seconds * share)
-        self.follow(wanted, limits)
+        self.follow(target_velocity, limits)
 
     def follow(self, velocity: Vec, limits: PathLimits) -> None:
         """Plan a change to a velocity NED [m/s]."""
@@ -218,7 +218,7 @@ class SmoothTrajectory:
         z.plan(velocity[2], vertical, limits.jerk_m_s3)
         synchronise(self.axes)
 
-    def _wanted(self, leg: PathSegment, limits: PathLimits) -> Vec:
+    def _target_velocity(self, leg: PathSegment, limits: PathLimits) -> Vec:
         """Return the velocity NED towards the target."""
         here, target = self.position, leg.target
         turning = leg.previous is not None and self._is_turning(target, limits.acceptance_m)
@@ -396,10 +396,6 @@ class Travel:
         """Heading without a requested one; None = the heading at the start of the leg."""
         self.speed_m_s = math.nan
         """Horizontal speed by MAV_CMD_DO_CHANGE_SPEED or similar; NaN = MPC_XY_CRUISE."""
-
-    def stop(self) -> None:
-        """Restart the trajectory at the vehicle with the next leg."""
-        self._time_us = None
 
     def launch(self, state: Vector, time_us: int, climb_m_s: float) -> None:
         """Start at a vehicle about to leave the ground with a climb rate [m/s]."""

@@ -27,8 +27,7 @@ from firmware_sim.mavlink.endpoint import (
 )
 from firmware_sim.mavlink.link import Link, LinkCounters, Payloads
 from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, gcs_link, onboard_link
-from firmware_sim.mavlink.services import connection, handle, send_pending, table
-from firmware_sim.mavlink.services.context import Context, sender
+from firmware_sim.mavlink.services import Context, connection, handle, send_pending, sender, table
 from firmware_sim.mavlink.streams import (
     BUILDERS,
     VEHICLE_BUILDERS,
@@ -245,14 +244,7 @@ class MavlinkServer:
         after_us: int,
         texts: Sequence[OperatorText],
     ) -> None:
-        """Send texts, events and due streams to clients.
-
-        Args:
-            due: Clients with anything to send, and their slow streams.
-            flown: (n,) logs of the newest ticks.
-            after_us: Time from the log of a tick to its end [µs].
-            texts: Texts for operators.
-        """
+        """Send texts, events and streams to clients that are due, each with its slow streams."""
         assert self._port is not None  # noqa: S101 (the caller has looked)
         now_us, state = self._now_us, self._port.state()
         origin, before, last = state.origin, self._context.row, len(flown) - 1
@@ -274,7 +266,7 @@ class MavlinkServer:
                     link.stream_fast(flown[last:], after_us, context, most)
                 else:
                     link.stream_fast(flown, after_us, context, most)
-            if texts or (client.events is not None and client.events.has_news(now_us)):
+            if texts or client.events.next_us <= now_us:
                 _stream_news(client, texts, now_us)
             # Streams beyond the share wait for the next tick, where they come first.
             if len(names) > share:
@@ -370,7 +362,8 @@ class MavlinkServer:
             )
             texts = TextEncoder()
             reply_texts = TextEncoder(REPLY_IDS) if config.separate_replies else texts
-            client = Client(peer, link, texts, reply_texts, heard_us=self._now_us)
+            events = EventSender(self._events)
+            client = Client(peer, link, texts, reply_texts, events, heard_us=self._now_us)
             if self._port is not None:
                 self._connect(client, self._port)
                 # A client that connects in flight starts its streams now.
@@ -423,7 +416,7 @@ class MavlinkServer:
         context.now_us = self._now_us
         self._is_transferring = True  # cleared by `send` when idle
         client.hear(source)
-        self._traffic.heard(client, message)
+        self._traffic.record_first(client, message)
         kind = message.get_type()
         effective = handle(message, kind, context)
         if effective:
@@ -466,9 +459,8 @@ def _stream_news(client: Client, texts: Iterable[OperatorText], now_us: int) -> 
     for text in texts:
         for chunk in client.texts.encode(text):
             client.link.stream(chunk)
-    if client.events is not None:
-        for message in client.events.due(now_us):
-            client.link.stream(message)
+    for message in client.events.due(now_us):
+        client.link.stream(message)
 
 
 def _tell(clients: Iterable[Client], text: OperatorText) -> None:
@@ -477,11 +469,11 @@ def _tell(clients: Iterable[Client], text: OperatorText) -> None:
             client.link.send(chunk)
 
 
-def _share(asked: Sequence[int]) -> int:
+def _share(requests: Sequence[int]) -> int:
     """Return the maximum number of streamed messages per client and tick, given their requests."""
-    if sum(asked) <= STREAMS_PER_TICK // 2:
+    if sum(requests) <= STREAMS_PER_TICK // 2:
         return STREAMS_PER_TICK // 2
-    return max(1, STREAMS_PER_TICK // 2 // sum(1 for number in asked if number))
+    return max(1, STREAMS_PER_TICK // 2 // sum(1 for number in requests if number))
 
 
 def _system_id(port: AutopilotPort) -> int:

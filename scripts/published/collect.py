@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from airl_mav.addons.fault_matrix.matrix import load, markdown
-from airl_mav.addons.roofline.points import Roofline, RooflinePoint
+from airl_mav.addons.roofline.page import Roofline, RooflinePoint
 from airl_mav.addons.roofline.roofline import RESULT_FILE as ROOFLINE_FILE
 from airl_mav.addons.roofline.roofline import SCHEMA as ROOFLINE_SCHEMA
 from airl_mav.addons.sweep.summary import SCHEMA as SWEEP_SCHEMA

@@ -26,10 +26,9 @@ from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.statistics import bootstrap_mean
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.policy.registry import find_policy
-from airl_mav.profiles.loading import list_profiles
+from airl_mav.profiles.loading import list_profiles, read_toml
 from airl_mav.report.document import with_interval
 from airl_mav.scenario.model import LevelName, Scenario
-from airl_mav.scenario.scenario_file import read_scenario_file
 
 
 class StudyOptions(BaseModel):
@@ -59,7 +58,7 @@ Declare = Callable[[Scenario], Experiment]
 def study(options: StudyOptions, model: type[Config], script: str) -> Iterator[tuple[Config, Path]]:
     """Yield the configuration and the folder; field errors name the configuration's file."""
     path = options.config or Path(script).with_suffix(".toml")
-    data = read_scenario_file(path)
+    data = read_toml(path)
     data |= validated(model, data, path).quick if options.quick else {}
     data |= {} if options.episodes is None else {"episodes": options.episodes}
     name = Path(script).stem + ("-quick" if options.quick else "")

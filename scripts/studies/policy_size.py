@@ -35,10 +35,10 @@ from airl_mav.core.machine import describe_machine, package_versions
 from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.latency.stages import MIN_SAMPLES, percentile
 from airl_mav.policy.actions import ActionSpec
+from airl_mav.policy.card import OnnxRuntime, outputs_of
 from airl_mav.policy.card_writing import NetworkSize, build_template, template_size
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.observation_spec import ObservationSpec
-from airl_mav.policy.runtime import OnnxRuntime, outputs_of
 from airl_mav.profiles.loading import load_profile
 from airl_mav.report.document import TOO_FEW_CELL, Column, TableView, markdown_table, print_table
 from airl_mav.report.heatmap import Field as Cell

@@ -32,7 +32,6 @@ from firmware_sim.autopilot.failsafes.failsafe_table import (
 )
 from firmware_sim.autopilot.failsafes.framework import (
     NO_INTERVENTION,
-    FailsafeInput,
     FailsafeResult,
     FailsafeState,
     Intervention,
@@ -70,8 +69,15 @@ class Machine:
         """Let time pass, change what is wrong, and update; return the outcome."""
         self.time_us += elapsed_us
         self.conditions = self.conditions._replace(**changes)
-        vehicle = FailsafeInput(self.armed, self.mode, self.mission_finished)
-        self.last = update(self.state, self.time_us, vehicle, self.conditions, self.options, asked)
+        now = Situation(
+            self.time_us,
+            self.conditions,
+            self.options,
+            self.mode,
+            self.mission_finished,
+            armed=self.armed,
+        )
+        self.last = update(self.state, now, asked)
         self.state, self.mode = self.last.state, self.last.intended
         if self.last.text is not None:
             self.texts.append(self.last.text.text)
@@ -125,7 +131,7 @@ def test_the_worse_of_two_is_taken_and_the_other_after_it() -> None:
 
 def test_the_user_takes_over_with_the_sticks_only_after_the_wait() -> None:
     m = flying(Mode.MISSION)
-    m.step(mission_failure=True)
+    m.step(flight_time_limit_exceeded=True)
     assert m.action() is FailsafeAction.HOLD
     m.step(3 * S, Intervention(sticks_moved=True))
     assert m.action() is FailsafeAction.HOLD
@@ -133,7 +139,7 @@ def test_the_user_takes_over_with_the_sticks_only_after_the_wait() -> None:
     assert m.action() is FailsafeAction.RTL
     m.step(10 * MS, Intervention(sticks_moved=True))
     assert (m.action(), m.mode, m.state.taken_over) == (FailsafeAction.WARN, Mode.POSITION, True)
-    m.step()
+    m.step(flight_time_limit_exceeded=False)
     assert m.action() is FailsafeAction.NONE
     assert not m.state.taken_over
 
@@ -176,15 +182,15 @@ def test_a_condition_that_flaps_acts_in_the_end() -> None:
     """A wait that has begun runs on without its cause; the next is shorter than the first."""
     m = flying(Mode.MISSION)
     for _ in range(3):
-        m.step(mission_failure=True)
+        m.step(flight_time_limit_exceeded=True)
         m.step(1 * S)
         assert m.action() is FailsafeAction.HOLD
-        m.step(mission_failure=False)
+        m.step(flight_time_limit_exceeded=False)
         m.step(500 * MS)
         assert m.action() is FailsafeAction.HOLD
     m.step(1 * S)
     assert m.action() is FailsafeAction.NONE
-    m.step(mission_failure=True)
+    m.step(flight_time_limit_exceeded=True)
     assert m.texts[-1] == "Failsafe activated: entering Hold for 3 seconds"
     m.step(3500 * MS)
     assert m.action() is FailsafeAction.RTL
@@ -458,25 +464,10 @@ RULES: list[Callable[[Known], FailsafeAction]] = [
         if k.c.gcs_connection_lost and k.mode not in (Mode.LAND, Mode.PRECISION_LAND)
         else FailsafeAction.NONE
     ),
-    lambda k: (
-        FailsafeAction.RTL
-        if k.mode is Mode.MISSION and k.c.mission_failure
-        else FailsafeAction.NONE
-    ),
-    lambda k: (
-        _pick(list(_LIMIT), k.p.com_wind_max_act, FailsafeAction.WARN)
-        if k.c.wind_limit_exceeded
-        else FailsafeAction.NONE
-    ),
     lambda k: FailsafeAction.RTL if k.c.flight_time_limit_exceeded else FailsafeAction.NONE,
     lambda k: (
         _pick(list(_LIMIT), k.p.com_pos_low_act, FailsafeAction.WARN)
         if k.c.local_position_accuracy_low and k.mode in (Mode.HOLD, Mode.MISSION)
-        else FailsafeAction.NONE
-    ),
-    lambda k: (
-        (FailsafeAction.LAND if k.mode in (Mode.TAKEOFF, Mode.RETURN) else FailsafeAction.HOLD)
-        if k.c.navigator_failure
         else FailsafeAction.NONE
     ),
     lambda k: (
@@ -491,18 +482,10 @@ RULES: list[Callable[[Known], FailsafeAction]] = [
         if k.c.battery_low_remaining_time
         else FailsafeAction.NONE
     ),
-    lambda k: FailsafeAction.WARN if k.c.battery_unhealthy else FailsafeAction.NONE,
     _low_battery,
     lambda k: (
         (FailsafeAction.WARN if k.p.cbrk_flightterm == 121212 else FailsafeAction.TERMINATE)
         if k.c.fd_critical_failure
-        else FailsafeAction.NONE
-    ),
-    lambda k: (
-        {0: FailsafeAction.WARN, 1: FailsafeAction.RTL, 2: FailsafeAction.LAND}.get(
-            k.p.com_imb_prop_act, FailsafeAction.NONE
-        )
-        if k.c.fd_imbalanced_prop
         else FailsafeAction.NONE
     ),
     lambda k: (
@@ -558,14 +541,12 @@ OPTIONS = st.builds(
     FailsafeSettings,
     com_act_fail_act=st.integers(0, 4),
     com_fltt_low_act=st.integers(0, 3),
-    com_imb_prop_act=st.integers(-1, 2),
     com_low_bat_act=st.integers(0, 3),
     com_obl_rc_act=st.integers(0, 7),
     com_pos_low_act=st.integers(0, 5),
     com_posctl_navl=st.integers(0, 1),
     com_rc_in_mode=st.integers(0, 4),
     com_rcl_except=st.integers(0, 7),
-    com_wind_max_act=st.integers(0, 5),
     cbrk_flightterm=st.sampled_from([0, 121212]),
     gf_action=st.integers(0, 5),
     nav_dll_act=st.sampled_from([0, 1, 2, 3, 5, 6]),

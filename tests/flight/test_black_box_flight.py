@@ -13,7 +13,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from airl_mav.addons.recordings.recorded_flight import episode_of, take_in
-from airl_mav.addons.refit.refly import FLOWN, REHEARSED, from_its_start, refly
+from airl_mav.addons.refit.refly import FLOWN, REHEARSED, Rehearsals, from_its_start, refly
 from airl_mav.black_box.mcap_file import BlackBoxFile, read_black_box
 from airl_mav.black_box.messages import (
     Decision,
@@ -214,7 +214,7 @@ def test_rehearsed_where_it_flew_it_is_the_same_flight(
 ) -> None:
     """Tolerances cover the lockstep hold: no message arrives while an action is held."""
     out = tmp_path / "out"
-    found = refly(recorded.path, out, arena=demo_scenario().arena_name, episodes=2)
+    found = refly(recorded.path, out, Rehearsals(arena=demo_scenario().arena_name, episodes=2))
     (flown,) = run.episodes
     assert flown.quality is not None
     assert found.flown_s == flown.quality.flight_time_s
@@ -229,7 +229,7 @@ def test_rehearsed_where_it_flew_it_is_the_same_flight(
     with pytest.raises(FieldError, match="a new or empty folder"):
         refly(recorded.path, out)
     with pytest.raises(FieldError, match="one with the goal of the flight"):
-        refly(recorded.path, tmp_path / "other", arena="static-obstacles", arena_seed=4)
+        refly(recorded.path, tmp_path / "other", Rehearsals("static-obstacles", 4))
 
 
 def test_code_that_a_recording_names_is_not_run_unasked(tmp_path: Path) -> None:

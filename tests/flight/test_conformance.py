@@ -299,10 +299,7 @@ def a_checklist() -> tuple[Checklist, list[TranscriptLine]]:
 
 
 def a_result(checklist: Checklist, **found: Any) -> ConformanceResult:
-    settings = ConformanceSettings(
-        "udpin://127.0.0.1:14540", "auto", 1.0, 10.0, STEP_NAMES, 1, False, 30.0
-    )
-    return ConformanceResult(settings, checklist.checks, **found)
+    return ConformanceResult(ConformanceSettings(), checklist.checks, **found)
 
 
 def test_checks_and_what_they_find() -> None:

@@ -19,12 +19,12 @@ from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.stage import LockstepStage
+from airl_mav.profiles.loading import read_toml
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.episode import faults_of
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.run_tables import faults_table
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.scenario_file import read_scenario_file
 from firmware_sim.simulation import EpisodeSetup
 from tests.support.lockstep_kit import SEED, demo_scenario
 
@@ -84,7 +84,7 @@ def test_a_run_folder_tells_its_faults_and_flies_them_again(tmp_path: Path) -> N
     assert "camera stuck at offboard+0.5s" in console.export_text()
     page = (out / "report.html").read_text()
     assert "camera stuck at offboard+0.5s for 0.3s" in page
-    again = Scenario.model_validate(read_scenario_file(out / "scenario.toml"))
+    again = Scenario.model_validate(read_toml(out / "scenario.toml"))
     assert [str(each) for each in again.faults] == ["camera stuck at offboard+0.5s for 0.3s"]
 
 

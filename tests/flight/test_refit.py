@@ -23,6 +23,7 @@ from airl_mav.addons.refit.refly import (
     NOTHING,
     VEHICLE,
     WIND,
+    Rehearsals,
     refly_parts,
     turned_wind,
 )
@@ -35,11 +36,11 @@ from airl_mav.experiments.experiment import load_run
 from airl_mav.latency.injection import parse_latency
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.conditions import WindSettings
+from airl_mav.profiles.loading import read_toml
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.tracking import track
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.scenario_file import read_scenario_file
 from airl_mav.vehicle_log import Series, VehicleLog, align, read_vehicle_log
 from tests.support.recorded_flights import RecordedFlight
 from tests.support.refit_truths import Truth, drawn_truth, errors_of, true_dead_time_s, uplink_s
@@ -103,7 +104,7 @@ def test_what_is_written_loads_as_it_is(refitted: Refitted) -> None:
     assert "measured in flight" in computer.workloads["flown"].source
     injection = parse_latency(str(out / "latency.txt"))
     assert injection.latency is not None and injection.latency.samples_ms == samples
-    scenario = Scenario(**read_scenario_file(out / "scenario.toml"), level="lockstep")
+    scenario = Scenario(**read_toml(out / "scenario.toml"), level="lockstep")
     assert scenario.wind.north_m_s == found.estimate("wind_north_m_s").value
     told = json.loads((out / "refit.json").read_text(encoding="utf-8"))
     assert told["estimates"]["mass_kg"]["value"] == found.estimate("mass_kg").value
@@ -152,7 +153,7 @@ def test_two_logs_tell_of_the_vehicle_together(refitted: Refitted, tmp_path: Pat
     assert both.flights[0].air.wind == both.flights[1].air.wind
     assert both.flights[0].air.wind is not None
     assert load_vehicle(str(out / "vehicle.toml")).body.mass_kg == both.vehicle.body.mass_kg
-    assert "wind" not in read_scenario_file(out / "scenario.toml")
+    assert "wind" not in read_toml(out / "scenario.toml")
     held = json.loads((out / "refit.json").read_text(encoding="utf-8"))
     assert [Path(each["ulg"]).name for each in held["flights"]] == ["flight.ulg", "again.ulg"]
 
@@ -175,7 +176,7 @@ def test_the_vehicles_log_alone_tells_all_but_the_computer(
     assert {each.name for each in out.iterdir()} == {"vehicle.toml", "scenario.toml", "refit.json"}
     vehicle = load_vehicle(str(out / "vehicle.toml"))
     assert vehicle.body.mass_kg == found.vehicle.body.mass_kg
-    scenario = Scenario(**read_scenario_file(out / "scenario.toml"), level="lockstep")
+    scenario = Scenario(**read_toml(out / "scenario.toml"), level="lockstep")
     assert scenario.wind.north_m_s == found.estimate("wind_north_m_s").value
     assert scenario.latency is None
     with pytest.raises(FieldError, match=r"nothing beside .*which is a log already"):
@@ -314,7 +315,7 @@ def test_the_same_flight_gives_the_same_refit(refitted: Refitted) -> None:
 def test_rehearsed_on_what_was_fitted_it_is_the_flight(refitted: Refitted, tmp_path: Path) -> None:
     """Once each: with all of the refit, with its parts, and with nothing of it."""
     path, out = refitted.flight.black_box, tmp_path / "out"
-    whole, parts = refly_parts(path, out, refitted.out, arena="static-obstacles", episodes=1)
+    whole, parts = refly_parts(path, out, refitted.out, Rehearsals("static-obstacles", episodes=1))
     by_name = {each.part: each for each in parts}
     assert set(by_name) == {NOTHING, LATENCY, VEHICLE, WIND, ALL}
     everything, nothing = by_name[ALL], by_name[NOTHING]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from airl_mav.addons.roofline.points import noticed_m
+from airl_mav.addons.roofline.page import noticed_m
 from airl_mav.addons.roofline.stopping_flights import fly_into, greatest_speed
 from airl_mav.core.errors import FieldError
 from airl_mav.envs import stopping

@@ -31,10 +31,10 @@ from airl_mav.core.fields import validated
 from airl_mav.core.machine import provenance
 from airl_mav.experiments.campaign import load_campaign, open_campaign
 from airl_mav.policy.actions import ActionSpec
+from airl_mav.policy.card import OnnxRuntime
 from airl_mav.policy.card_writing import NetworkSize, build_template, template_size
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.observation_spec import ObservationSpec
-from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import list_profiles
 from airl_mav.report.document import write_document

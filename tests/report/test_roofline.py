@@ -16,11 +16,11 @@ from rich.console import Console
 from scipy.optimize import brentq
 
 from airl_mav.addons.roofline import roofline as command
-from airl_mav.addons.roofline.points import Roofline, RooflinePoint, noticed_m
+from airl_mav.addons.roofline.page import Roofline, RooflinePoint, noticed_m
 from airl_mav.addons.roofline.roofline import RooflineRequest, roofline
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json
-from airl_mav.policy.card import read_card
+from airl_mav.policy.card import Runtime, read_card
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.profiles.vehicle import load_vehicle
@@ -157,7 +157,7 @@ def test_the_page_stands_alone(shown: tuple[Path, str]) -> None:
 # --- taking notice
 
 
-class StopsBefore:
+class StopsBefore(Runtime):
     """Network that turns away from objects nearer than a depth, above the horizon."""
 
     def __init__(self, depth_m: float) -> None:

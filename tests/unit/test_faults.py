@@ -16,9 +16,10 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.faults.fault import FOREVER_US, Fault, active, gust_share, next_change_us, window_us
 from airl_mav.faults.kinds import KINDS, Part, Phase
+from airl_mav.profiles.loading import read_toml
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.scenario_file import read_scenario_file, save_scenario
+from airl_mav.scenario.scenario_file import save_scenario
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 
 TIMES = st.floats(min_value=0.0, max_value=99_999.0, allow_nan=False)
@@ -126,7 +127,7 @@ def test_faults_of_a_command_line_come_back_from_its_file(tmp_path: Path) -> Non
     file = tmp_path / "scenario.toml"
     save_scenario(asked, file)
     assert "[[faults]]" in file.read_text()
-    assert Scenario.model_validate(read_scenario_file(file)).faults == asked.faults
+    assert Scenario.model_validate(read_toml(file)).faults == asked.faults
     # More of them on the command line come on top of those in the file.
     more = read_options(sitl_command.OPTIONS, "airl-sitl", [str(file), "--fault", "baro off"])
     assert [fault.part for fault in scenario_of(more).faults] == ["gps", "motor2", "baro"]
@@ -137,7 +138,7 @@ def test_a_fault_in_words_is_as_good_as_a_table(tmp_path: Path) -> None:
     file.write_text('faults = ["gps off at 8s for 5s"]\n')
     table = tmp_path / "table.toml"
     table.write_text('[[faults]]\npart = "gps"\nkind = "off"\nat_s = 8.0\nfor_s = 5.0\n')
-    both = [Scenario.model_validate(read_scenario_file(each)) for each in (file, table)]
+    both = [Scenario.model_validate(read_toml(each)) for each in (file, table)]
     assert both[0] == both[1]
 
 

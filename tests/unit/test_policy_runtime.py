@@ -26,14 +26,13 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy import learned, registry
 from airl_mav.policy.actions import Action, ActionSpec, commands
-from airl_mav.policy.card import CARD_FILE, PolicyCard, read_card
+from airl_mav.policy.card import CARD_FILE, PolicyCard, Runtime, TorchRuntime, read_card
 from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, decide, load_learned
 from airl_mav.policy.observation import Kinematics, Observation, encode
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.registry import find_policy, load_policy, policy_names
-from airl_mav.policy.runtime import Runtime, TorchRuntime
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.scenario.checks import decide_piloting, select_latency
 from airl_mav.scenario.model import DEFAULT_POLICY, Decisions, PilotSettings, Scenario
@@ -81,7 +80,7 @@ def scene(seed: int = 1, lens: Intrinsics = LENS) -> Observation:
     return encode(frame, state, (20.0, -5.0))
 
 
-class Answers:
+class Answers(Runtime):
     """Network that returns given outputs and records its inputs."""
 
     def __init__(self, outputs: Any) -> None:

@@ -19,10 +19,11 @@ from airl_mav.cli.options import read_options
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import unit_of, validated
 from airl_mav.profiles.conditions import Payload, WindSettings
+from airl_mav.profiles.loading import read_toml
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
-from airl_mav.scenario.scenario_file import anchored, read_scenario_file, save_scenario
+from airl_mav.scenario.scenario_file import anchored, save_scenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion, StandAloneVehicle
 from tests.support.processes import ROOT
 
@@ -212,7 +213,7 @@ def options(*words: str) -> sitl_command.SitlOptions:
 
 
 def read_file(path: Path) -> Scenario:
-    return validated(Scenario, read_scenario_file(path), path)
+    return validated(Scenario, read_toml(path), path)
 
 
 def test_a_scenario_survives_its_file(tmp_path: Path) -> None:

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from airl_mav.policy.actions import ActionSpec
-from airl_mav.policy.card import PolicyFacts, load_card
+from airl_mav.policy.card import OnnxRuntime, PolicyFacts, load_card
 from airl_mav.policy.card_writing import build_template, template_size, write_template
 from airl_mav.policy.observation_spec import ObservationSpec
-from airl_mav.policy.runtime import OnnxRuntime
 
 onnx = pytest.importorskip("onnx")
 torch = pytest.importorskip("torch")

@@ -2,7 +2,7 @@
 
 Checks a flight controller over MAVSDK against the assumptions of a rehearsal, flies step responses
 and compares them with PX4's. Always lands.
-Command: `airl conformance`. From Python: `conformance.run.check_conformance`.
+Command: `airl conformance`. From Python: `conformance.command.check_conformance`.
 Depends on: MAVSDK; needs no other add-on.
 Guide: docs/conformance.md.
 """

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 from rich.console import Console
 
 from airl_mav.addons.conformance import flight_checks
@@ -21,11 +21,13 @@ from airl_mav.addons.conformance.checklist import (
 )
 from airl_mav.addons.conformance.ground_checks import GROUND_CHECKS, heartbeat
 from airl_mav.addons.conformance.result import (
-    AUTO,
     ConformanceResult,
     ConformanceSettings,
+    check_table,
     judge,
+    line_text,
     load_reference,
+    step_table,
     summary,
 )
 from airl_mav.addons.conformance.telemetry import (
@@ -44,12 +46,13 @@ from airl_mav.addons.conformance.vehicle import SetpointStream, VehicleConnectio
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
+from airl_mav.core.fields import validated
 from airl_mav.core.progress import new_console
 from airl_mav.rehearsal.signals import terminated_as_interrupted
 from companion.link_interface import LinkError
 
 
-class ConformanceOptions(BaseModel):
+class ConformanceOptions(ConformanceSettings):
     """Fly any flight controller through checks and step responses: airl-firmware, PX4, ArduPilot.
 
     Works with SITL or a board. The vehicle takes off. A complete run needs 60 m to the north, 20 m
@@ -60,44 +63,7 @@ class ConformanceOptions(BaseModel):
         airl conformance --connect udpin://127.0.0.1:14540 --out result.json
     """
 
-    connect: str = Field(
-        default="udpin://127.0.0.1:14540",
-        description="MAVSDK connection to the flight controller: udpin://HOST:PORT or"
-        " serial://DEVICE:BAUD",
-    )
-    reference: str = Field(
-        default="auto",
-        description="stored step responses to compare with: auto (by the autopilot that is heard),"
-        " px4, ardupilot, or a path to a .toml",
-    )
-    speed: float = Field(
-        default=1.0,
-        description="simulated seconds per wall second of the vehicle; 1 for a real one",
-    )
-    altitude_m: float = Field(
-        default=10.0,
-        description="take-off altitude, 8 to 100 m, with --steps-only from 2 m: PX4 comes down"
-        " while it waits for setpoints",
-    )
-    repeat: int = Field(
-        default=1,
-        description="how often the steps are flown, 1 to 20: the table has the median; every other"
-        " time they are mirrored, so that the vehicle comes back",
-    )
-    steps: tuple[str, ...] | None = Field(
-        default=None,
-        description="names of the steps to fly, as north-2 yaw-90 (docs/conformance.md); by default"
-        " all",
-    )
     skip_steps: bool = Field(default=False, description="fly no step responses")
-    steps_only: bool = Field(
-        default=False,
-        description="check neither refusals nor frames, offboard loss or hold: fly the steps",
-    )
-    connect_timeout_s: float = Field(
-        default=30.0,
-        description="how long a flight controller is waited for, 1 to 3600 s of wall time",
-    )
     out: Path | None = Field(
         default=None, description="write everything to this .json; by default nothing"
     )
@@ -108,9 +74,6 @@ OPTIONS = ConformanceOptions
 
 def run(options: ConformanceOptions, console: Console | None = None) -> int:
     """Check a vehicle and print the result; return 0 if it conforms, else 1, or 130."""
-    from airl_mav.addons.conformance.result import check_table, line_text, step_table
-    from airl_mav.addons.conformance.telemetry import STEP_NAMES
-
     console = console or new_console()
     if options.out is not None and not options.out.parent.is_dir():
         raise FieldError("out", str(options.out), problem=f"no folder {options.out.parent}")
@@ -119,18 +82,12 @@ def run(options: ConformanceOptions, console: Console | None = None) -> int:
         raise FieldError("skip_steps", accepted=f"without {other}")
     if options.steps == ():
         raise FieldError("steps", accepted="one name or more")
-    steps: Any = () if options.skip_steps else options.steps or STEP_NAMES
+    asked = options.model_dump(include=set(ConformanceSettings.model_fields))
+    if options.skip_steps:
+        asked["steps"] = ()
     with terminated_as_interrupted():
         result = check_conformance(
-            options.connect,
-            reference=options.reference,
-            speed=options.speed,
-            altitude_m=options.altitude_m,
-            steps=steps,
-            repeat=options.repeat,
-            steps_only=options.steps_only,
-            connect_timeout_s=options.connect_timeout_s,
-            progress=lambda line: console.print(line_text(line), soft_wrap=True),
+            **asked, progress=lambda line: console.print(line_text(line), soft_wrap=True)
         )
     if result.steps and result.reference is not None:
         console.print(step_table(result, result.reference))
@@ -151,49 +108,29 @@ HEARTBEAT_S = 1.5  # Maximum heartbeat interval [s]
 
 
 def check_conformance(
-    connect: str = "udpin://127.0.0.1:14540",
-    *,
-    reference: str = AUTO,
-    speed: float = 1.0,
-    altitude_m: float = 10.0,
-    steps: Sequence[StepName] = STEP_NAMES,
-    repeat: int = 1,
-    steps_only: bool = False,
-    connect_timeout_s: float = 30.0,
-    progress: Callable[[TranscriptLine], None] | None = None,
+    *, progress: Callable[[TranscriptLine], None] = lambda _: None, **settings: Any
 ) -> ConformanceResult:
     """Fly a flight controller through all checks and step responses. It takes off.
 
     After any failure and after Ctrl-C the vehicle lands; an interrupted result is `interrupted`.
 
     Args:
-        connect: MAVSDK connection, udpin://HOST:PORT or serial://DEVICE:BAUD.
-        reference: Stored step responses: auto (by the autopilot), px4, ardupilot, or a path
-            (.toml).
-        speed: Simulated seconds per wall second of the vehicle, 0.01 to 100; 1 for a real one.
-        altitude_m: Take-off altitude, 8 to 100, with `steps_only` from 2 [m].
-        steps: Names of the steps to fly.
-        repeat: Repetitions of the steps, 1 to 20; every second one mirrored.
-        steps_only: Skip rejections, frames, offboard loss and hold.
-        connect_timeout_s: Timeout for finding a flight controller, 1 to 3600 [wall s].
         progress: Called with each line of the transcript, by any thread.
+        settings: Fields of `ConformanceSettings`.
 
     Raises:
         UsageError: Invalid value or connection, port taken, no heartbeat, or unknown autopilot;
             nothing was commanded.
     """
-    settings = ConformanceSettings(
-        connect, reference, speed, altitude_m, tuple(steps), repeat, steps_only, connect_timeout_s
-    )
-    if reference != AUTO:
-        load_reference(reference, 0)
-    transcript = Transcript(WallClock(speed), progress or (lambda _: None))
+    asked = validated(ConformanceSettings, settings)
+    asked.check()
+    transcript = Transcript(WallClock(asked.speed), progress)
     checklist = Checklist(transcript)
-    result = ConformanceResult(settings, checklist.checks, transcript.lines)
-    with closing(VehicleConnection(connect, speed, transcript)) as vehicle:
-        transcript.add("note", f"waiting for a flight controller on {connect}")
+    result = ConformanceResult(asked, checklist.checks, transcript.lines)
+    with closing(VehicleConnection(asked.connect, asked.speed, transcript)) as vehicle:
+        transcript.add("note", f"waiting for a flight controller on {asked.connect}")
         try:
-            vehicle.connect(connect_timeout_s)
+            vehicle.connect(asked.connect_timeout_s)
             _check(vehicle, checklist, result)
         except LinkError:
             pass  # Recorded with the failed check.
@@ -203,7 +140,7 @@ def check_conformance(
         result.autopilot_version = vehicle.telemetry.latest("AUTOPILOT_VERSION")
     if result.reference is not None and result.steps:
         for name in STEP_NAMES:
-            if name in settings.steps:
+            if name in asked.flown_steps:
                 found, stored = result.steps.get(name), result.reference
                 checklist.perform(f"step {name}", partial(judge, found, stored))
     return result
@@ -237,7 +174,7 @@ def _check_in_air(
         vehicle.call("offboard.stop()", vehicle.offboard.stop)
         with SetpointStream(vehicle, flight_checks.FACING_EAST) as stream:
             checklist.perform_all(flight_checks.setpoint_checks(stream), vehicle)
-    if settings.steps:
+    if settings.flown_steps:
         checklist.perform("step responses", lambda: _fly_steps(vehicle, settings, result.steps))
         vehicle.call("offboard.stop()", vehicle.offboard.stop)
     if not settings.steps_only:
@@ -258,7 +195,7 @@ def _fly_steps(
     vehicle.wait(FACE_NORTH_S)
     inexact = vehicle.clock.inexact
     for repetition in range(settings.repeat):
-        for leg in plan(settings.steps, mirrored=repetition % 2 == 1):
+        for leg in plan(settings.flown_steps, mirrored=repetition % 2 == 1):
             response = _fly_leg(vehicle, leg)
             if leg.step is not None and response is not None:
                 name = leg.step.name

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import Field
+from pydantic import BaseModel, Field
 from rich.table import Table
 from rich.text import Text
 
@@ -27,7 +27,7 @@ from airl_mav.addons.conformance.telemetry import (
     StepResponse,
 )
 from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.errors import FieldError, usage_errors
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import write_json
 from airl_mav.profiles.loading import list_profiles, load_profile
@@ -153,33 +153,67 @@ def load_reference(name: str, autopilot: int) -> Reference:
 SCHEMA = 1
 
 
-@dataclass(frozen=True)
-class ConformanceSettings:
-    """Settings of a run; see `check_conformance`."""
+class ConformanceSettings(BaseModel):
+    """Settings of a run."""
 
-    connect: str
-    reference: str
-    speed: float
-    altitude_m: float
-    steps: tuple[StepName, ...]
-    repeat: int
-    steps_only: bool
-    connect_timeout_s: float
+    connect: str = Field(
+        default="udpin://127.0.0.1:14540",
+        description="MAVSDK connection to the flight controller: udpin://HOST:PORT or"
+        " serial://DEVICE:BAUD",
+    )
+    reference: str = Field(
+        default=AUTO,
+        description="stored step responses to compare with: auto (by the autopilot that is heard),"
+        " px4, ardupilot, or a path to a .toml",
+    )
+    speed: float = Field(
+        default=1.0,
+        description="simulated seconds per wall second of the vehicle; 1 for a real one",
+    )
+    altitude_m: float = Field(
+        default=10.0,
+        description="take-off altitude, 8 to 100 m, with --steps-only from 2 m: PX4 comes down"
+        " while it waits for setpoints",
+    )
+    repeat: int = Field(
+        default=1,
+        description="how often the steps are flown, 1 to 20: the table has the median; every other"
+        " time they are mirrored, so that the vehicle comes back",
+    )
+    steps: tuple[str, ...] | None = Field(
+        default=None,
+        description="names of the steps to fly, as north-2 yaw-90 (docs/conformance.md); by default"
+        " all",
+    )
+    steps_only: bool = Field(
+        default=False,
+        description="check neither refusals nor frames, offboard loss or hold: fly the steps",
+    )
+    connect_timeout_s: float = Field(
+        default=30.0,
+        description="how long a flight controller is waited for, 1 to 3600 s of wall time",
+    )
 
-    def __post_init__(self) -> None:
+    @property
+    def flown_steps(self) -> tuple[str, ...]:
+        """Names of the steps to fly."""
+        return STEP_NAMES if self.steps is None else self.steps
+
+    def check(self) -> None:
         """Raise UsageError if a value is out of range."""
-        lowest_m = 2.0 if self.steps_only else 8.0
-        for name, value, low, high in (
-            ("speed", self.speed, 0.01, 100.0),
-            ("altitude_m", self.altitude_m, lowest_m, 100.0),
-            ("repeat", self.repeat, 1, 20),
-            ("connect_timeout_s", self.connect_timeout_s, 1.0, 3600.0),
+        for name, low, high in (
+            ("speed", 0.01, 100.0),
+            ("altitude_m", 2.0 if self.steps_only else 8.0, 100.0),
+            ("repeat", 1, 20),
+            ("connect_timeout_s", 1.0, 3600.0),
         ):
-            if not low <= value <= high:
+            if not low <= (value := getattr(self, name)) <= high:
                 raise FieldError(name, value, f"{low:g} <= value <= {high:g}")
-        for step in self.steps:
+        for step in self.flown_steps:
             if step not in STEP_NAMES:
                 raise FieldError("steps", step, ", ".join(STEP_NAMES))
+        if self.reference != AUTO:
+            load_reference(self.reference, 0)
 
 
 @dataclass
@@ -229,7 +263,7 @@ class ConformanceResult:
             "speed": settings.speed,
             "asked": {
                 "altitude_m": settings.altitude_m,
-                "steps": settings.steps,
+                "steps": settings.flown_steps,
                 "repeat": settings.repeat,
                 "behaviour": not settings.steps_only,
             },
@@ -256,10 +290,8 @@ class ConformanceResult:
 
     def write(self, path: Path) -> None:
         """Write all results to a .json. Raises UsageError if it cannot be written."""
-        try:
+        with usage_errors(path):
             write_json(path, self.as_data())
-        except OSError as error:
-            raise UsageError(f"{path}: {error.strerror}") from None
 
 
 def _without_nan(response: StepResponse) -> dict[str, float | None]:

@@ -9,7 +9,7 @@ import json
 import math
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -352,59 +352,39 @@ STOP_NED = StepSetpoint("ned")
 STOP_BODY = StepSetpoint("body")
 
 
-def _leg(
-    seconds: float, name: StepName, quantity: Quantity, before: float, after: float
-) -> HeldSetpoint:
-    """Return the leg of a step."""
-    step = SetpointStep(name, quantity, before, after)
-    return HeldSetpoint(step.setpoint, seconds, step)
+def _hover(seconds: float) -> HeldSetpoint:
+    return HeldSetpoint(STOP_NED, seconds)
+
+
+def _hover_body(seconds: float) -> HeldSetpoint:
+    return HeldSetpoint(STOP_BODY, seconds)
+
+
+def _leg(seconds: float, *step: Any) -> HeldSetpoint:
+    """Return the leg of a `SetpointStep`."""
+    measured = SetpointStep(*step)
+    return HeldSetpoint(measured.setpoint, seconds, measured)
 
 
 # Settling time by PX4's and ArduPilot's measurements, plus one second.
+NORTH_2 = _leg(5.0, "north-2", "north", 0.0, 2.0), _leg(5.0, "north-2-stop", "north", 2.0, 0.0)
+NORTH_5 = _leg(6.0, "north-5", "north", 0.0, 5.0), _leg(6.0, "north-5-stop", "north", 5.0, 0.0)
+UP_2, DOWN_1 = _leg(5.0, "up-2", "down", 0.0, -2.0), _leg(8.0, "down-1", "down", 0.0, 1.0)
+YAWSPEED_30 = _leg(4.0, "yawspeed-30", "heading rate", 0.0, 30.0)
 MANOEUVRES: tuple[tuple[HeldSetpoint, ...], ...] = (
-    (
-        HeldSetpoint(STOP_NED, 2.0),
-        _leg(5.0, "north-2", "north", 0.0, 2.0),
-        _leg(5.0, "north-2-stop", "north", 2.0, 0.0),
-    ),
-    (
-        HeldSetpoint(STOP_NED, 1.0),
-        _leg(6.0, "north-5", "north", 0.0, 5.0),
-        _leg(6.0, "north-5-stop", "north", 5.0, 0.0),
-    ),
-    (
-        HeldSetpoint(STOP_NED, 1.0),
-        _leg(5.0, "east-2", "east", 0.0, 2.0),
-        HeldSetpoint(STOP_NED, 3.0),
-    ),
-    (
-        HeldSetpoint(STOP_BODY, 2.0),
-        _leg(5.0, "forward-2", "forward", 0.0, 2.0),
-        HeldSetpoint(STOP_BODY, 3.0),
-    ),
-    (
-        *(HeldSetpoint(STOP_NED, 2.0), _leg(5.0, "up-2", "down", 0.0, -2.0)),
-        *(
-            HeldSetpoint(STOP_NED, 4.0),
-            _leg(8.0, "down-1", "down", 0.0, 1.0),
-            HeldSetpoint(STOP_NED, 2.0),
-        ),
-    ),
-    (
-        HeldSetpoint(STOP_NED, 2.0),
-        _leg(5.0, "yaw-90", "heading", 0.0, 90.0),
-        HeldSetpoint(STOP_NED, 4.0),
-    ),
-    (
-        *(HeldSetpoint(STOP_BODY, 2.0), _leg(4.0, "yawspeed-30", "heading rate", 0.0, 30.0)),
-        *(HeldSetpoint(STOP_BODY, 2.0), HeldSetpoint(STOP_NED, 4.0)),
-    ),
+    (_hover(2.0), *NORTH_2),
+    (_hover(1.0), *NORTH_5),
+    (_hover(1.0), _leg(5.0, "east-2", "east", 0.0, 2.0), _hover(3.0)),
+    (_hover_body(2.0), _leg(5.0, "forward-2", "forward", 0.0, 2.0), _hover_body(3.0)),
+    (_hover(2.0), UP_2, _hover(4.0), DOWN_1, _hover(2.0)),
+    (_hover(2.0), _leg(5.0, "yaw-90", "heading", 0.0, 90.0), _hover(4.0)),
+    (_hover_body(2.0), YAWSPEED_30, _hover_body(2.0), _hover(4.0)),
 )
 """Manoeuvres in flight order, each from a hover facing north. One pass: 40 m north, 10 m east, 10 m
 up; a second, mirrored pass returns."""
 
 
-def plan(names: tuple[StepName, ...], *, mirrored: bool) -> list[HeldSetpoint]:
+def plan(names: Collection[str], *, mirrored: bool) -> list[HeldSetpoint]:
     """Return the legs of the manoeuvres that contain the named steps; others are not measured."""
     legs = []
     for manoeuvre in MANOEUVRES:

@@ -23,9 +23,11 @@ from airl_mav.policy.actions import discrete_actions
 from airl_mav.policy.card import (
     ONNX_FILE,
     TORCH_FILE,
+    OnnxRuntime,
     PolicyCard,
     Quantisation,
     digest,
+    first_line,
     load_card,
     open_model,
     read_model,
@@ -34,7 +36,6 @@ from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.layouts import Encoded, encode_layout
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
-from airl_mav.policy.runtime import OnnxRuntime, first_line
 from airl_mav.scenario.checks import action_generator
 from airl_mav.scenario.model import DEFAULT_ARENA, Scenario
 from airl_mav.scenario.resolve import resolve

@@ -15,7 +15,7 @@ from pydantic import Field, field_validator
 from airl_mav.addons.profiling.soak import Soak, write_soak_page
 from airl_mav.core.clock import utc_now
 from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.errors import FieldError, usage_errors
 from airl_mav.core.fields import quantity
 from airl_mav.core.files import save_arrays, write_json
 from airl_mav.core.machine import MachineState, package_versions
@@ -176,7 +176,7 @@ def save(measured: ComputerMeasurement, path: Path) -> tuple[Path, ...]:
     written = workload.model_copy(update={"latency": by_file})
     title = f"t2 of {measured.card.name} on {profile.cpu}, {measured.network.runtime}, ms, in order"
     more: tuple[Path, ...] = ()
-    try:
+    with usage_errors(f"--out {path.parent}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         if measured.soak is not None:
             more = _save_soak(measured, measured.soak, path.with_name(f"{stem}.soak.npz"))
@@ -184,8 +184,6 @@ def save(measured: ComputerMeasurement, path: Path) -> tuple[Path, ...]:
         save_arrays(arrays, {**recording.columns, "flight": recording.flight_numbers})
         write_json(facts, _facts(measured, path.parent))
         write_profile(path, with_workload(profile, measured.workload, written))
-    except OSError as error:
-        raise UsageError(f"--out {path.parent}: {error.strerror}") from None
     return path, samples, arrays, facts, *more
 
 
@@ -205,11 +203,9 @@ def share(measured: ComputerMeasurement, path: Path) -> Path:
     inline = LatencyDistribution(distribution="samples", samples_ms=samples_ms)
     told = workload.model_copy(update={"latency": inline, "measured": how})
     profile = measured.profile.model_copy(update={"workloads": {measured.workload: told}})
-    try:
+    with usage_errors(f"--share {path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_profile(path, profile)
-    except OSError as error:
-        raise UsageError(f"--share {path}: {error.strerror}") from None
     return path
 
 

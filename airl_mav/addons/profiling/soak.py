@@ -104,26 +104,22 @@ class Soak:
         early = f" of {_minutes(self.asked_s)}, interrupted" if self.interrupted else ""
         return (
             f"soak of {_minutes(self.duration_s)}{early}: t2 from the first to the last {part}: "
-            f"{', '.join(moved)}; {self._frequency()}; {self._temperature()}; {self._throttling()}"
+            f"{', '.join(moved)}; {self._machine()}"
         )
 
-    def _frequency(self) -> str:
-        ends = self.ends("frequency_mhz")
-        if ends is None:
-            return "frequency: not told by this system"
-        fell = "dropped" if self.frequency_dropped else "did not drop"
-        return f"frequency {fell} ({ends[0]:.0f} to {ends[1]:.0f} MHz)"
-
-    def _temperature(self) -> str:
-        ends = self.ends("temperature_c")
-        if ends is None:
-            return "temperature: not told by this system"
-        return f"temperature {ends[0]:.1f} to {ends[1]:.1f} °C"
-
-    def _throttling(self) -> str:
-        if self.throttled is None:
-            return "throttling: not told by this system"
-        return "throttled" if self.throttled else "not throttled"
+    def _machine(self) -> str:
+        """Return frequency, temperature and throttling as text."""
+        mhz, celsius = self.ends("frequency_mhz"), self.ends("temperature_c")
+        frequency = temperature = throttling = None
+        if mhz is not None:
+            change = "dropped" if self.frequency_dropped else "did not drop"
+            frequency = f"frequency {change} ({mhz[0]:.0f} to {mhz[1]:.0f} MHz)"
+        if celsius is not None:
+            temperature = f"temperature {celsius[0]:.1f} to {celsius[1]:.1f} °C"
+        if self.throttled is not None:
+            throttling = "throttled" if self.throttled else "not throttled"
+        known = {"frequency": frequency, "temperature": temperature, "throttling": throttling}
+        return "; ".join(text or f"{name}: not told by this system" for name, text in known.items())
 
 
 def soak(

@@ -316,10 +316,10 @@ WIDEST = 0.15
 class Thrust:
     """Fitted thrust and mass."""
 
-    ratio_m_s2: FittedQuantity
-    """Maximum thrust per mass."""
     hover: FittedQuantity
     """Thrust in a hover as a share of maximum thrust."""
+    ratio_m_s2: FittedQuantity
+    """Maximum thrust per mass."""
     mass_kg: FittedQuantity
     """Take-off mass; not observable if the profile's mass is taken as known."""
     thrust_max_n: FittedQuantity
@@ -344,16 +344,16 @@ def thrust_of(found: FittedQuantity, vehicle: VehicleProfile, known: Known) -> T
     rotor = FittedQuantity("thrust_max_n", "thrust of a rotor", "N", profile=rotor_n)
     if found.value is None or found.low is None or found.high is None:
         why = found.unobservable
-        return Thrust(found, hover.without(why), mass.without(why), rotor.without(why))
+        return Thrust(hover.without(why), found, mass.without(why), rotor.without(why))
     ends = np.array([found.value, found.low, found.high])
     low_last = ends[[0, 2, 1]]
     hover = hover.found(GRAVITY_M_S2 / low_last, found.source)
     only = "only thrust per mass is observable; the {} is taken from the profile"
     if known == "thrust":
         mass = mass.found(vehicle.thrust_n / low_last, found.source)
-        return Thrust(found, hover, mass, rotor.without(only.format(known)))
+        return Thrust(hover, found, mass, rotor.without(only.format(known)))
     rotor = rotor.found(ends * mass_kg / len(CORNERS), found.source)
-    return Thrust(found, hover, mass.without(only.format(known)), rotor)
+    return Thrust(hover, found, mass.without(only.format(known)), rotor)
 
 
 def _ratio(

@@ -143,13 +143,9 @@ class Refit:
     @property
     def estimates(self) -> tuple[FittedQuantity, ...]:
         """All fitted or unobservable quantities."""
-        response, thrust, air, late = self.response, self.thrust, self.air, self.latencies
-        return (
-            *(response.dead_time_s, response.velocity_time_s, response.yaw_rate_time_s),
-            *(thrust.hover, thrust.ratio_m_s2, thrust.mass_kg, thrust.thrust_max_n),
-            *(air.drag_1_s, air.wind_north_m_s, air.wind_east_m_s),
-            *(late.t1_ms, late.t2_ms, late.link_ms),
-        )
+        parts = (self.response, self.thrust, self.air, self.latencies)
+        found = (value for part in parts for value in vars(part).values())
+        return tuple(value for value in found if isinstance(value, FittedQuantity))
 
     def estimate(self, key: str) -> FittedQuantity:
         """Return an estimate by key. Raises KeyError."""

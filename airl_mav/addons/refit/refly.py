@@ -67,6 +67,25 @@ AS_FLOWN = Changes()
 
 
 @dataclass(frozen=True)
+class Rehearsals:
+    """Settings of all rehearsals of a flight."""
+
+    arena: str | None = None
+    """Arena profile; None = an empty plain, where both paths start at the origin, heading north."""
+    arena_seed: int | None = None
+    """Seed of the arena; None = the flight's."""
+    episodes: int = 20
+    policy: str | None = None
+    """Policy; None = the flight's."""
+    trust: bool = False
+    """True permits code that the policy or the arena names."""
+    progress: bool = False
+
+
+USUAL = Rehearsals()
+
+
+@dataclass(frozen=True)
 class Reflight:
     """Result of a flight and its rehearsals."""
 
@@ -106,24 +125,14 @@ class Reflight:
 
 
 def refly(
-    path: Path,
-    out: Path,
-    *,
-    arena: str | None = None,
-    arena_seed: int | None = None,
-    episodes: int = 20,
-    policy: str | None = None,
-    trust: bool = False,
-    changes: Changes = AS_FLOWN,
-    progress: bool = False,
+    path: Path, out: Path, asked: Rehearsals = USUAL, changes: Changes = AS_FLOWN
 ) -> Reflight:
     """Rehearse a recorded flight several times, with different sensor noise.
 
     Discrete decisions amplify centimetres into another path around a tree. Sensor noise therefore
-    varies between rehearsals, and the recorded flight is compared with all of them. Without an
-    arena they fly over an empty plain, and both paths start at the origin, heading north. With the
-    flight's arena, its frame is kept. Arena seed and policy are the flight's by default. `out`
-    becomes the folder of the run folders `flown` and `rehearsed`.
+    varies between rehearsals, and the recorded flight is compared with all of them. With the
+    flight's arena, its frame is kept. `out` becomes the folder of the run folders `flown` and
+    `rehearsed`.
 
     Raises UsageError for a recording without navigation or with unusable settings, and if `out` is
     not empty.
@@ -137,21 +146,22 @@ def refly(
         raise FieldError("out", f"{out}", "a new or empty folder: it holds something else")
     out.mkdir(parents=True, exist_ok=True)
     _write_latencies(episode, out / LATENCIES_FILE)
-    wind = changes.wind
+    wind, arena = changes.wind, asked.arena
     if arena is None:
         wind = None if wind is None else turned_wind(wind, -_first_yaw(episode))
         episode = from_its_start(episode)
         arena = _plain(episode, out / ARENA_FILE)
     flew = str(box.run["config"].get("policy"))
-    if policy is None and names_code(flew) and not trust:
+    if asked.policy is None and names_code(flew) and not asked.trust:
         accepted = "with --trust, or a --policy of yours: it is code that would run on this machine"
         raise FieldError("policy", flew, accepted)
+    seed = episode.record.seed if asked.arena_seed is None else asked.arena_seed
     given = {
         "arena": arena,
-        "arena_seed": episode.record.seed if arena_seed is None else arena_seed,
-        "policy": policy or flew,
-        "trust": trust,
-        "episodes": episodes,
+        "arena_seed": seed,
+        "policy": asked.policy or flew,
+        "trust": asked.trust,
+        "episodes": asked.episodes,
     }
     scenario = _scenario(box, out / LATENCIES_FILE, given | _changed(changes, wind))
     _check_goal(scenario, episode)
@@ -159,7 +169,7 @@ def refly(
         episode.record, arena=scenario.arena, arena_seed=scenario.arena_seed_of(scenario.seed)
     )
     RunFolder.adopt(out / FLOWN, info).save_episodes([replace(episode, record=record)])
-    run = rehearse(scenario, out=out / REHEARSED, progress=progress)
+    run = rehearse(scenario, out=out / REHEARSED, progress=asked.progress)
     flown = _navigated(episode.trajectory, record)
     paths = [
         distances(flown, _navigated(run.trajectories[each.index], each))
@@ -351,21 +361,12 @@ def changes_of(folder: Path) -> Changes:
 
 
 def refly_parts(
-    path: Path,
-    out: Path,
-    folder: Path,
-    *,
-    arena: str | None = None,
-    arena_seed: int | None = None,
-    episodes: int = 20,
-    policy: str | None = None,
-    trust: bool = False,
-    progress: bool = False,
+    path: Path, out: Path, folder: Path, asked: Rehearsals = USUAL
 ) -> tuple[Reflight, tuple[PartFlown, ...]]:
     """Rehearse a recorded flight with a whole refit, each part of it, and none, on equal seeds.
 
     The change made by one part alone is the contribution of that part. Contributions need not add
-    up. `out` gets `parts` beside the folders of `refly`; see there for the other arguments.
+    up. `out` gets `parts` beside the folders of `refly`.
     """
     everything, base = changes_of(folder), _read(folder).vehicle
     nothing = Changes(vehicle=base, prompt=True)
@@ -376,22 +377,10 @@ def refly_parts(
         WIND: replace(nothing, wind=everything.wind),
     }
 
-    def flown(into: Path, changes: Changes) -> Reflight:
-        return refly(
-            path,
-            into,
-            arena=arena,
-            arena_seed=arena_seed,
-            episodes=episodes,
-            policy=policy,
-            trust=trust,
-            changes=changes,
-            progress=progress,
-        )
-
-    whole = flown(out, everything)
+    whole = refly(path, out, asked, everything)
     found = [
-        _figures(part, flown(out / PARTS_FOLDER / part, changes)) for part, changes in parts.items()
+        _figures(part, refly(path, out / PARTS_FOLDER / part, asked, changes))
+        for part, changes in parts.items()
     ]
     figures = (*found, _figures(ALL, whole))
     data = {

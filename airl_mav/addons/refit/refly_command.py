@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 from rich.console import Console
@@ -100,25 +100,23 @@ def run(options: ReflyOptions, console: Console | None = None) -> int:
     check_installed("black-box", "sim")
     _check(options)
     # Imported here: MCAP is an extra.
-    from airl_mav.addons.refit.refly import FLOWN, REHEARSED, refly
+    from airl_mav.addons.refit.refly import FLOWN, REHEARSED, Rehearsals, refly, refly_parts
 
     out = options.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-refly"
-    flown: dict[str, Any] = {
-        "arena": options.arena,
-        "arena_seed": options.arena_seed,
-        "episodes": options.episodes,
-        "policy": options.policy,
-        "trust": options.trust,
-        "progress": True,
-    }
+    asked = Rehearsals(
+        options.arena,
+        options.arena_seed,
+        options.episodes,
+        options.policy,
+        options.trust,
+        progress=True,
+    )
     parts: tuple[PartFlown, ...] = ()
     if options.parts and options.refit is not None:
         check_installed("refit")
-        from airl_mav.addons.refit.refly import refly_parts
-
-        found, parts = refly_parts(options.flight, out, options.refit, **flown)
+        found, parts = refly_parts(options.flight, out, options.refit, asked)
     else:
-        found = refly(options.flight, out, changes=_changes(options), **flown)
+        found = refly(options.flight, out, asked, _changes(options))
     comparison, runs = compare_folders([out / REHEARSED, out / FLOWN], (REHEARSED, FLOWN))
     show_comparison(comparison, runs, out, console)
     console.print()
@@ -161,13 +159,11 @@ def _check(options: ReflyOptions) -> None:
 
 def _changes(options: ReflyOptions) -> Changes:
     """Return the changes to the flight's settings in the rehearsals."""
-    from airl_mav.addons.refit.refly import AS_FLOWN
+    from airl_mav.addons.refit.refly import AS_FLOWN, changes_of
 
     changes = AS_FLOWN
     if options.refit is not None:
         check_installed("refit")
-        from airl_mav.addons.refit.refly import changes_of
-
         changes = changes_of(options.refit)
     return replace(
         changes,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 from scipy.signal import lfilter
 
 from airl_mav.addons.refit.flown import Array, FittedQuantity, Flown, block_intervals, seconds
@@ -81,18 +81,6 @@ class _Driven:
     turned: Array
     """(n,) heading [rad], unwrapped."""
     begun_m_s: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class _Solution:
-    """Solution of a least-squares problem with k parameters and n residuals."""
-
-    x: Array
-    """(k,)."""
-    fun: Array
-    """(n,) residuals."""
-    jac: Array
-    """(n, k)."""
 
 
 def fit_response(flown: Flown, known: Response | None, rng: np.random.Generator) -> ResponseFit:
@@ -187,8 +175,8 @@ def _velocity(
     low_s, high_s = (math.hypot(end, unsure_s) for end in ends[:, 0])
     value = float(found.x[0]) - shift_s
     dead = dead.found((value, value - low_s, value + high_s), source)
-    lag = _with_interval(lag, float(found.x[1]), ends[:, 1], f"velocity in {flown.told_by}")
-    return _known_to(dead, WIDEST_S), _known_to(lag, max(WIDEST_S, WIDEST_SHARE * found.x[1]))
+    lag = _time_constant(lag, found, ends, f"velocity in {flown.told_by}")
+    return _known_to(dead, WIDEST_S), lag
 
 
 def _link_share(flown: Flown) -> tuple[float, float, str]:
@@ -241,8 +229,7 @@ def _yaw_rate(
     starts = [(dead_s, 0.1, float(driven.turned[0])) for dead_s in DEAD_TIMES_S]
     found = _best(residuals, starts, high=(2.0, 5.0, math.inf), free=2)
     ends = block_intervals(found.jac, found.fun, driven.times_s, rng)
-    fitted = _with_interval(known, float(found.x[1]), ends[:, 1], f"heading in {flown.told_by}")
-    return _known_to(fitted, max(WIDEST_S, WIDEST_SHARE * found.x[1]))
+    return _time_constant(known, found, ends, f"heading in {flown.told_by}")
 
 
 def _lagged(wanted: NDArray[np.complex128] | Array, lag_s: float, begun: complex) -> Array:
@@ -257,7 +244,7 @@ def _best(
     starts: list[tuple[float, float, float]],
     high: tuple[float, float, float],
     free: int = 3,
-) -> _Solution:
+) -> OptimizeResult:
     """Return the best of several least-squares starts; the first `free` parameters are positive."""
     low = [0.0, 0.01, 0.0]
     low[free:] = [-math.inf] * (3 - free)
@@ -267,12 +254,16 @@ def _best(
         )
         for start in starts
     ]
-    best = min(found, key=lambda each: float(each.cost))
-    return _Solution(np.asarray(best.x), np.asarray(best.fun), np.asarray(best.jac))
+    return min(found, key=lambda each: float(each.cost))
 
 
-def _with_interval(known: FittedQuantity, value: float, ends: Array, source: str) -> FittedQuantity:
-    return known.found((value, value + ends[0], value + ends[1]), source)
+def _time_constant(
+    known: FittedQuantity, found: OptimizeResult, ends: Array, source: str
+) -> FittedQuantity:
+    """Return the second parameter of a solution with its interval."""
+    value = float(found.x[1])
+    fitted = known.found((value, value + ends[0, 1], value + ends[1, 1]), source)
+    return _known_to(fitted, max(WIDEST_S, WIDEST_SHARE * value))
 
 
 def _known_to(estimate: FittedQuantity, widest: float) -> FittedQuantity:

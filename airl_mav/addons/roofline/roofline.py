@@ -12,12 +12,12 @@ import numpy as np
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.addons.roofline.page import roofline_document
-from airl_mav.addons.roofline.points import (
+from airl_mav.addons.roofline.page import (
     LeftOut,
     Roofline,
     RooflinePoint,
     noticed_m,
+    roofline_document,
     roofline_point,
 )
 from airl_mav.core.clock import utc_now
@@ -165,29 +165,22 @@ def find_roofline(request: RooflineRequest) -> Roofline:
             computer,
             StoppingTask(loaded(bare, computer, request.payload), loop, distance_m),
             injection,
-            knee_share=request.knee_share,
-            mission_m=request.mission_m,
-            draws=request.draws,
-            seed=request.seed,
+            request,
         )
         points.append(point)
     if not points:
         told = "; ".join(f"{each.computer}: {each.why}" for each in left_out)
         raise FieldError("computers", " ".join(request.computers), problem=told)
+    same = {"vehicle", "workload", "knee_share", "mission_m", "draws", "seed"}
     return Roofline(
-        vehicle=request.vehicle,
         policy=policy.name,
-        workload=request.workload,
         sensing_distance_m=distance_m,
         noticed_m=noticed,
         frame_rate_hz=bare.camera.rate_hz,
         hold_s=hold_s,
-        knee_share=request.knee_share,
-        mission_m=request.mission_m,
-        draws=request.draws,
-        seed=request.seed,
         points=tuple(points),
         left_out=tuple(left_out),
+        **request.model_dump(include=same),
     )
 
 

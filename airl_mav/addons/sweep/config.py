@@ -14,8 +14,8 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import Each, ProfileModel, quantity
 from airl_mav.envs.evaluation import OUTCOMES, EpisodeResult, mean_of_successes
 from airl_mav.flight.judge import Outcome
+from airl_mav.policy.card import outputs_of
 from airl_mav.policy.card_writing import NetworkSize, template_size
-from airl_mav.policy.runtime import outputs_of
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projections import CHANNELS
 from airl_mav.profiles.vehicle import load_vehicle

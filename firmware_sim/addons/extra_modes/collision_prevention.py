@@ -53,7 +53,7 @@ class ObstacleMap:
         """Time of each bin's newest report [µs]."""
         self.ranges_cm = np.zeros(BINS)
         """Maximum range of the sensor of each bin [cm]."""
-        self.told = np.zeros(BINS, dtype=bool)
+        self.reported = np.zeros(BINS, dtype=bool)
         """True if the bin was ever reported, so lies in a sensor's field of view."""
         self.nearest_cm = UNKNOWN_CM
         """Minimum measurable distance [cm]."""
@@ -67,14 +67,14 @@ class ObstacleMap:
         offset = obstacles.offset_deg - (math.degrees(yaw) if obstacles.in_world else 0.0)
         count = min(BINS, math.ceil(360.0 / obstacles.increment_deg))
         mine = _edges(BINS, BIN_DEG, 0.0)
-        told = _edges(count, obstacles.increment_deg, offset)
-        for i, j in np.argwhere(_overlap(mine, told)).tolist():
+        reported = _edges(count, obstacles.increment_deg, offset)
+        for i, j in np.argwhere(_overlap(mine, reported)).tolist():
             distance_cm = obstacles.distances_cm[j]
             if distance_cm != UNKNOWN_CM and self._replaces(i, distance_cm, obstacles.farthest_cm):
                 self.distances_cm[i] = distance_cm
                 self.seen_us[i] = self.time_us
                 self.ranges_cm[i] = obstacles.farthest_cm
-                self.told[i] = True
+                self.reported[i] = True
 
     def forget(self, now_us: int) -> None:
         """Discard stale data."""
@@ -123,7 +123,7 @@ class CollisionPrevention:
 
     def constrain(
         self,
-        wanted: tuple[float, float],
+        commanded: tuple[float, float],
         velocity: tuple[float, float],
         obstacles: ObstacleBins | None,
         yaw: float,
@@ -132,7 +132,7 @@ class CollisionPrevention:
         """Return the permitted acceleration (north, east) [m/s²].
 
         Args:
-            wanted: Acceleration commanded by the sticks, north and east [m/s²].
+            commanded: Acceleration commanded by the sticks, north and east [m/s²].
             velocity: Velocity setpoint, north and east [m/s].
             obstacles: Newest report; None = none yet.
             yaw: Heading [rad].
@@ -149,12 +149,12 @@ class CollisionPrevention:
             since_us = max(self.map.time_us, self._active_us)
             self.gives_up = now_us - since_us > GIVE_UP_US
             return 0.0, 0.0
-        length = math.hypot(*wanted)
+        length = math.hypot(*commanded)
         if length <= _DEFLECTED_M_S2:
-            return wanted
+            return commanded
         directions = yaw + np.radians(BIN_DEG * np.arange(BINS))
         bins = np.stack([np.cos(directions), np.sin(directions)], axis=1)
-        index, direction = self._guided(np.array(wanted) / length, yaw, bins)
+        index, direction = self._guided(np.array(commanded) / length, yaw, bins)
         allowed = np.zeros(2)
         if self._is_feasible(index):
             allowed = length * self._scaled(direction, yaw, bins)
@@ -169,23 +169,23 @@ class CollisionPrevention:
     def _guided(self, direction: Vector, yaw: float, bins: Vector) -> tuple[int, Vector]:
         """Return bin and direction, turned by up to CP_GUIDE_ANG towards more space."""
         ahead = math.degrees(math.atan2(direction[1], direction[0]) - yaw) % 360.0
-        asked = best = int(ahead // BIN_DEG)
+        requested = best = int(ahead // BIN_DEG)
         distances, keep_cm = self.map.distances_cm, 100.0 * self._value("CP_DIST")
-        known = np.where(distances == UNKNOWN_CM, keep_cm, distances)
+        assumed = np.where(distances == UNKNOWN_CM, keep_cm, distances)
         least, most = math.inf, int(self._value("CP_GUIDE_ANG") // BIN_DEG)
         for aside in range(-most, most + 1):
-            i = (asked + aside) % BINS
-            mean = (known[i - 1] + known[i] + known[(i + 1) % BINS]) / 3.0
+            i = (requested + aside) % BINS
+            mean = (assumed[i - 1] + assumed[i] + assumed[(i + 1) % BINS]) / 3.0
             cost = 0.5 * keep_cm * abs(aside) - mean - distances[i]
             if cost < least and distances[i] != UNKNOWN_CM:
                 least, best = cost, i
-        return (asked, direction) if best == asked else (best, bins[best])
+        return (requested, direction) if best == requested else (best, bins[best])
 
     def _is_feasible(self, index: int) -> bool:
         """Return whether the requested direction has data, or may lack them."""
         if self.map.distances_cm[index] != UNKNOWN_CM:
             return True
-        return bool(self._value("CP_GO_NO_DATA")) and not self.map.told[index]
+        return bool(self._value("CP_GO_NO_DATA")) and not self.map.reported[index]
 
     def _scaled(self, direction: Vector, yaw: float, bins: Vector) -> Vector:
         """Return a direction, shortened by its component towards the closest obstacle."""
@@ -273,10 +273,10 @@ def _edges(count: int, width_deg: float, offset_deg: float) -> Vector:
     return np.stack([np.where(lower > upper, lower - 360.0, lower), upper], axis=1)
 
 
-def _overlap(mine: Vector, told: Vector) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def _overlap(mine: Vector, reported: Vector) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """Return the overlap (n, m) of the map's bins (n, 2) with the reported bins (m, 2)."""
     lower, upper = mine[:, None, 0], mine[:, None, 1]
-    low, high = told[None, :, 0], told[None, :, 1]
+    low, high = reported[None, :, 0], reported[None, :, 1]
     begins = (low > lower) & (low < upper)
     ends = (high > lower) & (high < upper)
     around = (low <= lower) & (high >= upper)

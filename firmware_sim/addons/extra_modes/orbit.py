@@ -22,12 +22,7 @@ from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import ModeRequest, OrbitRequest
 from firmware_sim.autopilot.modes.automatic import Hold
-from firmware_sim.autopilot.modes.interface import (
-    NAN,
-    FlightContext,
-    FlightMode,
-    since,
-)
+from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, since
 from firmware_sim.autopilot.modes.sticks import IDLE_THROTTLE, RELEASED, superexpo
 from firmware_sim.autopilot.smooth_trajectory import PathSegment, triple
 
@@ -124,15 +119,15 @@ class Orbit(FlightMode, modes=(Mode.ORBIT,)):
             self._yaw = now
             return NAN, NAN
         if self._facing is Facing.INITIAL_HEADING:
-            wanted, rate = self._initial_yaw, NAN
+            target, rate = self._initial_yaw, NAN
         elif self._facing is Facing.TANGENT:
-            wanted = math.atan2(side * outward[0], -side * outward[1])
+            target = math.atan2(side * outward[0], -side * outward[1])
         elif self._facing is Facing.PILOT:
-            wanted, rate = self._yaw, NAN
+            target, rate = self._yaw, NAN
         else:
-            wanted = math.atan2(-outward[1], -outward[0])
+            target = math.atan2(-outward[1], -outward[0])
         most = self._context.value("MPC_YAWRAUTO_MAX") * DEG * dt
-        self._yaw = wrap_pi(self._yaw + min(most, max(-most, wrap_pi(wanted - self._yaw))))
+        self._yaw = wrap_pi(self._yaw + min(most, max(-most, wrap_pi(target - self._yaw))))
         return self._yaw, rate
 
     def _apply(self, request: OrbitRequest) -> None:

@@ -68,7 +68,7 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
         """Start time of the current state [µs]."""
         self._reached_us: int | None = None
         self._found_us: int | None = None
-        self._known_us = 0
+        self._report_us = 0
         """Time of the newest processed report [µs]."""
         self._is_new = False
 
@@ -84,7 +84,7 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
             request = PrecisionRequest(triple(state, P), required=True)
         self._goal, self._required = request.place, request.required
         self._searches, self._next_us = 1, 0
-        self._known_us, self._is_new = -1, False
+        self._report_us, self._is_new = -1, False
         self._reached_us = self._found_us = None
         self._state = _State.START
 
@@ -92,7 +92,7 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
         """Check for the target periodically; return the demand."""
         if time_us >= self._next_us:
             self._next_us = time_us + PERIOD_US
-            self._look(triple(state, P), time_us)
+            self._update(triple(state, P), time_us)
         north, east, _ = self._goal
         travel = self._context.travel
         if self._state in _DOWNWARDS:
@@ -105,19 +105,19 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
 
     # --- states
 
-    def _look(self, position: Vec, now_us: int) -> None:
+    def _update(self, position: Vec, now_us: int) -> None:
         target = self._context.landing_target
-        self._is_new = target is not None and target.time_us != self._known_us
+        self._is_new = target is not None and target.time_us != self._report_us
         if target is not None:
-            self._known_us = target.time_us
-        if self._state is _State.START:
-            self._start(position, now_us)
-        elif self._state is _State.APPROACH:
-            self._approach(position, now_us)
-        elif self._state is _State.DESCEND:
-            self._descend(position, now_us)
-        elif self._state is _State.SEARCH:
-            self._search(position, now_us)
+            self._report_us = target.time_us
+        step = {
+            _State.START: self._start,
+            _State.APPROACH: self._approach,
+            _State.DESCEND: self._descend,
+            _State.SEARCH: self._search,
+        }.get(self._state)
+        if step is not None:
+            step(position, now_us)
 
     def _start(self, position: Vec, now_us: int) -> None:
         if self._begin_approach(position, now_us):
@@ -139,7 +139,7 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
 
     def _approach(self, position: Vec, now_us: int) -> None:
         target = self._target
-        if target is None or (self._is_over(target, position) and not self._is_seen(now_us)):
+        if target is None or (self._is_over(target, position) and not self._is_visible(now_us)):
             self._lose(position, now_us)
             return
         if self._is_new and self._is_over(target, position):
@@ -155,10 +155,10 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
             self._lose(position, now_us)
             return
         near = self._is_near_ground(target, position, now_us)
-        seen = self._is_seen(now_us)
+        visible = self._is_visible(now_us)
         if near:
-            seen = now_us - target.time_us < _LOST_NEAR_GROUND_US
-        if seen:
+            visible = now_us - target.time_us < _LOST_NEAR_GROUND_US
+        if visible:
             self._goal = *target.position[:2], self._goal[2]
         elif near:
             self._become(_State.FINAL, now_us)
@@ -166,7 +166,7 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
             self._lose(position, now_us)
 
     def _search(self, position: Vec, now_us: int) -> None:
-        if self._is_new and self._is_seen(now_us) and self._found_us is None:
+        if self._is_new and self._is_visible(now_us) and self._found_us is None:
             self._found_us = now_us
             north, east, down = self._goal
             self._goal = north, east, max(down, position[2] - _STOP_CLIMBING_M)
@@ -184,7 +184,7 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
 
     def _begin_approach(self, position: Vec, now_us: int) -> bool:
         """Approach a currently visible target; return whether there is one."""
-        if not (self._is_new and self._is_seen(now_us)):
+        if not (self._is_new and self._is_visible(now_us)):
             return False
         north, east, _ = self._goal
         self._goal = north, east, position[2]
@@ -209,7 +209,7 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
     def _target(self) -> LandingTarget | None:
         return self._context.landing_target
 
-    def _is_seen(self, now_us: int) -> bool:
+    def _is_visible(self, now_us: int) -> bool:
         """Return whether the target was reported within PLD_BTOUT."""
         target = self._target
         if target is None:
@@ -225,4 +225,4 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
     def _is_near_ground(self, target: LandingTarget, position: Vec, now_us: int) -> bool:
         """Return whether the vehicle is within PLD_FAPPR_ALT above a visible target."""
         above = target.position[2] - position[2]
-        return self._is_seen(now_us) and above < self._context.value("PLD_FAPPR_ALT")
+        return self._is_visible(now_us) and above < self._context.value("PLD_FAPPR_ALT")

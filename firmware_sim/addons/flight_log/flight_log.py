@@ -219,7 +219,7 @@ class LogFolder:
         self._folder = folder
         self._current = current
         self._complete: Sequence[Path] = ()
-        self._seen: tuple[int, bool] | None = None
+        self._scanned: tuple[int, bool] | None = None
         """Folder change time [ns] and closed flag of the log when `_complete` was scanned."""
         self._files: OrderedDict[Path, BinaryIO] = OrderedDict()
         """Open files; the most recently read file is last."""
@@ -263,10 +263,10 @@ class LogFolder:
             self._files.popitem()[1].close()
 
     def _completed(self) -> Sequence[Path]:
-        seen = self._folder.stat().st_mtime_ns, self._current.writer.closed
-        if seen != self._seen:
+        state = self._folder.stat().st_mtime_ns, self._current.writer.closed
+        if state != self._scanned:
             self.close()
-            self._seen = seen
+            self._scanned = state
             self._complete = sorted(self._folder.glob(f"*{ULOG_SUFFIX}"))
         return self._complete
 

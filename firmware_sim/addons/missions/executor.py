@@ -160,7 +160,7 @@ class MissionExecutor:
         self._disarmed_meanwhile = False
         self._activated_at = 0
         self._speed_to_restore = NAN
-        self._seen = (0, 0)
+        self._versions = (0, 0)
         self._home_altitude_m = NAN
         self._checked_for: object = None
 
@@ -170,13 +170,13 @@ class MissionExecutor:
         """Track changes of the plans while another mode flies."""
         if not armed:
             self._disarmed_meanwhile = True
-        self._look()
+        self._is_changed()
         self.review(situation)
 
     def activate(self, situation: NavigationState) -> None:
         """Start Mission mode."""
         plans = self._plans
-        self._look()
+        self._is_changed()
         self._validate(situation)
         over = len(plans.mission) > 0 and plans.current + 1 == len(plans.mission)
         if self._disarmed_meanwhile and self._began_before and over:
@@ -200,7 +200,7 @@ class MissionExecutor:
 
     def update(self, situation: NavigationState) -> None:
         """Advance the mission; call at 20 Hz in Mission mode."""
-        if self._look():
+        if self._is_changed():
             self.review(situation)
             self.triplet = STANDING
             self._begin(situation.landed)
@@ -214,20 +214,20 @@ class MissionExecutor:
             self._arrival.restart()
             if self._flown.autocontinue:
                 self._advance(situation)
-        self._look_at_roi(situation)
+        self._turn_to_roi(situation)
 
     # --- the mission as a whole
 
-    def _look(self) -> bool:
+    def _is_changed(self) -> bool:
         """Return whether a client has changed the mission or its current item."""
         plans = self._plans
         mission = plans.stored(MissionType.MISSION)
-        seen = (mission.revision, plans.set_current_count)
-        if seen == self._seen:
+        versions = (mission.revision, plans.set_current_count)
+        if versions == self._versions:
             return False
-        if mission.revision != self._seen[0]:
+        if mission.revision != self._versions[0]:
             self._began_before = False
-        self._seen = seen
+        self._versions = versions
         return True
 
     def review(self, situation: NavigationState) -> None:
@@ -255,10 +255,10 @@ class MissionExecutor:
         if not self.valid:
             self._running = False
             refused = MISSION_REFUSED if landed else MISSION_LOITER
-            self._say(Severity.CRITICAL, refused.message, refused.event())
+            self._announce(Severity.CRITICAL, refused.message, refused.event())
             return
         if not self._running:
-            self._say(Severity.INFO, "Executing Mission", MISSION_EXECUTE.event())
+            self._announce(Severity.INFO, "Executing Mission", MISSION_EXECUTE.event())
         self._running = True
         self._work = _Work.ITEM
         self._plans.reached = -1
@@ -288,7 +288,7 @@ class MissionExecutor:
             if following is None:
                 landed = situation.landed
                 end = MISSION_FINISHED if landed else MISSION_FINISHED_LOITER
-                self._say(Severity.INFO, end.message, end.event())
+                self._announce(Severity.INFO, end.message, end.event())
                 if self._plans.current + 1 == len(self._plans.mission):
                     self._plans.jumps_done.clear()
                 self._end(situation)
@@ -353,7 +353,7 @@ class MissionExecutor:
         if not math.isnan(self._climb_down) and self._work is _Work.ITEM:
             above_m = -(self._climb_down - situation.local(situation.home)[2])
             text = f"Climb to {above_m:.1f} meters above home"
-            self._say(Severity.INFO, text, MISSION_CLIMB.event(above_m))
+            self._announce(Severity.INFO, text, MISSION_CLIMB.event(above_m))
             then = flown.place
             flown.command = _N.TAKEOFF if situation.landed else _N.LOITER_TO_ALT
             flown.place = north, east, self._climb_down
@@ -436,7 +436,7 @@ class MissionExecutor:
         else:
             self.roi.command(item)
 
-    def _look_at_roi(self, situation: NavigationState) -> None:
+    def _turn_to_roi(self, situation: NavigationState) -> None:
         """Point the nose to the region of interest, unless the mount does (MIS_MNT_YAW_CTL)."""
         turns = self.triplet.kind in (TripletKind.POSITION, TripletKind.LOITER)
         if not turns or self._value("MIS_MNT_YAW_CTL") > 0.0:
@@ -448,7 +448,7 @@ class MissionExecutor:
             self._flown.yaw = yaw
             self.triplet = self.triplet._replace(yaw=yaw)
 
-    def _say(self, severity: Severity, text: str, event: MavlinkEvent) -> None:
+    def _announce(self, severity: Severity, text: str, event: MavlinkEvent) -> None:
         self._crew.say(OperatorText(severity, text, event))
 
 

@@ -16,12 +16,7 @@ from typing import NamedTuple
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import wrap_pi
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.navigation.plan import (
-    MissionType,
-    NavigationState,
-    PlanItem,
-    Plans,
-)
+from firmware_sim.autopilot.navigation.plan import MissionType, NavigationState, PlanItem, Plans
 
 
 class TripletKind(Enum):

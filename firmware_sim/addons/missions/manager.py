@@ -79,11 +79,11 @@ def along_mission(
 
 def onwards(plans: Plans, index: int) -> tuple[PlanItem, ...]:
     """Return the places from an item to the landing, including remaining jumps."""
-    left = Plans()
-    left.store(MissionType.MISSION, plans.mission, 0)
-    left.jumps_done = dict(plans.jumps_done)
+    remaining = Plans()
+    remaining.store(MissionType.MISSION, plans.mission, 0)
+    remaining.jumps_done = dict(plans.jumps_done)
     way: list[PlanItem] = []
-    following = go_to(left, index)
+    following = go_to(remaining, index)
     for _ in range(MOST_ITEMS):
         if following is None:
             break
@@ -92,7 +92,7 @@ def onwards(plans: Plans, index: int) -> tuple[PlanItem, ...]:
             return (*way, item)
         if item.has_position:
             way.append(_passed(item))
-        following = go_to(left, following + 1)
+        following = go_to(remaining, following + 1)
     return tuple(way)
 
 
@@ -290,8 +290,8 @@ class MissionManager(Missions):
 
     @property
     def _return_type(self) -> ReturnType:
-        asked = round(self._value("RTL_TYPE"))
-        return ReturnType(asked) if asked in set(ReturnType) else ReturnType.HOME_OR_RALLY
+        number = round(self._value("RTL_TYPE"))
+        return ReturnType(number) if number in set(ReturnType) else ReturnType.HOME_OR_RALLY
 
     def _goal(self, now: NavigationState) -> Destination:
         here = local_to_geodetic(np.array(now.position), now.origin)

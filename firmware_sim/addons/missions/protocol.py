@@ -7,16 +7,25 @@ MISSION_WRITE_PARTIAL_LIST) have no reply here either. https://mavlink.io/en/ser
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
+from airl_mav.core.frames import Geodetic
 from firmware_sim.addons.missions import wire_items
 from firmware_sim.addons.missions.items import MOST_ITEMS
-from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.autopilot.events.definition import Definition, Level, define
-from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem
+from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem, Stored
 from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
-from firmware_sim.mavlink.services.context import ANY, Context, ServiceState, sender
+from firmware_sim.mavlink.services import (
+    ANY,
+    Action,
+    Context,
+    ServiceState,
+    VehicleCommand,
+    sender,
+)
 
 RETRY_US = 250_000
 """Time without an item after which the request is repeated [µs] (PX4)."""
@@ -99,21 +108,21 @@ class MissionTransfer(ServiceState):
     """True if items are sent as MISSION_ITEM_INT; PX4 starts with MISSION_REQUEST and adapts."""
     sent_us: int = 0
     """Time of the newest request to the client [µs]."""
-    heard_us: int = 0
+    received_us: int = 0
     """Time of the client's newest message [µs]."""
 
     # Mission progress that this link has reported to its clients.
-    told_current: int = 0
-    told_reached: int = -1
+    sent_current: int = 0
+    sent_reached: int = -1
     repeats: int = 0
     """Number of repetitions of the newest MISSION_ITEM_REACHED."""
     repeated_us: int = 0
-    told_jumped: tuple[int, int] = (-1, 0)
+    sent_jumped: tuple[int, int] = (-1, 0)
 
     @property
     def is_running(self) -> bool:
         """True if timed messages are due: requests to the client, or repetitions."""
-        repeats = self.told_reached >= 0 and self.repeats < REPEATS
+        repeats = self.sent_reached >= 0 and self.repeats < REPEATS
         return self.activity is not Activity.IDLE or repeats
 
 
@@ -139,7 +148,7 @@ def handle_list(message: WireMessage, context: Context) -> bool:
     """Handle MISSION_REQUEST_LIST: start a download by sending the number of items."""
     transfer = context.state(MissionTransfer)
     partner = sender(message)
-    _settle(transfer)
+    _end_complete_download(transfer)
     # A repeated request from the same client restarts the download: the count was lost.
     again = (
         transfer.activity is _SENDING
@@ -152,9 +161,9 @@ def handle_list(message: WireMessage, context: Context) -> bool:
     # `heard_us` starts the transfer's timeout.
     transfer.activity, transfer.kind = _SENDING, message.mission_type
     transfer.index, transfer.partner = 0, partner
-    transfer.count = len(_items(context, transfer.kind))
-    transfer.sent_us = transfer.heard_us = context.now_us
-    identity = _identity(context, transfer.kind)
+    transfer.count = len(_stored(context, transfer.kind).items)
+    transfer.sent_us = transfer.received_us = context.now_us
+    identity = _stored(context, transfer.kind).identity
     context.link.send(
         dialect.MAVLink_mission_count_message(*partner, transfer.count, transfer.kind, identity)
     )
@@ -166,14 +175,14 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     transfer = context.state(MissionTransfer)
     transfer.integer = message.get_type() == "MISSION_REQUEST_INT"
     if sender(message) != transfer.partner:
-        _complain(context, "WPM: REJ. CMD: partner id mismatch", REQUEST_OF_ANOTHER)
+        _report(context, "WPM: REJ. CMD: partner id mismatch", REQUEST_OF_ANOTHER)
         return True
     if transfer.activity is _RECEIVING:
-        _complain(context, "WPM: REJ. CMD: Busy", REQUEST_WHILE_BUSY)
+        _report(context, "WPM: REJ. CMD: Busy", REQUEST_WHILE_BUSY)
         return True
     if transfer.activity is _IDLE or transfer.kind != message.mission_type:
         return False
-    transfer.heard_us = context.now_us
+    transfer.received_us = context.now_us
     index = message.seq
     # Accept the next item, or the previous one again (its reply was lost).
     if index == transfer.index < transfer.count:
@@ -181,7 +190,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     elif index != transfer.index - 1:
         return _break_off(context, REQUEST_UNEXPECTED)
     # The list may have changed during the download.
-    if index >= len(_items(context, transfer.kind)):
+    if index >= len(_stored(context, transfer.kind).items):
         return _break_off(context, REQUEST_BEYOND_END)
     _send_item(context, index)
     return True
@@ -191,7 +200,7 @@ def handle_ack(message: WireMessage, context: Context) -> bool:
     """Handle MISSION_ACK: end a download, or react to the client's reply to a request."""
     transfer = context.state(MissionTransfer)
     if sender(message) != transfer.partner:
-        _complain(context, "REJ. WP CMD: partner id mismatch", ACK_OF_ANOTHER)
+        _report(context, "REJ. WP CMD: partner id mismatch", ACK_OF_ANOTHER)
         return True
     if transfer.activity is _SENDING and transfer.kind == message.mission_type:
         transfer.activity = _IDLE
@@ -213,19 +222,19 @@ def handle_ack(message: WireMessage, context: Context) -> bool:
 def handle_count(message: WireMessage, context: Context) -> bool:
     """Handle MISSION_COUNT: start an upload. A count of 0 clears the list."""
     transfer, partner = context.state(MissionTransfer), sender(message)
-    _settle(transfer)
+    _end_complete_download(transfer)
     if transfer.activity is _SENDING:
-        _complain(context, "WPM: IGN MISSION_COUNT: Busy", COUNT_WHILE_SENDING)
+        _report(context, "WPM: IGN MISSION_COUNT: Busy", COUNT_WHILE_SENDING)
         _acknowledge(context, partner, _ERROR)
         return True
     # Renewed for any sender; the partner is checked below.
-    transfer.heard_us = context.now_us
+    transfer.received_us = context.now_us
     if transfer.activity is _RECEIVING:
         if partner != transfer.partner:
             _acknowledge(context, partner, _ERROR)
         # An upload that has received items is not restarted.
         elif transfer.index:
-            _complain(context, "WPM: REJ. CMD: Busy", COUNT_WHILE_RECEIVING)
+            _report(context, "WPM: REJ. CMD: Busy", COUNT_WHILE_RECEIVING)
             _acknowledge(context, partner, _ERROR)
         else:
             _request(context)  # the request was probably lost
@@ -244,11 +253,11 @@ def _begin_upload(message: WireMessage, context: Context) -> bool:
         transfer.integer = False
     transfer.partner, transfer.kind, transfer.checksum = partner, message.mission_type, 0
     # An unknown list type has room for 0 items.
-    known = transfer.kind in MOST_ITEMS
-    if message.count > (MOST_ITEMS[MissionType(transfer.kind)] if known else 0):
+    is_known = transfer.kind in MOST_ITEMS
+    if message.count > (MOST_ITEMS[MissionType(transfer.kind)] if is_known else 0):
         _acknowledge(context, partner, dialect.MAV_MISSION_NO_SPACE)
     elif message.count == 0:
-        if known:
+        if is_known:
             plans.clear(MissionType(transfer.kind))
         _acknowledge(context, partner, _ACCEPTED)
     else:
@@ -265,14 +274,14 @@ def handle_item(message: WireMessage, context: Context) -> bool:
     transfer, partner = context.state(MissionTransfer), sender(message)
     transfer.integer = wire_items.is_int(message)
     if partner != transfer.partner:
-        _complain(context, "REJ. MIS ITEM: partner id mismatch", ITEM_OF_ANOTHER)
+        _report(context, "REJ. MIS ITEM: partner id mismatch", ITEM_OF_ANOTHER)
         return True
     if message.mission_type != transfer.kind:
         _acknowledge(context, partner, _ERROR)
         return True
     if transfer.activity is _SENDING:
         # PX4 answers with an error, unlike to an item out of sequence.
-        _complain(context, "IGN MISSION_ITEM: Busy", ITEM_WHILE_SENDING)
+        _report(context, "IGN MISSION_ITEM: Busy", ITEM_WHILE_SENDING)
         _acknowledge(context, partner, _ERROR)
         return True
     if transfer.activity is _IDLE:
@@ -280,10 +289,10 @@ def handle_item(message: WireMessage, context: Context) -> bool:
             # The last item again: the acknowledgement was lost.
             _acknowledge(context, partner, _ACCEPTED, transfer.checksum)
         else:
-            _complain(context, "IGN MISSION_ITEM: No transfer", ITEM_WITHOUT_TRANSFER)
+            _report(context, "IGN MISSION_ITEM: No transfer", ITEM_WITHOUT_TRANSFER)
             _acknowledge(context, partner, _ERROR)
         return True
-    transfer.heard_us = context.now_us
+    transfer.received_us = context.now_us
     # PX4 ignores an item out of sequence; the request is repeated after a timeout.
     if message.seq != transfer.index:
         return False
@@ -294,7 +303,7 @@ def _take_item(message: WireMessage, context: Context) -> bool:
     transfer = context.state(MissionTransfer)
     item, kind = wire_items.parse(message), MissionType(transfer.kind)
     if isinstance(item, int):
-        _complain(context, "IGN MISSION_ITEM: Invalid item", ITEM_INVALID)
+        _report(context, "IGN MISSION_ITEM: Invalid item", ITEM_INVALID)
         _acknowledge(context, transfer.partner, item)
         _end_upload(context)
         return True
@@ -328,9 +337,9 @@ def _take_item(message: WireMessage, context: Context) -> bool:
 def handle_clear(message: WireMessage, context: Context) -> bool:
     """Handle MISSION_CLEAR_ALL: clear one list, or all lists."""
     transfer, kind = context.state(MissionTransfer), message.mission_type
-    _settle(transfer)
+    _end_complete_download(transfer)
     if transfer.activity is not _IDLE:
-        _complain(context, "WPM: IGN CLEAR CMD: Busy", CLEAR_WHILE_BUSY)
+        _report(context, "WPM: IGN CLEAR CMD: Busy", CLEAR_WHILE_BUSY)
         return True
     # MISSION_ACK contains the type of the last transfer.
     transfer.kind = kind
@@ -344,15 +353,15 @@ def handle_clear(message: WireMessage, context: Context) -> bool:
 def handle_set_current(message: WireMessage, context: Context) -> bool:
     """Handle MISSION_SET_CURRENT: select the item to resume with. The mode does not change."""
     plans = context.port.plans
-    _settle(context.state(MissionTransfer))
+    _end_complete_download(context.state(MissionTransfer))
     if context.state(MissionTransfer).activity is not _IDLE:
-        _complain(context, "WPM: IGN WP CURR CMD: Busy", CURRENT_WHILE_BUSY)
+        _report(context, "WPM: IGN WP CURR CMD: Busy", CURRENT_WHILE_BUSY)
     elif message.seq >= len(plans.mission):
-        _complain(context, "WPM: WP CURR CMD: Not in list", CURRENT_NOT_LISTED)
+        _report(context, "WPM: WP CURR CMD: Not in list", CURRENT_NOT_LISTED)
     else:
         plans.set_current(message.seq)
         # -1 forces a MISSION_CURRENT in the next tick.
-        context.state(MissionTransfer).told_current = -1
+        context.state(MissionTransfer).sent_current = -1
     return True
 
 
@@ -361,19 +370,19 @@ def send_pending(context: Context) -> None:
     transfer, plans = context.state(MissionTransfer), context.port.plans
     if transfer.activity is not _IDLE:
         _check_timeouts(context)
-    if plans.current != transfer.told_current:
-        transfer.told_current = plans.current
+    if plans.current != transfer.sent_current:
+        transfer.sent_current = plans.current
         context.link.send_stream("MISSION_CURRENT", context.port.state())
     # -1 because `_tell_reached` counts the first message as a repetition.
-    if plans.reached != transfer.told_reached:
-        transfer.told_reached, transfer.repeats = plans.reached, -1
+    if plans.reached != transfer.sent_reached:
+        transfer.sent_reached, transfer.repeats = plans.reached, -1
         transfer.repeated_us = context.now_us - REPEAT_US
-    if transfer.told_reached >= 0 and transfer.repeats < REPEATS:
-        _tell_reached(context)
+    if transfer.sent_reached >= 0 and transfer.repeats < REPEATS:
+        _send_reached(context)
     # After a DO_JUMP, the link's last partner receives the item again.
     jumped = (plans.jumped, plans.jumps_done.get(plans.jumped, 0))
-    if jumped != transfer.told_jumped:
-        transfer.told_jumped = jumped
+    if jumped != transfer.sent_jumped:
+        transfer.sent_jumped = jumped
         if jumped[0] >= 0 and transfer.activity is _IDLE and transfer.partner[0] >= 0:
             transfer.kind = int(MissionType.MISSION)
             _send_item(context, jumped[0])
@@ -382,22 +391,22 @@ def send_pending(context: Context) -> None:
 def _check_timeouts(context: Context) -> None:
     transfer, now_us = context.state(MissionTransfer), context.now_us
     # PX4's timeout applies to uploads and downloads.
-    if now_us - transfer.heard_us > TIMEOUT_US:
-        _complain(context, "Operation timeout", TIMED_OUT)
+    if now_us - transfer.received_us > TIMEOUT_US:
+        _report(context, "Operation timeout", TIMED_OUT)
         _end_upload(context)
     elif transfer.activity is _RECEIVING and now_us - transfer.sent_us > RETRY_US:
         _request(context)
 
 
-def _tell_reached(context: Context) -> None:
+def _send_reached(context: Context) -> None:
     transfer = context.state(MissionTransfer)
     if context.now_us - transfer.repeated_us >= REPEAT_US:
         transfer.repeated_us = context.now_us
         transfer.repeats += 1
-        context.link.send(dialect.MAVLink_mission_item_reached_message(transfer.told_reached))
+        context.link.send(dialect.MAVLink_mission_item_reached_message(transfer.sent_reached))
 
 
-def _settle(transfer: MissionTransfer) -> None:
+def _end_complete_download(transfer: MissionTransfer) -> None:
     """End a complete download: some clients (dronekit) never acknowledge it.
 
     PX4 does this when a new download starts, and otherwise waits for its timeout.
@@ -406,12 +415,8 @@ def _settle(transfer: MissionTransfer) -> None:
         transfer.activity = _IDLE
 
 
-def _items(context: Context, kind: int) -> tuple[object, ...]:
-    return context.port.plans.stored(MissionType(kind)).items if kind in MOST_ITEMS else ()
-
-
-def _identity(context: Context, kind: int) -> int:
-    return context.port.plans.stored(MissionType(kind)).identity if kind in MOST_ITEMS else 0
+def _stored(context: Context, kind: int) -> Stored:
+    return context.port.plans.stored(MissionType(kind)) if kind in MOST_ITEMS else Stored()
 
 
 def _request(context: Context) -> None:
@@ -452,14 +457,14 @@ def _acknowledge(context: Context, target: tuple[int, int], result: int, identit
     )
 
 
-def _complain(context: Context, text: str, event: Definition) -> None:
+def _report(context: Context, text: str, event: Definition) -> None:
     context.announce(OperatorText.of(Severity.CRITICAL, event, text=text))
 
 
 def _break_off(context: Context, why: Definition) -> bool:
     context.state(MissionTransfer).activity = _IDLE
     _acknowledge(context, context.state(MissionTransfer).partner, _ERROR)
-    _complain(context, "WPM: REJ. CMD: Req. WP was unexpected", why)
+    _report(context, "WPM: REJ. CMD: Req. WP was unexpected", why)
     return True
 
 
@@ -470,6 +475,42 @@ def _end_upload(context: Context) -> None:
         context.port.plans.receiving = False
     transfer.activity = _IDLE
     transfer.items = []
+
+
+# --- commands
+
+_ROI_LOCATION = 3
+"""Value of MAV_ROI_LOCATION."""
+
+
+def _start(command: VehicleCommand, context: Context) -> Result:
+    """Handle parameter 1: first item; -1 = continue the mission."""
+    index = command.params[0]
+    if not math.isfinite(index):
+        return Result.DENIED
+    return context.port.start_mission(int(index))
+
+
+def _start_landing(_command: VehicleCommand, context: Context) -> Result:
+    """Go to the mission's landing: DO_LAND_START, or the first landing; CANCELLED without one."""
+    commands = [item.command for item in context.port.plans.mission]
+    # DO_LAND_START has precedence; without one the first LAND item marks the landing.
+    for marker in (dialect.MAV_CMD_DO_LAND_START, dialect.MAV_CMD_NAV_LAND):
+        if marker in commands:
+            return context.port.start_mission(commands.index(marker))
+    return Result.CANCELLED
+
+
+def _look(command: VehicleCommand, context: Context) -> Result:
+    """Handle DO_SET_ROI_LOCATION, DO_SET_ROI (parameter 1: MAV_ROI) and DO_SET_ROI_NONE."""
+    place = Geodetic(*command.params[4:7])
+    # DO_SET_ROI carries the region type in parameter 1.
+    located = command.number == dialect.MAV_CMD_DO_SET_ROI_LOCATION or (
+        command.number != dialect.MAV_CMD_DO_SET_ROI_NONE and command.params[0] == _ROI_LOCATION
+    )
+    valid = math.isfinite(place.latitude_deg) and math.isfinite(place.longitude_deg)
+    context.port.look_at(place if located and valid else None)
+    return Result.ACCEPTED
 
 
 HANDLERS = {
@@ -487,3 +528,14 @@ HANDLERS = {
     }.items()
 }
 """Handlers by message name."""
+
+ACTIONS: dict[int, Action] = {
+    dialect.MAV_CMD_MISSION_START: _start,
+    dialect.MAV_CMD_DO_LAND_START: _start_landing,
+    dialect.MAV_CMD_DO_SET_ROI_LOCATION: _look,
+    dialect.MAV_CMD_DO_SET_ROI_NONE: _look,
+    dialect.MAV_CMD_DO_SET_ROI: _look,
+    dialect.MAV_CMD_NAV_ROI: _look,
+    # Effective only as a mission item.
+    dialect.MAV_CMD_DO_SET_ROI_WPNEXT_OFFSET: _look,
+}

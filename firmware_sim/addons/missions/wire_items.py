@@ -23,7 +23,7 @@ _INT_FRAMES = (PlanFrame.GLOBAL_INT, PlanFrame.GLOBAL_RELATIVE_ALT_INT)
 _ROI_NONE, _ROI_WPNEXT, _ROI_WPINDEX, _ROI_LOCATION = 0, 1, 2, 3
 """Values of MAV_ROI."""
 
-_Kept = Callable[[float], float]
+_Conversion = Callable[[float], float]
 
 
 def _as_is(value: float) -> float:
@@ -55,7 +55,7 @@ def _rounded(value: float) -> float:
     return float(int(value + 0.5)) if math.isfinite(value) else 0.0
 
 
-_PLACES: Mapping[int, tuple[_Kept, _Kept, _Kept, _Kept]] = MappingProxyType(
+_PLACES: Mapping[int, tuple[_Conversion, _Conversion, _Conversion, _Conversion]] = MappingProxyType(
     {
         _N.WAYPOINT: (_as_is, _as_is, _nothing, _heading),
         _N.LOITER_UNLIM: (_nothing, _nothing, _as_is, _heading),
@@ -158,8 +158,8 @@ def format_item(
             relative=item.altitude_is_relative and kind is not MissionType.FENCE, integer=integer
         )
         # PX4's storage keeps only the parameters that it uses; downloads show the others as 0.
-        kept = _PLACES[item.command]
-        first, second, third, fourth = (f(p) for f, p in zip(kept, item.params, strict=True))
+        conversions = _PLACES[item.command]
+        first, second, third, fourth = (f(p) for f, p in zip(conversions, item.params, strict=True))
         params = (first, second, third, fourth)
         x, y = (_fit(x * 1e7), _fit(y * 1e7)) if integer else (x, y)
     build = (

@@ -9,14 +9,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from firmware_sim.autopilot.events.definition import (
-    Level,
-    critical,
-    define,
-    error,
-    warning,
-    wrong,
-)
+from firmware_sim.autopilot.events.definition import Level, critical, define, error, warning, wrong
 
 _APPENDED = "append_health_and_arming_messages"
 """Event kind for which ground stations append the failing checks to the message."""
@@ -173,10 +166,7 @@ ARM_PARAMETER = wrong(
     "commander_unsupported_arm_disarm_param", "Unsupported ARM_DISARM param: {1:.3}", "float param1"
 )
 ARM_WHILE_CALIBRATING = critical("commander_arm_denied_calibrating", "Arming denied: calibrating")
-AUTO_MODE_UNSUPPORTED = wrong(
-    "commander_unsupported_auto_mode",
-    "Unsupported auto mode",
-)
+AUTO_MODE_UNSUPPORTED = wrong("commander_unsupported_auto_mode", "Unsupported auto mode")
 NO_HIGH_LATENCY = critical(
     "commander_ctrl_high_latency_failed", "Control high latency failed! Telemetry unavailable"
 )

@@ -86,7 +86,7 @@ class HealthReport(NamedTuple):
 def health_report(readiness: Readiness) -> HealthReport:
     """Return the findings of the checks for all modes."""
     in_modes = {mode: readiness._replace(mode=mode) for mode in Mode}
-    told: list[MavlinkEvent] = []
+    findings: list[MavlinkEvent] = []
     blocked = arming_error = arming_warning = health_error = health_warning = 0
     for check in CHECKS:
         modes = _blocked_modes(check, readiness, in_modes)
@@ -104,11 +104,11 @@ def health_report(readiness: Readiness) -> HealthReport:
             arming_warning |= bit * warning
         shown = modes if check.shown is None else modes | _modes_needing(check.shown(readiness))
         values = (shown or ALL_MODES, check.component.place, *check.values)
-        told.append(check.event.event(*values, level=level))
+        findings.append(check.event.event(*values, level=level))
     return HealthReport(
         ALL_MODES & ~EXTERNAL_MODES & ~blocked,
         ALL_MODES & ~EXTERNAL_MODES & ~_cannot_run(readiness),
-        tuple(told),
+        tuple(findings),
         arming_error,
         arming_warning,
         _present(readiness),
@@ -168,25 +168,25 @@ def _present(r: Readiness) -> int:
 class HealthReporter:
     """Sender of health reports, on change and on demand."""
 
-    def __init__(self, tell: Callable[[MavlinkEvent], None]) -> None:
+    def __init__(self, send: Callable[[MavlinkEvent], None]) -> None:
         """Store the callback that sends an event."""
-        self._tell = tell
-        self._seen: Readiness | None = None
+        self._send = send
+        self._readiness: Readiness | None = None
         self._report: HealthReport | None = None
-        self._told: HealthReport | None = None
-        self._told_us = 0
+        self._sent: HealthReport | None = None
+        self._sent_us = 0
 
     @property
-    def is_told(self) -> bool:
+    def is_sent(self) -> bool:
         """True if the newest report has been sent."""
-        return self._report == self._told
+        return self._report == self._sent
 
     def update(self, readiness: Readiness, now_us: int, *, force: bool = False) -> None:
         """Update the report; send changes at most every `REPORT_US`, or now with `force`."""
-        if readiness != self._seen or self._report is None:
-            self._seen, self._report = readiness, health_report(readiness)
-        due = self._report != self._told and now_us >= self._told_us + REPORT_US
+        if readiness != self._readiness or self._report is None:
+            self._readiness, self._report = readiness, health_report(readiness)
+        due = self._report != self._sent and now_us >= self._sent_us + REPORT_US
         if due or force:
-            self._told, self._told_us = self._report, now_us
+            self._sent, self._sent_us = self._report, now_us
             for event in self._report.events():
-                self._tell(event)
+                self._send(event)

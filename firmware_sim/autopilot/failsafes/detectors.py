@@ -50,7 +50,7 @@ class MotorFailure:
     def take(
         self,
         time_us: int,
-        told: Sequence[float],
+        commands: Sequence[float],
         outputs: Sequence[float],
         limits: Undercurrent,
     ) -> None:
@@ -58,11 +58,11 @@ class MotorFailure:
 
         Args:
             time_us: Time [µs].
-            told: Commands of the motors, 0..1.
+            commands: Commands of the motors, 0..1.
             outputs: Outputs of the motors, as reported by the speed controllers.
             limits: Undercurrent thresholds.
         """
-        for motor, (throttle, output) in enumerate(zip(told, outputs, strict=True)):
+        for motor, (throttle, output) in enumerate(zip(commands, outputs, strict=True)):
             # PX4 expects a minimum current in proportion to the command.
             least_a = throttle * limits.per_throttle_a
             if not (throttle > limits.throttle and current_a(output) < least_a):

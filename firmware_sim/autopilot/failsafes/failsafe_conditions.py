@@ -6,9 +6,9 @@ commander/failsafe/framework.h.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from enum import Enum, IntEnum, auto
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from firmware_sim.autopilot.events.definition import FailsafeAction, FailsafeCause
 from firmware_sim.autopilot.flight_modes import Mode, Need
@@ -26,7 +26,6 @@ class FailsafeSettings(NamedTuple):
     com_act_fail_act: int = 0
     com_fail_act_t: float = 5.0
     com_fltt_low_act: int = 3
-    com_imb_prop_act: int = 0
     com_lkdown_tko: float = 3.0
     com_low_bat_act: int = 0
     com_obl_rc_act: int = 0
@@ -35,23 +34,17 @@ class FailsafeSettings(NamedTuple):
     com_rc_in_mode: int = 3
     com_rcl_except: int = 0
     com_spoolup_time: float = 1.0
-    com_wind_max_act: int = 0
     cbrk_flightterm: int = 121212
     gf_action: int = 2
     nav_dll_act: int = 0
     nav_rcl_act: int = 2
 
-    @classmethod
-    def read(cls, value: Callable[[str], float]) -> FailsafeSettings:
-        """Read the parameters with a look-up by PX4 name, clipped to `LONGEST_S`."""
-        defaults = cls._field_defaults.values()
-        return cls(
-            *(
-                # The default's type keeps integer parameters integers.
-                type(default)(min(max(value(name.upper()), -LONGEST_S), LONGEST_S))
-                for name, default in zip(cls._fields, defaults, strict=True)
-            )
-        )
+
+def read_settings(defaults: Mapping[str, Any], value: Callable[[str], float]) -> Iterator[Any]:
+    """Yield parameters by the names of settings, clipped to `LONGEST_S`."""
+    for name, default in defaults.items():
+        # The default's type keeps integer parameters integers.
+        yield type(default)(min(max(value(name.upper()), -LONGEST_S), LONGEST_S))
 
 
 FLIGHT_TERMINATION_OFF = 121212
@@ -105,15 +98,10 @@ class Conditions(NamedTuple):
     gcs_connection_lost: bool = True
     battery_warning: BatteryWarning = BatteryWarning.NONE
     battery_low_remaining_time: bool = False
-    battery_unhealthy: bool = False
     geofence: FenceBreach = NO_BREACH
-    mission_failure: bool = False
-    navigator_failure: bool = False
-    wind_limit_exceeded: bool = False
     flight_time_limit_exceeded: bool = False
     fd_critical_failure: bool = False
     """Attitude or altitude outside the flight envelope, from the failure detector."""
-    fd_imbalanced_prop: bool = False
     fd_motor_failure: bool = False
 
 
@@ -131,7 +119,6 @@ _LACKED_BY: dict[str, int] = {
     "auto_mission_missing": Need.MISSION.value,
     "offboard_control_signal_lost": Need.OFFBOARD_SIGNAL.value,
     "manual_control_signal_lost": Need.MANUAL_CONTROL.value,
-    "wind_limit_exceeded": Need.CALM_AND_TIME.value,
     "flight_time_limit_exceeded": Need.CALM_AND_TIME.value,
 }
 _PLACES = tuple((Conditions._fields.index(name), bit) for name, bit in _LACKED_BY.items())

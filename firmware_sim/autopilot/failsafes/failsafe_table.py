@@ -1,7 +1,8 @@
 """Table of failsafes: condition, parameter, action. One row per failsafe, pure.
 
 Source: PX4 1.16, commander/failsafe/failsafe.cpp (checkStateAndMode and its callees). Not
-applicable to this vehicle and omitted: VTOL transitions, ESC arming failure.
+applicable to this vehicle and omitted: VTOL transitions, ESC arming failure, imbalanced propellers,
+wind limits, and failures of battery, mission and navigator.
 """
 
 from __future__ import annotations
@@ -38,17 +39,17 @@ MODE_OF_ACTION = {
 """Mode of each action; other actions keep the intended mode. In ascending order: if a mode cannot
 run, the next action replaces it."""
 
-OFFBOARD_LOSS: dict[int, tuple[FailsafeAction, Mode | None]] = {
-    0: (FailsafeAction.FALLBACK_POSCTRL, Mode.POSITION),
-    1: (FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE),
-    2: (FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
-    3: (FailsafeAction.RTL, Mode.RETURN),
-    4: (FailsafeAction.LAND, Mode.LAND),
-    5: (FailsafeAction.HOLD, Mode.HOLD),
-    6: (FailsafeAction.TERMINATE, Mode.TERMINATION),
-    7: (FailsafeAction.DISARM, None),
+OFFBOARD_LOSS = {
+    0: FailsafeAction.FALLBACK_POSCTRL,
+    1: FailsafeAction.FALLBACK_ALTCTRL,
+    2: FailsafeAction.FALLBACK_STABILIZED,
+    3: FailsafeAction.RTL,
+    4: FailsafeAction.LAND,
+    5: FailsafeAction.HOLD,
+    6: FailsafeAction.TERMINATE,
+    7: FailsafeAction.DISARM,
 }
-"""COM_OBL_RC_ACT: action, and the mode whose requirements apply from there on."""
+"""Actions of COM_OBL_RC_ACT."""
 
 
 def mode_of(action: FailsafeAction, intended: Mode) -> Mode:
@@ -74,10 +75,11 @@ def mode_fallback(
     action, mode = FailsafeAction.NONE, intended
     # Replacements in sequence: offboard loss first, then modes that cannot run.
     if conditions.offboard_control_signal_lost and mode.spec.needs & Need.OFFBOARD_SIGNAL:
-        action, next_mode = OFFBOARD_LOSS.get(settings.com_obl_rc_act, OFFBOARD_LOSS[0])
-        if next_mode is None:
+        action = OFFBOARD_LOSS.get(settings.com_obl_rc_act, OFFBOARD_LOSS[0])
+        if action is FailsafeAction.DISARM:
             return action
-        mode = next_mode
+        # From here on, the requirements of the action's mode apply.
+        mode = MODE_OF_ACTION[action]
     if settings.com_posctl_navl == 0:
         if mode is Mode.POSITION and not can_run(mode, conditions):
             action, mode = FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE
@@ -95,7 +97,7 @@ NOTHING = Options(FailsafeAction.NONE)
 
 
 class Situation(NamedTuple):
-    """Input of a table row."""
+    """Current state of the vehicle: input of the failsafes."""
 
     time_us: int
     conditions: Conditions
@@ -108,6 +110,7 @@ class Situation(NamedTuple):
     manual_control_lost_at_arming: bool = False
     """Manual control was lost at arming and has not returned: it is optional."""
     battery_at_arming: BatteryWarning = BatteryWarning.NONE
+    armed: bool = False
 
 
 class Trigger(Enum):
@@ -115,20 +118,15 @@ class Trigger(Enum):
 
     MANUAL_CONTROL = auto()
     GCS = auto()
-    MISSION = auto()
     MISSION_WITHOUT_LINKS = auto()
-    WIND = auto()
     FLIGHT_TIME = auto()
     POSITION_ACCURACY = auto()
-    NAVIGATOR = auto()
     GEOFENCE = auto()
     REMAINING_TIME = auto()
-    BATTERY_UNHEALTHY = auto()
     BATTERY_LOW = auto()
     BATTERY_CRITICAL = auto()
     BATTERY_EMERGENCY = auto()
     ATTITUDE = auto()
-    PROPELLER = auto()
     MOTOR = auto()
     MODE_FALLBACK = auto()
 
@@ -186,7 +184,7 @@ _LINK_LOSS = {0: _NONE, 1: _HOLD, 2: _RETURN, 3: _LAND, 5: _TERMINATE, 6: _DISAR
 
 _ESCAPABLE_HOLD = _LASTING_HOLD._replace(takeover=Takeover.MODE_SWITCH)
 _LIMITS = {0: _NONE, 1: _WARN, 2: _ESCAPABLE_HOLD, 3: _RETURN, 4: _TERMINATE, 5: _LAND}
-"""Responses of GF_ACTION and COM_WIND_MAX_ACT."""
+"""Responses of GF_ACTION."""
 
 _POSITION_LOW = {
     value: Options(action, takeover=Takeover.MODE_SWITCH)
@@ -242,16 +240,10 @@ def _links_lost_after_mission(s: Situation) -> bool:
     )
 
 
-def _in_first(s: Situation, seconds: float) -> bool:
-    return s.armed_us is not None and s.time_us < s.armed_us + seconds * US_PER_S
-
-
-def _spooling(s: Situation) -> bool:
-    return _in_first(s, s.settings.com_spoolup_time)
-
-
 def _taking_off(s: Situation) -> bool:
-    return _in_first(s, s.settings.com_lkdown_tko + s.settings.com_spoolup_time)
+    """Return whether COM_SPOOLUP_TIME + COM_LKDOWN_TKO after arming are not over."""
+    limit_s = s.settings.com_lkdown_tko + s.settings.com_spoolup_time
+    return s.armed_us is not None and s.time_us < s.armed_us + limit_s * US_PER_S
 
 
 def _terminates(s: Situation) -> bool:
@@ -308,29 +300,12 @@ TABLE: tuple[Row, ...] = (
         related=("COM_DL_LOSS_T",),
     ),
     Row(
-        Trigger.MISSION,
-        "Mission cannot be completed",
-        "the mission has become infeasible, in Mission",
-        lambda s: s.intended is Mode.MISSION and s.conditions.mission_failure,
-        {0: Options(FailsafeAction.RTL)},
-    ),
-    Row(
         Trigger.MISSION_WITHOUT_LINKS,
         "No link after the mission",
         "the mission is finished, the ground station lost and NAV_DLL_ACT 0, manual control unused",
         _links_lost_after_mission,
         {0: Options(FailsafeAction.RTL)},
         related=("NAV_DLL_ACT", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
-    ),
-    Row(
-        Trigger.WIND,
-        "Wind above its limit",
-        "the estimated wind exceeds its limit",
-        lambda s: s.conditions.wind_limit_exceeded,
-        _LIMITS,
-        "COM_WIND_MAX_ACT",
-        Options(FailsafeAction.WARN),
-        related=("COM_WIND_MAX",),
     ),
     Row(
         Trigger.FLIGHT_TIME,
@@ -353,20 +328,6 @@ TABLE: tuple[Row, ...] = (
         related=("COM_POS_LOW_EPH",),
     ),
     Row(
-        Trigger.NAVIGATOR,
-        "Mode failed in Takeoff or Return",
-        "what the mode flies to cannot be reached",
-        lambda s: s.conditions.navigator_failure and s.intended in (Mode.TAKEOFF, Mode.RETURN),
-        {0: _LAND},
-    ),
-    Row(
-        Trigger.NAVIGATOR,
-        "Mode failed otherwise",
-        "what the mode flies to cannot be reached",
-        lambda s: s.conditions.navigator_failure and s.intended not in (Mode.TAKEOFF, Mode.RETURN),
-        {0: _LASTING_HOLD},
-    ),
-    Row(
         Trigger.GEOFENCE,
         "Geofence breached",
         "too far from home, too high above it, or outside the uploaded fence",
@@ -384,20 +345,6 @@ TABLE: tuple[Row, ...] = (
         _caused({0: _NONE, 1: _WARN, 3: _RETURN}, FailsafeCause.LOW_REMAINING_FLIGHT_TIME),
         "COM_FLTT_LOW_ACT",
         related=("BAT1_CAPACITY", "RTL_TIME_FACTOR", "RTL_TIME_MARGIN"),
-    ),
-    Row(
-        Trigger.BATTERY_UNHEALTHY,
-        "Battery unhealthy at arming",
-        "the battery reports nothing, within COM_SPOOLUP_TIME of arming",
-        lambda s: s.conditions.battery_unhealthy and _spooling(s),
-        {0: Options(FailsafeAction.DISARM)},
-    ),
-    Row(
-        Trigger.BATTERY_UNHEALTHY,
-        "Battery unhealthy",
-        "the battery reports nothing for 5 s",
-        lambda s: s.conditions.battery_unhealthy and not _spooling(s),
-        {0: _WARN},
     ),
     _battery_row(
         Trigger.BATTERY_LOW,
@@ -443,15 +390,6 @@ TABLE: tuple[Row, ...] = (
         lambda s: s.conditions.fd_critical_failure and not _taking_off(s) and not _terminates(s),
         {0: _WARN},
         related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "CBRK_FLIGHTTERM"),
-    ),
-    Row(
-        Trigger.PROPELLER,
-        "Imbalanced propeller",
-        "the vibration exceeds its limit",
-        lambda s: s.conditions.fd_imbalanced_prop,
-        {-1: _NONE, 0: _WARN, 1: _RETURN, 2: _LAND},
-        "COM_IMB_PROP_ACT",
-        related=("FD_IMB_PROP_THR",),
     ),
     Row(
         Trigger.MOTOR,

@@ -90,14 +90,6 @@ def announcement(
     return OperatorText(Severity.CRITICAL, text, event)
 
 
-class FailsafeInput(NamedTuple):
-    """Flight state used by the failsafes."""
-
-    armed: bool
-    intended: Mode
-    mission_finished: bool = False
-
-
 class Intervention(NamedTuple):
     """User actions since the last update."""
 
@@ -171,45 +163,37 @@ class _Choice(NamedTuple):
 
 
 def update(
-    state: FailsafeState,
-    time_us: int,
-    vehicle: FailsafeInput,
-    conditions: Conditions,
-    settings: FailsafeSettings,
-    intervention: Intervention = NO_INTERVENTION,
+    state: FailsafeState, now: Situation, intervention: Intervention = NO_INTERVENTION
 ) -> FailsafeResult:
     """Return the active mode and action.
 
     Args:
         state: State after the last update; a new one after boot.
-        time_us: Simulated time, not decreasing [µs].
-        vehicle: State of the vehicle, and the intended mode.
-        conditions: Current failures.
-        settings: Parameters.
+        now: Current situation. Its time must not decrease; the state has the data of arming.
         intervention: User actions since the last update.
     """
-    elapsed_us = 0 if state.time_us is None else time_us - state.time_us
+    elapsed_us = 0 if state.time_us is None else now.time_us - state.time_us
     # A changed intended mode is a selection, too.
     chosen = intervention.mode_chosen or (
-        state.intended is not None and state.intended is not vehicle.intended
+        state.intended is not None and state.intended is not now.intended
     )
-    state = _begin(state, time_us, elapsed_us, vehicle, conditions)
+    state = _begin(state, now, elapsed_us)
     # Arming and disarming end actions that last until a mode change.
-    if state.armed is not vehicle.armed:
+    if state.armed is not now.armed:
         state = state._replace(held=_released(state.held), taken_over=False)
     if chosen or state.taken_over:
         state = state._replace(held=_released(state.held))
-    state, warned = _hold(state, time_us, vehicle, conditions, settings)
+    state, warned = _hold(state, now)
     # No delay without Hold: a stronger action, a takeover, or Hold is impossible.
-    if state.action > FailsafeAction.HOLD or state.taken_over or not can_run(Mode.HOLD, conditions):
+    stronger = state.action > FailsafeAction.HOLD
+    if stronger or state.taken_over or not can_run(Mode.HOLD, now.conditions):
         state = state._replace(delay_us=0)
-    intervention = intervention._replace(mode_chosen=chosen)
-    choice = _select(state, vehicle, conditions, settings, intervention)
+    choice = _select(state, now, intervention._replace(mode_chosen=chosen))
     text = None
     # Announce stronger actions, and new warnings of an unchanged action.
     if choice.action > state.action or (choice.action is not FailsafeAction.NONE and warned):
         text = announcement(
-            choice.action, choice.delayed, choice.cause, vehicle.intended, state.delay_us
+            choice.action, choice.delayed, choice.cause, now.intended, state.delay_us
         )
     intended = choice.intended
     if state.active and mode_of(choice.action, intended) is Mode.ORBIT:
@@ -217,38 +201,30 @@ def update(
     state = state._replace(
         action=choice.action,
         taken_over=choice.taken_over,
-        time_us=time_us,
-        armed=vehicle.armed,
+        time_us=now.time_us,
+        armed=now.armed,
         intended=intended,
-        start_delay_us=_start_delay(state, settings, elapsed_us, choice.delayed),
+        start_delay_us=_start_delay(state, now.settings, elapsed_us, choice.delayed),
     )
     mode = mode_of(choice.action, intended)
     return FailsafeResult(state, mode, intended, text, choice.delayed, choice.cause)
 
 
-def _begin(
-    state: FailsafeState,
-    time_us: int,
-    elapsed_us: int,
-    vehicle: FailsafeInput,
-    conditions: Conditions,
-) -> FailsafeState:
+def _begin(state: FailsafeState, now: Situation, elapsed_us: int) -> FailsafeState:
     """Advance the delays, and store the failures present at arming."""
     state = state._replace(delay_us=max(0, state.delay_us - elapsed_us))
-    lost = conditions.manual_control_signal_lost
-    if vehicle.armed and not state.armed:
+    lost = now.conditions.manual_control_signal_lost
+    if now.armed and not state.armed:
         state = state._replace(
-            armed_us=time_us,
+            armed_us=now.time_us,
             manual_control_lost_at_arming=lost,
-            battery_at_arming=conditions.battery_warning,
+            battery_at_arming=now.conditions.battery_warning,
         )
-    elif not vehicle.armed:
+    elif not now.armed:
         # Nothing is added while disarmed.
         state = state._replace(armed_us=None, manual_control_lost_at_arming=lost)
     # Manual control that returns is required from then on.
-    if not lost:
-        state = state._replace(manual_control_lost_at_arming=False)
-    return state
+    return state if lost else state._replace(manual_control_lost_at_arming=False)
 
 
 def _released(held: tuple[Held, ...]) -> tuple[Held, ...]:
@@ -256,42 +232,31 @@ def _released(held: tuple[Held, ...]) -> tuple[Held, ...]:
     return tuple(h for h in held if h.failing or h.options.clear is not Clear.ON_MODE_CHANGE)
 
 
-def _hold(
-    state: FailsafeState,
-    time_us: int,
-    vehicle: FailsafeInput,
-    conditions: Conditions,
-    settings: FailsafeSettings,
-) -> tuple[FailsafeState, bool]:
+def _hold(state: FailsafeState, now: Situation) -> tuple[FailsafeState, bool]:
     """Add new failures, drop cleared ones; return also whether a warning is new."""
-    situation = Situation(
-        time_us,
-        conditions,
-        settings,
-        vehicle.intended,
-        vehicle.mission_finished,
-        state.armed_us,
-        state.manual_control_lost_at_arming,
-        state.battery_at_arming,
+    now = now._replace(
+        armed_us=state.armed_us,
+        manual_control_lost_at_arming=state.manual_control_lost_at_arming,
+        battery_at_arming=state.battery_at_arming,
     )
     # One action per trigger; rows of one trigger exclude each other.
-    failing = dict(answers(situation))
+    failing = dict(answers(now))
     held: list[Held] = []
     for item in state.held:
-        now = failing.pop(item.trigger, None)
-        if now is not None:
+        answer = failing.pop(item.trigger, None)
+        if answer is not None:
             # The action may change; end condition and takeover rule stay.
-            held.append(Held(item.trigger, item.options._replace(action=now.action), True))
+            held.append(Held(item.trigger, item.options._replace(action=answer.action), True))
         elif item.options.clear is not Clear.WITH_CONDITION:
             held.append(item._replace(failing=False))
     warned = False
     # COM_FAIL_ACT_T up to 0.1 s means no delay, as in PX4.
-    waits = settings.com_fail_act_t > 0.1
+    waits = now.settings.com_fail_act_t > 0.1
     delay_us = state.delay_us
     for trigger, options in failing.items():
         if options.takeover is Takeover.AUTO:
             if waits and options.action is not FailsafeAction.WARN and delay_us == 0:
-                delay_us = _next_delay(state, settings)
+                delay_us = _next_delay(state, now.settings)
             takeover = Takeover.ALWAYS if waits else Takeover.MODE_SWITCH
             options = options._replace(takeover=takeover)
         held.append(Held(trigger, options, True))
@@ -311,26 +276,20 @@ def _start_delay(
     state: FailsafeState, settings: FailsafeSettings, elapsed_us: int, delayed: FailsafeAction
 ) -> int | None:
     """Return the duration of the next delay: an intermittent condition shortens it."""
-    left = _next_delay(state, settings)
+    remaining = _next_delay(state, settings)
     if delayed is not FailsafeAction.NONE:
-        return max(0, left - elapsed_us)
+        return max(0, remaining - elapsed_us)
     # Used delay does not return at once: it recovers at a quarter of real time.
-    left += elapsed_us // 4
-    return None if left >= settings.com_fail_act_t * US_PER_S else left
+    remaining += elapsed_us // 4
+    return None if remaining >= settings.com_fail_act_t * US_PER_S else remaining
 
 
-def _select(
-    state: FailsafeState,
-    vehicle: FailsafeInput,
-    conditions: Conditions,
-    settings: FailsafeSettings,
-    intervention: Intervention,
-) -> _Choice:
+def _select(state: FailsafeState, now: Situation, intervention: Intervention) -> _Choice:
     # Termination is final.
     if state.action is FailsafeAction.TERMINATE:
-        return _Choice(FailsafeAction.TERMINATE, vehicle.intended)
-    if not vehicle.armed:
-        return _Choice(FailsafeAction.NONE, vehicle.intended)
+        return _Choice(FailsafeAction.TERMINATE, now.intended)
+    if not now.armed:
+        return _Choice(FailsafeAction.NONE, now.intended)
     # Highest action and strictest takeover rule of all held failsafes.
     worst = Options(FailsafeAction.NONE, takeover=Takeover.ALWAYS)
     strictest = Takeover.ALWAYS
@@ -338,7 +297,7 @@ def _select(
         strictest = max(strictest, item.options.takeover)
         if item.options.action > worst.action:
             worst = item.options
-    action, cause, intended = worst.action, worst.cause, vehicle.intended
+    action, cause, intended = worst.action, worst.cause, now.intended
     delayed = FailsafeAction.NONE
     # During the delay the vehicle waits in Hold, and any mode selection takes over.
     if (
@@ -350,25 +309,25 @@ def _select(
         delayed, action, strictest = action, FailsafeAction.HOLD, Takeover.MODE_SWITCH
     # A mode switch in the update that starts the action does not end the action.
     by_mode = intervention.mode_chosen and state.action is action
-    wanted = state.taken_over or by_mode
+    takes_over = state.taken_over or by_mode
     if strictest is Takeover.ALWAYS:
-        wanted = wanted or intervention.sticks_moved
+        takes_over = takes_over or intervention.sticks_moved
     taken_over = False
     if (
         FailsafeAction.HOLD <= action <= FailsafeAction.DESCEND
         and strictest < Takeover.AUTO
-        and wanted
+        and takes_over
     ):
         # Sticks take over into Position; a mode selection keeps the selected mode.
         if not state.taken_over and intervention.sticks_moved:
             intended = Mode.POSITION
         action, taken_over, delayed = FailsafeAction.WARN, True, FailsafeAction.NONE
         # The user's mode may be impossible: then its fallback acts.
-        action = max(action, mode_fallback(conditions, settings, intended))
-    possible_now = possible(action, conditions)
+        action = max(action, mode_fallback(now.conditions, now.settings, intended))
+    possible_now = possible(action, now.conditions)
     if possible_now is not action:
         action, cause = possible_now, _GENERIC
-    if _already_on_the_way(intended, action, delayed, conditions):
+    if _already_on_the_way(intended, action, delayed, now.conditions):
         action, delayed = FailsafeAction.WARN, FailsafeAction.NONE
     return _Choice(action, intended, delayed, cause, taken_over)
 

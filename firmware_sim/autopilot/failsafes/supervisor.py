@@ -23,10 +23,11 @@ from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     Conditions,
     FailsafeSettings,
     lacking,
+    read_settings,
 )
+from firmware_sim.autopilot.failsafes.failsafe_table import Situation
 from firmware_sim.autopilot.failsafes.framework import (
     NO_INTERVENTION,
-    FailsafeInput,
     FailsafeState,
     Intervention,
     update,
@@ -62,7 +63,7 @@ class Supervisor:
         self,
         value: Callable[[str], float],
         estimator: Estimator,
-        tell: Callable[[MavlinkEvent], None] = lambda _event: None,
+        send_event: Callable[[MavlinkEvent], None] = lambda _event: None,
     ) -> None:
         """Store the look-up for PX4 parameters, the estimator and the event callback."""
         self._value = value
@@ -84,14 +85,14 @@ class Supervisor:
         self._armable = False
         self._state = FailsafeState()
         self._decided: tuple[object, ...] = ()
-        self._told: tuple[PrearmCheck, ...] | None = None
+        self._reported: tuple[PrearmCheck, ...] | None = None
         """Checks reported as failing; None: reporting starts when the vehicle is ready."""
-        self._told_us = 0
-        self._tell = tell
+        self._reported_us = 0
+        self._send_event = send_event
         self._pilot_us: int | None = None
         """Time of the newest pilot input at the last check with a pilot [µs]."""
-        self._reporter = HealthReporter(tell)
-        self._asked = False
+        self._reporter = HealthReporter(send_event)
+        self._report_requested = False
         """True if a report of all failing checks is requested."""
         self._check_us = 0
         self._checked = FlightPhase.BOOT
@@ -103,8 +104,10 @@ class Supervisor:
     def read_parameters(self) -> None:
         """Read the parameters again."""
         self.watch.read_parameters()
-        self._settings = FailsafeSettings.read(self._value)
-        self._arming = ArmingSettings.read(self._value)
+        self._settings = FailsafeSettings(
+            *read_settings(FailsafeSettings._field_defaults, self._value)
+        )
+        self._arming = ArmingSettings(*read_settings(ArmingSettings._field_defaults, self._value))
         # Changed limits may change every result.
         self.next_us, self._calm_flight = 0, None
 
@@ -125,7 +128,7 @@ class Supervisor:
 
     def tell_checks(self) -> None:
         """Report all failing checks at the next check, including reported ones."""
-        self._asked, self.next_us, self._check_us, self._calm_flight = True, 0, 0, None
+        self._report_requested, self.next_us, self._check_us, self._calm_flight = True, 0, 0, None
 
     # --- looking
 
@@ -149,7 +152,7 @@ class Supervisor:
         self.next_us = now_us + LOOK_US
         before = self.conditions
         self.conditions, texts = self.watch.look(sample, flight.phase)
-        self._tell_of_pilot(now_us, was_lost=before.manual_control_signal_lost)
+        self._report_pilot(now_us, was_lost=before.manual_control_signal_lost)
         # Arming rules depend on the phase.
         changed = self.conditions != before or flight.phase is not self._checked
         if now_us >= self._check_us or changed:
@@ -160,19 +163,23 @@ class Supervisor:
                 self.changes += 1
                 self._ready, self.failing = readiness, prearm.failing(readiness)
                 self._armable = not prearm.blocking(self.failing, readiness)
-            self._reporter.update(readiness, now_us, force=self._asked)
+            self._reporter.update(readiness, now_us, force=self._report_requested)
             texts += self._report(now_us, flight)
-        told = self.failing == self._told and not self._asked and self._reporter.is_told
-        calm = told and not changed and self.watch.is_calm
+        all_reported = (
+            self.failing == self._reported and not self._report_requested and self._reporter.is_sent
+        )
+        calm = all_reported and not changed and self.watch.is_calm
         self._calm_flight = flight if calm else None
         return texts
 
-    def _tell_of_pilot(self, now_us: int, *, was_lost: bool) -> None:
+    def _report_pilot(self, now_us: int, *, was_lost: bool) -> None:
         """Report that pilot input was lost or regained; PX4 has no text for it."""
         lost, heard_us = self.conditions.manual_control_signal_lost, self._pilot_us
         if lost is not was_lost and heard_us is not None:
             silent_s = (now_us - heard_us) / US_PER_S
-            self._tell(events.PILOT_LOST.event() if lost else events.PILOT_REGAINED.event(silent_s))
+            self._send_event(
+                events.PILOT_LOST.event() if lost else events.PILOT_REGAINED.event(silent_s)
+            )
         if not lost:
             self._pilot_us = now_us
 
@@ -210,7 +217,7 @@ class Supervisor:
             position=not seen.local_position_invalid,
             altitude=not seen.local_altitude_invalid,
             accel_error=self._estimator.recovery.doubts_inertial(now_us),
-            battery=seen.battery_warning < BatteryWarning.CRITICAL and not seen.battery_unhealthy,
+            battery=seen.battery_warning < BatteryWarning.CRITICAL,
             armable=self._armable,
         )
 
@@ -224,18 +231,18 @@ class Supervisor:
     def _report(self, now_us: int, flight: CommanderState) -> list[OperatorText]:
         """Return the newly failing checks once the vehicle has been ready."""
         # During boot any check may fail: reporting starts when the vehicle is ready.
-        if self._told is None:
+        if self._reported is None:
             if flight.phase is FlightPhase.BOOT:
-                self._asked = False
+                self._report_requested = False
                 return []
-            self._told = ()
-        unchanged = self.failing == self._told or now_us < self._told_us + REPORT_US
-        if unchanged and not self._asked:
+            self._reported = ()
+        unchanged = self.failing == self._reported or now_us < self._reported_us + REPORT_US
+        if unchanged and not self._report_requested:
             return []
         # A requested report repeats known checks.
-        known = () if self._asked else self._told
-        new = [check for check in self.failing if check.said and check not in known]
-        self._told, self._told_us, self._asked = self.failing, now_us, False
+        reported = () if self._report_requested else self._reported
+        new = [check for check in self.failing if check.announced and check not in reported]
+        self._reported, self._reported_us, self._report_requested = self.failing, now_us, False
         return [OperatorText(check.severity, check.text) for check in new]
 
     # --- arming and modes
@@ -262,13 +269,15 @@ class Supervisor:
         seen = (self.conditions, armed, flight.intended, finished, self._settings)
         # Time-dependent inputs: delays, and rows with a time limit after arming.
         waiting = state.delay_us > 0 or state.start_delay_us is not None
-        timed = self.conditions.fd_critical_failure or self.conditions.battery_unhealthy
+        timed = self.conditions.fd_critical_failure
         idle = not (waiting or timed or state.taken_over)
         if idle and seen == self._decided and intervention == NO_INTERVENTION:
             return None
         self._decided = seen
-        vehicle = FailsafeInput(armed, flight.intended, finished)
-        outcome = update(state, time_us, vehicle, self.conditions, self._settings, intervention)
+        now = Situation(
+            time_us, self.conditions, self._settings, flight.intended, finished, armed=armed
+        )
+        outcome = update(state, now, intervention)
         self._state = outcome.state
         action = outcome.state.action
         followed = replace(

@@ -32,17 +32,10 @@ from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
     Conditions,
     FenceBreach,
+    read_settings,
 )
 from firmware_sim.autopilot.sensor_monitor import CALM_US, SensorMonitor
-from firmware_sim.engine.record import (
-    ACCEL_ROW,
-    CHANGED,
-    GYRO_ROW,
-    MAG_ROW,
-    SEEN,
-    WATCHES,
-    Record,
-)
+from firmware_sim.engine.record import ACCEL_ROW, CHANGED, GYRO_ROW, MAG_ROW, SEEN, WATCHES, Record
 from firmware_sim.interfaces import BatterySample, SensorSample
 
 _GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR
@@ -99,11 +92,7 @@ class Reports:
     fence: FenceBreach = NO_BREACH
     mission_missing: bool = True
     """True if no feasible mission is stored."""
-    mission_failure: bool = False
-    """True if the active mission has become infeasible."""
     mission_finished: bool = False
-    navigator_failure: bool = False
-    """True if the mode's destination cannot be reached."""
     return_time_s: float = 0.0
     """Duration of a return including margins [s]; 0 = unknown."""
 
@@ -132,11 +121,6 @@ class WatchSettings(NamedTuple):
     fd_fail_p_ttri: float = 0.3
     fd_fail_r: float = 60.0
     fd_fail_r_ttri: float = 0.3
-
-    @classmethod
-    def read(cls, value: Callable[[str], float]) -> WatchSettings:
-        """Read the parameters with a look-up by PX4 name."""
-        return cls(*(value(name.upper()) for name in cls._fields))
 
 
 class Watch:
@@ -174,7 +158,9 @@ class Watch:
 
     def read_parameters(self) -> None:
         """Read the parameters again."""
-        self.settings = p = WatchSettings.read(self._value)
+        self.settings = p = WatchSettings(
+            *read_settings(WatchSettings._field_defaults, self._value)
+        )
         self._calm = None
         # 0 disables the check: no limit.
         tilts = (math.radians(abs(d)) or math.inf for d in (p.fd_fail_r, p.fd_fail_p))
@@ -214,12 +200,12 @@ class Watch:
         by_position = not math.isnan(setpoint.position[0])
         return not (self._local if by_position else self._velocity).valid
 
-    def hear_escs(self, time_us: int, told: Motors, outputs: Motors) -> None:
+    def hear_escs(self, time_us: int, commands: Motors, outputs: Motors) -> None:
         """Check the motor outputs reported by the speed controllers against the commands."""
         p = self.settings
         if p.fd_act_en:
             limits = Undercurrent(p.fd_act_mot_thr, p.fd_act_mot_c2t, p.fd_act_mot_tout)
-            self.motors.take(time_us, told, outputs, limits)
+            self.motors.take(time_us, commands, outputs, limits)
 
     def look(
         self, sample: SensorSample, phase: FlightPhase
@@ -257,8 +243,8 @@ class Watch:
             setpoint_us is None or now_us - setpoint_us > p.com_of_loss_t * US_PER_S,
             manual_us is None or now_us - manual_us > p.com_rc_loss_t * US_PER_S,
             gcs_us is None or now_us - gcs_us > p.com_dl_loss_t * US_PER_S,
-            *(reports.fence, reports.mission_missing, reports.mission_failure),
-            *(reports.navigator_failure, self.motors.failed, recovery.compass.given_up),
+            *(reports.fence, reports.mission_missing),
+            *(self.motors.failed, recovery.compass.given_up),
             *(recovery.consistency.restarts, self._estimator.compiled),
             not self._armed and self._estimator.field_disturbed,
         )
@@ -329,8 +315,6 @@ class Watch:
             battery_warning=self._battery,
             battery_low_remaining_time=self._lasts_too_short(sample, armed=armed),
             geofence=reports.fence,
-            mission_failure=reports.mission_failure,
-            navigator_failure=reports.navigator_failure,
             flight_time_limit_exceeded=long_flight,
             fd_critical_failure=self.attitude.update(
                 now_us,
@@ -386,9 +370,13 @@ class Watch:
 
     def _charge(self, battery: BatterySample, *, armed: bool) -> BatteryWarning:
         """Return the battery warning level, which cannot decrease while armed."""
-        p, left = self.settings, battery.remaining
+        p, remaining = self.settings, battery.remaining
         # The levels are nested: each limit passed adds one.
-        below = (left < p.bat_low_thr) + (left < p.bat_crit_thr) + (left < p.bat_emergen_thr)
+        below = (
+            (remaining < p.bat_low_thr)
+            + (remaining < p.bat_crit_thr)
+            + (remaining < p.bat_emergen_thr)
+        )
         warning = _WARNINGS[below]
         return max(warning, self._battery) if armed else warning
 

@@ -215,11 +215,13 @@ class Hold(FlightMode, modes=(Mode.HOLD,)):
         request stops the vehicle.
         """
         place, before = request.place, self._place
-        held = before.position if not self._braking else stopping_place(state, self._context.value)
+        origin = (
+            before.position if not self._braking else stopping_place(state, self._context.value)
+        )
         now = triple(state, P)
         north, east, down = place.position
         if math.isnan(north) or math.isnan(east):
-            north, east = held[0], held[1]
+            north, east = origin[0], origin[1]
         if math.isnan(down):
             down = now[2]
         self._place = PositionYaw((north, east, down), place.yaw)

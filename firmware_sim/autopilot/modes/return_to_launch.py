@@ -20,12 +20,7 @@ from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import ModeRequest, PositionYaw, PrecisionRequest
 from firmware_sim.autopilot.modes.automatic import landing_speed
-from firmware_sim.autopilot.modes.interface import (
-    FlightContext,
-    FlightMode,
-    here,
-    optional_mode,
-)
+from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, optional_mode
 from firmware_sim.autopilot.smooth_trajectory import PathSegment, triple
 
 _REQUIRED = 2
@@ -145,13 +140,13 @@ class ReturnToLaunch(FlightMode, modes=(Mode.RETURN,)):
     def _land(self, state: Vector) -> None:
         """Land, on a landing target if RTL_PLD_MD requires it."""
         self._stage = _Stage.LAND
-        asked = round(self._context.value("RTL_PLD_MD"))
-        if asked > 0 and self._precision is not None:
+        option = round(self._context.value("RTL_PLD_MD"))
+        if option > 0 and self._precision is not None:
             north, east, down = *self._home.position[:2], state.item(P + 2)
-            request = PrecisionRequest((north, east, down), required=asked == _REQUIRED)
+            request = PrecisionRequest((north, east, down), required=option == _REQUIRED)
             self._precision.enter(state, request)
             self._instead = self._precision
-        elif asked > 0:
+        elif option > 0:
             text = "RTL_PLD_MD has no effect without the add-on extra_modes"
             self._context.say(OperatorText(Severity.CRITICAL, text))
         self._context.say(OperatorText.of(Severity.INFO, events.RTL_LAND))
@@ -182,13 +177,13 @@ def return_height(value: Callable[[str], float], height_m: float, away_m: float)
     if angle <= 0.0:
         return max(height_m, highest)
     if away_m <= radius:
-        wanted = 2.0 * away_m
+        target_m = 2.0 * away_m
     else:
-        wanted = highest
+        target_m = highest
         if away_m <= value("RTL_MIN_DIST"):
-            wanted = min(highest, away_m / math.tan(min(89.0, max(1.0, angle)) * DEG))
-        wanted = max(wanted, 2.0 * radius)
-    return max(height_m, min(wanted, highest))
+            target_m = min(highest, away_m / math.tan(min(89.0, max(1.0, angle)) * DEG))
+        target_m = max(target_m, 2.0 * radius)
+    return max(height_m, min(target_m, highest))
 
 
 def return_time_s(value: Callable[[str], float], height_m: float, away_m: float) -> float:

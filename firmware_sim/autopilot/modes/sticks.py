@@ -19,13 +19,7 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import ModeRequest, Sticks
-from firmware_sim.autopilot.modes.interface import (
-    NAN,
-    FlightContext,
-    FlightMode,
-    descend,
-    since,
-)
+from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, descend, since
 from firmware_sim.autopilot.smooth_trajectory import Axis, triple
 
 _TURNS_RAD_S = 1e-3
@@ -81,8 +75,8 @@ class YawStick:
         """Return the heading [rad], NaN while turning, and the yaw rate [rad/s]."""
         value = self._value
         shaped = expo(deadzone(stick, value("MPC_HOLD_DZ")), value("MPC_YAW_EXPO"))
-        wanted = shaped * value("MPC_MAN_Y_MAX") * DEG
-        self._rate += (wanted - self._rate) * dt / (dt + value("MPC_MAN_Y_TAU"))
+        target = shaped * value("MPC_MAN_Y_MAX") * DEG
+        self._rate += (target - self._rate) * dt / (dt + value("MPC_MAN_Y_TAU"))
         if abs(self._rate) > _TURNS_RAD_S:
             self._held = NAN
         elif math.isnan(self._held):
@@ -107,17 +101,17 @@ class VerticalStick:
         """Return the demand, NED, from measured `down` and `height` above home [m]."""
         value, axis = self._value, self._axis
         shaped = expo(deadzone(stick, value("MPC_HOLD_DZ")), value("MPC_Z_MAN_EXPO"))
-        wanted = self._speed(shaped, height)
+        target = self._speed(shaped, height)
         axis.advance(dt)
         resting = abs(axis.velocity) < _AT_REST_M_S and abs(axis.acceleration) < _AT_REST_M_S2
-        if resting and wanted == 0.0:
+        if resting and target == 0.0:
             if math.isnan(self._held):
                 self._held = axis.position
         else:
             self._held = NAN
             axis.position = down
-        limit = value("MPC_ACC_UP_MAX") if wanted < 0.0 else value("MPC_ACC_DOWN_MAX")
-        axis.plan(wanted, limit, value("MPC_JERK_MAX"))
+        limit = value("MPC_ACC_UP_MAX") if target < 0.0 else value("MPC_ACC_DOWN_MAX")
+        axis.plan(target, limit, value("MPC_JERK_MAX"))
         return AxisDemand(self._held, axis.velocity, axis.acceleration)
 
     def put(self, down: float) -> float:
@@ -175,15 +169,15 @@ class HorizontalStick:
         boost = max(2.0, math.sqrt(speed)) if released else 1.0
         self._boost += (boost - self._boost) * dt / (dt + _BOOST_TAU_S)
         drag = [force / speed * self._boost * v for v in self._dragged()]
-        wanted = north * force, east * force
+        target = north * force, east * force
         if constrain is not None:
-            wanted = constrain(wanted, self._velocity)
-            released = wanted == (0.0, 0.0)
+            target = constrain(target, self._velocity)
+            released = target == (0.0, 0.0)
         before = self._acceleration
-        reversing = any(w * b < 0.0 for w, b in zip(wanted, before, strict=True))
+        reversing = any(w * b < 0.0 for w, b in zip(target, before, strict=True))
         if (released or reversing) and math.hypot(*self._velocity) < math.hypot(*drag) * dt:
             drag, self._velocity = [0.0, 0.0], (0.0, 0.0)
-        self._acceleration = self._limited([w - d for w, d in zip(wanted, drag, strict=True)], dt)
+        self._acceleration = self._limited([w - d for w, d in zip(target, drag, strict=True)], dt)
         vn, ve = (v + a * dt for v, a in zip(self._velocity, self._acceleration, strict=True))
         if released and math.hypot(vn, ve) < 1e-3:
             vn, ve = 0.0, 0.0
@@ -221,10 +215,10 @@ class HorizontalStick:
         share = braking * max(1.0, 1.0 / math.sqrt(speed)) + 1.0 - braking
         return vn * share, ve * share
 
-    def _limited(self, wanted: list[float], dt: float) -> tuple[float, float]:
+    def _limited(self, target: list[float], dt: float) -> tuple[float, float]:
         """Return an acceleration with limited jerk and tilt."""
         value, (bn, be) = self._value, self._acceleration
-        dn, de = wanted[0] - bn, wanted[1] - be
+        dn, de = target[0] - bn, target[1] - be
         step, most = math.hypot(dn, de), value("MPC_JERK_MAX") * dt
         share = 1.0 if step <= most else most / step
         north, east = bn + dn * share, be + de * share
@@ -281,12 +275,12 @@ class TerrainHold:
             return held
         if now.resets != self._resets:
             self._resets, self.locked_m = now.resets, NAN
-        known, limit = math.isfinite(now.ground_m), self._value("MPC_HOLD_MAX_XY")
+        is_known, limit = math.isfinite(now.ground_m), self._value("MPC_HOLD_MAX_XY")
         deflected = now.level > _DEFLECTED
         if self.holds:
-            if deflected or now.speed_m_s > limit or not known:
+            if deflected or now.speed_m_s > limit or not is_known:
                 self.holds = False
-        elif not deflected and now.speed_m_s < 0.5 * limit and known:
+        elif not deflected and now.speed_m_s < 0.5 * limit and is_known:
             self.holds = True
             if math.isfinite(held):
                 # Keep the height error.

@@ -220,7 +220,7 @@ class FenceMonitor:
         """Load a new fence, without areas that home or the flying vehicle violates."""
         fence = self._plans.stored(MissionType.FENCE)
         self._revision = fence.revision
-        kept = []
+        accepted = []
         for area in areas(fence.items):
             flying = not now.landed and self._value("GF_ACTION") > 0.0
             if not allows(area, now.home):
@@ -228,8 +228,8 @@ class FenceMonitor:
             elif flying and not allows(area, place()):
                 self._refuse(events.FENCE_WITHOUT_VEHICLE)
             else:
-                kept.append(area)
-        self._areas = tuple(kept)
+                accepted.append(area)
+        self._areas = tuple(accepted)
 
     def _refuse(self, why: Definition) -> None:
         self._say(OperatorText.of(Severity.CRITICAL, why))

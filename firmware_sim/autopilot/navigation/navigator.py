@@ -69,11 +69,11 @@ class Navigator:
 
         As in PX4, any place is allowed unless GF_ACTION is stronger than a warning.
         """
-        kept = round(self._value("GF_ACTION")) > _WARN
-        if now is None or not kept or not isinstance(request, Reposition):
+        enforced = round(self._value("GF_ACTION")) > _WARN
+        if now is None or not enforced or not isinstance(request, Reposition):
             return request
-        wanted = zip(request.place.position, now.position, strict=True)
-        there = [here if math.isnan(axis) else axis for axis, here in wanted]
+        axes = zip(request.place.position, now.position, strict=True)
+        there = [here if math.isnan(axis) else axis for axis, here in axes]
         if self.fence.inside(local_to_geodetic(np.array(there), now.origin), now.home):
             return request
         why = events.ALTITUDE_OUTSIDE if request.altitude_alone else events.REPOSITION_OUTSIDE

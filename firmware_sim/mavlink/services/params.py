@@ -9,7 +9,7 @@ import struct
 from firmware_sim.autopilot.autopilot_state import Arming, Result
 from firmware_sim.autopilot.port import ParameterStore, ParameterValue
 from firmware_sim.mavlink.codec import WireMessage, crc32part, dialect, param_value, payload
-from firmware_sim.mavlink.services.context import (
+from firmware_sim.mavlink.services import (
     Action,
     Context,
     Handlers,
@@ -153,15 +153,15 @@ def _store(command: VehicleCommand, context: Context) -> Result | None:
     if context.port.state().status.arming is Arming.ARMED:
         return Result.TEMPORARILY_REJECTED
     parameters = context.port.parameters
-    asked = command.integer(1)
+    action = command.integer(1)
     # Both resets restore the defaults.
-    if asked in (_RESET, _FACTORY_RESET):
+    if action in (_RESET, _FACTORY_RESET):
         parameters.reset()
-    elif asked == _LOAD:
+    elif action == _LOAD:
         return Result.ACCEPTED if parameters.load() else Result.FAILED
-    elif asked == _SAVE:
+    elif action == _SAVE:
         return Result.ACCEPTED if parameters.save() else Result.FAILED
-    elif asked != _RESET_SENSORS:  # sensors have no calibration to reset
+    elif action != _RESET_SENSORS:  # sensors have no calibration to reset
         return None
     return Result.ACCEPTED
 
