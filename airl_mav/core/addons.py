@@ -22,6 +22,7 @@ In `companion.addons`:
 In `firmware_sim.addons`:
 
     FIRMWARE: {value of `--firmware`: `firmware_sim.external.programs.FirmwareKind`}
+    BODIES: {value of `--plant`: class of the vehicle's `plant.body.PlantBody`}
     AIDING: {any name: class of the `estimator.Aiding` that fuses further sensors}
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
     SENSORS: {name in `profiles.vehicle.Sensors`: its `sensor_table.Sensor`}
