@@ -71,10 +71,8 @@ class ExternalVision:
     def __init__(self, estimator: Estimator, judge: Callable[[Vector, Vector], float]) -> None:
         """Start without odometry.
 
-        Args:
-            estimator: Its state and covariance are corrected or reset.
-            judge: Checks the innovation (3,) and variance (3,) of a velocity, restarts the filter
-                upon an inertial sensor fault, and returns the ratio of measured to stated variance.
+        `judge` checks the innovation (3,) and variance (3,) of a velocity, restarts the filter upon
+        an inertial sensor fault, and returns the ratio of measured to stated variance.
         """
         self._estimator, self._judge = estimator, judge
         self._value, self._state, self._fuse = estimator.value, estimator.state, estimator.fuse
@@ -102,14 +100,7 @@ class ExternalVision:
         """Callback with the downward shift [m] of a height reset to vision."""
 
     def take(self, odometry: Odometry, now_us: int, *, gps: bool, flying: bool) -> None:
-        """Fuse the selected data of a pose.
-
-        Args:
-            odometry: Pose as received.
-            now_us: Current time [µs].
-            gps: True if GPS is being fused.
-            flying: True if the vehicle is in the air.
-        """
+        """Fuse the selected data of a pose received now; `gps` is True if GPS is being fused."""
         # Bits above 15 have no meaning here.
         asked = Control(int(self._value("EKF2_EV_CTRL")) & 15)
         if self._is_stuck(odometry, now_us, flying=flying):

@@ -74,14 +74,7 @@ class RangeFinder:
     def __init__(
         self, value: Callable[[str], float], state: Vector, terrain: TerrainFilter, now_us: int
     ) -> None:
-        """Start without ranges.
-
-        Args:
-            value: Look-up for EKF2_* parameters by name.
-            state: Nominal state in the layout of `error_state`; updated.
-            terrain: Terrain filter.
-            now_us: Current time [µs].
-        """
+        """Start without ranges; the nominal state and the terrain filter are updated."""
         self._value, self._state, self.terrain = value, state, terrain
         self.sensor, self.consistency = RangeSensor(), RangeConsistency()
         self.tells_height, self.tells_ground = False, False
@@ -134,10 +127,7 @@ class RangeFinder:
     def step(self, now_us: int, aids: Callable[[], Aids], *, flying: bool) -> None:
         """Fuse a received range and check for timeouts; call once per tick.
 
-        Args:
-            now_us: Current time [µs].
-            aids: Returns the other aids for the vehicle's motion.
-            flying: True if the vehicle is in the air.
+        `aids` returns the other aids for the vehicle's motion.
         """
         step = now_us // STEP_US
         # Timeouts need at most PX4's 100 Hz.
@@ -381,11 +371,9 @@ class RangeFinder:
         self._agree(now_us)
 
     def _put_height(self, height_m: float, variance: float | None) -> None:
-        """Reset the vehicle's height; barometer offset and terrain shift with it.
+        """Reset the vehicle's height above z = 0; barometer offset and terrain shift with it.
 
-        Args:
-            height_m: Height above z = 0.
-            variance: Variance of the height [m²]; None = unchanged.
+        A variance [m²] of None leaves the covariance unchanged.
         """
         state, p = self._state, self.terrain.covariance
         moved = -height_m - state.item(es.P + 2)
@@ -503,9 +491,7 @@ class RangeSensor:
     def check(self, now_us: int, cos_tilt: float) -> None:
         """Check the newest range; once per step, after `take` if there is a new range.
 
-        Args:
-            now_us: Current time [µs].
-            cos_tilt: Cosine of the angle between the ray and straight down.
+        `cos_tilt` is the cosine of the angle between the ray and straight down.
         """
         self.cos_tilt = cos_tilt
         age_us = now_us - self.range_us
@@ -594,16 +580,10 @@ class RangeConsistency:
         *,
         sideways: bool,
     ) -> None:
-        """Check a range in flight.
+        """Check a range, with its variance [m²], against the estimated downward velocity in flight.
 
-        Args:
-            dist_bottom_m: Height above ground.
-            variance: Variance of the height [m²].
-            down_m_s: Estimated downward velocity.
-            down_variance: Variance of the velocity [m²/s²].
-            gate: EKF2_RNG_K_GATE.
-            now_us: Current time [µs].
-            sideways: True if the vehicle moves horizontally over possibly uneven ground.
+        `gate` is EKF2_RNG_K_GATE; `sideways` is True if the vehicle moves horizontally over
+        possibly uneven ground.
         """
         if sideways:
             self._moved_us = now_us

@@ -131,14 +131,9 @@ class TerrainFilter:
     def fuse_range(
         self, state: Vector, innovation: float, variance: float, *, height: bool, ground: bool
     ) -> None:
-        """Correct by a measured height above ground.
+        """Correct vehicle (`height`) or terrain (`ground`) by a measured height above ground.
 
-        Args:
-            state: Nominal state, updated.
-            innovation: Measured minus expected [m].
-            variance: Variance of the measurement [m²].
-            height: True to correct the vehicle.
-            ground: True to correct the terrain.
+        The innovation is measured minus expected [m], with the variance of the measurement [m²].
         """
         self.fuse_with_ground(state, innovation, _OF_RANGE, variance, vehicle=height, ground=ground)
 
@@ -152,15 +147,10 @@ class TerrainFilter:
         vehicle: bool,
         ground: bool,
     ) -> None:
-        """Correct by a measurement that depends on the terrain, without a gate.
+        """Correct vehicle or terrain by a measurement that depends on the terrain, without a gate.
 
-        Args:
-            state: Nominal state, updated.
-            innovation: Measured minus expected.
-            row: Jacobian by the 16 errors and the terrain (17,).
-            variance: Variance of the measurement.
-            vehicle: True to correct the vehicle.
-            ground: True to correct the terrain.
+        The innovation is measured minus expected; `row` (17,) is the Jacobian by the 16 errors and
+        the terrain.
         """
         p = self._joint()
         spread = p @ row
