@@ -5,6 +5,8 @@ The `__init__` of an add-on is light and may define tables, which the core reads
 
     COMMANDS: {command of `airl`: (purpose, module with OPTIONS and run)}
     EXECUTORS: {value of `--executor`: module with `connected`}
+    EXPORTS: {option of `airl export`: function from a policy's folder to a new policy}
+    ALGORITHMS: {name in training files: `Algorithm` of `training.algorithm_table`}
     VIEW: {part of the live view: its class or function} (`rehearsal.live_view`)
     RECORDINGS: {suffix of a flight's recording: function that makes a run folder of it}
     FORENSICS: {`examine` or `section`: function for the causes of a run's failed flights}
