@@ -60,11 +60,7 @@ def write_ulog(flight: RecordedFlight, path: Path) -> None:
     began_us = int(flight.replayed.path.time_us[0])
     later_us = max(0, -began_us)
     writer = UlogWriter(
-        path,
-        began_us + later_us,
-        EXPORTED,
-        (("sys_name", "airl-mav export-log"), *DESCRIBED),
-        (),
+        path, began_us + later_us, EXPORTED, (("sys_name", "airl-mav export-log"), *DESCRIBED), ()
     )
     try:
         texts = [(time_us, "", (severity, words)) for time_us, severity, words in _texts(flight)]
