@@ -18,8 +18,9 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
 from airl_mav.profiles.projections import SLOW, Renderer
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import AutopilotState, OperatorText, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
 from firmware_sim.fault_timeline import FailingLink
 from firmware_sim.interfaces import ULOG_SUFFIX, FlightController, TrueState
@@ -112,11 +113,9 @@ class FlightStack(Protocol):
         """Return the latest simulated time for the next call of `send` [µs]."""
 
     def send(self, now_us: int, flown: Record) -> None:
-        """Send the messages that are due.
+        """Send the messages due at simulated `now_us` [µs], after the newest tick.
 
-        Args:
-            now_us: Simulated time after the newest tick [µs].
-            flown: (n,) logs of the ticks since the last call; empty for external firmware.
+        `flown` is (n,) logs of the ticks since the last call; empty for external firmware.
         """
 
     def log_to(self, tlog: TlogWriter | None) -> None:
@@ -187,7 +186,7 @@ class BuiltinFlightStack:
             return
         self._save_us = None
         if not self._autopilot.parameters.save():
-            self._autopilot.report(OperatorText(Severity.CRITICAL, "Parameters could not be saved"))
+            self._autopilot.say(OperatorText(Severity.CRITICAL, "Parameters could not be saved"))
 
 
 @dataclass(frozen=True)
