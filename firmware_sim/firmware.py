@@ -18,8 +18,9 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
 from airl_mav.profiles.projections import SLOW, Renderer
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import AutopilotState, OperatorText, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
 from firmware_sim.fault_timeline import FailingLink
 from firmware_sim.interfaces import ULOG_SUFFIX, FlightController, TrueState
@@ -46,20 +47,16 @@ class FrameServer(Protocol):
     @property
     def awaited(self) -> bool:
         """True if a client waits for the next frame, which must then be on time."""
-        ...
 
     @property
     def transport_us(self) -> int | None:
         """Time from exposure to a client that reads between ticks [µs]; None = read at any time."""
-        ...
 
     def publish(self, frame: Frame) -> None:
         """Offer a frame without blocking."""
-        ...
 
     def close(self) -> None:
         """Release the resources."""
-        ...
 
 
 class FlightLog(Protocol):
@@ -92,7 +89,6 @@ class FlightStack(Protocol):
             UsageError: The vehicle's parameters are invalid, or the firmware does not exist.
             FirmwareLostError: External firmware died while it booted.
         """
-        ...
 
     def connect(self, tick: Callable[[], int], truth: Callable[[], TrueState]) -> None:
         """Open MAVLink after the flight controller's first tick.
@@ -106,36 +102,27 @@ class FlightStack(Protocol):
             UsageError: External firmware is silent, or configured for another vehicle.
             FirmwareLostError: External firmware died.
         """
-        ...
 
     def filenos(self) -> Sequence[int]:
         """Return the descriptors that become readable when MAVLink arrives."""
-        ...
 
     def receive(self, now_us: int) -> int:
         """Handle messages received by simulated `now_us` [µs]; return how many took effect."""
-        ...
 
     def next_send_us(self) -> float:
         """Return the latest simulated time for the next call of `send` [µs]."""
-        ...
 
     def send(self, now_us: int, flown: Record) -> None:
-        """Send the messages that are due.
+        """Send the messages due at simulated `now_us` [µs], after the newest tick.
 
-        Args:
-            now_us: Simulated time after the newest tick [µs].
-            flown: (n,) logs of the ticks since the last call; empty for external firmware.
+        `flown` is (n,) logs of the ticks since the last call; empty for external firmware.
         """
-        ...
 
     def log_to(self, tlog: TlogWriter | None) -> None:
         """Start to log the onboard link to a tlog; None stops logging."""
-        ...
 
     def counters(self) -> dict[str, LinkCounters]:
         """Return traffic counters by link name."""
-        ...
 
     def strangers(self) -> Sequence[str]:
         """Return a line for each unidentified client that commanded the vehicle in this episode.
@@ -143,11 +130,9 @@ class FlightStack(Protocol):
         The heartbeat of such a client is neither a companion's nor a ground station's. Empty for
         external firmware, whose MAVLink is not inspected here.
         """
-        ...
 
     def close(self) -> None:
         """Release everything."""
-        ...
 
 
 class BuiltinFlightStack:
@@ -201,7 +186,7 @@ class BuiltinFlightStack:
             return
         self._save_us = None
         if not self._autopilot.parameters.save():
-            self._autopilot.report(OperatorText(Severity.CRITICAL, "Parameters could not be saved"))
+            self._autopilot.say(OperatorText(Severity.CRITICAL, "Parameters could not be saved"))
 
 
 @dataclass(frozen=True)

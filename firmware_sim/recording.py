@@ -90,7 +90,7 @@ def fault_arrays(acted: Sequence[Acted]) -> dict[str, NDArray[Any]]:
 
 
 @kernel
-def _sample(times_us: Ints, powers_w: Vector, memory: Vector, kept: Ints, mean_w: Vector) -> int:
+def _sample(times_us: Ints, powers_w: Vector, memory: Vector, sampled: Ints, mean_w: Vector) -> int:
     """Select the sampled ticks and average the power between them; return their number.
 
     Args:
@@ -98,7 +98,7 @@ def _sample(times_us: Ints, powers_w: Vector, memory: Vector, kept: Ints, mean_w
         powers_w: (n,) electrical power [W].
         memory: (4,) time of the last tick and of the last sample [µs], -1 = none; energy since the
             last sample [W µs]; power at the last tick [W]. Updated.
-        kept: (n,) output: indices of the sampled ticks.
+        sampled: (n,) output: indices of the sampled ticks.
         mean_w: (n,) output: mean power since the previous sample [W].
     """
     m = 0
@@ -111,7 +111,7 @@ def _sample(times_us: Ints, powers_w: Vector, memory: Vector, kept: Ints, mean_w
         if first or time_us - memory[1] >= SAMPLE_US:
             mean_w[m] = power_w if first else memory[2] / (time_us - memory[1])
             memory[1], memory[2] = time_us, 0.0
-            kept[m] = k
+            sampled[m] = k
             m += 1
     return m
 
@@ -129,12 +129,12 @@ class TrajectoryRecorder:
 
     def extend(self, times_us: Ints, powers_w: Vector, states: Vector) -> Ints:
         """Add n ticks with states (n, >= 10); return the indices (m,) of the sampled ticks."""
-        kept, mean_w = np.empty(len(times_us), np.int64), np.empty(len(times_us))
-        m = _sample(times_us, powers_w, self._memory, kept, mean_w)
-        self._times.append(times_us[kept[:m]])
+        sampled, mean_w = np.empty(len(times_us), np.int64), np.empty(len(times_us))
+        m = _sample(times_us, powers_w, self._memory, sampled, mean_w)
+        self._times.append(times_us[sampled[:m]])
         self._powers.append(mean_w[:m])
-        self._states.append(states[kept[:m], :10])
-        return kept[:m]
+        self._states.append(states[sampled[:m], :10])
+        return sampled[:m]
 
     def trajectory(self) -> Trajectory:
         """Return the recorded trajectory."""
@@ -202,10 +202,10 @@ class FlightRecorder:
             truths: (n,) log of the aircraft.
             flown: (n,) log of the flight controller; without content for external firmware.
         """
-        kept = self._trajectory.extend(truths["time_us"], truths["power_w"], truths["motion"])
+        sampled = self._trajectory.extend(truths["time_us"], truths["power_w"], truths["motion"])
         if self._internals is not None:
-            self._estimates.append(flown["state"][kept, :RATES])
-            self._estimated_us.append(flown["time_us"][kept])
+            self._estimates.append(flown["state"][sampled, :RATES])
+            self._estimated_us.append(flown["time_us"][sampled])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the recorded arrays by name in the episode file (docs/run-folder.md)."""

@@ -199,8 +199,8 @@ class Simulation:
         Raises:
             UsageError: The vehicle's parameter overrides are invalid.
         """
-        asked, nominal = setup.aircraft, Airframe.from_profile(setup.vehicle)
-        wind = wind_of_episode(asked.wind, setup.seed)
+        aircraft, nominal = setup.aircraft, Airframe.from_profile(setup.vehicle)
+        wind = wind_of_episode(aircraft.wind, setup.seed)
         self.autopilot: FlightController = autopilot or builtin_autopilot(setup)
         self._internals = self.autopilot.internals
         self.plant = Plant(
@@ -208,8 +208,8 @@ class Simulation:
             setup.arena,
             np.random.default_rng(setup.seed),
             start_us=start_us,
-            aircraft=asked.model_copy(update={"wind": wind}),
-            airframe=draw_airframe(nominal, asked.spread, stream(setup.seed, Stream.AIRFRAME)),
+            aircraft=aircraft.model_copy(update={"wind": wind}),
+            airframe=draw_airframe(nominal, aircraft.spread, stream(setup.seed, Stream.AIRFRAME)),
             rate_hz=self.autopilot.rate_hz,
             computer_w=setup.computer_w,
         )
@@ -220,7 +220,7 @@ class Simulation:
         self._unaltered = self._fly
         """The flight controller's step, without faults."""
         self._setup = setup
-        if asked.faults:
+        if aircraft.faults:
             self._let_fail(start_us)
         if self.autopilot.internals is not None:
             self.autopilot.internals.failures = ClientFaults(self._faults_now)
@@ -229,8 +229,8 @@ class Simulation:
         if setup.arena is not None:
             vehicle = setup.vehicle
             self._camera = camera_by(
-                *(vehicle.camera, setup.arena, start_us, asked.sensors, setup.seed),
-                *(asked.renderer, vehicle.cameras),
+                *(vehicle.camera, setup.arena, start_us, aircraft.sensors, setup.seed),
+                *(aircraft.renderer, vehicle.cameras),
             )
             if self.faults is not None:
                 failing_camera = fault_effect("camera")
@@ -442,15 +442,15 @@ class CrashDetector:
     def __init__(self) -> None:
         self.hit: str | None = None
         """Name of the first body hit; None = no crash."""
-        self._seen = 0
+        self._checked = 0
 
     def look(self, simulation: Simulation) -> bool:
         """Check the contacts of this tick; return True if the first crash is among them."""
         hits = simulation.plant.collisions
-        if len(hits) == self._seen:
+        if len(hits) == self._checked:
             return False
-        new = hits[self._seen :]
-        self._seen = len(hits)
+        new = hits[self._checked :]
+        self._checked = len(hits)
         crashes = [hit.what for hit in new if is_crash(hit, simulation.autopilot.flight)]
         if self.hit is not None or not crashes:
             return False

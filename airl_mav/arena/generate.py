@@ -44,7 +44,7 @@ from airl_mav.arena.walls import (
     with_walls,
 )
 from airl_mav.core.errors import UsageError
-from airl_mav.core.seeding import seeded
+from airl_mav.core.streams import seeded
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.walls import HEADROOM_M
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import difflib
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import NoReturn
 
 from rich.console import Console
 from rich.table import Table
 
 from airl_mav import __version__
-from airl_mav.core.addons import addon_commands
+from airl_mav.core.addons import entries
 from airl_mav.core.errors import EXIT_USAGE
 from airl_mav.core.progress import new_console
 
@@ -44,7 +45,7 @@ def subcommands() -> dict[str, tuple[str, str]]:
     core = {
         name: (purpose, f"airl_mav.cli.{name}_command") for name, purpose in SUBCOMMANDS.items()
     }
-    return core | addon_commands()
+    return core | entries("airl_mav", "COMMANDS")
 
 
 def main(words: Sequence[str] | None = None) -> NoReturn:
@@ -71,7 +72,7 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
 
 def _print_help(console: Console) -> None:
     console.print("usage: airl COMMAND [OPTIONS]", highlight=False)
-    addons = {name: purpose for name, (purpose, _) in addon_commands().items()}
+    addons = {name: purpose for name, (purpose, _) in entries("airl_mav", "COMMANDS").items()}
     for title, commands in (("Commands", SUBCOMMANDS), ("Add-ons", addons)):
         if not commands:
             continue
@@ -89,31 +90,22 @@ def _print_help(console: Console) -> None:
 # --- entry points of the console scripts
 
 
-def sitl() -> None:
-    """Run `airl-sitl`."""
-    _run("airl-sitl", "airl_mav.cli.sitl_command", sys.argv[1:])
+def _run(prog: str, module: str, words: Sequence[str] | None = None) -> NoReturn:
+    # Imported here: the list of commands does not need the option models.
+    from airl_mav.cli.options import run_command
+
+    run_command(prog, module, words)
 
 
-def firmware() -> None:
-    """Run `airl-firmware`."""
-    _run("airl-firmware", "airl_mav.cli.firmware_command", sys.argv[1:])
-
-
-def companion() -> None:
-    """Run `airl-companion`, which needs only the light installation."""
-    _run("airl-companion", "airl_mav.cli.companion_command", sys.argv[1:])
+sitl = partial(_run, "airl-sitl", "airl_mav.cli.sitl_command")
+firmware = partial(_run, "airl-firmware", "airl_mav.cli.firmware_command")
+companion = partial(_run, "airl-companion", "airl_mav.cli.companion_command")
+"""`airl-companion` needs only the light installation."""
 
 
 def airl() -> None:
     """Run `airl` with its subcommands."""
     main(sys.argv[1:])
-
-
-def _run(prog: str, module: str, words: Sequence[str]) -> NoReturn:
-    # Imported here: the list of commands does not need the option models.
-    from airl_mav.cli.options import run_command
-
-    run_command(prog, module, words)
 
 
 if __name__ == "__main__":

@@ -5,8 +5,11 @@ The `__init__` of an add-on is light and may define tables, which the core reads
 
     COMMANDS: {command of `airl`: (purpose, module with OPTIONS and run)}
     EXECUTORS: {value of `--executor`: module with `connected`}
+    EXPORTS: {option of `airl export`: function from a policy's folder to a new policy}
+    ALGORITHMS: {name in training files: `Algorithm` of `training.algorithm_table`}
     VIEW: {part of the live view: its class or function} (`rehearsal.live_view`)
     RECORDINGS: {suffix of a flight's recording: function that makes a run folder of it}
+    FORENSICS: {`examine` or `section`: function for the causes of a run's failed flights}
     NOTEBOOK: {`run` or `comparison`: function that returns its HTML}
     LIGHT: the commands can be imported without the simulator
     SITL_OPTIONS: {option of `airl sitl`: function to a context manager around the flights}
@@ -19,9 +22,7 @@ In `companion.addons`:
 In `firmware_sim.addons`:
 
     FIRMWARE: {value of `--firmware`: `firmware_sim.external.programs.FirmwareKind`}
-
-In `firmware_sim.addons`:
-
+    BODIES: {value of `--plant`: class of the vehicle's `plant.body.PlantBody`}
     AIDING: {any name: class of the `estimator.Aiding` that fuses further sensors}
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
     SENSORS: {name in `profiles.vehicle.Sensors`: its `sensor_table.Sensor`}
@@ -91,16 +92,6 @@ def load_entry(package: str, table: str, name: str, option: tuple[str, object], 
     if place is None:
         raise FieldError(*option, problem=f"needs the add-on {package}/addons/{addon}")
     return load(place)
-
-
-def addon_commands() -> dict[str, tuple[str, str]]:
-    """Return the subcommands of add-ons: purpose and module by name."""
-    return entries("airl_mav", "COMMANDS")
-
-
-def addon_executors() -> dict[str, str]:
-    """Return the executors of add-ons: modules by name."""
-    return entries("airl_mav", "EXECUTORS")
 
 
 def after_import(package: str, ours: str) -> None:

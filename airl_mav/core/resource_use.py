@@ -26,7 +26,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, TypeAlias
 
 from airl_mav.core.clock import Clock, processor_time_us
 from airl_mav.core.constants import US_PER_S
@@ -47,19 +47,8 @@ SAMPLE_EVERY_S = 1.0
 """Sampling interval, far below the fastest overflow of a RAPL counter (about a minute)."""
 
 
-class PowerSource(Protocol):
-    """Interface of a power source."""
-
-    @property
-    def name(self) -> str:
-        """Description of the measured power."""
-
-    def take_j(self, elapsed_s: float) -> float | None:
-        """Return the energy of the last `elapsed_s` seconds, since the previous call [J]."""
-
-
 class EnergyCounters:
-    """Energy counters that overflow to 0. Implements `PowerSource`."""
+    """Energy counters that overflow to 0."""
 
     def __init__(self, name: str, zones: tuple[Path, ...]) -> None:
         """Set the folders of readable counters in the power capping framework."""
@@ -68,7 +57,7 @@ class EnergyCounters:
         self._last_uj = self._read()
 
     def take_j(self, elapsed_s: float) -> float | None:  # noqa: ARG002 (not needed by a counter)
-        """Return the energy since the previous call; see `PowerSource`."""
+        """Return the energy of the last `elapsed_s` seconds, since the previous call [J]."""
         before, self._last_uj = self._last_uj, self._read()
         total_uj = 0.0
         for zone, last, now in zip(self._zones, before, self._last_uj, strict=True):
@@ -98,7 +87,7 @@ class Rail:
 
 
 class Rails:
-    """Sum of instantaneous powers, interpolated linearly over time. Implements `PowerSource`."""
+    """Sum of instantaneous powers, interpolated linearly over time."""
 
     def __init__(self, name: str, rails: tuple[Rail, ...]) -> None:
         self.name = name
@@ -106,7 +95,7 @@ class Rails:
         self._last_w = self._read_w()
 
     def take_j(self, elapsed_s: float) -> float | None:
-        """Return the energy since the previous call; see `PowerSource`."""
+        """Return the energy since the previous call; as `EnergyCounters` does."""
         before, self._last_w = self._last_w, self._read_w()
         if before is None or self._last_w is None:
             return None
@@ -116,6 +105,9 @@ class Rails:
         read = [rail.read_w() for rail in self._rails]
         known = [watts for watts in read if watts is not None]
         return sum(known) if len(known) == len(read) else None
+
+
+PowerSource: TypeAlias = "EnergyCounters | Rails"
 
 
 def find_power_source(root: Path = Path("/")) -> tuple[PowerSource | None, str]:

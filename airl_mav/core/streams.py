@@ -31,10 +31,12 @@ class Stream(IntEnum):
 
 def stream(seed: int, name: Stream, *more: int) -> np.random.Generator:
     """Return the generator of one stream of an episode; `more` numbers identify its parts."""
-    # Imported late, as it is compiled: capability queries do not need numba.
-    from airl_mav.core.seeding import seeded
-
     return seeded(seed, name, *more)
+
+
+def seeded(seed: int, *key: int) -> np.random.Generator:
+    """Return the generator of a seed and a key."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
 
 
 def words_of(name: str) -> tuple[int, ...]:

@@ -23,7 +23,7 @@ from multiprocessing.process import BaseProcess
 from types import ModuleType
 from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
-from airl_mav.core.addons import addon_executors
+from airl_mav.core.addons import entries
 from airl_mav.core.compiling import Heard, heard_compiling
 from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.core.errors import FieldError, UsageError
@@ -473,7 +473,7 @@ def open_executor(settings: Workers, *, in_process: bool = False) -> Iterator[Ex
     """Open the configured executor; a single worker may be this process if `in_process`."""
     cores = min(usable_cores(), GREATEST_WORKERS)
     if settings.executor != "process":
-        known = addon_executors()
+        known = entries("airl_mav", "EXECUTORS")
         if settings.executor not in known:
             raise FieldError("executor", settings.executor, ", ".join(("process", *known)))
         gpus = settings.ray_gpus if isinstance(settings, ExecutorSettings) else 0.0

@@ -83,9 +83,9 @@ class Fault(ProfileModel):
             if len(numbers) != amount.width or not all(
                 math.isfinite(v) and amount.low <= v <= amount.high for v in numbers
             ):
-                given = ",".join(f"{v:g}" for v in numbers) or "none"
+                listed = ",".join(f"{v:g}" for v in numbers) or "none"
                 raise ValueError(
-                    f"value of {name}, {amount.meaning}, {given}: accepted: {amount.accepted}"
+                    f"value of {name}, {amount.meaning}, {listed}: accepted: {amount.accepted}"
                 )
         if self.for_s is not None and not about.lasts:
             raise ValueError(f"for_s of {name}: it happens once, without a duration")
@@ -111,8 +111,7 @@ class Fault(ProfileModel):
 
     def __str__(self) -> str:
         """Return the fault as text that parses into the same fault."""
-        told: Mapping[str, Any] = self.model_dump()
-        return fault_text(told)
+        return fault_text(self.model_dump())
 
 
 def link_fails(faults: Iterable[Fault]) -> bool:
@@ -213,9 +212,7 @@ def gust_share(elapsed_s: float, duration_s: float) -> float:
 
 PARTS: tuple[str, ...] = get_args(Part)
 
-
 PHASES: tuple[str, ...] = get_args(Phase)
-
 
 KIND_WORDS = {
     "lost": "off",
@@ -229,15 +226,11 @@ KIND_WORDS = {
 }
 """Synonyms of kinds, used only if the part has no kind with this name."""
 
-
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-
 
 _AMOUNT = re.compile(rf"({_NUMBER}(?:,{_NUMBER})*)(.*)")
 
-
 _TIME = re.compile(rf"({_NUMBER})(ms|s)")
-
 
 _MS_PER_S = 1000.0
 
@@ -265,10 +258,10 @@ def read_fault(text: str) -> dict[str, Any]:
         fields["value"] = _amount("".join(rest[:cut]), about.amount, text)
     clauses = rest[cut:]
     while clauses:
-        word, said, clauses = clauses[0], clauses[1:2], clauses[2:]
-        if word not in ("at", "for") or not said:
+        word, token, clauses = clauses[0], clauses[1:2], clauses[2:]
+        if word not in ("at", "for") or not token:
             raise ValueError(f"{text!r}: {word!r}: accepted: at TIME, at PHASE+TIME, for TIME")
-        more = _when(said[0], text) if word == "at" else {"for_s": _time(said[0], text)}
+        more = _when(token[0], text) if word == "at" else {"for_s": _time(token[0], text)}
         if set(more) & set(fields):
             raise ValueError(f"{text!r}: {word!r} stands twice")
         fields |= more
@@ -306,12 +299,12 @@ def _numbers(values: Sequence[float]) -> str:
     return ",".join(f"{v:g}" if float(f"{v:g}") == v else repr(v) for v in values)
 
 
-def _amount(said: str, amount: Amount, text: str) -> list[float]:
-    found = _AMOUNT.fullmatch(said)
+def _amount(token: str, amount: Amount, text: str) -> list[float]:
+    found = _AMOUNT.fullmatch(token)
     if found is None or found[2] not in amount.units:
         accepted = ", ".join(unit or "no unit" for unit in amount.units)
         raise ValueError(
-            f"{text!r}: {said!r}: accepted: {amount.accepted}, written with {accepted}"
+            f"{text!r}: {token!r}: accepted: {amount.accepted}, written with {accepted}"
         )
     factor = amount.units[found[2]]
     numbers = [float(number) for number in found[1].split(",")]
@@ -321,20 +314,20 @@ def _amount(said: str, amount: Amount, text: str) -> list[float]:
     return [float(f"{number * factor:.15g}") for number in numbers]
 
 
-def _when(said: str, text: str) -> dict[str, Any]:
-    phase, _, later = said.partition("+")
+def _when(token: str, text: str) -> dict[str, Any]:
+    phase, _, later = token.partition("+")
     if phase in PHASES:
         return {"phase": phase, "at_s": _time(later, text) if later else 0.0}
-    if _TIME.fullmatch(said) is None:
+    if _TIME.fullmatch(token) is None:
         raise ValueError(
-            f"{text!r}: at {said!r}: accepted: a time as 8s or 500ms, or a phase"
+            f"{text!r}: at {token!r}: accepted: a time as 8s or 500ms, or a phase"
             f" ({', '.join(PHASES)}), also with a time as hold+2s"
         )
-    return {"at_s": _time(said, text)}
+    return {"at_s": _time(token, text)}
 
 
-def _time(said: str, text: str) -> float:
-    found = _TIME.fullmatch(said)
+def _time(token: str, text: str) -> float:
+    found = _TIME.fullmatch(token)
     if found is None or not math.isfinite(float(found[1])):
-        raise ValueError(f"{text!r}: {said!r}: accepted: a time as 8s or 500ms")
+        raise ValueError(f"{text!r}: {token!r}: accepted: a time as 8s or 500ms")
     return float(found[1]) / (_MS_PER_S if found[2] == "ms" else 1.0)

@@ -260,7 +260,6 @@ KINDS: Mapping[tuple[Part, str], Kind] = {
 }
 """All faults, by part and kind."""
 
-
 NOISE_SEED = 1 << 32
 """Multiplied by a camera noise fault's number, from 1, and added to the episode's seed, so that its
 noise differs from the healthy camera's."""

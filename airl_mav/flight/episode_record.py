@@ -1,12 +1,14 @@
-"""Setup of a flight, and the record of one episode: one JSON line of `episodes.jsonl`."""
+"""Setup of a flight, the record of one episode (a line of `episodes.jsonl`), and its ranking."""
 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 from pydantic import TypeAdapter
 
 from airl_mav.core.constants import US_PER_S, Level
@@ -166,3 +168,59 @@ def run_sha256(episodes: Sequence[EpisodeRecord]) -> str | None:
 
 
 _ADAPTER = TypeAdapter(EpisodeRecord)
+
+
+@dataclass(frozen=True)
+class UsualFlight:
+    """Medians of a run over the flights that reached the goal."""
+
+    pace_s_m: float | None
+    """Flight time per metre of the straight line to the goal's edge."""
+    path_ratio: float | None
+    """Ratio of the flown distance to the straight line."""
+    speed_m_s: float | None
+    """Mean speed of a flight."""
+
+
+def straight_m(record: EpisodeRecord) -> float:
+    """Return the horizontal straight distance from the start to the goal's edge [m]."""
+    return max(0.1, math.hypot(*record.goal[:2]) - record.goal_radius_m)
+
+
+def usual_flight(records: Sequence[EpisodeRecord]) -> UsualFlight:
+    """Return the medians of a run; all None if no flight reached the goal."""
+    good = [(r, r.quality) for r in records if r.outcome is Outcome.SUCCESS and r.quality]
+    if not good:
+        return UsualFlight(None, None, None)
+    return UsualFlight(
+        float(np.median([q.flight_time_s / straight_m(r) for r, q in good])),
+        float(np.median([q.distance_m / straight_m(r) for r, q in good])),
+        float(np.median([q.mean_speed_m_s for _, q in good])),
+    )
+
+
+def time_lost_s(record: EpisodeRecord, usual: UsualFlight) -> float | None:
+    """Return the time lost relative to the run's median pace [s]."""
+    if record.quality is None or usual.pace_s_m is None:
+        return None
+    return record.quality.flight_time_s - usual.pace_s_m * straight_m(record)
+
+
+def path_excess(record: EpisodeRecord) -> float | None:
+    """Return the excess of the flown distance over the straight line, as a fraction."""
+    if record.quality is None:
+        return None
+    return record.quality.distance_m / straight_m(record) - 1.0
+
+
+def ranked(episodes: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
+    """Return all flights, worst first: failures, then successes, each by time lost."""
+    usual = usual_flight(episodes)
+
+    def key(e: EpisodeRecord) -> tuple[bool, float, int]:
+        lost_s = time_lost_s(e, usual)
+        if lost_s is None:
+            lost_s = 0.0 if e.quality is None else e.quality.flight_time_s
+        return (e.outcome is Outcome.SUCCESS, -lost_s, e.index)
+
+    return sorted(episodes, key=key)

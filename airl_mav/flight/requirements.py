@@ -63,7 +63,7 @@ ACCEPTED = (
 
 _REQUIREMENT = re.compile(
     r"\s*(?P<measure>[a-z_]+)(?P<gap>\s+gap)?\s*(?P<sense>>=|<=)\s*"
-    r"(?P<limit>[-+]?[0-9.]+(?:e[-+]?[0-9]+)?)\s*(?P<unit>%|[a-zA-Z][a-zA-Z0-9/]*)?\s*",
+    r"(?P<limit>[-+]?[0-9.]+(?:e[-+]?[0-9]+)?)\s*(?P<unit>%|[a-zA-Z][a-zA-Z0-9/]*)?\s*"
 )
 
 
@@ -209,9 +209,7 @@ def wilson_percent(rate: float, n: int) -> Estimate:
 
 
 def _more_flights(
-    requirement: Requirement,
-    estimate: Estimate,
-    project: Callable[[float, int], Estimate] | None,
+    requirement: Requirement, estimate: Estimate, project: Callable[[float, int], Estimate] | None
 ) -> int | None:
     """Return the additional flights for a decision at the same figure; None: out of reach.
 
@@ -288,9 +286,7 @@ class InterimAnalysis:
 
 
 def plan_looks(
-    threshold: float,
-    looks: Sequence[int] = LOOKS,
-    spent: Callable[[int], float] = error_spent,
+    threshold: float, looks: Sequence[int] = LOOKS, spent: Callable[[int], float] = error_spent
 ) -> Iterator[InterimAnalysis]:
     """Yield the looks of a test in order.
 

@@ -61,13 +61,13 @@ class Trajectory:
         start = max(start_us, int(self.time_us[0]))
         end = min(end_us, int(self.time_us[-1]))
         if end < start:
-            return self._rows(np.zeros(0, np.int64))
+            return self.at(np.zeros(0, np.int64))
         inside = self.time_us[(self.time_us > start) & (self.time_us < end)]
-        return self._rows(np.unique(np.concatenate([[start], inside, [end]]).astype(np.int64)))
+        return self.at(np.unique(np.concatenate([[start], inside, [end]]).astype(np.int64)))
 
-    def _rows(self, times: NDArray[np.int64]) -> Trajectory:
-        """Return the state at the given times [µs], all inside the recording."""
-        before = np.searchsorted(self.time_us, times, side="left")
+    def at(self, times: NDArray[np.int64]) -> Trajectory:
+        """Return the state at increasing times [µs]; outside the recording, at its ends."""
+        before = np.minimum(np.searchsorted(self.time_us, times, side="left"), len(self) - 1)
 
         def linear(values: NDArray[np.float64]) -> NDArray[np.float64]:
             at = [np.interp(times, self.time_us, column) for column in values.T]
@@ -95,6 +95,15 @@ class Trajectory:
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Trajectory:
         """Build from arrays by field name. Raises KeyError or ValueError if invalid."""
         return cls(**{field.name: arrays[field.name] for field in fields(cls)})
+
+
+def estimate_of(stamps: Mapping[str, NDArray[Any]]) -> Trajectory | None:
+    """Return the path estimated by the flight controller; None if not recorded."""
+    if not len(stamps.get("estimate/time_us", ())):
+        return None
+    names = ("time_us", "position", "velocity", "quaternion")
+    arrays = {name: stamps[f"estimate/{name}"] for name in names}
+    return Trajectory(**arrays, power_w=np.zeros(len(arrays["time_us"])))
 
 
 def pose_at(
@@ -325,9 +334,7 @@ def command_steps(decisions: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
     return steps
 
 
-def _sent(
-    decisions: Mapping[str, NDArray[Any]],
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _sent(decisions: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return times (k,) [µs] and velocities (k, 3) [m/s] of the sent commands."""
     if "sent_us" not in decisions or SETPOINT not in decisions:
         return np.zeros(0, np.int64), np.zeros((0, 3))

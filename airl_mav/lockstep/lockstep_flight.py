@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,7 @@ from airl_mav.rehearsal.episode import (
     part_of,
 )
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
-from airl_mav.rehearsal.live_view import FlightTap, ViewEnds, view_part
+from airl_mav.rehearsal.live_view import ViewEnds, view_part
 from airl_mav.rehearsal.observer import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.checks import TRANSPORT_US
@@ -173,7 +174,8 @@ class LockstepFlight:
             ticked: Called after every tick, with the first object that was hit.
         """
         self._view = view
-        self._watched: FlightTap | None = None
+        self._watched: Any = None
+        """Live view's part `flight`; None without a viewer."""
         self._patience_s = patience_s
         self._lands = lands
         self._ticked = ticked

@@ -18,7 +18,7 @@ from airl_mav.core.files import save_arrays
 from airl_mav.core.resource_use import UseMeter
 from airl_mav.core.scheduling import held_to
 from airl_mav.rehearsal import channel
-from airl_mav.rehearsal.live_view import CompanionTap, view_part
+from airl_mav.rehearsal.live_view import view_part
 from airl_mav.scenario.resolve import ResolvedScenario
 from companion.frame_source import open_camera
 from companion.link_interface import LinkError
@@ -38,7 +38,7 @@ class Missions:
         self,
         scenario: ResolvedScenario,
         harness: channel.ChildChannel,
-        tap: CompanionTap | None = None,
+        tap: Any = None,
     ) -> None:
         """Load the policy without connecting. Raises UsageError."""
         self._scenario = scenario
@@ -128,7 +128,7 @@ class Missions:
 def fly(begin: channel.Begin, harness: channel.ChildChannel) -> None:
     """Fly missions on request until the pipe closes."""
     with ExitStack() as held:
-        tap: CompanionTap | None = None
+        tap: Any = None
         if begin.view is not None:
             tap = held.enter_context(closing(view_part("companion")(begin.view, begin.scenario)))
         missions = Missions(begin.scenario, harness, tap)

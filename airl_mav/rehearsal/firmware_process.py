@@ -28,7 +28,7 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.episode_setup import episode_setup, state_of
-from airl_mav.rehearsal.live_view import SimulationTap, view_part
+from airl_mav.rehearsal.live_view import view_part
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.checks import check_fitted
 from airl_mav.scenario.resolve import ResolvedScenario
@@ -123,7 +123,7 @@ class Service:
         firmware: Firmware,
         harness: channel.ChildChannel,
         scenario: ResolvedScenario,
-        tap: SimulationTap | None = None,
+        tap: Any = None,
     ) -> None:
         """Store firmware, harness, scenario and view, and register callbacks."""
         self._tap = tap
@@ -236,7 +236,7 @@ def fly_requested(begin: channel.Begin, harness: channel.ChildChannel) -> None:
     )
     with ExitStack() as held:
         held.enter_context(closing(firmware))
-        tap: SimulationTap | None = None
+        tap: Any = None
         if begin.view is not None:
             tap = held.enter_context(closing(view_part("simulation")(begin.view, scenario)))
         with heard_compiling(lambda begins: harness.send(channel.Compiling(begins=begins))):

@@ -20,9 +20,7 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_typed, replace_file, write_json
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.statistics import (
-    Estimate,
-)
+from airl_mav.flight.statistics import Estimate
 from airl_mav.latency.stages import MIN_SAMPLES, Summary
 
 if TYPE_CHECKING:

@@ -90,6 +90,12 @@ class QualityMeasure:
             return NONE
         return f"{self.scale * value:,.{self.digits}f}{f' {self.unit}' if unit else ''}".rstrip()
 
+    def interval(self, estimate: Estimate) -> str:
+        """Return the 95 % interval of an estimate in the displayed unit."""
+        if estimate.low is None:
+            return NONE
+        return f"{self.plain(estimate.low)} … {self.plain(estimate.high)}"
+
     def with_interval(self, quality: Aggregate) -> str:
         """Return the measure of a run in the displayed unit, with its 95 % interval in brackets."""
         return with_interval(self.of(quality).scaled(self.scale), self.digits)
@@ -249,8 +255,8 @@ def conduct_table(run: LoadedRun, summary: RunSummary) -> TableView | None:
 
     def mean(measure: QualityMeasure) -> tuple[str, ...]:
         of = measure.of(q)
-        interval = NONE if of.low is None else f"{measure.plain(of.low)} … {measure.plain(of.high)}"
-        return measure.title, measure.plain(of.value, unit=True), interval, f"{of.n:,}"
+        value = measure.plain(of.value, unit=True)
+        return measure.title, value, measure.interval(of), f"{of.n:,}"
 
     def greatest(title: str, name: str) -> tuple[str, ...]:
         peaks = known(good, name)

@@ -18,14 +18,13 @@ from airl_mav.arena.draw import GOAL_COLOUR, MOVING_COLOURS, START_COLOUR
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.arena.triangles import drawn, standing
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import goal_height_m
+from airl_mav.core.frames import goal_height_m, quats_to_euler
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.document import OUTCOME_LABELS
-from airl_mav.report.forensics.camera_view import headings
-from airl_mav.report.forensics.worst import flown_path
+from airl_mav.report.run_arenas import flown_path
 from airl_mav.report.run_figures import OUTCOME_COLOURS, speed_colours
 from airl_mav.report.scene import GLASS_OPACITY
 
@@ -170,7 +169,7 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
         "path": {
             "time": _rounded(seconds),
             "place": _rounded(place),
-            "heading": _rounded(headings(path.quaternion)),
+            "heading": _rounded(np.unwrap(quats_to_euler(path.quaternion)[2])),
             "speed": _rounded(speed),
         },
         "navigation": round(since_us / US_PER_S, 2),

@@ -5,6 +5,7 @@ Images are rendered from the true pose without noise. Telemetry is the recorded 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.exposure import expose
-from airl_mav.camera.render import camera_pose
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.picture import RANGE_M
+from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import Arrays
@@ -30,10 +33,10 @@ from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.policy.registry import find_policy
-from airl_mav.prediction.compensator import Compensator, DecisionMemory
+from airl_mav.prediction import Compensator, DecisionMemory
+from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
-from airl_mav.report.forensics.camera_view import PolicyCamera
 
 ONE = np.zeros(1, np.intp)
 
@@ -42,6 +45,31 @@ SAME_ACTION = 0.01
 
 MOST = 2000
 """Maximum number of recomputed decisions, from the start of a flight."""
+
+
+@dataclass(frozen=True)
+class PolicyCamera:
+    """Camera of the policy."""
+
+    intrinsics: Intrinsics
+    range_m: float
+    """Maximum depth with a return [m]; for a colour camera, larger than any arena."""
+    mount: Mount
+
+    @classmethod
+    def of(cls, camera: Camera) -> PolicyCamera:
+        """Create the policy camera from a profile's camera."""
+        range_m = camera.range_m if camera.kind == "depth" else RANGE_M
+        return cls(Intrinsics.of(camera), range_m, Mount.of(camera))
+
+    @property
+    def half_angle_rad(self) -> float:
+        """Half of the horizontal field of view [rad]."""
+        return 0.5 * self.intrinsics.horizontal_fov_rad
+
+    def aside_rad(self, bearing_rad: float) -> float:
+        """Return the horizontal angle [rad] from the optical axis to a bearing from the heading."""
+        return abs(math.remainder(bearing_rad - self.mount.yaw, math.tau))
 
 
 @dataclass(frozen=True)
@@ -105,11 +133,11 @@ def seen_decisions(
     needed = ("capture_us", "infer_start_us", "action_ready_us", "sent_us", column)
     if path is None or not len(path) or any(name not in stamps for name in needed):
         return
-    lens = _Lens(arena, PolicyCamera.of(vehicle.camera), path, record.started_us)
+    lens = Lens(arena, PolicyCamera.of(vehicle.camera), path, record.started_us)
     # Only the cameras of the network's input are rendered.
     names = () if again is None else again.policy.card.observation.cameras
     further = {
-        name: _Further(_Lens(arena, PolicyCamera.of(camera), path, record.started_us))
+        name: _Further(Lens(arena, PolicyCamera.of(camera), path, record.started_us))
         for name, camera in vehicle.cameras.items()
         if name in names
     }
@@ -138,7 +166,7 @@ def seen_decisions(
 
 
 @dataclass(frozen=True)
-class _Lens:
+class Lens:
     """Camera along a recorded path."""
 
     arena: Arena
@@ -158,7 +186,7 @@ class _Lens:
 class _Further:
     """Additional camera along a recorded path, with its images of earlier decisions."""
 
-    def __init__(self, lens: _Lens) -> None:
+    def __init__(self, lens: Lens) -> None:
         self._lens = lens
         self._earlier: deque[NDArray[Any]] = deque(maxlen=MOST_FRAMES - 1)
 

@@ -8,6 +8,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.errors import UsageError
 from airl_mav.core.plugins import GENERATORS, is_loaded, load_part
 from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord
+from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -82,3 +83,11 @@ def arena_of(run: LoadedRun, episode: EpisodeRecord) -> Arena | None:
         return arenas_of([episode], vehicle_of(run.info)).get(episode.index)
     except UsageError:
         return None
+
+
+def flown_path(run: LoadedRun, record: EpisodeRecord) -> Trajectory | None:
+    """Return a flight's path up to the verdict, without the landing recorded after it."""
+    path = run.trajectories.get(record.index)
+    if path is None or not len(path):
+        return None
+    return path.between(int(path.time_us[0]), record.ended_us)

@@ -171,12 +171,7 @@ def _draw_path(
     ax.plot(*points.T, color=theme.HALO, lw=4.2, zorder=2.5, solid_capstyle="round")
     pieces, levels = coloured_pieces(points, 0.5 * (speed[1:] + speed[:-1]), top_speed)
     path = LineCollection(
-        pieces,
-        cmap=colours,
-        norm=scale,
-        linewidths=2.2,
-        capstyle="round",
-        zorder=2.6,
+        pieces, cmap=colours, norm=scale, linewidths=2.2, capstyle="round", zorder=2.6
     )
     path.set_array(levels)
     ax.add_collection(path)
@@ -347,10 +342,7 @@ def _draw_ground(ax: Axes, bounds: Bounds | None) -> None:
 
 
 def _draw_paths(
-    ax: Axes,
-    outcome: Outcome,
-    flights: Sequence[EpisodeRecord],
-    paths: Mapping[int, Trajectory],
+    ax: Axes, outcome: Outcome, flights: Sequence[EpisodeRecord], paths: Mapping[int, Trajectory]
 ) -> None:
     """Draw flights with one outcome as thin lines; failed flights end with a mark."""
     failed = outcome is not Outcome.SUCCESS

@@ -18,25 +18,17 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import rgb_of
+from airl_mav.core import addons
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.files import Arrays, replace_file
-from airl_mav.flight.episode_record import EpisodeRecord
+from airl_mav.flight.episode_record import EpisodeRecord, ranked
 from airl_mav.latency.stages import STAGES, decision_series
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.report import document, run_tables
+from airl_mav.report import document
 from airl_mav.report.document import Section, ms, tables_section
 from airl_mav.report.energy_section import energy_section
-from airl_mav.report.forensics.evidence import Cause, ranked
-from airl_mav.report.forensics.worst import (
-    EXAMINED,
-    ExaminedFlight,
-    causes_table,
-    examine_worst,
-    flown_path,
-    worst_table,
-)
 from airl_mav.report.measures import RunSummary, conduct_table, rate_digits, summarize_run
 from airl_mav.report.plotly_scene import (
     ALL_FLIGHTS,
@@ -46,9 +38,17 @@ from airl_mav.report.plotly_scene import (
     top_speed,
 )
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision, policy_again, seen_decisions
-from airl_mav.report.run_arenas import arenas_of, vehicle_of
+from airl_mav.report.run_arenas import arenas_of, flown_path, vehicle_of
 from airl_mav.report.run_figures import map_figure, overview_picture
-from airl_mav.report.run_tables import MAX_FLIGHTS, episodes_table
+from airl_mav.report.run_tables import (
+    MAX_FLIGHTS,
+    episodes_table,
+    estimation_table,
+    faults_table,
+    quality_table,
+    real_time_table,
+    setup_rows,
+)
 from airl_mav.report.run_verdict import OverallVerdict, save_verdict, verdict_of
 from airl_mav.report.theme import FigureImage, palette, shades
 from airl_mav.report.timeline import latency_section
@@ -202,6 +202,32 @@ class ShownFlight:
 
 
 @dataclass(frozen=True)
+class Cause:
+    """Cause of a failed or long flight."""
+
+    kind: str
+    """Short name of the cause, equal for all flights with this cause."""
+    sentences: tuple[str, ...]
+    """Sentences with the supporting numbers."""
+
+
+EXAMINED = 100
+"""Maximum number of flights with a derived cause, worst first."""
+
+
+@dataclass(frozen=True)
+class ExaminedFlight:
+    """Flight and its cause."""
+
+    record: EpisodeRecord
+    cause: Cause
+    lost_s: float | None
+    """Time lost relative to the run's median pace over the same straight line [s]."""
+    excess: float | None
+    """Excess of the flown distance over the straight line, as a fraction."""
+
+
+@dataclass(frozen=True)
 class ReportInput:
     """Run and data derived from it, for the sections of its page."""
 
@@ -211,6 +237,7 @@ class ReportInput:
     vehicle: VehicleProfile | None
     summary: RunSummary
     worst: Sequence[ExaminedFlight]
+    """Causes of the worst flights; empty without the add-on forensics."""
     view: Sequence[ShownFlight]
     """Flights in the view of single flights, worst first."""
     policy: PolicyAgain | None
@@ -223,12 +250,12 @@ class ReportInput:
 
 def pictured(run: LoadedRun) -> list[EpisodeRecord]:
     """Return the episodes with still pictures, worst first."""
-    return ranked(run)[:MAX_PICTURED]
+    return ranked(run.episodes)[:MAX_PICTURED]
 
 
 def shown(run: LoadedRun) -> list[EpisodeRecord]:
     """Return the episodes for the view of single flights, worst first."""
-    return ranked(run)[:MAX_SHOWN]
+    return ranked(run.episodes)[:MAX_SHOWN]
 
 
 def report_input(
@@ -245,7 +272,8 @@ def report_input(
         if arena is not None and vehicle is not None:
             seen = tuple(seen_decisions(run, record, arena, vehicle, again))
         flights.append(ShownFlight(SceneFlight(record, path, arena), tracked, seen))
-    worst = examine_worst(run, arenas, vehicle)
+    examine = addons.entries("airl_mav", "FORENSICS").get("examine")
+    worst = addons.load(examine)(run, arenas, vehicle) if examine else []
     return ReportInput(run, arenas, vehicle, summarize_run(run), worst, flights, again)
 
 
@@ -290,7 +318,7 @@ def page_data(page: ReportInput, pictures: Iterable[FigureImage]) -> str:
     fov, range_m = (0.0, 0.0) if vehicle is None else (
         vehicle.camera.horizontal_fov_deg, vehicle.camera.range_m,
     )  # fmt: skip
-    everyone = ranked(run)[:ALL_FLIGHTS]
+    everyone = ranked(run.episodes)[:ALL_FLIGHTS]
     data: dict[str, Any] = {
         "pictures": {picture.name: picture.svg for picture in pictures},
         "flights": [
@@ -340,34 +368,22 @@ def write_report(
     """Write a run's `report.html`, `verdict.json` and PNG files; return the page's path."""
     run = load(run) if isinstance(run, Path) else run
     vehicle = vehicle_of(run.info)
-    arenas = arenas_of([*ranked(run)[:EXAMINED], *shown(run)], vehicle)
+    arenas = arenas_of([*ranked(run.episodes)[:EXAMINED], *shown(run)], vehicle)
     verdict = verdict or verdict_of(run)
     page = build_page(run, arenas, out, vehicle=vehicle, verdict=verdict)
     save_verdict(verdict, page.parent)
     return page
 
 
-def _setup(page: ReportInput) -> list[Section]:
-    return [Section("What flew", facts=run_tables.setup_rows(page.run))]
-
-
 def _quality(page: ReportInput) -> tuple[Section, ...]:
     feeds = not page.run.info.setup.computer_on_ground
-    quality = run_tables.quality_table(page.summary, computer=feeds)
+    quality = quality_table(page.summary, computer=feeds)
     return tables_section(quality, conduct_table(page.run, page.summary))
 
 
-def _real_time(page: ReportInput) -> tuple[Section, ...]:
-    return tables_section(run_tables.real_time_table(page.run, page.summary))
-
-
 def _worst(page: ReportInput) -> tuple[Section, ...]:
-    causes = tables_section(causes_table(page.worst, page.run))
-    return causes + tables_section(worst_table(page.worst, len(page.run.episodes)))
-
-
-def _estimator(page: ReportInput) -> tuple[Section, ...]:
-    return tables_section(run_tables.estimation_table([flight.tracked for flight in page.view]))
+    section = addons.entries("airl_mav", "FORENSICS").get("section")
+    return tuple(addons.load(section)(page)) if section else ()
 
 
 def _provenance(page: ReportInput) -> list[Section]:
@@ -389,13 +405,21 @@ class PageSection(NamedTuple):
 
 
 SECTIONS = (
-    PageSection("setup", "What flew", _setup),
+    PageSection(
+        "setup", "What flew", lambda page: [Section("What flew", facts=setup_rows(page.run))]
+    ),
     PageSection("quality", "Quality of flight", _quality),
-    PageSection("", "Faults", lambda page: tables_section(run_tables.faults_table(page.run))),
-    PageSection("", "Real time", _real_time),
+    PageSection("", "Faults", lambda page: tables_section(faults_table(page.run))),
+    PageSection(
+        "", "Real time", lambda page: tables_section(real_time_table(page.run, page.summary))
+    ),
     PageSection("worst", "Worst flights", _worst),
     PageSection("by-flight", "Flight by flight", by_flight_section),
-    PageSection("estimator", "Estimator", _estimator),
+    PageSection(
+        "estimator",
+        "Estimator",
+        lambda page: tables_section(estimation_table([each.tracked for each in page.view])),
+    ),
     PageSection("latency", "Decision latency", latency_section),
     PageSection("energy", "Energy", energy_section),
     PageSection("flights", "Flights", flights_section),

@@ -17,7 +17,7 @@ from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.core.resource_use import ProcessUse
 from airl_mav.flight.episode_record import EpisodeRecord, Part, Setup, run_sha256
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.statistics import NO_ESTIMATE, Estimate
+from airl_mav.flight.statistics import NO_ESTIMATE
 from airl_mav.latency.stages import CommandAges, Summary, command_ages, summarize
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, TICK_LATENESS, LoadedRun
@@ -32,7 +32,6 @@ from airl_mav.report.measures import (
     MEAN_SPEED,
     PACK,
     SUCCESS_RATE,
-    QualityMeasure,
     RunSummary,
     conduct_table,
     rate_digits,
@@ -163,10 +162,12 @@ def quality_table(summary: RunSummary, *, computer: bool = True) -> document.Tab
         measures.append(replace(COMPUTER_ENERGY, unit="J", scale=1.0, digits=0))
     measures.append(MEAN_SPEED)
     measures += [measure for measure in PACK if measure.of(q).n]
-    rows = tuple(
-        _estimate_row(measure, measure.of(q), summary.medians.get(measure.key, NO_ESTIMATE))
-        for measure in measures
-    )
+    rows = []
+    for measure in measures:
+        mean, median = measure.of(q), summary.medians.get(measure.key, NO_ESTIMATE)
+        value, middle = measure.plain(mean.value, unit=True), measure.plain(median.value)
+        intervals = measure.interval(mean), measure.interval(median)
+        rows.append((measure.title, value, intervals[0], middle, intervals[1], f"{mean.n}"))
     notes = [
         "Means and medians over the flights that reached the goal; n is their number (for the "
         "success rate: all valid flights). Intervals: Wilson for the rate, bootstrap "
@@ -179,20 +180,7 @@ def quality_table(summary: RunSummary, *, computer: bool = True) -> document.Tab
         )
     if 1 < q.flight_time_s.n < FEW_FLIGHTS:
         notes.append(f"Bootstrap intervals of fewer than {FEW_FLIGHTS} flights are too narrow.")
-    return document.TableView("quality", "Quality of flight", columns, rows, tuple(notes))
-
-
-def _estimate_row(measure: QualityMeasure, mean: Estimate, median: Estimate) -> tuple[str, ...]:
-
-    def interval(of: Estimate) -> str:
-        return (
-            document.NONE
-            if of.low is None
-            else f"{measure.plain(of.low)} … {measure.plain(of.high)}"
-        )
-
-    value, middle = measure.plain(mean.value, unit=True), measure.plain(median.value)
-    return measure.title, value, interval(mean), middle, interval(median), f"{mean.n}"
+    return document.TableView("quality", "Quality of flight", columns, tuple(rows), tuple(notes))
 
 
 def real_time_table(run: LoadedRun, summary: RunSummary) -> document.TableView | None:

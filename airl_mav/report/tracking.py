@@ -17,12 +17,12 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.files import Arrays
 from airl_mav.core.frames import ned_to_heading, quat_multiply, quats_to_euler
 from airl_mav.flight.episode_record import EpisodeRecord
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.trajectory import Trajectory, estimate_of
 from airl_mav.latency.stamps import ATTITUDE, NO_STAMP, RATES, SETPOINT, commanded, setpoint_column
 from airl_mav.rehearsal.run_folder import MOTOR_OUTPUTS, MOTOR_TIMES, LoadedRun
 from airl_mav.report import theme
-from airl_mav.report.forensics.worst import flown_path
 from airl_mav.report.policy_view import SeenDecision
+from airl_mav.report.run_arenas import flown_path
 from airl_mav.report.theme import pictured
 
 Floats = NDArray[np.float64]
@@ -117,8 +117,8 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
     elif "body_roll_rate_deg_s" in commands.values:
         flown = replace(flown, **_turned(path))
     estimated = errors = None
-    if len(stamps.get("estimate/time_us", ())) > 1:
-        believed = _at(stamps, path.time_us)
+    if (recorded := estimate_of(stamps)) is not None and len(recorded) > 1:
+        believed = recorded.at(path.time_us)
         estimated, estimated_heading = _motion(
             path.time_us, believed.position, believed.velocity, believed.quaternion
         )
@@ -191,27 +191,6 @@ def _turned(path: Trajectory) -> dict[str, Floats]:
     sides = np.concatenate([steps[:1], steps, steps[-1:]])
     rates = np.degrees(0.5 * (sides[:-1] + sides[1:]))
     return dict(zip(COMMANDED[RATES], rates.T, strict=False))
-
-
-def _at(stamps: Arrays, time_us: NDArray[np.int64]) -> Trajectory:
-    """Return the estimates, linearly interpolated at times (m,)."""
-    times = stamps["estimate/time_us"]
-    quaternion = stamps["estimate/quaternion"]
-    # q and -q are the same attitude; interpolation between opposite signs would pass through 0.
-    flips = np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0.0, -1.0, 1.0)
-    near = quaternion * np.cumprod(np.concatenate([[1.0], flips]))[:, None]
-
-    def linear(values: Floats) -> Floats:
-        return np.stack([np.interp(time_us, times, column) for column in values.T], axis=1)
-
-    turned = linear(near)
-    return Trajectory(
-        time_us,
-        linear(stamps["estimate/position"]),
-        linear(stamps["estimate/velocity"]),
-        turned / np.linalg.norm(turned, axis=1, keepdims=True),
-        np.zeros(len(time_us)),
-    )
 
 
 def _errors(

@@ -29,7 +29,7 @@ from airl_mav.latency.injection import (
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import PolicyInfo, camera_refused, find_policy
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction import Compensator
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import check_noise, check_renderer
 from airl_mav.profiles.computer import ComputerProfile
@@ -38,7 +38,7 @@ from airl_mav.profiles.loading import load_profile, profile_digest
 from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.projections import CameraKind
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.scenario.aircraft import Aircraft, FirmwareName, PlantName
+from airl_mav.scenario.aircraft import FirmwareName, PlantName
 from airl_mav.scenario.checks import (
     NATIVE_T2_US,
     action_generator,
@@ -340,17 +340,24 @@ class ResolvedScenario:
             injection=self.injection,
             speed=self.speed,
             between_commands=between_commands(self.pilot, hover_s),
-            conditions=", ".join([*_conditions(scenario), *self._plant(), *self._zone()]),
+            conditions=", ".join(self._conditions()),
         )
 
-    def _plant(self) -> Iterator[str]:
-        """Yield a non-default plant; level gym has none."""
-        if self.level != "gym" and self.scenario.plant != "pybullet":
-            yield f"plant {self.scenario.plant}"
-
-    def _zone(self) -> Iterator[str]:
-        """Yield the requested curriculum zone of the goals."""
-        if (zone := self.scenario.zone) is not None:
+    def _conditions(self) -> Iterator[str]:
+        """Yield each non-default condition of the flights: field and value."""
+        scenario = self.scenario
+        for table in ("payload", "wind", "spread", "sensors"):
+            for name, value in getattr(scenario, table).model_dump(exclude_defaults=True).items():
+                yield f"{table}.{name} {value:g}"
+        if scenario.renderer != "raycast":
+            yield f"renderer {scenario.renderer}"
+        if scenario.battery_charge < 1.0:
+            yield f"battery_charge {scenario.battery_charge:g}"
+        yield from (f"fault: {fault}" for fault in scenario.faults)
+        # Level gym has no plant.
+        if self.level != "gym" and scenario.plant != "pybullet":
+            yield f"plant {scenario.plant}"
+        if (zone := scenario.zone) is not None:
             yield f"zone {zone} (goals within {self.arena.zones_m[zone]:g} m)"
 
     @property
@@ -397,15 +404,3 @@ class ResolvedScenario:
     def __getstate__(self) -> dict[str, Any]:
         """Exclude the loaded network: each process opens a new one."""
         return {key: value for key, value in self.__dict__.items() if key != "_loaded_policy"}
-
-
-def _conditions(scenario: Aircraft) -> Iterator[str]:
-    """Yield each non-default condition of an aircraft: field and value."""
-    for table in ("payload", "wind", "spread", "sensors"):
-        for name, value in getattr(scenario, table).model_dump(exclude_defaults=True).items():
-            yield f"{table}.{name} {value:g}"
-    if scenario.renderer != "raycast":
-        yield f"renderer {scenario.renderer}"
-    if scenario.battery_charge < 1.0:
-        yield f"battery_charge {scenario.battery_charge:g}"
-    yield from (f"fault: {fault}" for fault in scenario.faults)

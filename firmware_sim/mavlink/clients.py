@@ -23,7 +23,7 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.mavlink.codec import Decoder, WireMessage, is_signed
 from firmware_sim.mavlink.endpoint import Peer, Sender, SharedEndpoint
 from firmware_sim.mavlink.link import Link, LinkCounters
-from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services import Context
 from firmware_sim.mavlink.texts_and_events import EventSender, TextEncoder
 
 FRAMES_PER_S = 2_000
@@ -143,25 +143,26 @@ class Complaints:
     """Operator warnings about rejected and dropped data, at a limited rate."""
 
     def __init__(self) -> None:
-        self._told: dict[tuple[str, str], tuple[int, int]] = {}
-        """Last warning by link and type: time [µs], counter value."""
+        self._last: dict[tuple[str, str], tuple[int, int]] = {}
+        """Last warning by link and problem: time [µs], counter value."""
 
     def restart(self) -> None:
         """Restart the intervals, because simulated time may restart. Keeps reported counts."""
-        self._told = {key: (-EVERY_US, count) for key, (_, count) in self._told.items()}
+        self._last = {key: (-EVERY_US, count) for key, (_, count) in self._last.items()}
 
     def due(self, name: str, refused: int, dropped: int, now_us: int) -> list[OperatorText]:
         """Return the warnings due on a link at `now_us` [µs] about rejected and dropped data."""
         texts: list[OperatorText] = []
-        for kind, count, problem in (
-            ("refused", refused, "frames refused: bad signature"),
-            ("dropped", dropped, "datagrams dropped: flood or full"),
-        ):
+        counts = {
+            "frames refused: bad signature": refused,
+            "datagrams dropped: flood or full": dropped,
+        }
+        for problem, count in counts.items():
             # The first warning is due at once.
-            told_us, told = self._told.get((name, kind), (-EVERY_US, 0))
-            if count > told and now_us - told_us >= EVERY_US:
-                self._told[name, kind] = now_us, count
-                texts.append(OperatorText(Severity.WARNING, f"{name}: {count - told} {problem}"))
+            last_us, last = self._last.get((name, problem), (-EVERY_US, 0))
+            if count > last and now_us - last_us >= EVERY_US:
+                self._last[name, problem] = now_us, count
+                texts.append(OperatorText(Severity.WARNING, f"{name}: {count - last} {problem}"))
         return texts
 
 
@@ -190,8 +191,7 @@ class Client:
     link: Link
     texts: TextEncoder
     reply_texts: TextEncoder
-    events: EventSender | None = None
-    """Event sender; None without an autopilot."""
+    events: EventSender
     context: Context | None = None
     """Context of the handlers; None without an autopilot."""
     announced_origin: Geodetic | None = None
@@ -208,19 +208,18 @@ class Client:
     def wakes(self, now_us: int, texts: Sequence[OperatorText]) -> bool:
         """Return True if anything may be due for this client at simulated time [µs]."""
         # Ordered by cost and likelihood: the due time alone decides in most ticks.
-        events = self.events
         return bool(
             self.link.scheduler.wake_us <= now_us
             or texts
             or self.late
             or self.link.pending
             or self.announced_origin is None
-            or (events is not None and events.next_us <= now_us)
+            or self.events.next_us <= now_us
         )
 
     def next_us(self, now_us: int) -> float:
         """Return the next due time of all but the fast streams [µs]; `now_us` = immediately."""
-        events, context, plan = self.events, self.context, self.link.scheduler
+        context, plan = self.context, self.link.scheduler
         # Pending frames and running transfers need the very next tick.
         if self.late or self.link.pending or (context is not None and context.is_busy):
             return now_us
@@ -228,7 +227,7 @@ class Client:
         if self.announced_origin is None:
             # The origin is announced only on the time grid of the slow streams.
             slow_us = min(slow_us, plan.grid_us(now_us))
-        return slow_us if events is None else min(slow_us, events.next_us)
+        return min(slow_us, self.events.next_us)
 
     def due(self, now_us: int) -> list[str]:
         """Return the streams due at simulated time [µs], deferred ones first."""
@@ -388,9 +387,9 @@ class Clients:
         messages = self._doorkeeper.feed(chunk)
         self._strangers.take(max(1, len(messages)), now_us)
         if self._signing is not None and self._signing.key is not None:
-            heard = len(messages)
+            count = len(messages)
             messages = [m for m in messages if self._signing.accepts(bytes(m.get_msgbuf()))]
-            self._gone += LinkCounters(0, 0, 0, 0, 0, refused=heard - len(messages))
+            self._gone += LinkCounters(0, 0, 0, 0, 0, refused=count - len(messages))
             if not any(is_signed(m) for m in messages):
                 # An accepted unsigned frame creates no client. Otherwise one heartbeat with a
                 # spoofed source address would direct minutes of telemetry to that address.

@@ -70,10 +70,10 @@ def _digest() -> str:
     for name in INCLUDED:
         # Size and time reveal an upgrade of pymavlink without reading half a megabyte of text.
         try:
-            seen = (DEFINITIONS / f"{name}.xml").stat()
+            info = (DEFINITIONS / f"{name}.xml").stat()
         except OSError as error:
             raise ImportError(f"pymavlink lacks its message definitions: {error}") from error
-        digest.update(f"{name} {seen.st_size} {seen.st_mtime_ns}".encode())
+        digest.update(f"{name} {info.st_size} {info.st_mtime_ns}".encode())
     return digest.hexdigest()[:16]
 
 
@@ -139,12 +139,12 @@ def generate(newer: Path, definitions: Path, included: tuple[str, ...], module: 
     options = mavgen.Opts(
         str(module.with_suffix("")), wire_protocol="2.0", language="Python3", validate=False
     )
-    said = io.StringIO()
+    output = io.StringIO()
     # In a rehearsal, a process's standard output is its channel to the harness.
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
         made = mavgen.mavgen(options, [str(source)])
     if not made:
-        raise ImportError(f"pymavlink's generator failed: {said.getvalue()}")
+        raise ImportError(f"pymavlink's generator failed: {output.getvalue()}")
 
 
 if TYPE_CHECKING:

@@ -40,15 +40,12 @@ class Sender(Protocol):
     @property
     def send_errors(self) -> int:
         """Number of chunks that could not be sent."""
-        ...
 
     def send(self, data: bytes) -> None:
         """Send one frame immediately, as a reply."""
-        ...
 
     def send_streams(self, frames: Sequence[bytes]) -> None:
         """Send the telemetry of one tick, one frame after the other."""
-        ...
 
 
 class Endpoint(Sender, Protocol):
@@ -59,15 +56,12 @@ class Endpoint(Sender, Protocol):
 
     def receive(self) -> list[bytes]:
         """Return all chunks that have arrived, oldest first."""
-        ...
 
     def fileno(self) -> int | None:
         """Return the descriptor to wait on, or None if the endpoint has no descriptor."""
-        ...
 
     def close(self) -> None:
         """Release the resources. Repeated calls have no effect."""
-        ...
 
 
 class SharedEndpoint(Endpoint, Protocol):
@@ -76,18 +70,15 @@ class SharedEndpoint(Endpoint, Protocol):
     @property
     def is_polled(self) -> bool:
         """True if data may have arrived although the descriptor is not readable."""
-        ...
 
     def arrivals(self) -> Iterator[tuple[Peer, bytes]]:
         """Yield received chunks with their peers, oldest first, up to a maximum number.
 
         Chunks not taken from the iterator remain for the next call.
         """
-        ...
 
     def towards(self, peer: Peer) -> Sender | None:
         """Return a sender to one peer; None if the preset remote is not set."""
-        ...
 
 
 class MemoryEndpoint:
@@ -183,9 +174,9 @@ class UdpEndpoint:
         self,
         local: Address,
         remote: Address | None,
-        *,
         local_option: str,
         remote_option: str,
+        *,
         insecure: bool = False,
     ) -> None:
         """Bind the socket.

@@ -15,7 +15,7 @@ import numpy as np
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.signing import Signing
-from firmware_sim.autopilot.autopilot_state import AutopilotState
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
 from firmware_sim.mavlink.codec import (
     SYSTEM_ID,
@@ -91,8 +91,8 @@ class Link:
     ) -> None:
         """Open a link that streams `builders` and replies with `replies`; None = the same builders.
 
-        `endpoint` sends to one client; None = the config's. `system_id` is the vehicle's. `signing`
-        signs sent frames, with `link_id`, and checks received frames; None = neither.
+        `endpoint` sends to one client; None = the config's. `signing` signs sent frames, with
+        `link_id`, and checks received frames; None = neither.
         """
         self.name = config.name
         self.builders = builders
@@ -109,11 +109,7 @@ class Link:
         """Callback for the frames of both directions; None = disabled."""
         self.ignored = 0
         self.endpoint: Sender = config.endpoint if endpoint is None else endpoint
-        self._streams = {
-            name: (layout(name), builder)
-            for name, builder in builders.items()
-            if builder is not None
-        }
+        self._streams = {name: (layout(name), build) for name, build in builders.items() if build}
         self._replies = builders if replies is None else replies
         self._stream_encoder = Encoder(system_id)
         self._reply_encoder = (
@@ -153,9 +149,9 @@ class Link:
         messages = self._decoder.feed(chunk)
         # Frames are checked after decoding: signatures do not change the payload.
         if self._signing is not None and self._signing.key is not None:
-            heard = len(messages)
+            count = len(messages)
             messages = [m for m in messages if self._signing.accepts(bytes(m.get_msgbuf()))]
-            self._refused += heard - len(messages)
+            self._refused += count - len(messages)
         self.note(messages)
         return messages
 
@@ -231,8 +227,7 @@ class Link:
                 payload = payloads[builder]
             else:
                 values = builder(state)
-                payload = None if values is None else _payload(shape, values)
-                payloads[builder] = payload
+                payload = payloads[builder] = None if values is None else _payload(shape, values)
             if payload is None:
                 # A stream without content does not wake the link.
                 quiet.add(name)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from firmware_sim import sensor_table
 from firmware_sim.mavlink.endpoint import (
@@ -22,77 +22,70 @@ from firmware_sim.mavlink.endpoint import (
     UdpEndpoint,
 )
 
-ONBOARD_HZ: Mapping[str, float] = MappingProxyType(
-    {
-        "HEARTBEAT": 1.0,
-        "TIMESYNC": 10.0,
-        "ATTITUDE": 100.0,
-        "ATTITUDE_QUATERNION": 50.0,
-        "LOCAL_POSITION_NED": 30.0,
-        "ODOMETRY": 30.0,
-        "GLOBAL_POSITION_INT": 50.0,
-        "HIGHRES_IMU": 50.0,
-        "ALTITUDE": 10.0,
-        "ATTITUDE_TARGET": 10.0,
-        "POSITION_TARGET_LOCAL_NED": 10.0,
-        "POSITION_TARGET_GLOBAL_INT": 10.0,
-        "SERVO_OUTPUT_RAW": 10.0,
-        "VFR_HUD": 10.0,
-        "GPS_RAW_INT": 10.0,
-        "EXTENDED_SYS_STATE": 5.0,
-        "SYS_STATUS": 5.0,
-        "ESTIMATOR_STATUS": 1.0,
-        "PING": 1.0,
-        "SCALED_PRESSURE": 1.0,
-        "SYSTEM_TIME": 1.0,
-        "MISSION_CURRENT": 1.0,
-        "BATTERY_STATUS": 0.5,
-        "HOME_POSITION": 0.5,
-        "VIBRATION": 0.5,
-        "CURRENT_MODE": 0.5,
-        "TIME_ESTIMATE_TO_TARGET": 0.5,
-        "ORBIT_EXECUTION_STATUS": 5.0,
-        "ESC_INFO": 10.0,
-        "ESC_STATUS": 10.0,
-        "RC_CHANNELS": 20.0,
-        "DISTANCE_SENSOR": 10.0,
-        "OPTICAL_FLOW_RAD": 10.0,
-    }
+
+def _table(*rows: tuple[Any, ...]) -> Mapping[str, float]:
+    """Return the rates of rows that hold a rate [Hz] and the names of consecutive streams."""
+    return MappingProxyType({name: hz for hz, *names in rows for name in names})
+
+
+ONBOARD_HZ = _table(
+    (1.0, "HEARTBEAT"),
+    (10.0, "TIMESYNC"),
+    (100.0, "ATTITUDE"),
+    (50.0, "ATTITUDE_QUATERNION"),
+    (30.0, "LOCAL_POSITION_NED", "ODOMETRY"),
+    (50.0, "GLOBAL_POSITION_INT", "HIGHRES_IMU"),
+    (
+        10.0,
+        "ALTITUDE",
+        "ATTITUDE_TARGET",
+        "POSITION_TARGET_LOCAL_NED",
+        "POSITION_TARGET_GLOBAL_INT",
+        "SERVO_OUTPUT_RAW",
+        "VFR_HUD",
+        "GPS_RAW_INT",
+    ),
+    (5.0, "EXTENDED_SYS_STATE", "SYS_STATUS"),
+    (1.0, "ESTIMATOR_STATUS", "PING", "SCALED_PRESSURE", "SYSTEM_TIME", "MISSION_CURRENT"),
+    (
+        0.5,
+        "BATTERY_STATUS",
+        "HOME_POSITION",
+        "VIBRATION",
+        "CURRENT_MODE",
+        "TIME_ESTIMATE_TO_TARGET",
+    ),
+    (5.0, "ORBIT_EXECUTION_STATUS"),
+    (10.0, "ESC_INFO", "ESC_STATUS"),
+    (20.0, "RC_CHANNELS"),
+    (10.0, "DISTANCE_SENSOR", "OPTICAL_FLOW_RAD"),
 )
 """Onboard (API) link, 14580 -> 14540 [Hz]."""
 
-GCS_HZ: Mapping[str, float] = MappingProxyType(
-    {
-        "HEARTBEAT": 1.0,
-        "ATTITUDE": 50.0,
-        "ATTITUDE_QUATERNION": 50.0,
-        "LOCAL_POSITION_NED": 50.0,
-        "GLOBAL_POSITION_INT": 50.0,
-        "ATTITUDE_TARGET": 50.0,
-        "POSITION_TARGET_LOCAL_NED": 50.0,
-        "POSITION_TARGET_GLOBAL_INT": 1.0,
-        "SERVO_OUTPUT_RAW": 50.0,
-        "GPS_RAW_INT": 5.0,
-        "VFR_HUD": 4.0,
-        "ALTITUDE": 1.0,
-        "EXTENDED_SYS_STATE": 1.0,
-        "SCALED_PRESSURE": 1.0,
-        "SYS_STATUS": 1.0,
-        "MISSION_CURRENT": 1.0,
-        "BATTERY_STATUS": 0.5,
-        "ESTIMATOR_STATUS": 0.5,
-        "HOME_POSITION": 0.5,
-        "PING": 0.1,
-        "VIBRATION": 0.1,
-        "CURRENT_MODE": 0.5,
-        "TIME_ESTIMATE_TO_TARGET": 0.5,
-        "ORBIT_EXECUTION_STATUS": 5.0,
-        "ESC_INFO": 1.0,
-        "ESC_STATUS": 1.0,
-        "RC_CHANNELS": 5.0,
-        "DISTANCE_SENSOR": 0.5,
-        "OPTICAL_FLOW_RAD": 1.0,
-    }
+GCS_HZ = _table(
+    (1.0, "HEARTBEAT"),
+    (
+        50.0,
+        "ATTITUDE",
+        "ATTITUDE_QUATERNION",
+        "LOCAL_POSITION_NED",
+        "GLOBAL_POSITION_INT",
+        "ATTITUDE_TARGET",
+        "POSITION_TARGET_LOCAL_NED",
+    ),
+    (1.0, "POSITION_TARGET_GLOBAL_INT"),
+    (50.0, "SERVO_OUTPUT_RAW"),
+    (5.0, "GPS_RAW_INT"),
+    (4.0, "VFR_HUD"),
+    (1.0, "ALTITUDE", "EXTENDED_SYS_STATE", "SCALED_PRESSURE", "SYS_STATUS", "MISSION_CURRENT"),
+    (0.5, "BATTERY_STATUS", "ESTIMATOR_STATUS", "HOME_POSITION"),
+    (0.1, "PING", "VIBRATION"),
+    (0.5, "CURRENT_MODE", "TIME_ESTIMATE_TO_TARGET"),
+    (5.0, "ORBIT_EXECUTION_STATUS"),
+    (1.0, "ESC_INFO", "ESC_STATUS"),
+    (5.0, "RC_CHANNELS"),
+    (0.5, "DISTANCE_SENSOR"),
+    (1.0, "OPTICAL_FLOW_RAD"),
 )
 """Ground station link, 18570 -> 14550 [Hz]."""
 
@@ -183,25 +176,19 @@ def bind_udp_links(
         UsageError: A port is in use, or an address is reachable from other machines without
             `insecure`.
     """
-    api = UdpEndpoint(
-        (bind, api_local_port),
-        api_remote,
-        local_option="--api-local-port",
-        remote_option="--api-port",
-        insecure=insecure,
-    )
-    try:
-        gcs = UdpEndpoint(
-            (bind, gcs_local_port),
-            gcs_remote,
-            local_option="--gcs-local-port",
-            remote_option="--gcs-port",
-            insecure=insecure,
-        )
-    except Exception:
-        api.close()
-        raise
-    return UdpLinks(api, gcs)
+    ends: list[UdpEndpoint] = []
+    for name, port, remote in (
+        ("api", api_local_port, api_remote),
+        ("gcs", gcs_local_port, gcs_remote),
+    ):
+        options = f"--{name}-local-port", f"--{name}-port"
+        try:
+            ends.append(UdpEndpoint((bind, port), remote, *options, insecure=insecure))
+        except Exception:
+            for end in ends:
+                end.close()
+            raise
+    return UdpLinks(*ends)
 
 
 DEVICE_PORTS = {payload_link: (14280, 14030), gimbal_link: (13030, 13280)}
@@ -224,13 +211,8 @@ def bind_device_links(
         # As in PX4 SITL, each instance shifts all ports by its number.
         local, remote = (port + instance for port in ports)
         try:
-            end = UdpEndpoint(
-                (bind, local),
-                (remote_host, remote),
-                local_option="--instance",
-                remote_option="--instance",
-                insecure=insecure,
-            )
+            ends = (bind, local), (remote_host, remote)
+            end = UdpEndpoint(*ends, "--instance", "--instance", insecure=insecure)
         except PortTakenError:
             say(f"UDP port {local} is taken: no {link.__name__.replace('_', ' ')}")
             continue

@@ -14,8 +14,8 @@ from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.signing import Signing, StoredSigning
 from firmware_sim import sensor_table
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import OperatorText
-from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.engine.record import Record
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.clients import Allowance, Client, Clients, Complaints, TickTime
@@ -27,8 +27,7 @@ from firmware_sim.mavlink.endpoint import (
 )
 from firmware_sim.mavlink.link import Link, LinkCounters, Payloads
 from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, gcs_link, onboard_link
-from firmware_sim.mavlink.services import connection, handle, send_pending, table
-from firmware_sim.mavlink.services.context import Context, sender
+from firmware_sim.mavlink.services import Context, connection, handle, send_pending, sender, table
 from firmware_sim.mavlink.streams import (
     BUILDERS,
     VEHICLE_BUILDERS,
@@ -77,7 +76,7 @@ class MavlinkServer:
     def __init__(
         self,
         links: Sequence[LinkConfig],
-        port: AutopilotPort | None = None,
+        port: BuiltinAutopilot | None = None,
         *,
         boot_unix_us: int,
         clock: Clock | None = None,
@@ -94,7 +93,7 @@ class MavlinkServer:
             signing: Stored key, required on all links; None = no key until a client sets one, which
                 is lost when the server closes.
         """
-        self._port: AutopilotPort | None = None
+        self._port: BuiltinAutopilot | None = None
         self._has_sample = False
         """True if the autopilot has received a sample."""
         self._tick_time = TickTime(clock)
@@ -141,7 +140,7 @@ class MavlinkServer:
         if port is not None:
             self.attach(port)
 
-    def attach(self, port: AutopilotPort, truth: Callable[[], TrueState] | None = None) -> None:
+    def attach(self, port: BuiltinAutopilot, truth: Callable[[], TrueState] | None = None) -> None:
         """Replace the autopilot between two episodes; `truth` returns the true state for clients.
 
         Keeps clients and the rates they have set. Drops running parameter lists and messages for
@@ -245,14 +244,7 @@ class MavlinkServer:
         after_us: int,
         texts: Sequence[OperatorText],
     ) -> None:
-        """Send texts, events and due streams to clients.
-
-        Args:
-            due: Clients with anything to send, and their slow streams.
-            flown: (n,) logs of the newest ticks.
-            after_us: Time from the log of a tick to its end [µs].
-            texts: Texts for operators.
-        """
+        """Send texts, events and streams to clients that are due, each with its slow streams."""
         assert self._port is not None  # noqa: S101 (the caller has looked)
         now_us, state = self._now_us, self._port.state()
         origin, before, last = state.origin, self._context.row, len(flown) - 1
@@ -274,7 +266,7 @@ class MavlinkServer:
                     link.stream_fast(flown[last:], after_us, context, most)
                 else:
                     link.stream_fast(flown, after_us, context, most)
-            if texts or (client.events is not None and client.events.has_news(now_us)):
+            if texts or client.events.next_us <= now_us:
                 _stream_news(client, texts, now_us)
             # Streams beyond the share wait for the next tick, where they come first.
             if len(names) > share:
@@ -370,7 +362,8 @@ class MavlinkServer:
             )
             texts = TextEncoder()
             reply_texts = TextEncoder(REPLY_IDS) if config.separate_replies else texts
-            client = Client(peer, link, texts, reply_texts, heard_us=self._now_us)
+            events = EventSender(self._events)
+            client = Client(peer, link, texts, reply_texts, events, heard_us=self._now_us)
             if self._port is not None:
                 self._connect(client, self._port)
                 # A client that connects in flight starts its streams now.
@@ -379,7 +372,7 @@ class MavlinkServer:
 
         return Clients(config.name, config.endpoint, welcome, self._tick_time, self._signing)
 
-    def _connect(self, client: Client, port: AutopilotPort) -> None:
+    def _connect(self, client: Client, port: BuiltinAutopilot) -> None:
         client.link.identify(self._system_id)
         # Ends transfers that refer to the old autopilot.
         client.close()
@@ -423,7 +416,7 @@ class MavlinkServer:
         context.now_us = self._now_us
         self._is_transferring = True  # cleared by `send` when idle
         client.hear(source)
-        self._traffic.heard(client, message)
+        self._traffic.record_first(client, message)
         kind = message.get_type()
         effective = handle(message, kind, context)
         if effective:
@@ -466,9 +459,8 @@ def _stream_news(client: Client, texts: Iterable[OperatorText], now_us: int) -> 
     for text in texts:
         for chunk in client.texts.encode(text):
             client.link.stream(chunk)
-    if client.events is not None:
-        for message in client.events.due(now_us):
-            client.link.stream(message)
+    for message in client.events.due(now_us):
+        client.link.stream(message)
 
 
 def _tell(clients: Iterable[Client], text: OperatorText) -> None:
@@ -477,14 +469,14 @@ def _tell(clients: Iterable[Client], text: OperatorText) -> None:
             client.link.send(chunk)
 
 
-def _share(asked: Sequence[int]) -> int:
+def _share(requests: Sequence[int]) -> int:
     """Return the maximum number of streamed messages per client and tick, given their requests."""
-    if sum(asked) <= STREAMS_PER_TICK // 2:
+    if sum(requests) <= STREAMS_PER_TICK // 2:
         return STREAMS_PER_TICK // 2
-    return max(1, STREAMS_PER_TICK // 2 // sum(1 for number in asked if number))
+    return max(1, STREAMS_PER_TICK // 2 // sum(1 for number in requests if number))
 
 
-def _system_id(port: AutopilotPort) -> int:
+def _system_id(port: BuiltinAutopilot) -> int:
     """Return MAV_SYS_ID, which PX4 reads at boot."""
     stored = port.parameters.by_name("MAV_SYS_ID")
     return SYSTEM_ID if stored is None else int(stored.value)

@@ -25,8 +25,9 @@ from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.vehicle import atmosphere
 from airl_mav.vehicle.rotation import rotate, yaw_of
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
+from firmware_sim.autopilot.autopilot_state import Arming
 from firmware_sim.autopilot.failsafes import detectors
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import FLOWN_TICK, POSITION, TRAJECTORY, Fields, Record
 from firmware_sim.mavlink.codec import COMPONENT_ID, dialect, message_id
 from firmware_sim.mavlink.streams import units
@@ -559,36 +560,27 @@ def _parts(v: Vector, row: Fields, context: Vector, parts: int) -> None:
         _health(v, row, context)
 
 
-(_ZERO, _NAN, _ONE, _HEALTHY, _LOCATED, _TIME_US, _ROLL, _QW, _P, _X, _VX, _VAR_X, _VAR_ROLL) = (
-    _AT[name]
-    for name in (
-        *("zero", "nan", "one", "healthy", "located", "time_us", "roll", "qw", "p", "x", "vx"),
-        *("var_x", "var_roll"),
-    )
+def _indices(names: str) -> list[int]:
+    return [_AT[name] for name in names.split()]
+
+
+_ZERO, _NAN, _ONE, _HEALTHY, _LOCATED, _TIME_US, _ROLL, _QW = _indices(
+    "zero nan one healthy located time_us roll qw"
 )
-(_VAR_VX, _LAT_E7, _VX_CM, _YAW_CDEG, _AX, _PRESSURE, _AMSL, _UP, _ABOVE_HOME, _TERRAIN_AT) = (
-    _AT[name]
-    for name in (
-        *("var_vx", "lat_e7", "vx_cm", "yaw_cdeg", "ax", "pressure", "amsl", "up", "above_home"),
-        "terrain",
-    )
+_P, _X, _VX, _VAR_X, _VAR_ROLL, _VAR_VX, _LAT_E7, _VX_CM = _indices(
+    "p x vx var_x var_roll var_vx lat_e7 vx_cm"
 )
-(_GROUND_SPEED, _HEADING_DEG, _THROTTLE, _HUD_ALT, _CLIMB, _SP_QW, _SP_THRUST, _SP_MASK) = (
-    _AT[name]
-    for name in (
-        *("ground_speed", "heading_deg", "throttle", "hud_alt", "climb", "sp_qw", "sp_thrust"),
-        "sp_mask",
-    )
+_YAW_CDEG, _AX, _PRESSURE, _AMSL, _UP, _ABOVE_HOME, _TERRAIN_AT, _GROUND_SPEED = _indices(
+    "yaw_cdeg ax pressure amsl up above_home terrain ground_speed"
 )
-(_SP_X, _SP_VX, _SP_AX, _SP_YAW, _PWM_1, _LOCAL_NED) = (
-    _AT[name] for name in ("sp_x", "sp_vx", "sp_ax", "sp_yaw", "pwm_1", "local_ned")
+_HEADING_DEG, _THROTTLE, _HUD_ALT, _CLIMB, _SP_QW, _SP_THRUST, _SP_MASK, _SP_X = _indices(
+    "heading_deg throttle hud_alt climb sp_qw sp_thrust sp_mask sp_x"
 )
-(_GOAL_KNOWN, _FIX_KNOWN, _ESC_CDEG_1, _RPM_1, _VOLT, _AMPERE_1, _PARTS_PRESENT, _BATTERY_MV) = (
-    _AT[name]
-    for name in (
-        *("goal_known", "fix_known", "esc_cdeg_1", "rpm_1", "volt", "ampere_1", "parts_present"),
-        "battery_mv",
-    )
+_SP_VX, _SP_AX, _SP_YAW, _PWM_1, _LOCAL_NED, _GOAL_KNOWN, _FIX_KNOWN, _ESC_CDEG_1 = _indices(
+    "sp_vx sp_ax sp_yaw pwm_1 local_ned goal_known fix_known esc_cdeg_1"
+)
+_RPM_1, _VOLT, _AMPERE_1, _PARTS_PRESENT, _BATTERY_MV = _indices(
+    "rpm_1 volt ampere_1 parts_present battery_mv"
 )
 _PARACHUTE: int = dialect.MAV_SYS_STATUS_RECOVERY_SYSTEM
 _X_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_X_IGNORE

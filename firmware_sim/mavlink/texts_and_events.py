@@ -42,29 +42,29 @@ class EventBuffer:
     """Most recent events of a vehicle since boot."""
 
     def __init__(self) -> None:
-        self._kept: deque[SentEvent] = deque(maxlen=KEPT)
+        self._stored: deque[SentEvent] = deque(maxlen=KEPT)
         self.latest = FIRST_SEQUENCE - 1
         """Sequence number of the newest event; `FIRST_SEQUENCE - 1` before the first event."""
 
     def __len__(self) -> int:
         """Return the number of stored events."""
-        return len(self._kept)
+        return len(self._stored)
 
     def add(self, event: MavlinkEvent, time_us: int) -> None:
         """Add an event that occurred at simulated `time_us` [µs]."""
         self.latest = (self.latest + 1) % NUMBERS
-        self._kept.append(SentEvent(self.latest, time_us, event))
+        self._stored.append(SentEvent(self.latest, time_us, event))
 
     def get(self, sequence: int) -> SentEvent | None:
         """Return the event with a sequence number; None = expired or not yet occurred."""
-        for sent in self._kept:
+        for sent in self._stored:
             if sent.sequence == sequence:
                 return sent
         return None
 
     def after(self, sequence: int) -> int:
         """Return the sequence number of the first stored event after another event."""
-        following = [s.sequence for s in self._kept if s.sequence != sequence]
+        following = [s.sequence for s in self._stored if s.sequence != sequence]
         return min(following, key=lambda s: (s - sequence) % NUMBERS, default=self.latest)
 
 
@@ -77,10 +77,6 @@ class EventSender:
         self._sent = buffer.latest
         self._announced_us = 0
         self._first = len(buffer) == 0
-
-    def has_news(self, now_us: int) -> bool:
-        """Return True if anything is due at simulated `now_us` [µs]. Usually False."""
-        return now_us >= self.next_us
 
     @property
     def next_us(self) -> int:
@@ -126,14 +122,11 @@ def message(sent: SentEvent) -> WireMessage:
 
 CHUNK_BYTES = 50
 
-
 _LAST_ID = 65_535
-
 
 SAID_BY_EVENT = b"\t"
 """Suffix of a text that is also sent as an event, as in PX4. Ground stations with event support
 skip such texts."""
-
 
 REPLY_IDS = 32_768
 """First id of replies if they are numbered separately from the autopilot's texts. The ids of two

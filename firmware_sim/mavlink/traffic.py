@@ -14,7 +14,7 @@ from pathlib import Path
 from airl_mav.core.files import LogFile
 from firmware_sim.mavlink.clients import Client
 from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
-from firmware_sim.mavlink.services.context import ANY, sender
+from firmware_sim.mavlink.services import ANY, sender
 
 _TIME = struct.Struct(">Q")
 _LINK_BITS = 0b11
@@ -73,7 +73,7 @@ class TrafficLog:
             self._names[client.link.name] += 1
             self._tap(client, tlog)
 
-    def heard(self, client: Client, message: WireMessage) -> None:
+    def record_first(self, client: Client, message: WireMessage) -> None:
         """Start a client's log at its first frame."""
         main = self._main
         # The limit bounds the open files during a flood of clients.
@@ -133,7 +133,6 @@ COMMANDS = frozenset(
 )
 """Messages that change the vehicle's behaviour."""
 
-
 ANNOUNCED = (dialect.MAV_TYPE_GCS, dialect.MAV_TYPE_ONBOARD_CONTROLLER)
 """MAV_TYPE values in the heartbeat of a ground station and of a companion computer."""
 
@@ -173,9 +172,7 @@ REMEMBERED_FRAMES = 128
 """Number of recent frames per sender that are not forwarded again. Below 256, the number of
 sequence numbers: a sender of heartbeats alone repeats its frames after that."""
 
-
 REMEMBERED_SENDERS = 256
-
 
 NEVER = frozenset((dialect.MAVLINK_MSG_ID_SETUP_SIGNING,))
 """Messages that are never forwarded. A signing key is for its recipient only."""
@@ -187,7 +184,7 @@ class Forwarder:
     def __init__(self, everybody: Callable[[], Iterable[Client]]) -> None:
         """Store the callable that returns all clients of all links."""
         self._everybody = everybody
-        self._seen: OrderedDict[tuple[int, int], deque[bytes]] = OrderedDict()
+        self._recent: OrderedDict[tuple[int, int], deque[bytes]] = OrderedDict()
 
     def forward(self, message: WireMessage, origin: Client, system_id: int, now_us: int) -> bool:
         """Forward a message to the clients concerned; return True if any received it.
@@ -222,16 +219,16 @@ class Forwarder:
         return True
 
     def _is_new(self, source: tuple[int, int], frame: bytes) -> bool:
-        frames = self._seen.get(source)
+        frames = self._recent.get(source)
         if frames is None:
             # The sender that was silent longest is removed (`move_to_end` below keeps this order).
-            if len(self._seen) >= REMEMBERED_SENDERS:
-                self._seen.popitem(last=False)
-            frames = self._seen[source] = deque(maxlen=REMEMBERED_FRAMES)
+            if len(self._recent) >= REMEMBERED_SENDERS:
+                self._recent.popitem(last=False)
+            frames = self._recent[source] = deque(maxlen=REMEMBERED_FRAMES)
         if frame in frames:
             return False
         frames.append(frame)
-        self._seen.move_to_end(source)
+        self._recent.move_to_end(source)
         return True
 
 
@@ -242,5 +239,5 @@ def _concerns(target: tuple[int, int], client: Client) -> bool:
     if system == ANY:
         return bool(client.components)
     if component == ANY:
-        return any(heard[0] == system for heard in client.components)
+        return any(source[0] == system for source in client.components)
     return target in client.components

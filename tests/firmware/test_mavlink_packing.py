@@ -16,14 +16,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from airl_mav.core.frames import local_to_geodetic, quat_from_euler, quat_to_euler, quat_yaw
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Setpoint
+from firmware_sim.addons.ground_station_services.information import SILENT
+from firmware_sim.autopilot.autopilot_state import Arming, Setpoint
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import BatterySample
 from firmware_sim.mavlink.codec import SYSTEM_ID, Encoder, Values, WireLayout, dialect, layout
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import Link, Payloads
 from firmware_sim.mavlink.px4_links import onboard_link
-from firmware_sim.mavlink.streams import BUILDERS, SILENT, units
+from firmware_sim.mavlink.streams import BUILDERS, addon_builders, units
 from firmware_sim.mavlink.telemetry import payload
 from tests.support.kinematic_autopilot import ORIGIN, KinematicAutopilot
 from tests.support.mavlink_clients import Bench
@@ -199,12 +201,12 @@ def test_every_stream_at_rest() -> None:
     own |= {"TIME_ESTIMATE_TO_TARGET", "MAG_CAL_REPORT"}
     # There is no plant, no manual control input, and no radio.
     lacking = {"HIL_STATE_QUATERNION", "MANUAL_CONTROL", "RC_CHANNELS"}
-    own |= lacking
+    own |= lacking | addon_builders().keys()
     assert set(streams(bench)) == BUILDERS.keys() | own
     # There is no orbit, no target position, and no sensor that looks down.
     idle = {"ORBIT_EXECUTION_STATUS", "POSITION_TARGET_GLOBAL_INT"}
     idle |= {"DISTANCE_SENSOR", "OPTICAL_FLOW_RAD"}
-    silent = SILENT.keys() | idle | lacking
+    silent = idle | lacking | set(SILENT)
     assert check_streams(bench.autopilot, bench) == (BUILDERS.keys() | own) - silent
 
 

@@ -17,7 +17,7 @@ from airl_mav.camera.picture import render_picture
 from airl_mav.camera.render import camera_pose
 from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
-from airl_mav.report.forensics.camera_view import PolicyCamera
+from airl_mav.report.policy_view import PolicyCamera
 from tests.support.run_demo import write_demo_run
 
 

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from airl_mav.addons.forensics.worst import examine_worst
 from airl_mav.arena.geometry import Arena
 from airl_mav.flight.judge import Outcome
 from airl_mav.latency.injection import NOTHING_INJECTED
@@ -22,7 +23,6 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder, load
 from airl_mav.report.document import TableView
 from airl_mav.report.energy_section import energy_flights_table, energy_table, flight_energies
-from airl_mav.report.forensics.worst import examine_worst
 from airl_mav.report.measures import conduct_table, summarize_run
 from airl_mav.report.plotly_scene import plotly_script
 from airl_mav.report.run_report import MAX_PICTURED, build_page

@@ -9,20 +9,20 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from airl_mav.core.frames import heading_to_ned, quat_yaw
 from airl_mav.core.signing import Signing
-from firmware_sim.autopilot.autopilot_state import (
-    AutopilotState,
-    Landed,
-    OperatorText,
-    Result,
-    Setpoint,
-    Severity,
-)
+from firmware_sim.autopilot.autopilot_state import Landed, OperatorText, Result, Setpoint, Severity
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.link import Link
 from firmware_sim.mavlink.px4_links import LinkConfig
-from firmware_sim.mavlink.services import handle, table
-from firmware_sim.mavlink.services.context import Context, VehicleCommand, for_vehicle, sender
+from firmware_sim.mavlink.services import (
+    Context,
+    VehicleCommand,
+    for_vehicle,
+    handle,
+    sender,
+    table,
+)
 from firmware_sim.mavlink.streams import BUILDERS, Builder, status
 from firmware_sim.mavlink.telemetry import PARTS, TickContext, flown_of
 from firmware_sim.mavlink.texts_and_events import EventBuffer, TextEncoder

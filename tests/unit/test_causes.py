@@ -9,44 +9,39 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Shape, Tour
-from airl_mav.camera.render import camera_pose
-from airl_mav.core.frames import quat_to_matrix
-from airl_mav.envs.stopping import braking_of
-from airl_mav.flight.episode_record import EpisodeRecord
-from airl_mav.flight.judge import Outcome
-from airl_mav.flight.trajectory import Trajectory, measure_quality
-from airl_mav.profiles.appearance import Appearance
-from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.report.forensics.camera_view import (
-    PolicyCamera,
-    bearing,
-    nearest_spot,
-    view_obstacle,
-    view_wall,
-)
-from airl_mav.report.forensics.evidence import (
-    NO_CAUSE,
-    Evidence,
-    UsualFlight,
-    path_excess,
-    straight_m,
-    time_lost_s,
-    usual_flight,
-)
-from airl_mav.report.forensics.long_flights import (
+from airl_mav.addons.forensics.camera_view import bearing, nearest_spot, view_obstacle, view_wall
+from airl_mav.addons.forensics.long_flights import (
     MIN_TURNS,
+    NO_CAUSE,
     SPOT_M,
+    Evidence,
     longest_limit_cycle,
     swinging_stretches,
 )
-from airl_mav.report.forensics.worst import (
+from airl_mav.addons.forensics.worst import (
     USUAL,
     cause_of,
     decisions_in_effect,
     examine_collision,
     hit_number,
 )
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Shape, Tour
+from airl_mav.camera.render import camera_pose
+from airl_mav.core.frames import quat_to_matrix
+from airl_mav.envs.stopping import braking_of
+from airl_mav.flight.episode_record import (
+    EpisodeRecord,
+    UsualFlight,
+    path_excess,
+    straight_m,
+    time_lost_s,
+    usual_flight,
+)
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.trajectory import Trajectory, measure_quality
+from airl_mav.profiles.appearance import Appearance
+from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.report.policy_view import PolicyCamera
 
 CAMERA = load_vehicle("quad").camera
 BRAKING = braking_of(load_vehicle("quad"))

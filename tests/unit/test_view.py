@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib import colormaps
 
-from airl_mav.addons.view.panel import NO_RETURN, VIRIDIS, camera_picture, numbers_html, texts_html
+from airl_mav.addons.view.panel import NO_RETURN, camera_picture, numbers_html, texts_html
 from airl_mav.addons.view.taps import Hand, HandCompensator, HandLatency
 from airl_mav.addons.view.view_messages import (
     STRIP_S,
@@ -252,11 +251,6 @@ def test_near_is_bright_and_nothing_is_dark() -> None:
     nothing, near, far = picture[0, side // 2], picture[0, 3 * side // 2], picture[0, 5 * side // 2]
     assert tuple(nothing) == NO_RETURN
     assert int(near.sum()) > int(far.sum()) + 100
-
-
-def test_depth_has_the_colours_of_matplotlib() -> None:
-    theirs = colormaps["viridis"](np.arange(256), bytes=True)[:, :3]
-    np.testing.assert_array_equal(VIRIDIS, theirs)
 
 
 def test_numbers_and_texts_are_told_and_escaped() -> None:

@@ -12,7 +12,7 @@ from airl_mav.addons.view.replayed_flight import ReplayedFlight
 from airl_mav.black_box.messages import Decision
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import goal_distance_m
-from airl_mav.flight.trajectory import Trajectory, pose_at
+from airl_mav.flight.trajectory import Trajectory, estimate_of, pose_at
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, SETPOINTS, STAMPS, setpoint_column
 from airl_mav.rehearsal.run_folder import RunInfo
 from airl_mav.vehicle.power import drain, open_circuit, terminal_voltage
@@ -36,14 +36,7 @@ class RecordedFlight:
     @property
     def estimate(self) -> Trajectory | None:
         """Path estimated by the flight controller; None if not recorded."""
-        stamps = self.replayed.stamps
-        if "estimate/time_us" not in stamps or not len(stamps["estimate/time_us"]):
-            return None
-        arrays = {
-            name: stamps[f"estimate/{name}"]
-            for name in ("time_us", "position", "velocity", "quaternion")
-        }
-        return Trajectory(**arrays, power_w=np.zeros(len(arrays["time_us"])))
+        return estimate_of(self.replayed.stamps)
 
     @property
     def believed(self) -> Trajectory:

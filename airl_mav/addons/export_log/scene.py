@@ -219,10 +219,7 @@ def _surface(
     name: str, places: Floats, faces: NDArray[np.int32], rgb: scene.Colour, at: messages.Timestamp
 ) -> messages.SceneEntity:
     surface = messages.TriangleListPrimitive(
-        pose=_ORIGIN,
-        points=points(places),
-        color=colour(rgb),
-        indices=faces.ravel().tolist(),
+        pose=_ORIGIN, points=points(places), color=colour(rgb), indices=faces.ravel().tolist()
     )
     return _entity(name, at, triangles=[surface])
 

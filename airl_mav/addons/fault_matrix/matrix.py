@@ -8,7 +8,9 @@ import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -40,12 +42,9 @@ landing speed; crashed: faster, or upside down; flying: still in the air at the 
 further from home, or higher, than the bound; broken: NaN or infinity, or an exception.
 """
 
-
 MATRIX_PHASES: tuple[Phase, ...] = (*("ground", "climb", "hold", "offboard", "mission", "landing"),)
 
-
 SAFE: frozenset[End] = frozenset({"landed"})
-
 
 FALLS: frozenset[End] = frozenset({"landed", "crashed"})
 """Results without control: the vehicle falls, within the bounds."""
@@ -103,10 +102,8 @@ CASES: tuple[Case, ...] = (
 """Faults that PX4 is expected to survive, and faults that no quadrotor survives. Covers the flight
 controller alone: camera and link faults belong to the companion."""
 
-
 STANDS: frozenset[End] = frozenset({"landed", "flying"})
 """Results without a landing detection: safe, but the motors may keep running."""
-
 
 FITTED_CASES: tuple[Case, ...] = (
     Case("rangefinder off"),
@@ -119,9 +116,7 @@ FITTED_CASES: tuple[Case, ...] = (
 )
 """Faults of optional sensors, flown only on request."""
 
-
 CASE_OF: Mapping[str, Case] = {case.fault: case for case in (*CASES, *FITTED_CASES)}
-
 
 AFTER_S = 0.5
 """Time from the start of the phase to the fault [s]."""
@@ -175,71 +170,65 @@ def fly_fault(vehicle: VehicleProfile, fault: str, phase: Phase, seed: int) -> F
         simulation.close()
 
 
+@dataclass
 class _Flight:
     """Simulated pilot of one flight."""
 
-    def __init__(
-        self,
-        simulation: Simulation,
-        autopilot: BuiltinAutopilot,
-        fault: str,
-        phase: Phase,
-        seed: int,
-    ) -> None:
-        self._simulation, self._autopilot = simulation, autopilot
-        self._told = fault, phase, seed
-        self._said: list[str] = []
-        self._streams = False
-        self._farthest_m = 0.0
-        self._touchdowns: list[float] = []
-        self._ticks = 0
-        self._autopilot.on_message = lambda message: self._hear(message.text)
+    simulation: Simulation
+    autopilot: BuiltinAutopilot
+    fault: str
+    phase: Phase
+    seed: int
+    texts: list[str] = field(default_factory=list)
+    """Texts for the operator after the start of the fault."""
+    streams: bool = False
+    """True while the pilot sends offboard setpoints."""
+    farthest_m: float = 0.0
+    touchdowns: list[float] = field(default_factory=list)
+    ticks: int = 0
+
+    def __post_init__(self) -> None:
+        """Listen to the autopilot's texts."""
+        self.autopilot.on_message = lambda message: self._hear(message.text)
 
     def _hear(self, text: str) -> None:
-        faults = self._simulation.faults
-        if faults is not None and faults.acted(self._simulation.time_us):
-            self._said.append(text)
+        faults = self.simulation.faults
+        if faults is not None and faults.acted(self.simulation.time_us):
+            self.texts.append(text)
 
     def fly(self) -> FaultFlight:
-        simulation = self._simulation
+        simulation = self.simulation
         pilot, end = self._pilot(), None
         while end is None and simulation.time_us < LONGEST_S * US_PER_S:
             try:
                 end = next(pilot, None) or self._tick()
             except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as error:
-                self._said.append(f"{type(error).__name__}: {error}")
+                self.texts.append(f"{type(error).__name__}: {error}")
                 end = "broken"
-        fault, phase, seed = self._told
-        return FaultFlight(
-            fault,
-            phase,
-            seed,
-            end or "flying",
-            max(self._touchdowns, default=None),
-            round(self._farthest_m, 3),
-            self._autopilot.flight.mode.name,
-            tuple(dict.fromkeys(self._said)),
-        )
+        touchdown_m_s, farthest_m = max(self.touchdowns, default=None), round(self.farthest_m, 3)
+        mode, texts = self.autopilot.flight.mode.name, tuple(dict.fromkeys(self.texts))
+        result = end or "flying", touchdown_m_s, farthest_m, mode, texts
+        return FaultFlight(self.fault, self.phase, self.seed, *result)
 
     def _tick(self) -> End | None:
         """Fly a tick; return the end if the flight is over, otherwise None."""
-        simulation, flight = self._simulation, self._autopilot.flight
-        if self._streams and simulation.time_us % _REPEAT_US < TICK_US:
+        simulation, flight = self.simulation, self.autopilot.flight
+        if self.streams and simulation.time_us % _REPEAT_US < TICK_US:
             self._offer()
         flown = flight.phase is Commander.AIR
         simulation.tick()
-        self._ticks += 1
-        if self._ticks % _LOOK_TICKS == 0 and not (
+        self.ticks += 1
+        if self.ticks % _LOOK_TICKS == 0 and not (
             np.isfinite(simulation.plant.motion).all()
-            and np.isfinite(self._autopilot.estimator.state).all()
+            and np.isfinite(self.autopilot.estimator.state).all()
         ):
             return "broken"
         distance_m = math.dist((0.0, 0.0, 0.0), simulation.plant.position)
-        self._farthest_m = max(self._farthest_m, distance_m)
+        self.farthest_m = max(self.farthest_m, distance_m)
         if distance_m > FENCE_M:
             return "flown away"
         for hit in simulation.plant.collisions:  # collisions of this tick only: nothing is recorded
-            self._touchdowns.append(hit.speed_m_s)
+            self.touchdowns.append(hit.speed_m_s)
             if hit.speed_m_s >= TOUCHDOWN_M_S and flown:
                 return "crashed"
         return None
@@ -248,11 +237,11 @@ class _Flight:
         """Send an offboard setpoint to the north."""
         north = np.array([2.0, 0.0, 0.0])
         setpoint = Setpoint(np.full(3, math.nan), north, 0.0, math.nan)
-        self._autopilot.offer_setpoint(setpoint, self._simulation.time_us)
+        self.autopilot.offer_setpoint(setpoint, self.simulation.time_us)
 
     def _waypoint(self) -> PlanItem:
         """Return a mission item north of any position that is reached."""
-        origin = self._autopilot.estimator.origin
+        origin = self.autopilot.estimator.origin
         if origin is None:
             raise ValueError("a mission without a position")
         place = local_to_geodetic(np.array([FENCE_M, 0.0, 0.0]), origin)
@@ -267,9 +256,9 @@ class _Flight:
 
     def _pilot(self) -> Iterator[End | None]:
         """Act as the pilot, one tick per step; yield the end when it is known."""
-        autopilot = self._autopilot
+        autopilot = self.autopilot
         while autopilot.flight.phase is Commander.BOOT:
-            if self._simulation.time_us > 20 * US_PER_S:
+            if self.simulation.time_us > 20 * US_PER_S:
                 yield "not armed"
             yield None
         yield from self._wait(2.0)
@@ -282,17 +271,17 @@ class _Flight:
         autopilot.takeoff(ALTITUDE_M)
         yield from self._fly_as(Mode.TAKEOFF, 30.0, until=Mode.HOLD)
         yield from self._fly_as(Mode.HOLD, 2.0)
-        north = Mode.MISSION if self._told[1] == "mission" else Mode.OFFBOARD
+        north = Mode.MISSION if self.phase == "mission" else Mode.OFFBOARD
         if autopilot.flight.mode is Mode.HOLD:
             if north is Mode.MISSION:
                 autopilot.plans.store(MissionType.MISSION, (self._waypoint(),), 1, 0)
             else:
-                self._streams = True
+                self.streams = True
                 self._offer()
                 yield None
             autopilot.set_mode(north)
         yield from self._fly_as(north, 3.0)
-        self._streams = False
+        self.streams = False
         if autopilot.flight.mode is north:
             autopilot.set_mode(Mode.LAND)
         else:
@@ -304,9 +293,9 @@ class _Flight:
         self, mode: Mode, limit_s: float, until: Mode | None = None
     ) -> Iterator[End | None]:
         """Wait while a mode is active, at most `limit_s` [s]."""
-        end_us = self._simulation.time_us + limit_s * US_PER_S
-        flight = self._autopilot
-        while flight.flight.mode is mode and self._simulation.time_us < end_us:
+        end_us = self.simulation.time_us + limit_s * US_PER_S
+        flight = self.autopilot
+        while flight.flight.mode is mode and self.simulation.time_us < end_us:
             if flight.flight.phase < Commander.GROUND:
                 yield "landed"
             yield None
@@ -315,10 +304,10 @@ class _Flight:
 
     def _until_down(self, limit_s: float) -> Iterator[End | None]:
         """Wait until the motors are off, at most `limit_s` [s]."""
-        end_us = self._simulation.time_us + limit_s * US_PER_S
-        while self._simulation.time_us < end_us:
-            if self._autopilot.flight.phase < Commander.GROUND:
-                yield "landed" if self._simulation.plant.position[2] > -0.5 else "crashed"
+        end_us = self.simulation.time_us + limit_s * US_PER_S
+        while self.simulation.time_us < end_us:
+            if self.autopilot.flight.phase < Commander.GROUND:
+                yield "landed" if self.simulation.plant.position[2] > -0.5 else "crashed"
             yield None
 
     def _wait(self, seconds: float) -> Iterator[None]:
@@ -376,40 +365,22 @@ def fly_matrix(
         if [flight.seed for flight in cell.flights] == list(seeds)
     }
     jobs = [(fault, phase) for fault in faults for phase in phases]
+    missing = [job for job in jobs if job not in kept]
+    fly = partial(_fly_cell, vehicle, tuple(seeds))
     cells: list[MatrixCell] = []
-    for cell in _flown_cells(vehicle, jobs, tuple(seeds), kept, workers):
-        cells.append(cell)
-        flown(cell)
+    # Spawned processes: pybullet and compiled kernels do not survive a fork beside threads.
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, mp_context=context) if workers > 1 else None
+    with pool or nullcontext():
+        new = iter(map(fly, missing) if pool is None else pool.map(fly, missing))
+        for job in jobs:
+            cells.append(kept.get(job) or next(new))
+            flown(cells[-1])
     return cells
 
 
-def _flown_cells(
-    vehicle: VehicleProfile,
-    jobs: Sequence[tuple[str, Phase]],
-    seeds: Sequence[int],
-    kept: Mapping[tuple[str, Phase], MatrixCell],
-    workers: int,
-) -> Iterator[MatrixCell]:
-    """Yield the cells of the jobs, in the order of the jobs."""
-    if workers == 1:
-        for job in jobs:
-            yield kept.get(job) or _fly_cell(vehicle, *job, seeds)
-        return
-    # Spawned processes: pybullet and compiled kernels do not survive a fork beside threads.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        waiting = {
-            job: pool.submit(_fly_cell, vehicle, *job, seeds) for job in jobs if job not in kept
-        }
-        for job in jobs:
-            yield kept.get(job) or waiting[job].result()
-
-
-def _fly_cell(
-    vehicle: VehicleProfile, fault: str, phase: Phase, seeds: Sequence[int]
-) -> MatrixCell:
-    flights = tuple(fly_fault(vehicle, fault, phase, seed) for seed in seeds)
-    return MatrixCell(fault, phase, flights)
+def _fly_cell(vehicle: VehicleProfile, seeds: Sequence[int], job: tuple[str, Phase]) -> MatrixCell:
+    return MatrixCell(*job, tuple(fly_fault(vehicle, *job, seed) for seed in seeds))
 
 
 def markdown(cells: Sequence[MatrixCell]) -> str:

@@ -107,9 +107,7 @@ def episode_of(
     quality = None
     if navigation_us is not None and len(path):
         quality = measure_quality(
-            *(path, navigation_us, ended_us, 0.0),
-            decisions=stamps,
-            hold_s=asked.pilot.hold_s,
+            *(path, navigation_us, ended_us, 0.0), decisions=stamps, hold_s=asked.pilot.hold_s
         )
     batteries = [status.battery_remaining for status in box.all_of(Status)]
     record = EpisodeRecord(

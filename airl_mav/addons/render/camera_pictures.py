@@ -38,7 +38,7 @@ from airl_mav.core.frames import quat_to_matrix
 from airl_mav.flight.trajectory import pose_at
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.projections import distorted, steepness
-from airl_mav.report.forensics.camera_view import PolicyCamera
+from airl_mav.report.policy_view import PolicyCamera
 from airl_mav.report.theme import coloured
 
 ROOM = {

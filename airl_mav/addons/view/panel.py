@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Callable, Iterable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -15,30 +16,6 @@ from viser import uplot
 from airl_mav.addons.view.view_messages import STRIP_S, Decided, Image, Shown
 from airl_mav.camera.frame import nearness, rgb_of
 from airl_mav.core.constants import US_PER_S
-
-_COLOURS = """
-44015444025544035745055845065a45085b46095c460b5e460c5f460e61470f62471163471265471466471567471669
-47186a48196b481a6c481c6e481d6f481e70482071482172482273482374472575472676472777472878472a79472b7a
-472c7b462d7c462f7c46307d46317e45327f45347f453580453681443781443982433a83433b83433c84423d84423e85
-4240854141864142864043874044873f45873f47883e48883e49893d4a893d4b893d4c893c4d8a3c4e8a3b508a3b518a
-3a528b3a538b39548b39558b38568b38578c37588c37598c365a8c365b8c355c8c355d8c345e8d345f8d33608d33618d
-32628d32638d31648d31658d31668d30678d30688d2f698d2f6a8d2e6b8e2e6c8e2e6d8e2d6e8e2d6f8e2c708e2c718e
-2c728e2b738e2b748e2a758e2a768e2a778e29788e29798e287a8e287a8e287b8e277c8e277d8e277e8e267f8e26808e
-26818e25828e25838d24848d24858d24868d23878d23888d23898d22898d228a8d228b8d218c8d218d8c218e8c208f8c
-20908c20918c1f928c1f938b1f948b1f958b1f968b1e978a1e988a1e998a1e998a1e9a891e9b891e9c891e9d881e9e88
-1e9f881ea0871fa1871fa2861fa38620a48520a58521a68521a78422a78423a88323a98224aa8225ab8126ac8127ad80
-28ae7f29af7f2ab07e2bb17d2cb17d2eb27c2fb37b30b47a32b57a33b67935b77836b87738b97639b9763bba753dbb74
-3ebc7340bd7242be7144be7045bf6f47c06e49c16d4bc26c4dc26b4fc36951c46853c56755c66657c66559c7645bc862
-5ec96160c96062ca5f64cb5d67cc5c69cc5b6bcd596dce5870ce5672cf5574d05477d05279d1517cd24f7ed24e81d34c
-83d34b86d44988d5478bd5468dd64490d64392d74195d73f97d83e9ad83c9dd93a9fd938a2da37a5da35a7db33aadb32
-addc30afdc2eb2dd2cb5dd2bb7dd29bade27bdde26bfdf24c2df22c5df21c7e01fcae01ecde01dcfe11cd2e11bd4e11a
-d7e219dae218dce218dfe318e1e318e4e318e7e419e9e419ece41aeee51bf1e51cf3e51ef6e61ff8e621fae622fde724
-"""
-"""RGB of each colour, two hexadecimal digits per channel."""
-
-VIRIDIS: NDArray[np.uint8] = np.frombuffer(bytes.fromhex(_COLOURS), np.uint8).reshape(256, 3)
-"""RGB (256, 3) from dark to bright."""
-
 
 NO_RETURN = (38, 42, 48)
 """Colour of pixels without a depth return."""
@@ -51,12 +28,21 @@ WARNING = 4
 NOTHING = "–"
 
 
+@cache
+def viridis() -> NDArray[np.uint8]:
+    """Return RGB (256, 3) from dark to bright."""
+    # Imported with the first image: the page is ready sooner without matplotlib.
+    from matplotlib import colormaps
+
+    return np.asarray(colormaps["viridis"](np.arange(256), bytes=True)[:, :3], np.uint8)
+
+
 def camera_picture(image: Image, range_m: float) -> NDArray[np.uint8]:
     """Return a `Frame.image` as RGB (h, w, 3); near depth is bright, up to `range_m` [m]."""
     if image.ndim == 3:
         picture = rgb_of(image)
     else:
-        picture = VIRIDIS[(255.0 * nearness(image, range_m)).astype(np.uint8)]
+        picture = viridis()[(255.0 * nearness(image, range_m)).astype(np.uint8)]
         picture[image == 0] = NO_RETURN
     times = max(1, math.ceil(LEAST_PX / picture.shape[1]))
     larger: NDArray[np.uint8] = np.kron(picture, np.ones((times, times, 1), np.uint8))

@@ -17,12 +17,11 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.files import Arrays
-from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord
+from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord, ranked
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import SETPOINT, commanded, setpoint_column
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE, RUN_FILE, LoadedRun, load
-from airl_mav.report.forensics.evidence import ranked
 from airl_mav.report.run_arenas import arenas_of, spec_of, vehicle_of
 
 INFO, WARNING = 6, 4
@@ -117,17 +116,11 @@ class ReplayedFlight:
         """Return the camera image at a time, without noise; None without an arena."""
         if self.arena is None:
             return None
-        # Imported here, as they load numba and a flight is shown before its arena.
-        from airl_mav.camera.exposure import expose
-        from airl_mav.camera.render import camera_pose
-        from airl_mav.report.forensics.camera_view import PolicyCamera
+        # Imported here, as it loads numba and a flight is shown before its arena.
+        from airl_mav.report.policy_view import Lens, PolicyCamera
 
         camera = PolicyCamera.of(self.vehicle.camera)
-        position, _, quaternion = pose_at(self.path, time_us)
-        from_us = time_us - self.record.started_us
-        at, attitude = camera_pose(position, quaternion, camera.mount)
-        centers = self.arena.centers_at(from_us)
-        return expose(self.arena, centers, camera.intrinsics, camera.range_m, at, attitude)
+        return Lens(self.arena, camera, self.path, self.record.started_us).image(time_us)
 
     def show(self, shown: Shown, seconds: float) -> None:
         """Set `shown` to a time after the reset [s]; its episode and arena remain."""
@@ -135,14 +128,11 @@ class ReplayedFlight:
         position, velocity, quaternion = pose_at(self.path, time_us)
         navigates = record.navigates(time_us)
         flies = navigates or -position[2] > STANDING_M
-        x, y, z = position.tolist()
-        vx, vy, vz = velocity.tolist()
-        q0, q1, q2, q3 = quaternion.tolist()
         shown.vehicle = view_messages.VehicleState(
             time_us=time_us,
-            position=(x, y, z),
-            velocity=(vx, vy, vz),
-            quaternion=(q0, q1, q2, q3),
+            position=tuple(position.tolist()),
+            velocity=tuple(velocity.tolist()),
+            quaternion=tuple(quaternion.tolist()),
             rotors=TURNING if flies else (0.0, 0.0, 0.0, 0.0),
             battery=None,
             mode=OFFBOARD if navigates else "",
@@ -170,7 +160,6 @@ class ReplayedFlight:
             for name in ("capture_us", "infer_start_us", "action_ready_us", "sent_us")
         )
         column = setpoint_column(self.stamps) or SETPOINT
-        first, second, third, fourth = (float(part) for part in self.stamps[column][number])
         image = self.image(captured_us)
         shown.decided_image, shown.decisions = image, number + 1
         shown.decided = view_messages.Decided(
@@ -179,7 +168,7 @@ class ReplayedFlight:
             ready_us=ready_us,
             sent_us=sent_us,
             expires_us=None,
-            setpoint=(first, second, third, fourth),
+            setpoint=tuple(self.stamps[column][number].tolist()),
             commands=commanded(self.stamps),
             compensated=self.compensated,
             shape=(1, 1) if image is None else view_messages.shape_of(image),
@@ -275,7 +264,9 @@ class ReplayedRun:
         self.title = f"{self._run.info.setup.policy.name} in {self._run.info.setup.arena.name}"
         """Title of the run: policy and arena."""
         paths = self._run.trajectories
-        recorded = [e for e in ranked(self._run) if e.index in paths and len(paths[e.index])]
+        recorded = [
+            e for e in ranked(self._run.episodes) if e.index in paths and len(paths[e.index])
+        ]
         if not recorded:
             raise UsageError(f"{path}: no flight is recorded")
         self.records: tuple[EpisodeRecord, ...] = tuple(recorded)

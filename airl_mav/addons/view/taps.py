@@ -19,7 +19,7 @@ from airl_mav.core.frames import Goal
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.latency.injection import LatencySampler
 from airl_mav.policy.observation import Kinematics
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction import Compensator
 from airl_mav.rehearsal.channel import State, Text
 from airl_mav.rehearsal.live_view import ViewEnds
 from airl_mav.rehearsal.observer import WARNING, Observer
@@ -212,14 +212,13 @@ class CompanionTap:
 
     def decided(self, decision: SentDecision) -> None:
         """Send a decision of the companion."""
-        first, second, third, fourth = (float(number) for number in decision.setpoint)
         shown = messages.Decided(
             captured_us=decision.seen.frame.capture_time_us,
             began_us=decision.started_us,
             ready_us=decision.ready_us,
             sent_us=decision.sent_us,
             expires_us=decision.expires_us,
-            setpoint=(first, second, third, fourth),
+            setpoint=tuple(float(number) for number in decision.setpoint),
             commands=self._scenario.pilot.commands,
             compensated=self._scenario.vehicle.compensable and self._hand.compensates(),
             shape=messages.shape_of(decision.image),

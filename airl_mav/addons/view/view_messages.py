@@ -41,6 +41,9 @@ class Message(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+CAMERA_FIELDS = ("forward_m", "right_m", "up_m", "pitch_up_deg", "yaw_deg", "projection", "range_m")
+
+
 class VehicleShape(Message):
     """Dimensions of a vehicle and mounting of its main camera [m, deg]."""
 
@@ -71,15 +74,9 @@ class VehicleShape(Message):
             arm_right_m=rotor.arm_right_m,
             rotor_radius_m=radius_m,
             height_m=vehicle.body.height_m,
-            camera_forward_m=camera.forward_m,
-            camera_up_m=camera.up_m,
-            camera_pitch_up_deg=camera.pitch_up_deg,
-            camera_right_m=camera.right_m,
-            camera_yaw_deg=camera.yaw_deg,
-            camera_projection=camera.projection,
             camera_fov_deg=camera.horizontal_fov_deg,
             camera_aspect=camera.width_px / camera.height_px,
-            camera_range_m=camera.range_m,
+            **{f"camera_{name}": getattr(camera, name) for name in CAMERA_FIELDS},
         )
 
 

@@ -173,9 +173,7 @@ class RunPage:
         self._scene = FlightScene(server)
         self._controls = controls = Controls(server.gui, Steering(speed=request.speed))
         knob = partial(
-            controls.add_knob,
-            compensable=request.compensable,
-            compensated=request.compensated,
+            controls.add_knob, compensable=request.compensable, compensated=request.compensated
         )
         head = controls.add_pace if request.paced else lambda: None
         latency = knob if request.steerable else lambda: None

@@ -241,11 +241,7 @@ def curve_pictures(comparison: Comparison) -> list[FigureImage]:
         name = f"degradation-{measure.title.replace(', ', '-').replace(' ', '-')}"
         pictures.append(
             curves_picture(
-                name,
-                f"{measure.title}, against the first",
-                (axis, "%"),
-                losses,
-                published,
+                name, f"{measure.title}, against the first", (axis, "%"), losses, published
             )
         )
     return pictures

@@ -40,11 +40,7 @@ Runs = Mapping[str, LoadedRun]
 
 
 def contrast_pictures(
-    prefix: str,
-    comparison: Comparison,
-    contrasts: Sequence[Contrast],
-    *,
-    medians: bool = False,
+    prefix: str, comparison: Comparison, contrasts: Sequence[Contrast], *, medians: bool = False
 ) -> list[theme.FigureImage]:
     """Draw contrasts with intervals and published values, one picture per measure."""
     names = [contrast_head(comparison, each) for each in contrasts]

@@ -76,10 +76,7 @@ def _start_row(run: ComparedRun) -> tuple[str, ...]:
 
 def split_table(comparison: Comparison) -> TableView:
     """Return the flights with different outcomes, one seed per row."""
-    columns = (
-        Column("seed"),
-        *(Column(run.mark, number=False) for run in comparison.runs),
-    )
+    columns = (Column("seed"), *(Column(run.mark, number=False) for run in comparison.runs))
     split = comparison.extra["split"]
     rows = tuple(
         (
@@ -183,11 +180,7 @@ def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: P
     sections = [
         *tables_section(levels),
         *(
-            Section(
-                view.title,
-                headlines=tables.contrast_headlines(contrast),
-                tables=(view,),
-            )
+            Section(view.title, headlines=tables.contrast_headlines(contrast), tables=(view,))
             for contrast in contrasts
             for view in (tables.contrast_table(comparison, contrast),)
         ),

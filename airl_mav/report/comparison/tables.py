@@ -272,12 +272,7 @@ def contrasts_table(
     if min((c.successes for c in contrasts), default=FEW_FLIGHTS) < FEW_FLIGHTS:
         notes.append(_NARROW.format(FEW_FLIGHTS, "pairs"))
     return document.TableView(
-        "contrasts",
-        title,
-        columns,
-        tuple(rows),
-        tuple(notes),
-        in_terminal="stacked",
+        "contrasts", title, columns, tuple(rows), tuple(notes), in_terminal="stacked"
     )
 
 

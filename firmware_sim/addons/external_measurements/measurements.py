@@ -19,7 +19,7 @@ from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.inputs import LandingTarget, ObstacleBins
 from firmware_sim.interfaces import DistanceReading, FlowReading, Odometry, PoseFrame, VelocityFrame
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import Context, Handlers, for_anyone
+from firmware_sim.mavlink.services import Context, Handlers, for_anyone
 from firmware_sim.mavlink.streams.units import DIAGONAL
 
 _FUSED = (
@@ -89,15 +89,15 @@ def handle_odometry(message: WireMessage, context: Context) -> bool:
 
 def handle_vision_position(message: WireMessage, context: Context) -> bool:
     """Handle VISION_POSITION_ESTIMATE: a pose in local NED."""
-    told = _diagonal(message.covariance)
+    variances = _diagonal(message.covariance)
     angles = _finite(message.roll, message.pitch, message.yaw)
     return _see(
         Odometry(
             _finite(message.x, message.y, message.z),
             None,
             None if angles is None else quat_from_euler(*angles.tolist()),
-            position_variance=told[:3],
-            orientation_variance=told[3:],
+            position_variance=variances[:3],
+            orientation_variance=variances[3:],
             reset_counter=message.reset_counter,
         ),
         context,

@@ -37,7 +37,6 @@ STREAMED_UP = frozenset(
 )
 """Streamed messages of a companion, which have no acknowledgement."""
 
-
 Frame = TypeVar("Frame")
 
 
@@ -47,12 +46,12 @@ class Lane(Generic[Frame]):
     def __init__(self) -> None:
         self._acting: list[tuple[Acting, np.random.Generator]] = []
         self._under_way: deque[tuple[int, Frame]] = deque()
-        self._held: Frame | None = None
+        self._delayed: Frame | None = None
 
     @property
     def quiet(self) -> bool:
         """True if frames pass as on a healthy link."""
-        return not self._acting and not self._under_way and self._held is None
+        return not self._acting and not self._under_way and self._delayed is None
 
     @property
     def cut(self) -> bool:
@@ -67,7 +66,7 @@ class Lane(Generic[Frame]):
         """Discard all frames in transit and all faults."""
         self._acting = []
         self._under_way.clear()
-        self._held = None
+        self._delayed = None
 
     def put(self, frame: Frame, now_us: int) -> None:
         """Send a frame at simulated `now_us` [µs]."""
@@ -88,13 +87,13 @@ class Lane(Generic[Frame]):
                 wait = wait or kind == "reorder"
         if self._under_way:
             due_us = max(due_us, self._under_way[-1][0])
-        if wait and self._held is None:
-            self._held = frame
+        if wait and self._delayed is None:
+            self._delayed = frame
             return
         self._under_way.extend([(due_us, frame)] * copies)
-        if self._held is not None:
-            self._under_way.append((due_us, self._held))
-            self._held = None
+        if self._delayed is not None:
+            self._under_way.append((due_us, self._delayed))
+            self._delayed = None
 
     def arrived(self, now_us: int) -> Iterator[Frame]:
         """Remove and yield the frames that have arrived by simulated `now_us` [µs], in order."""
@@ -104,9 +103,9 @@ class Lane(Generic[Frame]):
     def hurry(self) -> None:
         """Make all frames in transit arrive immediately."""
         frames = [frame for _, frame in self._under_way]
-        if self._held is not None:
-            frames.append(self._held)
-            self._held = None
+        if self._delayed is not None:
+            frames.append(self._delayed)
+            self._delayed = None
         self._under_way = deque((0, frame) for frame in frames)
 
 

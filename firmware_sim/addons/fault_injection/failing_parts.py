@@ -1,4 +1,4 @@
-"""Sensor, motor, battery and wind faults, inserted only in episodes with faults.
+"""Sensor, motor, battery, wind and camera faults, inserted only in episodes with faults.
 
 A sensor that is off has None in the sample. Accelerometer and gyro are never None: flight
 controllers count time by their samples. If one is off, it repeats its last sample like a stuck
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -42,31 +43,26 @@ from firmware_sim.plant.camera import OnboardCamera
 from firmware_sim.plant.plant import Blowing, Plant
 
 
-def thrust_left(acting: Sequence[Acting]) -> dict[int, float]:
-    """Return the remaining share of thrust of each failing motor, by index from 0."""
+def motor_effects(acting: Sequence[Acting]) -> tuple[dict[int, float], dict[int, float]]:
+    """Return the remaining share of thrust, and the factor on the time constant, of faulty motors.
+
+    Both by index of the motor, from 0.
+    """
     left: dict[int, float] = {}
+    slow: dict[int, float] = {}
     for _, fault, *_ in acting:
-        if fault.kind == "slow":
-            continue
         motor = MOTORS.index(fault.part)
-        left[motor] = left.get(motor, 1.0) * _share(fault)
-    return left
+        if fault.kind == "slow":
+            slow[motor] = slow.get(motor, 1.0) * fault.amount
+        else:
+            left[motor] = left.get(motor, 1.0) * _share(fault)
+    return left, slow
 
 
 def _share(fault: Fault) -> float:
     if fault.kind == "off":
         return 0.0
     return 1.0 + fault.amount if fault.kind == "mismatch" else fault.amount
-
-
-def slowness(acting: Sequence[Acting]) -> dict[int, float]:
-    """Return the factor on the time constant of each slow motor, by index from 0."""
-    slow: dict[int, float] = {}
-    for _, fault, *_ in acting:
-        if fault.kind == "slow":
-            motor = MOTORS.index(fault.part)
-            slow[motor] = slow.get(motor, 1.0) * fault.amount
-    return slow
 
 
 def weakened(
@@ -101,8 +97,8 @@ def slowed(
     """
     motors = list(controls.motors)
     for index, factor in slow.items():
-        now, asked = speeds[index], steady_speed(motors[index], thrust_curve)
-        reached = now + (asked - now) * (1.0 - lag ** (1.0 / factor)) / (1.0 - lag)
+        now, target = speeds[index], steady_speed(motors[index], thrust_curve)
+        reached = now + (target - now) * (1.0 - lag ** (1.0 / factor)) / (1.0 - lag)
         motors[index] = command_for(reached * reached, thrust_curve)
     first, second, third, fourth = motors
     return controls._replace(motors=(first, second, third, fourth))
@@ -134,7 +130,6 @@ FIELDS = {
 
 INERTIAL = ("accel", "gyro")
 
-
 Effect = Callable[[Any, int], Any]
 """Effect of a fault on one sensor: maps value and time [µs] to the measured value; None = no sample
 in this tick. May be stateful."""
@@ -144,18 +139,18 @@ def _off(value: Any, time_us: int) -> None:
     """Return no sample."""
 
 
+@dataclass
 class Stuck:
     """Stuck sensor: repeats the first sample of the fault at the sensor's rate."""
 
-    def __init__(self) -> None:
-        self._held: Any = None
+    sample: Any = None
 
     def __call__(self, value: Any, time_us: int) -> Any:
         """Return the held sample, or None without a sample in this tick."""
         del time_us
-        if self._held is None:
-            self._held = value
-        return None if value is None else self._held
+        if self.sample is None:
+            self.sample = value
+        return None if value is None else self.sample
 
 
 class Late:
@@ -180,43 +175,36 @@ class Late:
         return self._newest if self._always else arrived
 
 
+@dataclass
 class Biased:
-    """Constant error."""
+    """Error that is constant, or grows at a constant velocity."""
 
-    def __init__(self, offset: Vector) -> None:
-        self._offset = offset
+    offset: Vector
+    velocity: Vector | None = None
+    since_us: int = 0
 
     def __call__(self, value: Any, time_us: int) -> Any:
         """Return the value with the error."""
-        del time_us
-        return None if value is None else shifted(value, self._offset)
-
-
-class Drifting:
-    """Position error that grows at a constant velocity."""
-
-    def __init__(self, velocity: Vector, since_us: int) -> None:
-        self._velocity, self._since_us = velocity, since_us
-
-    def __call__(self, value: Any, time_us: int) -> Any:
-        """Return the fix with the error."""
         if value is None:
             return None
-        return shifted(value, self._velocity * ((time_us - self._since_us) / US_PER_S))
+        if self.velocity is None:
+            return shifted(value, self.offset)
+        return shifted(value, self.velocity * ((time_us - self.since_us) / US_PER_S))
 
 
+@dataclass
 class Noisy:
     """White noise in addition to the sensor's noise."""
 
-    def __init__(self, sd: Vector, rng: np.random.Generator) -> None:
-        self._sd, self._rng = sd, rng
+    sd: Vector
+    rng: np.random.Generator
 
     def __call__(self, value: Any, time_us: int) -> Any:
         """Return the value with additional noise."""
         del time_us
         if value is None:
             return None
-        error = self._sd * self._rng.standard_normal(len(self._sd))
+        error = self.sd * self.rng.standard_normal(len(self.sd))
         moved = shifted(value, error[:3])
         if isinstance(moved, GpsFix):
             return moved._replace(velocity_ned=moved.velocity_ned + error[3:])
@@ -241,13 +229,13 @@ def shifted(value: Any, offset: Vector) -> Any:
     return value + offset
 
 
-def farther(told: DistanceReading, error_m: float) -> DistanceReading:
+def farther(reading: DistanceReading, error_m: float) -> DistanceReading:
     """Return a range with an error, with quality 0 if it is outside the sensor's limits."""
-    if told.quality == 0:
-        return told
-    distance_m = max(0.0, told.distance_m + error_m)
-    within = told.least_m <= distance_m <= told.greatest_m
-    return told._replace(distance_m=distance_m, quality=told.quality if within else 0)
+    if reading.quality == 0:
+        return reading
+    distance_m = max(0.0, reading.distance_m + error_m)
+    within = reading.least_m <= distance_m <= reading.greatest_m
+    return reading._replace(distance_m=distance_m, quality=reading.quality if within else 0)
 
 
 def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
@@ -256,7 +244,9 @@ def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
     gps = profile.gps
     horizontal, speed = gps.horizontal_noise_m, gps.velocity_noise_m_s
     vision = profile.vision
-    seen = (0.0, 0.0) if vision is None else (vision.position_noise_m, vision.velocity_noise_m_s)
+    vision_sd = (0.0, 0.0)
+    if vision is not None:
+        vision_sd = vision.position_noise_m, vision.velocity_noise_m_s
     ranges, flow = profile.rangefinder, profile.optical_flow
     known: dict[str, list[float]] = {
         "accel": [profile.imu.accel_noise_m_s2 * white] * 3,
@@ -264,7 +254,7 @@ def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
         "mag": [profile.magnetometer.noise_gauss] * 3,
         "baro": [profile.barometer.noise_pa / PA_PER_HPA],
         "gps": [horizontal, horizontal, gps.vertical_noise_m, speed, speed, speed],
-        "vision": [seen[0]] * 3 + [seen[1]] * 3,
+        "vision": [vision_sd[0]] * 3 + [vision_sd[1]] * 3,
         "rangefinder": [0.0 if ranges is None else ranges.noise_m],
         "flow": [0.0 if flow is None else flow.noise_rad_s] * 2,
     }
@@ -284,7 +274,8 @@ def effect_of(acting: Acting, profile: Sensors, tick_s: float, rng: np.random.Ge
     if kind == "bias":
         return Biased(np.array(fault.value))
     if kind == "drift":
-        return Drifting(np.array(fault.value), acting.since_us)
+        velocity = np.array(fault.value)
+        return Biased(np.zeros(3), velocity, acting.since_us)
     # `amount` is the ratio of total noise to the sensor's noise; their variances add.
     more = math.sqrt(max(0.0, fault.amount**2 - 1.0))
     return Noisy(more * noise_sd(part, profile, tick_s), rng)
@@ -398,8 +389,7 @@ class FailingParts:
             each.number: before.get(each.number) or self._effect_of(each) for each in sensors
         }
         self._effects = [(each.fault.part, self._memories[each.number]) for each in sensors]
-        motors = timeline.acting(*MOTORS)
-        self._left, self._slow = thrust_left(motors), slowness(motors)
+        self._left, self._slow = motor_effects(timeline.acting(*MOTORS))
         battery = timeline.acting("battery")
         for each in battery:
             if each.fault.kind == "drop" and each.number not in self._dropped:
@@ -482,5 +472,5 @@ class FailingCamera:
 
 def _showing(frame: Frame, image: NDArray[Any], jpeg: bytes | None) -> Frame:
     """Return a copy of a frame with another image of the main camera."""
-    shown = image, frame.intrinsics, jpeg, frame.further
-    return Frame(frame.sequence, frame.capture_time_us, *shown)
+    picture = image, frame.intrinsics, jpeg, frame.further
+    return Frame(frame.sequence, frame.capture_time_us, *picture)

@@ -10,7 +10,7 @@ from airl_mav.faults.fault import Fault
 from airl_mav.faults.kinds import MOTORS, Part
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.context import Action, Context, VehicleCommand
+from firmware_sim.mavlink.services import Action, Context, VehicleCommand
 
 ENABLED = "SYS_FAILURE_EN"
 

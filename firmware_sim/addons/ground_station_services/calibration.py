@@ -9,6 +9,7 @@ cancelled. Source: PX4 1.16, Commander::handle_command and the texts of a runnin
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -16,14 +17,15 @@ import numpy as np
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events
+from firmware_sim.autopilot.events.definition import Definition
 from firmware_sim.interfaces import SensorSample
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.context import Action, Context, ServiceState, VehicleCommand
+from firmware_sim.mavlink.services import Action, Context, ServiceState, VehicleCommand
 
 MOVING_RAD_S = 0.2
 """Minimum body rate that counts as motion [rad/s]."""
 
-_GYRO_STEP_S, _LEVEL_STEP_S, _REST_S, _AGAIN_S = 0.15, 0.5, 1.0, 5.0
+_REST_S, _AGAIN_S = 1.0, 5.0
 
 
 class CalibrationText(NamedTuple):
@@ -90,44 +92,28 @@ def _started(sensor: str) -> CalibrationText:
     return _info(f"[cal] calibration started: 2 {sensor}")
 
 
-def _done(sensor: str) -> CalibrationText:
-    return _info(f"[cal] calibration done: {sensor}")
-
-
 def failed(sensor: str) -> CalibrationText:
     """Return the final step of a failed calibration."""
     return _critical(f"[cal] calibration failed: {sensor}")
 
 
 def _at_rest(
-    context: Context, sensor: str, percents: range, step_s: float, needs_rest: bool = True
+    context: Context, sensor: str, percents: range, step_s: float
 ) -> Iterator[CalibrationText]:
     """Return the steps of a calibration that needs no rotation of the vehicle."""
     yield _started(sensor)
     for percent in percents:
         # Motion makes the calibration fail, as in PX4 SITL.
-        if needs_rest and _moving(context.port.sample):
+        if _moving(context.port.sample):
             yield _critical("ERROR: Motion during calibration")
             yield failed(sensor)
             return
         yield _info(f"[cal] progress <{percent}>", step_s)
-    yield _done(sensor)
+    yield _info(f"[cal] calibration done: {sensor}")
 
 
 def _moving(sample: SensorSample | None) -> bool:
     return sample is None or float(np.abs(sample.gyro).max()) > MOVING_RAD_S
-
-
-def _gyro(context: Context) -> Iterator[CalibrationText]:
-    return _at_rest(context, "gyro", range(0, 101, 10), _GYRO_STEP_S)
-
-
-def _level(context: Context) -> Iterator[CalibrationText]:
-    return _at_rest(context, "level", range(0, 101, 20), _LEVEL_STEP_S)
-
-
-def _barometer(context: Context) -> Iterator[CalibrationText]:
-    return _at_rest(context, "baro", range(0), _LEVEL_STEP_S, needs_rest=False)
 
 
 def _one_side(context: Context, sensor: str) -> Iterator[CalibrationText]:
@@ -170,29 +156,26 @@ def _airspeed(_context: Context) -> Iterator[CalibrationText]:
     yield _critical("[cal] calibration failed: airspeed", _AGAIN_S)  # no airspeed sensor
 
 
-def _silent(_context: Context) -> Iterator[CalibrationText]:
-    return iter(())
-
-
-def _trim(_context: Context) -> Iterator[CalibrationText]:
-    yield CalibrationText(0.0, OperatorText.of(Severity.INFO, events.TRIMMED, text="trim cal done"))
-
-
-def _rc_begins(_context: Context) -> Iterator[CalibrationText]:
-    yield CalibrationText(0.0, OperatorText.of(Severity.INFO, events.RC_CALIBRATION))
-
-
 Routine = Callable[[Context], Iterator[CalibrationText]]
 
+
+def _one_event(event: Definition, text: str | None = None) -> Routine:
+    """Return the routine that announces one event."""
+    message = OperatorText.of(Severity.INFO, event, text=text)
+    return lambda _context: iter((CalibrationText(0.0, message),))
+
+
+_rc_begins = _one_event(events.RC_CALIBRATION)
+
 ROUTINES: dict[tuple[int, int], tuple[str, Routine]] = {
-    (1, 1): ("gyro", _gyro),
+    (1, 1): ("gyro", partial(_at_rest, sensor="gyro", percents=range(0, 101, 10), step_s=0.15)),
     (2, 1): ("mag", _magnetometer),
-    (3, 1): ("baro", _barometer),
+    (3, 1): ("baro", partial(_at_rest, sensor="baro", percents=range(0), step_s=0.5)),
     (4, 1): ("rc", _rc_begins),
-    (4, 2): ("trim", _trim),
+    (4, 2): ("trim", _one_event(events.TRIMMED, "trim cal done")),
     (5, 1): ("accel", _accelerometer),
-    (5, 2): ("level", _level),
-    (5, 4): ("quick", _silent),
+    (5, 2): ("level", partial(_at_rest, sensor="level", percents=range(0, 101, 20), step_s=0.5)),
+    (5, 4): ("quick", lambda _context: iter(())),
     (6, 1): ("airspeed", _airspeed),
     (6, 2): ("airspeed", _airspeed),
 }
@@ -205,12 +188,12 @@ def _calibrate(command: VehicleCommand, context: Context) -> Result:
     """Handle PREFLIGHT_CALIBRATION: one parameter selects the sensor; all zero cancels."""
     running = context.vehicle_state(RunningCalibration)
     # NaN counts as 0: the parameter is not set.
-    asked = {number: command.integer(number) or 0 for number in range(1, 8)}
+    values = {number: command.integer(number) or 0 for number in range(1, 8)}
     if context.port.state().status.arming is Arming.ARMED:
         return Result.TEMPORARILY_REJECTED
     if running.is_running:
         # A second calibration request does not replace the running one.
-        if any(asked.values()):
+        if any(values.values()):
             return Result.TEMPORARILY_REJECTED
         # Cancelling replaces the running steps with the two final texts.
         cancelled = (_critical("[cal] calibration cancelled"), failed(running.sensor))
@@ -218,11 +201,11 @@ def _calibrate(command: VehicleCommand, context: Context) -> Result:
         return Result.ACCEPTED
     # The first match wins: PX4 evaluates the parameters in this order.
     for (number, value), (sensor, routine) in ROUTINES.items():
-        if asked[number] == value:
+        if values[number] == value:
             running.start(sensor, routine(context), context.now_us)
             running.radio = running.radio or routine is _rc_begins
             return Result.ACCEPTED
-    if asked[_ESC] == 1:
+    if values[_ESC] == 1:
         text = "[cal] calibration failed: Disconnect battery and try again"
         context.announce(OperatorText(Severity.CRITICAL, text))
         return Result.DENIED

@@ -33,7 +33,7 @@ from firmware_sim.autopilot.events.definition import (
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.prearm import CHECKS
 from firmware_sim.mavlink.codec import crc32part, dialect
-from firmware_sim.mavlink.services.context import Action, Context, VehicleCommand
+from firmware_sim.mavlink.services import Action, Context, VehicleCommand
 from firmware_sim.mavlink.streams.units import boot_ms
 
 _MIB = 1024.0 * 1024.0

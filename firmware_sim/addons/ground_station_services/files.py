@@ -10,10 +10,11 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
-from firmware_sim.mavlink.services.context import ServiceState
+from firmware_sim.mavlink.services import ServiceState
 
 GREATEST_BYTES = 64 * 1024 * 1024
 """Maximum total size of clients' files [bytes], so that no client can fill the disk."""
@@ -78,7 +79,6 @@ class Storage(ServiceState):
 
 CHUNK_BYTES = 1 << 16
 
-
 SESSION = 0
 """Number of a client's only session, as in PX4."""
 
@@ -110,12 +110,14 @@ class RefusedError(Exception):
 class FtpRequest:
     """Unpacked FTP request."""
 
+    sequence: int
     session: int
     opcode: int
     offset: int
     size: int
     """Size of the data; in a read, the requested size."""
     data: bytes
+    sender: tuple[int, int]
 
     @property
     def name(self) -> str:
@@ -147,13 +149,10 @@ class Session:
 DATA_BYTES = 239
 """Maximum data in one message [bytes]."""
 
-
 READ_ONLY = "etc"
 """Folder of the vehicle's files, read-only for clients."""
 
-
 _SIZE = struct.Struct("<I")
-
 
 Operation = Callable[[FtpRequest, Session, Storage], bytes]
 """Executes a request and returns the data of the reply.
@@ -201,15 +200,9 @@ def _open_to_read(request: FtpRequest, session: Session, storage: Storage) -> by
     return _SIZE.pack(session.size)
 
 
-def _create(request: FtpRequest, session: Session, storage: Storage) -> bytes:
-    return _open_to_write(request, session, storage, os.O_TRUNC)
-
-
-def _open_existing(request: FtpRequest, session: Session, storage: Storage) -> bytes:
-    return _open_to_write(request, session, storage, 0)
-
-
-def _open_to_write(request: FtpRequest, session: Session, storage: Storage, flags: int) -> bytes:
+def _open_to_write(
+    request: FtpRequest, session: Session, storage: Storage, flags: int = 0
+) -> bytes:
     path = _writable(request.name, storage)
     _check_free(session)
     storage.check_room(0)
@@ -291,10 +284,6 @@ def _rename(request: FtpRequest, _session: Session, storage: Storage) -> bytes:
     return b""
 
 
-def _nothing(_request: FtpRequest, _session: Session, _storage: Storage) -> bytes:
-    return b""
-
-
 def _check_free(session: Session) -> None:
     if session.file is not None:
         raise RefusedError(Code.NO_SESSIONS)
@@ -311,18 +300,18 @@ def _writable(name: str, storage: Storage) -> Path:
 
 
 OPERATIONS: dict[int, Operation] = {
-    0: _nothing,
+    0: lambda _request, _session, _storage: b"",
     1: _terminate,
     2: _reset,
     3: _list,
     4: _open_to_read,
     5: _read,
-    6: _create,
+    6: partial(_open_to_write, flags=os.O_TRUNC),
     7: _write,
     8: _on_path(Path.unlink),
     9: _on_path(Path.mkdir, more=True),
     10: _on_path(Path.rmdir),
-    11: _open_existing,
+    11: _open_to_write,
     12: _truncate,
     13: _rename,
 }

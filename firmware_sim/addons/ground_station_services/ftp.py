@@ -9,7 +9,6 @@ import errno
 import struct
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.addons.ground_station_services import component_metadata
@@ -26,7 +25,7 @@ from firmware_sim.addons.ground_station_services.files import (
     read_at,
 )
 from firmware_sim.mavlink.codec import WireMessage, crc32part
-from firmware_sim.mavlink.services.context import (
+from firmware_sim.mavlink.services import (
     Context,
     Handlers,
     ServiceState,
@@ -59,47 +58,28 @@ class Burst:
 
     sequence: int
     offset: int
-    asker: tuple[int, int]
-
-
-class Answered(NamedTuple):
-    """Fields of a reply that refer to its request."""
-
-    sequence: int
-    session: int
-    opcode: int
-    offset: int
-    asker: tuple[int, int]
+    receiver: tuple[int, int]
 
 
 class Checksum:
     """CRC-32 of a file, computed in parts: a large file takes longer than a tick."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, request: FtpRequest, path: Path) -> None:
         """Open the file. Raises OSError."""
+        self.request = request
         self._crc = 0
         self._file = path.open("rb", buffering=0)
 
-    def go_on(self) -> bytes | None:
+    def next_part(self) -> bytes | None:
         """Read the next part; return the reply's data after the last. Raises OSError."""
         chunk = self._file.read(CHUNK_BYTES)
         self._crc = crc32part(chunk, self._crc)
         # A full chunk means that more data may follow, possibly empty.
-        if len(chunk) == CHUNK_BYTES:
-            return None
-        return self._crc.to_bytes(4, "little")
+        return None if len(chunk) == CHUNK_BYTES else self._crc.to_bytes(4, "little")
 
     def close(self) -> None:
         """Close the file. Repeated calls have no effect."""
         self._file.close()
-
-
-@dataclass(slots=True)
-class Summing:
-    """Checksum request in progress."""
-
-    asked: Answered
-    sum: Checksum
 
 
 @dataclass(slots=True)
@@ -108,7 +88,7 @@ class FtpClient(ServiceState):
 
     session: Session = field(default_factory=Session)
     burst: Burst | None = None
-    summing: Summing | None = None
+    checksum: Checksum | None = None
     used_us: int = 0
     last_sequence: int | None = None
     last_answer: bytes = b""
@@ -116,18 +96,18 @@ class FtpClient(ServiceState):
     @property
     def is_running(self) -> bool:
         """True during a burst or a checksum."""
-        return self.burst is not None or self.summing is not None
+        return self.burst is not None or self.checksum is not None
 
     def close(self) -> None:
         """Close the open file and stop the checksum."""
         self.session.close()
-        self.stop_summing()
+        self.stop_checksum()
 
-    def stop_summing(self) -> None:
+    def stop_checksum(self) -> None:
         """Cancel a checksum in progress, if any."""
-        if self.summing is not None:
-            self.summing.sum.close()
-            self.summing = None
+        if self.checksum is not None:
+            self.checksum.close()
+            self.checksum = None
 
 
 def handle_request(message: WireMessage, context: Context) -> bool:
@@ -137,49 +117,47 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     # Replies from another FTP server on the link.
     if opcode in (_ACK, _NAK):
         return False
-    client, asker = context.state(FtpClient), sender(message)
+    client = context.state(FtpClient)
     # The client repeats a request whose reply was lost: resend, do not execute twice.
     if sequence == client.last_sequence:
-        _send(client.last_answer, asker, context)
+        _send(client.last_answer, sender(message), context)
         return True
-    if client.summing is not None and client.summing.asked.sequence == sequence:
+    if client.checksum is not None and client.checksum.request.sequence == sequence:
         return True  # repeated while the checksum is running
     # A new request ends a running checksum, since a client has one request at a time.
-    client.stop_summing()
+    client.stop_checksum()
     # A client that crashed leaves its session open.
     if client.session.file is not None and context.now_us - client.used_us > _IDLE_US:
         client.session.close()
     client.used_us = context.now_us
     data = payload[_HEADER.size :][: min(size, DATA_BYTES)]
-    request = FtpRequest(session, opcode, offset, size, data)
-    asked = Answered(sequence, session, opcode, offset, asker)
+    request = FtpRequest(sequence, session, opcode, offset, size, data, sender(message))
     try:
         if size > DATA_BYTES:
             raise RefusedError(Code.INVALID_DATA_SIZE)
         # A burst read has no separate reply: `send_pending` sends the data.
         if opcode == _BURST:
             client.session.opened(request)
-            client.burst = Burst((sequence + 1) & 0xFFFF, offset, asker)
+            client.burst = Burst((sequence + 1) & 0xFFFF, offset, request.sender)
             return True
         # Checksums of large files take several ticks.
         if opcode == _CRC32:
-            component_metadata.provide(context.vehicle_state(Storage))
-            checksum = Checksum(context.vehicle_state(Storage).path(request.name))
+            storage = context.vehicle_state(Storage)
+            component_metadata.provide(storage)
+            client.checksum = Checksum(request, storage.path(request.name))
             client.burst = None
-            client.summing = Summing(asked, checksum)
-            _sum(client.summing, context)
+            _continue_checksum(client.checksum, context)
             return True
-        answer = _carried_out(request, context)
-        kind = _ACK
+        answer, kind = _execute(request, context), _ACK
     except (RefusedError, OSError) as error:
         answer, kind = _error(error), _NAK
     # Any other request ends a burst.
     client.burst = None
-    _answer(asked, kind, answer, context)
+    _answer(request, kind, answer, context)
     return True
 
 
-def _answer(request: Answered, kind: int, answer: bytes, context: Context) -> None:
+def _answer(request: FtpRequest, kind: int, answer: bytes, context: Context) -> None:
     client = context.state(FtpClient)
     sequence = (request.sequence + 1) & 0xFFFF
     # As in PX4: the client's session number, except after opening a session.
@@ -189,19 +167,19 @@ def _answer(request: Answered, kind: int, answer: bytes, context: Context) -> No
     small = len(answer) <= _SMALL_BYTES
     # Large replies are not kept: the client reads again by offset.
     client.last_sequence, client.last_answer = (request.sequence, body) if small else (None, b"")
-    _send(body, request.asker, context)
+    _send(body, request.sender, context)
 
 
-def _sum(summing: Summing, context: Context) -> None:
+def _continue_checksum(checksum: Checksum, context: Context) -> None:
     """Continue a checksum, and reply when it is complete."""
     kind = _ACK
     try:
-        answer = summing.sum.go_on()
+        answer = checksum.next_part()
     except OSError as error:
         answer, kind = _error(error), _NAK
     if answer is not None:
-        context.state(FtpClient).stop_summing()
-        _answer(summing.asked, kind, answer, context)
+        context.state(FtpClient).stop_checksum()
+        _answer(checksum.request, kind, answer, context)
 
 
 def send_pending(context: Context) -> None:
@@ -209,8 +187,8 @@ def send_pending(context: Context) -> None:
     client = context.states.get(FtpClient)
     if client is None:
         return
-    if client.summing is not None:
-        _sum(client.summing, context)
+    if client.checksum is not None:
+        _continue_checksum(client.checksum, context)
     if client.burst is None:
         return
     # The file can end, or the session close, within this loop.
@@ -230,10 +208,10 @@ def send_pending(context: Context) -> None:
         body = _packed(burst.sequence, SESSION, kind, _BURST, offset, data)
         burst.sequence = (burst.sequence + 1) & 0xFFFF
         client.used_us = context.now_us
-        _send(body, burst.asker, context)
+        _send(body, burst.receiver, context)
 
 
-def _carried_out(request: FtpRequest, context: Context) -> bytes:
+def _execute(request: FtpRequest, context: Context) -> bytes:
     operation = OPERATIONS.get(request.opcode)
     if operation is None:
         raise RefusedError(Code.UNKNOWN_COMMAND)
@@ -262,9 +240,9 @@ def _packed(sequence: int, session: int, kind: int, opcode: int, offset: int, da
     return (header + data).ljust(_PAYLOAD_BYTES, b"\0")
 
 
-def _send(body: bytes, asker: tuple[int, int], context: Context) -> None:
+def _send(body: bytes, receiver: tuple[int, int], context: Context) -> None:
     network = 0
-    context.link.send_payload("FILE_TRANSFER_PROTOCOL", bytes((network, *asker)) + body)
+    context.link.send_payload("FILE_TRANSFER_PROTOCOL", bytes((network, *receiver)) + body)
 
 
 # --- MAVLink FTP

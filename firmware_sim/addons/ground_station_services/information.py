@@ -1,6 +1,7 @@
 """Messages on request: flight times, modes, outputs, fence, IMU, and a summary for satellite links.
 
-REQUEST_DATA_STREAM, the predecessor of SET_MESSAGE_INTERVAL, is here, too.
+Also REQUEST_DATA_STREAM, the predecessor of SET_MESSAGE_INTERVAL, and the answers to commands and
+rates without effect.
 Sources: PX4 1.16, src/modules/mavlink/streams/*.hpp (HIGH_LATENCY2, AVAILABLE_MODES), and the
 messages of a running PX4.
 """
@@ -11,26 +12,24 @@ import math
 
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import local_to_geodetic, quat_yaw
-from firmware_sim.autopilot.autopilot_state import (
-    Arming,
-    AutopilotState,
-    Result,
-)
+from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
+from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import (
     BY_CUSTOM_MODE,
     Mode,
     ModeSpec,
 )
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.link import OFF
-from firmware_sim.mavlink.services.context import (
+from firmware_sim.mavlink.services import (
     Action,
     Context,
     Handlers,
     VehicleCommand,
     for_vehicle_or_all,
 )
-from firmware_sim.mavlink.streams import Builder, units
+from firmware_sim.mavlink.streams import Builder, no_content, units
 from firmware_sim.mavlink.streams.sensors import scaled_pressure
 from firmware_sim.mavlink.streams.status import NO_MISSION, base_mode
 from firmware_sim.mavlink.streams.units import boot_ms, percent
@@ -185,10 +184,8 @@ def scaled_imu(state: AutopilotState) -> Values:
 _PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900, 1_000, 1_000
 """Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
 
-
 _OUTPUTS = 16
 """Number of outputs in PX4's simulation. Outputs without a motor stay at the disarmed pulse."""
-
 
 _OUTPUT_FIELDS = 32
 """Number of slots in ACTUATOR_OUTPUT_STATUS."""
@@ -246,12 +243,12 @@ GROUPS: dict[int, tuple[str, ...]] = {
 
 def _request_modes(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 2: number of the mode, starting at 1; 0 = all."""
-    asked = command.integer(2) or 0
+    number = command.integer(2) or 0
     modes = available_modes()
-    if not 0 <= asked <= len(modes):
+    if not 0 <= number <= len(modes):
         return Result.DENIED
     # Modes are numbered from 1.
-    for fields in modes if asked == 0 else modes[asked - 1 : asked]:
+    for fields in modes if number == 0 else modes[number - 1 : number]:
         context.link.send(dialect.MAVLink_available_modes_message(*fields))
     return Result.ACCEPTED
 
@@ -273,11 +270,11 @@ def handle_data_stream(message: WireMessage, context: Context) -> bool:
         if not start:
             scheduler.set_interval(name, scheduler.default_us(name), context.now_us)
             continue
-        asked_us = US_PER_S // message.req_message_rate
+        requested_us = US_PER_S // message.req_message_rate
         present_us = scheduler.interval_us(name)
         # Only a shorter interval is set: a request must not slow another client's stream.
-        if present_us == OFF or max(asked_us, 1) < present_us:
-            scheduler.set_interval(name, max(asked_us, 1), context.now_us)
+        if present_us == OFF or max(requested_us, 1) < present_us:
+            scheduler.set_interval(name, max(requested_us, 1), context.now_us)
     return bool(names)
 
 
@@ -285,7 +282,24 @@ HANDLERS: Handlers = {"REQUEST_DATA_STREAM": (for_vehicle_or_all, handle_data_st
 
 REQUESTS: dict[int, Action] = {dialect.MAVLINK_MSG_ID_AVAILABLE_MODES: _request_modes}
 
+SILENT = (
+    *("GPS_STATUS", "NAV_CONTROLLER_OUTPUT", "COMMAND_LONG"),
+    *("CAMERA_TRIGGER", "SCALED_IMU2", "SCALED_IMU3", "GPS2_RAW"),
+    *("SCALED_PRESSURE3", "LANDING_TARGET", "EFI_STATUS", "WIND_COV"),
+    *("GPS_RTCM_DATA", "ADSB_VEHICLE", "DEBUG_VECT", "NAMED_VALUE_FLOAT"),
+    *("STATUSTEXT", "DEBUG", "CAMERA_IMAGE_CAPTURED", "MOUNT_ORIENTATION"),
+    *("GIMBAL_MANAGER_INFORMATION", "GIMBAL_MANAGER_STATUS", "GIMBAL_DEVICE_INFORMATION"),
+    *("GIMBAL_DEVICE_SET_ATTITUDE", "GIMBAL_DEVICE_ATTITUDE_STATUS"),
+    *("OBSTACLE_DISTANCE", "RAW_RPM", "DEBUG_FLOAT_ARRAY", "FIGURE_EIGHT_EXECUTION_STATUS"),
+    *("OPEN_DRONE_ID_BASIC_ID", "OPEN_DRONE_ID_LOCATION", "OPEN_DRONE_ID_SYSTEM"),
+)
+"""Streams of PX4 without content here, because the vehicle lacks the device.
+
+A real PX4 accepts a rate for these streams and sends nothing, as does this simulator. Source: the
+ids accepted by SET_MESSAGE_INTERVAL on a running PX4 1.16."""
+
 BUILDERS: dict[str, Builder] = {
+    **dict.fromkeys(SILENT, no_content),
     "FENCE_STATUS": fence_status,
     "ACTUATOR_OUTPUT_STATUS": actuator_output_status,
     "HIL_ACTUATOR_CONTROLS": hil_actuator_controls,
@@ -296,3 +310,53 @@ BUILDERS: dict[str, Builder] = {
     "PROTOCOL_VERSION": protocol_version,
     "HIGH_LATENCY2": high_latency2,
 }
+
+
+ACCEPTED = (
+    dialect.MAV_CMD_DO_SET_ACTUATOR,
+    dialect.MAV_CMD_DO_GO_AROUND,
+    dialect.MAV_CMD_EXTERNAL_WIND_ESTIMATE,
+)
+
+
+NOT_ACKNOWLEDGED = [
+    int(getattr(dialect, f"MAV_CMD_{name}"))
+    for name in (
+        *("CONFIGURE_ACTUATOR", "DO_FIGURE_EIGHT", "DO_SET_CAM_TRIGG_DIST"),
+        *("DO_SET_CAM_TRIGG_INTERVAL", "OBLIQUE_SURVEY", "SET_CAMERA_ZOOM"),
+        *("SET_CAMERA_FOCUS", "START_RX_PAIR", "SET_CAMERA_MODE", "DO_DIGICAM_CONTROL"),
+        *("DO_TRIGGER_CONTROL", "DO_GRIPPER", "DO_WINCH", "DO_MOUNT_CONTROL"),
+        *("DO_MOUNT_CONFIGURE", "DO_MOUNT_CONTROL_QUAT", "DO_GIMBAL_MANAGER_PITCHYAW"),
+        *("DO_GIMBAL_MANAGER_CONFIGURE", "REQUEST_CAMERA_INFORMATION", "NAV_DELAY"),
+        *("DO_VTOL_TRANSITION", "PREFLIGHT_SET_SENSOR_OFFSETS", "PREFLIGHT_UAVCAN"),
+        *("PAYLOAD_PREPARE_DEPLOY", "PAYLOAD_CONTROL_DEPLOY"),
+    )
+]
+"""Commands to parts that the vehicle lacks."""
+
+
+def _answer(result: Result | None) -> Action:
+    """Return an action without effect that returns this result."""
+    return lambda _command, _context: result
+
+
+def _actuator_test(_command: VehicleCommand, context: Context) -> Result | None:
+    """Handle ACTUATOR_TEST: PX4 rejects it while armed; disarmed, it has no effect here."""
+    armed = context.port.state().status.arming is Arming.ARMED
+    return Result.DENIED if armed else None
+
+
+def _high_latency(_command: VehicleCommand, context: Context) -> Result:
+    context.announce(OperatorText.of(Severity.CRITICAL, events.NO_HIGH_LATENCY))
+    return Result.FAILED
+
+
+ACTIONS: dict[int, Action] = {
+    **dict.fromkeys(ACCEPTED, _answer(Result.ACCEPTED)),
+    **dict.fromkeys(NOT_ACKNOWLEDGED, _answer(None)),
+    dialect.MAV_CMD_ACTUATOR_TEST: _actuator_test,
+    dialect.MAV_CMD_CONTROL_HIGH_LATENCY: _high_latency,
+    # The estimator accepts an external position only while it has none.
+    dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE: _answer(Result.TEMPORARILY_REJECTED),
+}
+"""Commands without effect here, answered as by a running PX4 1.16 SITL."""

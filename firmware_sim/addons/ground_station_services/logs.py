@@ -7,13 +7,14 @@ with LOGGING_DATA(_ACKED), as in PX4 1.16 (mavlink_log_handler.cpp, mavlink_ulog
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
-from firmware_sim.autopilot.port import LogEntry
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import (
+from firmware_sim.mavlink.services import (
     Action,
     Context,
     Handlers,
@@ -22,7 +23,6 @@ from firmware_sim.mavlink.services.context import (
     for_vehicle_or_all,
 )
 
-ENTRIES_PER_TICK = 1
 PACKETS_PER_TICK = 8
 """LOG_DATA messages per client and tick: 180 kB per second."""
 PIECES_PER_TICK = 2
@@ -36,30 +36,14 @@ _ACK_TIMEOUT_US = 50_000
 _ACK_TRIES = 50
 """ACK_TIMEOUT [µs] and ACK_MAX_TRIES of ulog_stream_ack."""
 
-
 PIECE_BYTES = 249
 """Size of LOGGING_DATA.data [bytes]."""
-
 
 NO_MESSAGE = 255
 """Value of first_message_offset if no message starts in this piece."""
 
-
-_HEAD_BYTES = 16
-"""Size of a ULog header [bytes]: magic, version and time, before the first message."""
-
-
-_MESSAGE_HEAD_BYTES = 3
-
-
-@dataclass(slots=True)
-class LogListing:
-    """Log entries that remain to be sent."""
-
-    entries: Sequence[LogEntry]
-    """Entries of all logs at the time of the request."""
-    number: int
-    last: int
+_FILE_HEAD_BYTES, _MESSAGE_HEAD_BYTES = 16, 3
+"""Size of a ULog header (magic, version and time) and of a message header [bytes]."""
 
 
 @dataclass(slots=True)
@@ -71,11 +55,11 @@ class LogDownload:
     end: int
 
 
-@dataclass(slots=True)
-class Piece:
-    """Piece of a log stream."""
+class Piece(NamedTuple):
+    """Piece of a log stream: the fields of LOGGING_DATA."""
 
     sequence: int
+    length: int
     first_message: int
     data: bytes
 
@@ -96,7 +80,10 @@ class LogStream:
         self._head_bytes = head_bytes
         self._offset = 0
         self._sequence = 0
-        self._boundaries = MessageBoundaries()
+        self._skip = _FILE_HEAD_BYTES
+        """Offset of the next message in the next piece."""
+        self._cut = b""
+        """Start of a message header truncated by the end of a piece."""
 
     @property
     def in_head(self) -> bool:
@@ -106,7 +93,7 @@ class LogStream:
     def skip_to(self, offset: int) -> None:
         """Continue from the end of a message. Valid only after the header."""
         self._offset = max(self._offset, offset)
-        self._boundaries = MessageBoundaries(skip=0)
+        self._skip, self._cut = 0, b""
 
     def next_piece(self, read: Callable[[int, int, int], bytes]) -> Piece | None:
         """Return the next piece, read by `LogStore.read`; None until enough data is written."""
@@ -117,46 +104,27 @@ class LogStream:
         data = read(self.number, self._offset, room)
         if len(data) < room:
             return None
-        piece = Piece(self._sequence, self._boundaries.first_in(data), data)
+        padded = data.ljust(PIECE_BYTES, b"\0")
+        piece = Piece(self._sequence, len(data), self._first_message(data), padded)
         self._offset += len(data)
         # The sequence number has 16 bits and wraps around.
         self._sequence = self._sequence + 1 & 0xFFFF
         return piece
 
-
-class MessageBoundaries:
-    """Finder of message boundaries in a ULog file that arrives in pieces."""
-
-    def __init__(self, skip: int = _HEAD_BYTES) -> None:
-        """Start `skip` bytes before the first message."""
-        self._skip = skip
-        self._head = b""
-        """Start of a message header truncated by the end of a piece."""
-
-    def first_in(self, data: bytes) -> int:
-        """Return the offset of the first message that starts in a piece; `NO_MESSAGE` if absent."""
-        first, at = NO_MESSAGE, self._skip
-        if self._head:
-            # `_head` holds a message header that was split between two pieces.
-            # The rest of the header is at the start of this piece.
-            lacking = _MESSAGE_HEAD_BYTES - len(self._head)
-            head = self._head + data[:lacking]
-            if len(head) < _MESSAGE_HEAD_BYTES:
-                self._head = head
-                return first
-            at = lacking + int.from_bytes(head[:2], "little")
-            self._head = b""
+    def _first_message(self, data: bytes) -> int:
+        """Return the offset of the first message that starts in the next piece."""
+        before, first, at = len(self._cut), NO_MESSAGE, self._skip
+        whole, self._cut = self._cut + data, b""
         # Walk from message to message by the size in each header.
-        while at < len(data):
-            first = at if first == NO_MESSAGE else first
-            head = data[at : at + _MESSAGE_HEAD_BYTES]
-            if len(head) < _MESSAGE_HEAD_BYTES:
-                self._head = head
-                self._skip = 0
-                return first
-            at += _MESSAGE_HEAD_BYTES + int.from_bytes(head[:2], "little")
-        # The next message starts this many bytes into the next piece.
-        self._skip = at - len(data)
+        while at < len(whole):
+            if first == NO_MESSAGE and at >= before:
+                first = at - before
+            header = whole[at : at + _MESSAGE_HEAD_BYTES]
+            if len(header) < _MESSAGE_HEAD_BYTES:
+                self._cut, at = header, len(whole)
+                break
+            at += _MESSAGE_HEAD_BYTES + int.from_bytes(header[:2], "little")
+        self._skip = at - len(whole)
         return first
 
 
@@ -164,14 +132,15 @@ class MessageBoundaries:
 class LogTransfers(ServiceState):
     """Log transfers of one client."""
 
-    listing: LogListing | None = None
+    listing: deque[WireMessage] = field(default_factory=deque)
+    """LOG_ENTRY messages that remain to be sent, one per tick."""
     download: LogDownload | None = None
     stream: LogStream | None = None
 
     @property
     def is_running(self) -> bool:
         """True during any transfer."""
-        return not (self.listing is None and self.download is None and self.stream is None)
+        return bool(self.listing) or self.download is not None or self.stream is not None
 
 
 def send_pending(context: Context) -> None:
@@ -179,8 +148,8 @@ def send_pending(context: Context) -> None:
     logs = context.states.get(LogTransfers)
     if logs is None:
         return
-    if logs.listing is not None:
-        _send_entries(context, logs.listing)
+    if logs.listing:
+        context.link.send(logs.listing.popleft())
     if logs.download is not None:
         _send_data(context, logs.download)
     if logs.stream is not None:
@@ -196,12 +165,14 @@ def handle_list(message: WireMessage, context: Context) -> bool:
     total = len(entries)
     # An empty list is one entry with count 0.
     if total == 0:
-        number, size, utc_s, last = 0, 0, 0, 0
-        context.link.send(dialect.MAVLink_log_entry_message(number, 0, last, utc_s, size))
+        context.link.send(dialect.MAVLink_log_entry_message(0, 0, 0, 0, 0))
         return True
     # Clients request up to 65535: the range ends at the last log.
     first, last = (min(number, total - 1) for number in (message.start, message.end))
-    context.state(LogTransfers).listing = LogListing(entries, first, last)
+    context.state(LogTransfers).listing = deque(
+        dialect.MAVLink_log_entry_message(number, total, total - 1, *entries[number])
+        for number in range(first, last + 1)
+    )
     return True
 
 
@@ -215,7 +186,8 @@ def handle_data(message: WireMessage, context: Context) -> bool:
 def handle_end(_message: WireMessage, context: Context) -> bool:
     """Stop sending."""
     logs = context.state(LogTransfers)
-    logs.listing = logs.download = None
+    logs.listing.clear()
+    logs.download = None
     return True
 
 
@@ -225,23 +197,9 @@ def handle_erase(_message: WireMessage, context: Context) -> bool:
     return True
 
 
-def _send_entries(context: Context, listing: LogListing) -> None:
-    entries, total = listing.entries, len(listing.entries)
-    for number in range(listing.number, min(listing.number + ENTRIES_PER_TICK, listing.last + 1)):
-        entry = entries[number]
-        context.link.send(
-            dialect.MAVLink_log_entry_message(
-                number, total, total - 1, entry.utc_s, entry.size_bytes
-            )
-        )
-    listing.number += ENTRIES_PER_TICK
-    if listing.number > listing.last:
-        context.state(LogTransfers).listing = None
-
-
 def _send_data(context: Context, download: LogDownload) -> None:
-    wanted = min(PACKETS_PER_TICK * _PACKET_BYTES, download.end - download.offset)
-    data = context.port.logs.read(download.number, download.offset, wanted)
+    requested = min(PACKETS_PER_TICK * _PACKET_BYTES, download.end - download.offset)
+    data = context.port.logs.read(download.number, download.offset, requested)
     # A packet that is not full signals the end of the log to the client.
     for at in range(0, max(len(data), 1), _PACKET_BYTES):
         part = data[at : at + _PACKET_BYTES]
@@ -250,7 +208,7 @@ def _send_data(context: Context, download: LogDownload) -> None:
         )
     download.offset += len(data)
     # A short read is the end of the file.
-    if len(data) < wanted or download.offset >= download.end:
+    if len(data) < requested or download.offset >= download.end:
         context.state(LogTransfers).download = None
 
 
@@ -268,12 +226,6 @@ def _start(command: VehicleCommand, context: Context) -> Result:
 def _stop(_command: VehicleCommand, context: Context) -> None:
     """Stop the stream. PX4 does not acknowledge this command."""
     context.state(LogTransfers).stream = None
-
-
-ACTIONS: dict[int, Action] = {
-    dialect.MAV_CMD_LOGGING_START: _start,
-    dialect.MAV_CMD_LOGGING_STOP: _stop,
-}
 
 
 def handle_ack(message: WireMessage, context: Context) -> bool:
@@ -298,9 +250,10 @@ def _stream(context: Context, stream: LogStream) -> None:
         return
     logs = context.port.logs
     for _ in range(PIECES_PER_TICK):
+        in_head = stream.in_head
+        piece = stream.next_piece(logs.read)
         # The header is sent reliably, one piece at a time; the data is not.
-        if stream.in_head:
-            piece = stream.next_piece(logs.read)
+        if in_head:
             if piece is not None:
                 stream.waiting, stream.tries = piece, 0
                 _send_acked(context, stream, piece)
@@ -308,26 +261,20 @@ def _stream(context: Context, stream: LogStream) -> None:
             if not stream.in_head and log is not None:
                 # The client can download data from before its request.
                 stream.skip_to(log.size_bytes)
+        if in_head or piece is None:
             return
-        piece = stream.next_piece(logs.read)
-        if piece is None:
-            return
-        context.link.send(dialect.MAVLink_logging_data_message(*stream.target, *_fields(piece)))
+        context.link.send(dialect.MAVLink_logging_data_message(*stream.target, *piece))
 
 
 def _send_acked(context: Context, stream: LogStream, piece: Piece) -> None:
     stream.sent_us, stream.tries = context.now_us, stream.tries + 1
-    context.link.send(dialect.MAVLink_logging_data_acked_message(*stream.target, *_fields(piece)))
+    context.link.send(dialect.MAVLink_logging_data_acked_message(*stream.target, *piece))
 
 
-def _fields(piece: Piece) -> tuple[int, int, int, bytes]:
-    return (
-        piece.sequence,
-        len(piece.data),
-        piece.first_message,
-        piece.data.ljust(PIECE_BYTES, b"\0"),
-    )
-
+ACTIONS: dict[int, Action] = {
+    dialect.MAV_CMD_LOGGING_START: _start,
+    dialect.MAV_CMD_LOGGING_STOP: _stop,
+}
 
 HANDLERS: Handlers = {
     "LOG_REQUEST_LIST": (for_vehicle_or_all, handle_list),

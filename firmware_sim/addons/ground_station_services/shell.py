@@ -11,11 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+from firmware_sim.autopilot.autopilot_state import Arming
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.port import AutopilotPort
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import Context, Handlers, ServiceState, for_anyone
+from firmware_sim.mavlink.services import Context, Handlers, ServiceState, for_anyone
 
 PROMPT = "pxh> "
 
@@ -90,11 +91,11 @@ def send_pending(context: Context) -> None:
 
 # --- commands: each prints PX4's output, as far as available here
 
-Shown = Callable[[Sequence[str], AutopilotPort, int], str]
+Shown = Callable[[Sequence[str], BuiltinAutopilot, int], str]
 """Returns the output of a command, given its arguments, the autopilot, and the time [µs]."""
 
 
-def run(words: Sequence[str], port: AutopilotPort, now_us: int) -> str:
+def run(words: Sequence[str], port: BuiltinAutopilot, now_us: int) -> str:
     """Return the output of a command line, in whole lines."""
     if not words:
         return ""
@@ -104,19 +105,10 @@ def run(words: Sequence[str], port: AutopilotPort, now_us: int) -> str:
     return command(words[1:], port, now_us)
 
 
-def _help(_words: Sequence[str], _port: AutopilotPort, _now_us: int) -> str:
-    return "".join(f"  {name}\n" for name in sorted(COMMANDS))
+_VERSION = "HW arch: AIRL_SITL\nPX4 version: 1.16.0 (emulated by airl-mav)\n"
 
 
-def _version(_words: Sequence[str], _port: AutopilotPort, _now_us: int) -> str:
-    return "HW arch: AIRL_SITL\nPX4 version: 1.16.0 (emulated by airl-mav)\n"
-
-
-def _uptime(_words: Sequence[str], _port: AutopilotPort, now_us: int) -> str:
-    return f"Uptime: {now_us / US_PER_S:.3f} s of simulated time\n"
-
-
-def _parameters(words: Sequence[str], port: AutopilotPort, _now_us: int) -> str:
+def _parameters(words: Sequence[str], port: BuiltinAutopilot, _now_us: int) -> str:
     """Run param show [NAME, with * and ?]."""
     # Only `show` is supported: the shell is read-only.
     if not words or words[0] != "show" or len(words) > 2:
@@ -129,23 +121,23 @@ def _parameters(words: Sequence[str], port: AutopilotPort, _now_us: int) -> str:
         if found is not None and fnmatch.fnmatchcase(found.name, pattern):
             value = found.value
             # PX4 prints floats with four decimals.
-            shown = f"{value}" if isinstance(value, int) else f"{value:.4f}"
-            lines.append(f"x   {found.name} [{index},{index}] : {shown}")
+            text = f"{value}" if isinstance(value, int) else f"{value:.4f}"
+            lines.append(f"x   {found.name} [{index},{index}] : {text}")
     return "\n".join([*lines, "", f" {len(store)}/{len(store)} parameters used.", ""])
 
 
-def _commander(words: Sequence[str], port: AutopilotPort, _now_us: int) -> str:
+def _commander(words: Sequence[str], port: BuiltinAutopilot, _now_us: int) -> str:
     if list(words) != ["status"]:
         return "usage: commander status\n"
     status = port.state().status
     armed = "Armed" if status.arming is Arming.ARMED else "Disarmed"
-    said = (
+    lines = (
         armed,
         f"navigation mode: {_title(status.mode)}",
         f"user intended navigation mode: {_title(status.intended_mode)}",
         f"in failsafe: {'yes' if status.failsafe else 'no'}",
     )
-    return "".join(f"INFO  [commander] {line}\n" for line in said)
+    return "".join(f"INFO  [commander] {line}\n" for line in lines)
 
 
 def _title(mode: Mode) -> str:
@@ -191,7 +183,7 @@ _TOPICS: Mapping[str, Callable[[AutopilotState], Mapping[str, float]]] = {
 }
 
 
-def _listener(words: Sequence[str], port: AutopilotPort, now_us: int) -> str:
+def _listener(words: Sequence[str], port: BuiltinAutopilot, now_us: int) -> str:
     """Run listener TOPIC: print its newest message once."""
     topic = words[0] if words else ""
     fields = _TOPICS.get(topic)
@@ -201,22 +193,23 @@ def _listener(words: Sequence[str], port: AutopilotPort, now_us: int) -> str:
     state = port.state()
     age_s = (now_us - state.time_us) / US_PER_S
     lines = [f"    timestamp: {state.time_us} ({age_s:.6f} seconds ago)"]
-    lines += [f"    {name}: {_shown(value)}" for name, value in fields(state).items()]
+    lines += [f"    {name}: {_formatted(value)}" for name, value in fields(state).items()]
     return "\n".join(["", f"TOPIC: {topic}", f" {topic}", *lines, "", ""])
 
 
-def _shown(value: float) -> str:
+def _formatted(value: float) -> str:
     return f"{value:.4f}" if isinstance(value, float) else f"{value}"
 
 
 COMMANDS: Mapping[str, Shown] = {
     "commander": _commander,
-    "help": _help,
+    "help": lambda *_: "".join(f"  {name}\n" for name in sorted(COMMANDS)),
     "listener": _listener,
     "param": _parameters,
-    "uptime": _uptime,
-    "ver": _version,
+    "uptime": lambda _words, _port, now_us: (
+        f"Uptime: {now_us / US_PER_S:.3f} s of simulated time\n"
+    ),
+    "ver": lambda *_: _VERSION,
 }
-
 
 HANDLERS: Handlers = {"SERIAL_CONTROL": (for_anyone, handle_input)}

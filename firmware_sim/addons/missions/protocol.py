@@ -7,16 +7,25 @@ MISSION_WRITE_PARTIAL_LIST) have no reply here either. https://mavlink.io/en/ser
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
+from airl_mav.core.frames import Geodetic
 from firmware_sim.addons.missions import wire_items
 from firmware_sim.addons.missions.items import MOST_ITEMS
-from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.autopilot.events.definition import Definition, Level, define
 from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem, Stored
 from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
-from firmware_sim.mavlink.services.context import ANY, Context, ServiceState, sender
+from firmware_sim.mavlink.services import (
+    ANY,
+    Action,
+    Context,
+    ServiceState,
+    VehicleCommand,
+    sender,
+)
 
 RETRY_US = 250_000
 """Time without an item after which the request is repeated [µs] (PX4)."""
@@ -468,6 +477,42 @@ def _end_upload(context: Context) -> None:
     transfer.items = []
 
 
+# --- commands
+
+_ROI_LOCATION = 3
+"""Value of MAV_ROI_LOCATION."""
+
+
+def _start(command: VehicleCommand, context: Context) -> Result:
+    """Handle parameter 1: first item; -1 = continue the mission."""
+    index = command.params[0]
+    if not math.isfinite(index):
+        return Result.DENIED
+    return context.port.start_mission(int(index))
+
+
+def _start_landing(_command: VehicleCommand, context: Context) -> Result:
+    """Go to the mission's landing: DO_LAND_START, or the first landing; CANCELLED without one."""
+    commands = [item.command for item in context.port.plans.mission]
+    # DO_LAND_START has precedence; without one the first LAND item marks the landing.
+    for marker in (dialect.MAV_CMD_DO_LAND_START, dialect.MAV_CMD_NAV_LAND):
+        if marker in commands:
+            return context.port.start_mission(commands.index(marker))
+    return Result.CANCELLED
+
+
+def _look(command: VehicleCommand, context: Context) -> Result:
+    """Handle DO_SET_ROI_LOCATION, DO_SET_ROI (parameter 1: MAV_ROI) and DO_SET_ROI_NONE."""
+    place = Geodetic(*command.params[4:7])
+    # DO_SET_ROI carries the region type in parameter 1.
+    located = command.number == dialect.MAV_CMD_DO_SET_ROI_LOCATION or (
+        command.number != dialect.MAV_CMD_DO_SET_ROI_NONE and command.params[0] == _ROI_LOCATION
+    )
+    valid = math.isfinite(place.latitude_deg) and math.isfinite(place.longitude_deg)
+    context.port.look_at(place if located and valid else None)
+    return Result.ACCEPTED
+
+
 HANDLERS = {
     name: (is_addressed, handler)
     for name, handler in {
@@ -483,3 +528,14 @@ HANDLERS = {
     }.items()
 }
 """Handlers by message name."""
+
+ACTIONS: dict[int, Action] = {
+    dialect.MAV_CMD_MISSION_START: _start,
+    dialect.MAV_CMD_DO_LAND_START: _start_landing,
+    dialect.MAV_CMD_DO_SET_ROI_LOCATION: _look,
+    dialect.MAV_CMD_DO_SET_ROI_NONE: _look,
+    dialect.MAV_CMD_DO_SET_ROI: _look,
+    dialect.MAV_CMD_NAV_ROI: _look,
+    # Effective only as a mission item.
+    dialect.MAV_CMD_DO_SET_ROI_WPNEXT_OFFSET: _look,
+}

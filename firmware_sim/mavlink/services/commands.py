@@ -13,15 +13,14 @@ from operator import attrgetter
 
 from airl_mav.core.frames import Geodetic, geodetic_to_local
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import NavigationMode
 from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, MODE_NOT_AVAILABLE
 from firmware_sim.autopilot.flight_modes import MAIN_AUTO, MAIN_POSCTL, Mode
 from firmware_sim.autopilot.inputs import OrbitRequest, PositionYaw, Reposition
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services import table
-from firmware_sim.mavlink.services.context import (
+from firmware_sim.mavlink.services import (
     ANY,
     Action,
     Context,
@@ -30,6 +29,7 @@ from firmware_sim.mavlink.services.context import (
     for_anyone,
     for_vehicle,
     sender,
+    table,
 )
 from firmware_sim.mavlink.streams.units import INT32_MAX
 
@@ -37,8 +37,6 @@ NAN = math.nan
 
 _CHANGE_MODE: int = dialect.MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
 _GROUND_SPEED: int = dialect.SPEED_TYPE_GROUNDSPEED
-_ROI_LOCATION = 3
-"""Value of MAV_ROI_LOCATION."""
 
 _LOWEST_M, _HIGHEST_M = -12_000.0, 100_000.0
 """Range of valid origin altitudes above mean sea level, as in EKF2 [m]."""
@@ -102,24 +100,6 @@ def local_place(command: VehicleCommand, context: Context) -> Vec:
     return north, east, down
 
 
-def _start(command: VehicleCommand, context: Context) -> Result:
-    """Handle parameter 1: first item; -1 = continue the mission."""
-    index = command.params[0]
-    if not math.isfinite(index):
-        return Result.DENIED
-    return context.port.start_mission(int(index))
-
-
-def _start_landing(_command: VehicleCommand, context: Context) -> Result:
-    """Go to the mission's landing: DO_LAND_START, or the first landing; CANCELLED without one."""
-    commands = [item.command for item in context.port.plans.mission]
-    # DO_LAND_START has precedence; without one the first LAND item marks the landing.
-    for marker in (dialect.MAV_CMD_DO_LAND_START, dialect.MAV_CMD_NAV_LAND):
-        if marker in commands:
-            return context.port.start_mission(commands.index(marker))
-    return Result.CANCELLED
-
-
 def _set_home(command: VehicleCommand, context: Context) -> Result:
     """Handle parameter 1: 1 = current position; otherwise parameters 5 to 7 are the position."""
     if command.params[0] > 0.5:
@@ -128,18 +108,6 @@ def _set_home(command: VehicleCommand, context: Context) -> Result:
     if not all(math.isfinite(value) for value in place):
         return Result.DENIED
     return context.port.set_home(place)
-
-
-def _look(command: VehicleCommand, context: Context) -> Result:
-    """Handle DO_SET_ROI_LOCATION, DO_SET_ROI (parameter 1: MAV_ROI) and DO_SET_ROI_NONE."""
-    place = Geodetic(*command.params[4:7])
-    # DO_SET_ROI carries the region type in parameter 1.
-    located = command.number == dialect.MAV_CMD_DO_SET_ROI_LOCATION or (
-        command.number != dialect.MAV_CMD_DO_SET_ROI_NONE and command.params[0] == _ROI_LOCATION
-    )
-    valid = math.isfinite(place.latitude_deg) and math.isfinite(place.longitude_deg)
-    context.port.look_at(place if located and valid else None)
-    return Result.ACCEPTED
 
 
 def handle_set_origin(message: WireMessage, context: Context) -> bool:
@@ -159,63 +127,6 @@ def handle_set_origin(message: WireMessage, context: Context) -> bool:
 def _is_on_the_globe(place: Geodetic) -> bool:
     latitude, longitude, altitude = place
     return abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and _LOWEST_M < altitude < _HIGHEST_M
-
-
-_NAVIGATION: dict[int, Action] = {
-    dialect.MAV_CMD_DO_REPOSITION: _reposition,
-    dialect.MAV_CMD_DO_CHANGE_ALTITUDE: _change_altitude,
-    dialect.MAV_CMD_DO_CHANGE_SPEED: _change_speed,
-    dialect.MAV_CMD_DO_ORBIT: _orbit,
-    dialect.MAV_CMD_MISSION_START: _start,
-    dialect.MAV_CMD_DO_LAND_START: _start_landing,
-    dialect.MAV_CMD_DO_SET_HOME: _set_home,
-    dialect.MAV_CMD_DO_SET_ROI_LOCATION: _look,
-    dialect.MAV_CMD_DO_SET_ROI_NONE: _look,
-    dialect.MAV_CMD_DO_SET_ROI: _look,
-    dialect.MAV_CMD_NAV_ROI: _look,
-    # Effective only as a mission item.
-    dialect.MAV_CMD_DO_SET_ROI_WPNEXT_OFFSET: _look,
-}
-
-
-# Commands without effect here are answered as by a running PX4 1.16 SITL.
-
-ACCEPTED = (
-    dialect.MAV_CMD_DO_SET_ACTUATOR,
-    dialect.MAV_CMD_DO_GO_AROUND,
-    dialect.MAV_CMD_EXTERNAL_WIND_ESTIMATE,
-)
-
-NOT_ACKNOWLEDGED = [
-    int(getattr(dialect, f"MAV_CMD_{name}"))
-    for name in (
-        *("CONFIGURE_ACTUATOR", "DO_FIGURE_EIGHT", "DO_SET_CAM_TRIGG_DIST"),
-        *("DO_SET_CAM_TRIGG_INTERVAL", "OBLIQUE_SURVEY", "SET_CAMERA_ZOOM"),
-        *("SET_CAMERA_FOCUS", "START_RX_PAIR", "SET_CAMERA_MODE", "DO_DIGICAM_CONTROL"),
-        *("DO_TRIGGER_CONTROL", "DO_GRIPPER", "DO_WINCH", "DO_MOUNT_CONTROL"),
-        *("DO_MOUNT_CONFIGURE", "DO_MOUNT_CONTROL_QUAT", "DO_GIMBAL_MANAGER_PITCHYAW"),
-        *("DO_GIMBAL_MANAGER_CONFIGURE", "REQUEST_CAMERA_INFORMATION", "NAV_DELAY"),
-        *("DO_VTOL_TRANSITION", "PREFLIGHT_SET_SENSOR_OFFSETS", "PREFLIGHT_UAVCAN"),
-        *("PAYLOAD_PREPARE_DEPLOY", "PAYLOAD_CONTROL_DEPLOY"),
-    )
-]
-"""Commands to parts that the vehicle lacks."""
-
-
-def _answer(result: Result | None) -> Action:
-    """Return an action without effect that returns this result."""
-    return lambda _command, _context: result
-
-
-def _actuator_test(_command: VehicleCommand, context: Context) -> Result | None:
-    """Handle ACTUATOR_TEST: PX4 rejects it while armed; disarmed, it has no effect here."""
-    armed = context.port.state().status.arming is Arming.ARMED
-    return Result.DENIED if armed else None
-
-
-def _high_latency(_command: VehicleCommand, context: Context) -> Result:
-    context.announce(OperatorText.of(Severity.CRITICAL, events.NO_HIGH_LATENCY))
-    return Result.FAILED
 
 
 FORCE_MAGIC = 21_196
@@ -328,13 +239,11 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
     dialect.MAV_CMD_RUN_PREARM_CHECKS: _run_checks,
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
-    **_NAVIGATION,
-    **dict.fromkeys(ACCEPTED, _answer(Result.ACCEPTED)),
-    **dict.fromkeys(NOT_ACKNOWLEDGED, _answer(None)),
-    dialect.MAV_CMD_ACTUATOR_TEST: _actuator_test,
-    dialect.MAV_CMD_CONTROL_HIGH_LATENCY: _high_latency,
-    # The estimator accepts an external position only while it has none.
-    dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE: _answer(Result.TEMPORARILY_REJECTED),
+    dialect.MAV_CMD_DO_REPOSITION: _reposition,
+    dialect.MAV_CMD_DO_CHANGE_ALTITUDE: _change_altitude,
+    dialect.MAV_CMD_DO_CHANGE_SPEED: _change_speed,
+    dialect.MAV_CMD_DO_ORBIT: _orbit,
+    dialect.MAV_CMD_DO_SET_HOME: _set_home,
 }
 """Actions by command. Commands without an action in any service are UNSUPPORTED."""
 

@@ -13,8 +13,7 @@ from airl_mav.core.clock import NS_PER_US
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect, message_name
 from firmware_sim.mavlink.link import OFF
-from firmware_sim.mavlink.services import table
-from firmware_sim.mavlink.services.context import (
+from firmware_sim.mavlink.services import (
     ANY,
     Action,
     Context,
@@ -24,6 +23,7 @@ from firmware_sim.mavlink.services.context import (
     for_vehicle,
     for_vehicle_or_all,
     sender,
+    table,
 )
 from firmware_sim.mavlink.streams import Builder
 from firmware_sim.mavlink.streams.units import INT32_MAX
@@ -80,8 +80,8 @@ def _request_message(command: VehicleCommand, context: Context) -> Result:
 
 
 def _request_interval(command: VehicleCommand, context: Context) -> Result:
-    asked = command.integer(2)
-    return Result.DENIED if asked is None else _send_interval(asked & 0xFFFF, context)
+    number = command.integer(2)
+    return Result.DENIED if number is None else _send_interval(number & 0xFFFF, context)
 
 
 REQUESTS: dict[int, Action] = {
@@ -117,8 +117,8 @@ def handle_event(request: WireMessage, context: Context) -> bool:
     """Handle REQUEST_EVENT: resend events, or RESPONSE_EVENT_ERROR for each expired event."""
     first, last = request.first_sequence, request.last_sequence
     # Limited: the first error reply already contains the oldest available number.
-    wanted = min((last - first) % NUMBERS + 1, KEPT)
-    for number in range(first, first + wanted):
+    events_requested = min((last - first) % NUMBERS + 1, KEPT)
+    for number in range(first, first + events_requested):
         # Sequence numbers wrap around at 65536.
         sequence = number % NUMBERS
         sent = context.events.get(sequence)

@@ -23,7 +23,7 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Setpoint, Sever
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.inputs import FollowedTarget, Source, Sticks
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import Context, Handlers, for_anyone, for_vehicle_or_all
+from firmware_sim.mavlink.services import Context, Handlers, for_anyone, for_vehicle_or_all
 
 _CRITICAL = Severity.CRITICAL
 _POSITION_SHIFT, _VELOCITY_SHIFT, _ACCELERATION_SHIFT = 0, 3, 6
@@ -272,7 +272,7 @@ def handle_channels(message: WireMessage, context: Context) -> bool:
 
     Pulling the pitch stick increases its pulse width. All four channels are required.
     """
-    context.radio.hear(message, context.now_us)
+    context.radio.receive(message, context.now_us)
     raw = (message.chan1_raw, message.chan2_raw, message.chan3_raw, message.chan4_raw)
     if any(width in _NO_CHANNEL for width in raw):
         return False

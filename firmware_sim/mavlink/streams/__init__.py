@@ -14,8 +14,8 @@ from functools import cache
 from types import MappingProxyType
 
 from airl_mav.core.addons import entries, load
-from firmware_sim.autopilot.autopilot_state import AutopilotState
-from firmware_sim.autopilot.port import AutopilotPort
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import SYSTEM_ID, Values
 from firmware_sim.mavlink.streams import sensors, status
@@ -25,28 +25,10 @@ Builder = Callable[[AutopilotState], "Values | None"]
 """Returns one message's fields, in order of definition, from a snapshot; None = no content yet.
 Plain values: creating message objects takes longer than all the rest."""
 
-_SILENT = (
-    *("GPS_STATUS", "NAV_CONTROLLER_OUTPUT", "COMMAND_LONG"),
-    *("CAMERA_TRIGGER", "SCALED_IMU2", "SCALED_IMU3", "GPS2_RAW"),
-    *("SCALED_PRESSURE3", "LANDING_TARGET", "EFI_STATUS", "WIND_COV"),
-    *("GPS_RTCM_DATA", "ADSB_VEHICLE", "DEBUG_VECT", "NAMED_VALUE_FLOAT"),
-    *("STATUSTEXT", "DEBUG", "CAMERA_IMAGE_CAPTURED", "MOUNT_ORIENTATION"),
-    *("GIMBAL_MANAGER_INFORMATION", "GIMBAL_MANAGER_STATUS", "GIMBAL_DEVICE_INFORMATION"),
-    *("GIMBAL_DEVICE_SET_ATTITUDE", "GIMBAL_DEVICE_ATTITUDE_STATUS"),
-    *("OBSTACLE_DISTANCE", "RAW_RPM", "DEBUG_FLOAT_ARRAY", "FIGURE_EIGHT_EXECUTION_STATUS"),
-    *("OPEN_DRONE_ID_BASIC_ID", "OPEN_DRONE_ID_LOCATION", "OPEN_DRONE_ID_SYSTEM"),
-)
-"""Streams of PX4 without content here, because the vehicle lacks the device.
 
-A real PX4 accepts a rate for these streams and sends nothing, as does this simulator. Source: the
-ids accepted by SET_MESSAGE_INTERVAL on a running PX4 1.16."""
-
-
-def _nothing(state: AutopilotState) -> None:
+def no_content(state: AutopilotState) -> None:
     """Return None: the stream has no content."""
 
-
-SILENT: Mapping[str, Builder] = MappingProxyType(dict.fromkeys(_SILENT, _nothing))
 
 _PACKED = (
     *("ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "ODOMETRY"),
@@ -57,7 +39,6 @@ _PACKED = (
 
 BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
     {
-        **SILENT,
         "HEARTBEAT": status.heartbeat,
         **dict.fromkeys(_PACKED),
         "EXTENDED_SYS_STATE": status.extended_sys_state,
@@ -73,7 +54,7 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "CURRENT_MODE": status.current_mode,
         "ESC_INFO": None,
         "ESC_STATUS": None,
-        **dict.fromkeys(("DISTANCE_SENSOR", "OPTICAL_FLOW_RAD"), _nothing),
+        **dict.fromkeys(("DISTANCE_SENSOR", "OPTICAL_FLOW_RAD"), no_content),
     }
 )
 """Streams that need only the snapshot. None = packed by compiled code (`telemetry`). The server
@@ -90,7 +71,7 @@ def addon_builders() -> dict[str, Builder]:
 class Vehicle:
     """Source of the streams that need more than the snapshot, for any attached autopilot."""
 
-    port: AutopilotPort
+    port: BuiltinAutopilot
 
     def __init__(self, boot_unix_us: int) -> None:
         """Start without an autopilot; simulated time 0 is at `boot_unix_us` [µs since 1970]."""
@@ -100,7 +81,7 @@ class Vehicle:
         self.truth: Callable[[], TrueState] | None = None
 
     def attach(
-        self, port: AutopilotPort, truth: Callable[[], TrueState] | None, system_id: int
+        self, port: BuiltinAutopilot, truth: Callable[[], TrueState] | None, system_id: int
     ) -> None:
         """Attach another autopilot, with its vehicle's true state; None = unavailable."""
         self.port, self.truth, self.system_id = port, truth, system_id

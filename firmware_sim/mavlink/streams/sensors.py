@@ -10,8 +10,9 @@ import numpy as np
 
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.kernels import kernel
-from firmware_sim.autopilot.autopilot_state import AutopilotState, Vector
-from firmware_sim.autopilot.port import ParameterStore
+from firmware_sim.autopilot.autopilot_state import Vector
+from firmware_sim.autopilot.parameter_store import Parameters
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.streams import units
@@ -61,7 +62,7 @@ def mag_cal_report(value: Callable[[str], float]) -> Values | None:
     )
 
 
-def battery_status(state: AutopilotState, parameters: ParameterStore) -> Values:
+def battery_status(state: AutopilotState, parameters: Parameters) -> Values:
     """Return battery 0: pack voltage in the first slot (cells unmeasured), current, charge."""
     battery = state.battery
     # -1 and INT16_MAX are MAVLink's values for unknown.
@@ -82,7 +83,7 @@ def battery_status(state: AutopilotState, parameters: ParameterStore) -> Values:
     )
 
 
-def _charge_state(remaining: float, parameters: ParameterStore) -> int:
+def _charge_state(remaining: float, parameters: Parameters) -> int:
     """Return the MAV_BATTERY_CHARGE_STATE of a charge 0..1, from PX4's warning thresholds."""
     state: int = dialect.MAV_BATTERY_CHARGE_STATE_OK
     # Thresholds descend, so the last match is the most severe state.
@@ -178,10 +179,8 @@ def clearance(state: AutopilotState, down: float) -> tuple[float, float]:
 
 CHANNELS = 18
 
-
 _ZERO_SAYS_NOTHING = 8
 """First channel for which 0 means unused. UINT16_MAX means unused for all channels."""
-
 
 _FULL_SIGNAL = 100
 
@@ -190,19 +189,19 @@ class Radio:
     """Channel values of the newest RC_CHANNELS_OVERRIDE, common to all clients."""
 
     def __init__(self) -> None:
-        self._said: tuple[int, ...] = ()
+        self._channels: tuple[int, ...] = ()
         self._time_us = 0
         self._count = 0
         """Number of RC_CHANNELS_OVERRIDE messages received."""
 
-    def hear(self, message: WireMessage, now_us: int) -> None:
+    def receive(self, message: WireMessage, now_us: int) -> None:
         """Store an RC_CHANNELS_OVERRIDE received at simulated `now_us` [µs]."""
-        said = [getattr(message, f"chan{number}_raw") for number in range(1, CHANNELS + 1)]
+        channels = [getattr(message, f"chan{number}_raw") for number in range(1, CHANNELS + 1)]
         # Trailing unused channels do not count: PX4 reports the number of channels up to the last
         # used one.
-        while said and _says_nothing(said[-1], len(said) - 1):
-            said.pop()
-        self._said, self._time_us = tuple(said), now_us
+        while channels and _says_nothing(channels[-1], len(channels) - 1):
+            channels.pop()
+        self._channels, self._time_us = tuple(channels), now_us
         self._count += 1
 
     def updates(self) -> Builder:
@@ -215,11 +214,11 @@ class Radio:
             if sent == self._count:
                 return None
             sent = self._count
-            said = self._said
+            channels = self._channels
             # RC_CHANNELS always has 18 values; UINT16_MAX marks the missing ones.
-            unused = (UINT16_MAX,) * (CHANNELS - len(said))
-            signal = _FULL_SIGNAL if said else 0
-            return boot_ms(self._time_us), len(said), *said, *unused, signal
+            unused = (UINT16_MAX,) * (CHANNELS - len(channels))
+            signal = _FULL_SIGNAL if channels else 0
+            return boot_ms(self._time_us), len(channels), *channels, *unused, signal
 
         return build
 

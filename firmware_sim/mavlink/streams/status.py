@@ -14,18 +14,14 @@ import numpy as np
 
 from airl_mav.core.addons import entries
 from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local, local_to_geodetic
-from firmware_sim.autopilot.autopilot_state import (
-    Arming,
-    AutopilotState,
-    CommanderStatus,
-    Landed,
-)
+from firmware_sim.autopilot.autopilot_state import Arming, CommanderStatus, Landed
 from firmware_sim.autopilot.flight_modes import (
     MAIN_AUTO,
     WITH_STICKS,
     Mode,
 )
 from firmware_sim.autopilot.modes.return_to_launch import return_time_s
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams import units
@@ -220,31 +216,23 @@ def _may_be_armed(state: AutopilotState) -> bool:
 def _estimator_flags(state: AutopilotState) -> int:
     """Return the flags of a converged estimator."""
     health, known = state.health, state.origin is not None
-    flags: int = 0
-    for good, bits in (
+    above_ground = state.clearance is not None and state.clearance.valid
+    # A disarmed vehicle is assumed stationary.
+    stationary = state.status.arming is not Arming.ARMED
+    relative = dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_PRED_POS_HORIZ_REL
+    absolute = dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_PRED_POS_HORIZ_ABS
+    flags = (
         (health.attitude, dialect.ESTIMATOR_ATTITUDE),
         (health.velocity, dialect.ESTIMATOR_VELOCITY_HORIZ),
         (health.altitude, dialect.ESTIMATOR_VELOCITY_VERT | dialect.ESTIMATOR_POS_VERT_ABS),
-        (
-            health.position,
-            dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_PRED_POS_HORIZ_REL,
-        ),
-        (
-            health.position and known,
-            dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_PRED_POS_HORIZ_ABS,
-        ),
+        (health.position, relative),
+        (health.position and known, absolute),
         (bool(state.estimate.innovation_ratio[0] > 1.0), dialect.ESTIMATOR_GPS_GLITCH),
         (health.accel_error, dialect.ESTIMATOR_ACCEL_ERROR),
-        (
-            state.clearance is not None and state.clearance.valid,
-            dialect.ESTIMATOR_POS_VERT_AGL,
-        ),
-        # A disarmed vehicle is assumed stationary.
-        (state.status.arming is not Arming.ARMED, dialect.ESTIMATOR_CONST_POS_MODE),
-    ):
-        if good:
-            flags |= bits
-    return flags
+        (above_ground, dialect.ESTIMATOR_POS_VERT_AGL),
+        (stationary, dialect.ESTIMATOR_CONST_POS_MODE),
+    )
+    return sum([bits for is_set, bits in flags if is_set])
 
 
 def mission_current(state: AutopilotState) -> Values:
@@ -300,7 +288,6 @@ def autopilot_state_for_gimbal_device(state: AutopilotState) -> Values:
 
 
 _NO_AIRSPEEDS = (0, 0)
-
 
 _UNKNOWN_TIME = -1
 """Value of unknown times: PX4 estimates only the return time."""

@@ -13,26 +13,47 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Arena
-from airl_mav.core.constants import US_PER_S
-from airl_mav.envs.stopping import braking_of
-from airl_mav.flight.episode_record import EpisodeRecord
-from airl_mav.flight.judge import Outcome
-from airl_mav.flight.trajectory import Trajectory, measure_leg, pose_at
-from airl_mav.latency.stamps import NO_STAMP
-from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.document import NONE, OUTCOME_LABELS, TableView, columns_of
-from airl_mav.report.forensics import evidence
-from airl_mav.report.forensics.camera_view import (
+from airl_mav.addons.forensics.camera_view import (
     ObstacleView,
-    PolicyCamera,
     bearing,
     passes_through,
     view_obstacle,
     view_wall,
 )
-from airl_mav.report.forensics.long_flights import cause_of_long_flight
+from airl_mav.addons.forensics.long_flights import (
+    HALF_WIDTH_M,
+    NO_CAUSE,
+    Evidence,
+    cause_of_long_flight,
+)
+from airl_mav.arena.geometry import Arena
+from airl_mav.core.constants import US_PER_S
+from airl_mav.envs.stopping import braking_of
+from airl_mav.flight.episode_record import (
+    EpisodeRecord,
+    UsualFlight,
+    path_excess,
+    ranked,
+    straight_m,
+    time_lost_s,
+    usual_flight,
+)
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.trajectory import Trajectory, measure_leg, pose_at
+from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.document import (
+    NONE,
+    OUTCOME_LABELS,
+    Section,
+    TableView,
+    columns_of,
+    tables_section,
+)
+from airl_mav.report.policy_view import PolicyCamera
+from airl_mav.report.run_arenas import flown_path
+from airl_mav.report.run_report import EXAMINED, Cause, ExaminedFlight, ReportInput
 
 LOOK_BACK = 5
 """Number of decisions before a collision with examined frames."""
@@ -93,7 +114,7 @@ def hit_number(reason: str, arena: Arena | None) -> int | None:
     return number if number < len(arena.obstacles) else None
 
 
-def examine_collision(flight: evidence.Evidence) -> CollisionAnalysis | None:
+def examine_collision(flight: Evidence) -> CollisionAnalysis | None:
     """Return the analysis of a collision; None without a collision or a recording."""
     record, path, stamps, arena = flight.record, flight.path, flight.stamps, flight.arena
     if record.outcome is not Outcome.COLLISION or not len(path):
@@ -108,16 +129,12 @@ def examine_collision(flight: evidence.Evidence) -> CollisionAnalysis | None:
     if decisions.size:
         frames = stamps["capture_us"][decisions[-LOOK_BACK:]]
         frame_us = int(frames[-1])
-        before_s, blind_m = (
-            (hit_us - frame_us) / US_PER_S,
-            measure_leg(path, frame_us, hit_us).distance_m,
-        )
+        before_s = (hit_us - frame_us) / US_PER_S
+        blind_m = measure_leg(path, frame_us, hit_us).distance_m
         motor_us = int(stamps.get("motor_us", stamps["sent_us"])[decisions[-1]])
         if motor_us != NO_STAMP:
-            lag_s, lag_m = (
-                (motor_us - frame_us) / US_PER_S,
-                measure_leg(path, frame_us, motor_us).distance_m,
-            )
+            lag_s = (motor_us - frame_us) / US_PER_S
+            lag_m = measure_leg(path, frame_us, motor_us).distance_m
             answer_m_s = float(np.linalg.norm(pose_at(path, motor_us)[1]))
         if arena is not None and flight.camera is not None:
             if number is not None:
@@ -156,46 +173,40 @@ before it brakes or swerves."""
 USUAL = "as usual"
 
 
-def cause_of(flight: evidence.Evidence, usual: evidence.UsualFlight) -> evidence.Cause:
+def cause_of(flight: Evidence, usual: UsualFlight) -> Cause:
     """Return the cause of a failure or of a longer flight than usual."""
     outcome = flight.record.outcome
     if outcome is Outcome.ABORTED:
-        return evidence.Cause("aborted", (f"{flight.record.reason}.",))
+        return Cause("aborted", (f"{flight.record.reason}.",))
     if outcome is Outcome.COLLISION:
         crash = examine_collision(flight)
-        return (
-            evidence.Cause(evidence.NO_CAUSE, ())
-            if crash is None
-            else _cause_of_collision(flight, crash)
-        )
+        return Cause(NO_CAUSE, ()) if crash is None else _cause_of_collision(flight, crash)
     if not len(flight.path):
-        return evidence.Cause(evidence.NO_CAUSE, ())
+        return Cause(NO_CAUSE, ())
     if outcome is Outcome.SUCCESS and not _slow(flight.record, usual):
-        return evidence.Cause(USUAL, ())
+        return Cause(USUAL, ())
     return cause_of_long_flight(flight, usual)
 
 
-def _slow(record: EpisodeRecord, usual: evidence.UsualFlight) -> bool:
+def _slow(record: EpisodeRecord, usual: UsualFlight) -> bool:
     """Return True if time or distance of a flight clearly exceeds the run's median."""
-    lost, excess = evidence.time_lost_s(record, usual), evidence.path_excess(record)
+    lost, excess = time_lost_s(record, usual), path_excess(record)
     if lost is None or excess is None or usual.pace_s_m is None or usual.path_ratio is None:
         return False
-    slow = lost > SLOW_EXCESS * usual.pace_s_m * evidence.straight_m(record)
+    slow = lost > SLOW_EXCESS * usual.pace_s_m * straight_m(record)
     return slow or excess + 1.0 > (1.0 + SLOW_EXCESS) * usual.path_ratio
 
 
-def _cause_of_collision(flight: evidence.Evidence, crash: CollisionAnalysis) -> evidence.Cause:
+def _cause_of_collision(flight: Evidence, crash: CollisionAnalysis) -> Cause:
     if flight.record.navigation_us is None or flight.record.reason.endswith("take-off"):
-        return evidence.Cause("hit during the take-off", (f"At {crash.speed_m_s:.1f} m/s.",))
+        return Cause("hit during the take-off", (f"At {crash.speed_m_s:.1f} m/s.",))
     if crash.before_s is None or crash.blind_m is None:
-        return evidence.Cause(
-            "hit before the first decision", ("No decision had reached the motors yet.",)
-        )
+        return Cause("hit before the first decision", ("No decision had reached the motors yet.",))
     sentences = [
         f"The last frame that still moved the motors was {crash.before_s:.2f} s old at the "
         f"collision; the vehicle flew {crash.blind_m:.1f} m on it."
     ]
-    kind = evidence.NO_CAUSE
+    kind = NO_CAUSE
     if (view := crash.view) is not None:
         sentences.insert(0, _where(crash, flight.camera))
         half_angle = flight.camera.half_angle_rad if flight.camera else math.pi
@@ -221,7 +232,7 @@ def _cause_of_collision(flight: evidence.Evidence, crash: CollisionAnalysis) -> 
             f"Until the motors answered that frame, {crash.lag_s:.2f} s and {crash.lag_m:.1f} m "
             f"went by; speed at the collision {crash.speed_m_s:.1f} m/s."
         )
-    return evidence.Cause(kind, tuple(sentences))
+    return Cause(kind, tuple(sentences))
 
 
 def _seen(
@@ -232,7 +243,7 @@ def _seen(
         return "seen and flown into"
     if crash.before_s - crash.lag_s < ACT_S:
         return "seen too late to act"
-    room_m = max(0.0, view.distance_m - evidence.HALF_WIDTH_M - crash.lag_m)
+    room_m = max(0.0, view.distance_m - HALF_WIDTH_M - crash.lag_m)
     if braking_m is None or crash.answer_m_s is None:
         return "seen and flown into"
     stops = braking_m(crash.answer_m_s) <= room_m
@@ -269,9 +280,6 @@ def _side(angle_rad: float) -> str:
     return f"{abs(degrees)}° to the {'right' if degrees > 0 else 'left'}"
 
 
-EXAMINED = 100
-"""Maximum number of flights with a derived cause, worst first."""
-
 LISTED = 12
 """Maximum number of rows in the table of worst flights."""
 
@@ -283,37 +291,17 @@ NOT_RECORDED = Trajectory(
 )
 
 
-@dataclass(frozen=True)
-class ExaminedFlight:
-    """Flight and its cause."""
-
-    record: EpisodeRecord
-    cause: evidence.Cause
-    lost_s: float | None
-    """Time lost relative to the run's median pace over the same straight line [s]."""
-    excess: float | None
-    """Excess of the flown distance over the straight line, as a fraction."""
-
-
-def flown_path(run: LoadedRun, record: EpisodeRecord) -> Trajectory | None:
-    """Return a flight's path up to the verdict, without the landing recorded after it."""
-    path = run.trajectories.get(record.index)
-    if path is None or not len(path):
-        return None
-    return path.between(int(path.time_us[0]), record.ended_us)
-
-
 def examine_worst(
     run: LoadedRun, arenas: Mapping[int, Arena], vehicle: VehicleProfile | None
 ) -> list[ExaminedFlight]:
     """Return up to `EXAMINED` worst flights with their causes, as far as data allow."""
-    usual = evidence.usual_flight(run.episodes)
+    usual = usual_flight(run.episodes)
     camera = None if vehicle is None else PolicyCamera.of(vehicle.camera)
     brake = None if vehicle is None else partial(_braking_m, vehicle)
     examined = []
-    for record in evidence.ranked(run)[:EXAMINED]:
+    for record in ranked(run.episodes)[:EXAMINED]:
         path = flown_path(run, record)
-        flight = evidence.Evidence(
+        flight = Evidence(
             record,
             NOT_RECORDED if path is None else path,
             run.latency.get(record.index, {}),
@@ -321,7 +309,7 @@ def examine_worst(
             camera,
             brake,
         )
-        lost_s, excess = evidence.time_lost_s(record, usual), evidence.path_excess(record)
+        lost_s, excess = (time_lost_s(record, usual), path_excess(record))
         examined.append(ExaminedFlight(record, cause_of(flight, usual), lost_s, excess))
     return examined
 
@@ -336,7 +324,7 @@ def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView | Non
     shown = judged[:LISTED]
     notes = [
         "Failed flights first, each by time lost: its time less that of the run's median pace over "
-        "the same straight way. Causes are worked out from what was recorded.",
+        "the same straight way. Causes are worked out from what was recorded."
     ]
     if len(shown) < total:
         notes.append(f"The {len(shown)} worst of {total:,} flights.")
@@ -370,20 +358,20 @@ def causes_table(judged: Sequence[ExaminedFlight], run: LoadedRun) -> TableView 
     for kind, count in counts.most_common():
         which = [f"{j.record.index}" for j in failed if j.cause.kind == kind]
         more = ", …" if len(which) > NAMED else ""
-        rows.append(
-            (
-                kind,
-                f"{count}",
-                f"{100.0 * count / len(failed):.0f}",
-                ", ".join(which[:NAMED]) + more,
-            )
-        )
+        share = f"{100.0 * count / len(failed):.0f}"
+        rows.append((kind, f"{count}", share, ", ".join(which[:NAMED]) + more))
     columns = columns_of("<cause | flights | of those that failed [%] | <which")
     all_failed = sum(e.outcome is not Outcome.SUCCESS for e in run.episodes)
     notes: tuple[str, ...] = ()
     if all_failed > len(failed):
         notes = (f"The first {len(failed)} of {all_failed:,} flights that failed.",)
     return TableView("causes", "Why flights failed", columns, tuple(rows), notes)
+
+
+def worst_section(page: ReportInput) -> tuple[Section, ...]:
+    """Return the causes of failed flights, and the worst flights."""
+    causes = tables_section(causes_table(page.worst, page.run))
+    return causes + tables_section(worst_table(page.worst, len(page.run.episodes)))
 
 
 def _braking_m(vehicle: VehicleProfile, speed_m_s: float) -> float:

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Obstacles, PlacedMesh, Shape
 from airl_mav.arena.ground import Ground
-from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import RANGE_M
-from airl_mav.camera.render import Mount, camera_pose, render
-from airl_mav.control.loops import heading_of
+from airl_mav.camera.render import camera_pose, render
+from airl_mav.core.frames import quat_yaw
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.profiles.appearance import DEFAULT
-from airl_mav.profiles.camera import Camera
+from airl_mav.report.policy_view import PolicyCamera
 
 Floats = NDArray[np.float64]
 
@@ -25,31 +23,6 @@ NOTHING_M = 1e-6
 
 SAME_DEPTH_M = 1e-3
 """Tolerance for depths of the same surface."""
-
-
-@dataclass(frozen=True)
-class PolicyCamera:
-    """Camera of the policy."""
-
-    intrinsics: Intrinsics
-    range_m: float
-    """Maximum depth with a return [m]; for a colour camera, larger than any arena."""
-    mount: Mount
-
-    @classmethod
-    def of(cls, camera: Camera) -> PolicyCamera:
-        """Create the policy camera from a profile's camera."""
-        range_m = camera.range_m if camera.kind == "depth" else RANGE_M
-        return cls(Intrinsics.of(camera), range_m, Mount.of(camera))
-
-    @property
-    def half_angle_rad(self) -> float:
-        """Half of the horizontal field of view [rad]."""
-        return 0.5 * self.intrinsics.horizontal_fov_rad
-
-    def aside_rad(self, bearing_rad: float) -> float:
-        """Return the horizontal angle [rad] from the optical axis to a bearing from the heading."""
-        return abs(math.remainder(bearing_rad - self.mount.yaw, math.tau))
 
 
 @dataclass(frozen=True)
@@ -77,24 +50,9 @@ def _clear(arena: Arena, camera: PolicyCamera) -> NDArray[np.bool_] | None:
     return arena.clear if camera.intrinsics.kind == "depth" else None
 
 
-def heading_rad(quaternion: Floats) -> float:
-    """Return the heading [rad] of an attitude, 0 = north, positive to the east."""
-    w, x, y, z = (float(part) for part in quaternion)
-    cos, sin = heading_of((w, x, y, z))
-    return math.atan2(sin, cos)
-
-
-def headings(quaternions: Floats) -> Floats:
-    """Return the unwrapped headings (n,) [rad] of attitudes (n, 4)."""
-    w, x, y, z = quaternions.T
-    angle = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    unwrapped: Floats = np.unwrap(angle)
-    return unwrapped
-
-
 def bearing(quaternion: Floats, offset: Floats) -> float:
     """Return the bearing [rad] of an offset NED [m] from the heading, positive to the right."""
-    angle = math.atan2(offset[1], offset[0]) - heading_rad(quaternion)
+    angle = math.atan2(offset[1], offset[0]) - quat_yaw(quaternion)
     return math.remainder(angle, 2.0 * math.pi)
 
 
@@ -123,10 +81,8 @@ def view_obstacle(
 ) -> ObstacleView:
     """Return direction and visibility of obstacle i in a frame; it may move since `began_us`."""
     position, _, quaternion = pose_at(path, frame_us)
-    centers, centers_then = (
-        arena.centers_at(frame_us - began_us),
-        arena.centers_at(hit_us - began_us),
-    )
+    centers = arena.centers_at(frame_us - began_us)
+    centers_then = arena.centers_at(hit_us - began_us)
     spot = nearest_spot(arena.obstacles, i, centers_then[i], pose_at(path, hit_us)[0])
     offset = spot + (centers[i] - centers_then[i])[:2] - position[:2]
     eye, attitude = camera_pose(position, quaternion, camera.mount)

@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.arena.geometry import Arena
 from airl_mav.arena.placement import bounding_boxes, segments_clear
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import goal_distance_m
-from airl_mav.flight.episode_record import EpisodeRecord
+from airl_mav.core.frames import goal_distance_m, quats_to_euler
+from airl_mav.flight.episode_record import EpisodeRecord, UsualFlight, path_excess, straight_m
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP
-from airl_mav.report.forensics.camera_view import headings
-from airl_mav.report.forensics.evidence import (
-    HALF_WIDTH_M,
-    NO_CAUSE,
-    Cause,
-    Evidence,
-    UsualFlight,
-    path_excess,
-    straight_m,
-)
+from airl_mav.report.policy_view import PolicyCamera
+from airl_mav.report.run_report import Cause
 
 MIN_TURNS = 6
 """Minimum number of sign changes of a limit cycle; fewer are an evasive manoeuvre."""
@@ -186,7 +179,7 @@ def _swinging(swing: LimitCycle | None, start_us: int) -> Cause | None:
 
 
 def _circling(part: Trajectory) -> Cause | None:
-    heading = headings(part.quaternion)
+    heading = np.unwrap(quats_to_euler(part.quaternion)[2])
     turns = float(heading[-1] - heading[0]) / (2.0 * math.pi)
     if abs(turns) < CIRCLES:
         return None
@@ -272,3 +265,24 @@ def _time_limit_too_short(record: EpisodeRecord, usual: UsualFlight) -> Cause | 
 def _power(part: Trajectory) -> str:
     time_s = (part.time_us[-1] - part.time_us[0]) / US_PER_S
     return f"{time_s:.0f} s at {part.power_w[1:].mean():.0f} W on average emptied the battery."
+
+
+HALF_WIDTH_M = 0.3
+"""Half-width of a vehicle [m]."""
+
+NO_CAUSE = "no cause found in the data"
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Available data of one flight."""
+
+    record: EpisodeRecord
+    path: Trajectory
+    """Path up to the verdict; empty if not recorded."""
+    stamps: Mapping[str, NDArray[Any]]
+    """Decisions by column; empty without decisions."""
+    arena: Arena | None = None
+    camera: PolicyCamera | None = None
+    braking_m: Callable[[float], float] | None = None
+    """Function of the vehicle's stopping distance [m] from a speed [m/s]."""

@@ -1,1 +1,0 @@
-"""Causes of failed and long flights, derived from recorded data."""
