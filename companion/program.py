@@ -28,7 +28,7 @@ from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import InFlight, Kinematics, observe, views_of
 from airl_mav.policy.registry import camera_refused, find_policy
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction import Compensator
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.projections import PROJECTIONS
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle

@@ -5,7 +5,7 @@ return at about the camera's height. A planar lidar on a level platform measures
 MAVLink's OBSTACLE_DISTANCE carries it. Earlier scans are compensated for the vehicle's own motion:
 static objects keep their position in the newest scan, moving ones do not.
 
-This is the numpy version of the companion; `envs.encoding` has the same as compiled loops.
+This is the numpy version of the companion; `envs.observations` has the same as compiled loops.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.policy.registry import find_policy
-from airl_mav.prediction.compensator import Compensator, DecisionMemory
+from airl_mav.prediction import Compensator, DecisionMemory
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo

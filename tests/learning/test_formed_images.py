@@ -52,7 +52,7 @@ def motion_of(env: Navigation, i: int) -> Motion:
 def captured(env: Navigation) -> np.ndarray:
     """Images of where the vehicles are now."""
     everyone = np.ones(2, np.bool_)
-    env.cameras.capture(env.fleet, env._places.batch, everyone, env.seeds)
+    env.cameras.capture(env.fleet, env.places.batch, everyone, env.seeds)
     return env.cameras.image.copy()
 
 

@@ -44,7 +44,7 @@ def test_the_plant_s_ranges_are_the_twin_s() -> None:
     env.begin([0, 1], [5, 8])
     for _ in range(2):
         env.fly(np.array([[4.0, 0.0, 0.9], [2.0, 1.0, -0.7]]))
-    env.cameras.capture(env.fleet, env._places.batch, np.ones(2, np.bool_), env.seeds)
+    env.cameras.capture(env.fleet, env.places.batch, np.ones(2, np.bool_), env.seeds)
     noise = noise_of(env.camera, SensorNoise())
     assert noise is not None
     camera, frames = env.camera, env.cameras._frames(env.fleet.time_us)

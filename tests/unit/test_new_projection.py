@@ -66,7 +66,7 @@ from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import expose
 from airl_mav.core.errors import FieldError
-from airl_mav.prediction.compensator import Reprojector
+from airl_mav.prediction import Reprojector
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.vehicle import load_vehicle
 

@@ -120,15 +120,10 @@ class LiveFlight(ServerListener):
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002
         """Resend the newest message of the channel; called from the server's thread."""
         with self._lock:
-            newest = self._newest.get(channel.id)
-            if newest is not None:
-                self._log(*newest)
+            if (newest := self._newest.get(channel.id)) is not None:
+                newest[0].log(newest[1], log_time=newest[2])
         self._another.set()
         self._watched.set()
-
-    @staticmethod
-    def _log(channel: foxglove.Channel, data: bytes, time_ns: int) -> None:
-        channel.log(data, log_time=time_ns)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until a viewer has subscribed to its topics; return False on timeout."""
@@ -148,7 +143,7 @@ class LiveFlight(ServerListener):
             channel = self._channels[message.channel]
             with self._lock:
                 self._newest[channel.id()] = channel, message.data, time_ns
-                self._log(channel, message.data, time_ns)
+                channel.log(message.data, log_time=time_ns)
 
     def run(self, ended: Callable[[], None], clock: Clock | None = None) -> None:
         """Publish the flight repeatedly until interrupted; `ended` is called after each."""

@@ -61,10 +61,8 @@ class DownwardRay:
     def length_m(self, position: Vector, quaternion: Vector, elapsed_us: int) -> float | None:
         """Return the distance to the nearest surface [m]; None = out of range.
 
-        Args:
-            position: (3,) position of the vehicle, NED [m].
-            quaternion: (4,) body -> NED.
-            elapsed_us: Time since the moving obstacles started [µs].
+        The vehicle is at a position (3,) NED [m] in an attitude (4,) body -> NED; the moving
+        obstacles started `elapsed_us` [µs] ago.
         """
         arena, scene = self._arena, self._scene
         if arena is not None and arena.tours:

@@ -22,7 +22,7 @@ from airl_mav.arena.relief import extreme_within, plane_at
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
-from firmware_sim.plant.contacts.convex import corner_of, note
+from firmware_sim.addons.kernel_plant.convex import corner_of, note
 
 KEPT = 4
 """Maximum number of stored points (MANIFOLD_CACHE_SIZE)."""
@@ -88,20 +88,11 @@ def touch_floor(
     rows: Vector,
     count: int,
 ) -> int:
-    """Find the contacts with the floor.
+    """Find the contacts with the floor; return the new number of contacts in `rows` (MOST, ROW).
 
-    Args:
-        p: Position of the vehicle's centre, NED [m].
-        q: Attitude body -> NED.
-        half: (3,) half extents of the box [m].
-        close: Maximum distance of a contact [m].
-        kept: (4, 7) stored points: in vehicle axes, on the floor NED, distance [m]; updated.
-        many: (1,) number of stored points; updated.
-        rows: (MOST, ROW) contacts; written from `count`.
-        count: Number of contacts so far.
-
-    Returns:
-        New number of contacts.
+    Position p is NED [m], attitude q body -> NED, `half` (3,) half extents of the box [m], `close`
+    the maximum distance of a contact [m]. Updates the stored points `kept` (4, 7): in vehicle axes,
+    on the floor NED, distance [m]; and their number `many` (1,).
     """
     # Bullet finds one new point per tick: the deepest corner.
     corner = deepest_corner(q, half)
@@ -167,20 +158,7 @@ def near_ground(relief: Relief, p: Vec, radius: float, close: float) -> bool:
 def touch_ground(
     p: Vec, q: Quat, half: Vector, close: float, relief: Relief, rows: Vector, count: int
 ) -> int:
-    """Find the contacts with hills.
-
-    Args:
-        p: Position of the vehicle's centre, NED [m].
-        q: Attitude body -> NED.
-        half: (3,) half extents of the box [m].
-        close: Maximum distance of a contact [m].
-        relief: Ground.
-        rows: (MOST, ROW) contacts; written from `count`.
-        count: Number of contacts so far.
-
-    Returns:
-        New number of contacts.
-    """
+    """Find the contacts with hills; arguments and result as `touch_floor`."""
     for k in range(8):
         arm = rotate(q, corner_of(k, half))
         height, up, across = plane_at(relief, p[0] + arm[0], p[1] + arm[1])
@@ -266,17 +244,9 @@ def _touch_points(
 def _touch_ridges(
     p: Vec, a: Vec, b: Vec, family: int, close: float, relief: Relief, rows: Vector, count: int
 ) -> int:
-    """Find the points where a box edge crosses ridges of the ground.
+    """Find the points where a box edge from a to b, relative to p [m], crosses ground ridges.
 
-    Args:
-        p: Position of the vehicle's centre, NED [m].
-        a: First end of the edge, relative to p [m].
-        b: Second end of the edge, relative to p [m].
-        family: Ground edges: 0 from west to east, 1 from south to north, 2 diagonals.
-        close: Maximum distance of a contact [m].
-        relief: Ground.
-        rows: (MOST, ROW) contacts; written from `count`.
-        count: Number of contacts so far.
+    `family` of ground edges: 0 from west to east, 1 from south to north, 2 diagonals.
     """
     grid = relief.grid
     d = (b[0] - a[0], b[1] - a[1], b[2] - a[2])

@@ -14,6 +14,7 @@ from airl_mav.arena.geometry import Shape
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, multiply, rotate
+from firmware_sim.plant.body import reach_along
 
 ROW = 8
 """Number of values in a contact row: arm from the vehicle's centre NED [m], normal NED from the
@@ -21,10 +22,6 @@ other body to the vehicle, distance [m], and owner (`FLOOR_ID`, and so on)."""
 
 MOST = 32
 """Maximum number of contacts."""
-
-BREAKING_SHARE = 0.02
-"""Distance below which bodies are close, as a fraction of the box's half diagonal (Bullet's
-gContactBreakingThreshold)."""
 
 
 @kernel
@@ -35,14 +32,6 @@ def corner_of(k: int, half: Vector) -> Vec:
         half[1] if k & 2 else -half[1],
         half[2] if k & 4 else -half[2],
     )
-
-
-@kernel
-def reach_along(q: Quat, half: Vector, n: Vec) -> float:
-    """Return the extent [m] of a box at attitude q from its centre along a unit vector."""
-    a = rotate(conjugate(q), n)
-    reach: float = abs(a[0]) * half[0] + abs(a[1]) * half[1] + abs(a[2]) * half[2]
-    return reach
 
 
 @kernel
@@ -84,12 +73,9 @@ def _clamped(x: float, most: float) -> float:
 
 @kernel
 def nearest_point(kind: int, size: Vec, x: Vec) -> Vec:
-    """Return the nearest point to x of an obstacle around the origin; x if inside.
+    """Return the nearest point to x of an obstacle around the origin [m]; x if inside.
 
-    Args:
-        kind: Shape.
-        size: Half extents of the obstacle, as `Obstacles.half_size` [m].
-        x: Point in the obstacle's axes [m].
+    `size` are the half extents as `Obstacles.half_size`; x is in the obstacle's axes.
     """
     if kind == _BOX:
         return _clamped(x[0], size[0]), _clamped(x[1], size[1]), _clamped(x[2], size[2])
@@ -115,14 +101,8 @@ def separation(kind: int, size: Vec, d: Vec, q: Quat, half: Vector) -> tuple[flo
     """Return the vehicle's distance from a box or cylinder [m], and the unit axis to it.
 
     Negative distances are penetration depths. Positive distances are lower bounds, exact if faces
-    or the side of a cylinder are nearest.
-
-    Args:
-        kind: Shape.
-        size: Half extents of the obstacle [m].
-        d: Vehicle's centre, in the obstacle's axes [m].
-        q: Attitude of the vehicle in the obstacle's axes.
-        half: (3,) half extents of the vehicle [m].
+    or the side of a cylinder are nearest. The vehicle's centre d [m] and attitude q are in the
+    obstacle's axes; sizes are half extents [m].
     """
     axes = np.zeros((_MOST_AXES, 3))
     # Axes of the obstacle's faces; a cylinder has only the vertical one.
@@ -231,26 +211,12 @@ def touch_obstacle(
     count: int,
     owner: int,
 ) -> int:
-    """Find the contacts with a wall or an obstacle.
+    """Find the contacts with a wall or an obstacle; return the new number of contacts.
 
     As in Bullet, box contacts require overlap; cylinder and sphere contacts start earlier, at
-    `close`.
-
-    Args:
-        kind: Shape.
-        size: Half extents [m].
-        center: NED [m].
-        yaw: Heading of a box's first axis [rad].
-        p: Position of the vehicle's centre, NED [m].
-        q: Attitude of the vehicle, body -> NED.
-        half: (3,) half extents of the vehicle's box [m].
-        close: Maximum distance of a contact with a cylinder or sphere [m].
-        rows: (MOST, ROW) contacts; written from `count`.
-        count: Number of contacts so far.
-        owner: Owner id of the contacts.
-
-    Returns:
-        New number of contacts.
+    `close` [m]. The obstacle's centre is NED [m], its sizes are half extents [m], `yaw` is the
+    heading of a box's first axis [rad]; the vehicle is given as in `touch_floor`, `owner` is the id
+    of the contacts.
     """
     # Work in the obstacle's axes: only yaw turns it.
     turn = (math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))

@@ -20,8 +20,17 @@ from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
 from airl_mav.vehicle.airframe import Airframe, accelerate, airframe_of, drift
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
+from firmware_sim.addons.kernel_plant.convex import MOST, ROW, touch_obstacle
+from firmware_sim.addons.kernel_plant.ground_contact import (
+    FLOOR_ID,
+    KEPT,
+    near_ground,
+    touch_floor,
+    touch_ground,
+)
 from firmware_sim.engine.dynamics import WIDTH, quaternion, rates, velocity, write
 from firmware_sim.plant.body import (
+    BREAKING_SHARE,
     FLOOR,
     NOTHING,
     Solids,
@@ -30,14 +39,6 @@ from firmware_sim.plant.body import (
     place_at,
     room_among,
     solids_of,
-)
-from firmware_sim.plant.contacts.convex import BREAKING_SHARE, MOST, ROW, touch_obstacle
-from firmware_sim.plant.contacts.ground_contact import (
-    FLOOR_ID,
-    KEPT,
-    near_ground,
-    touch_floor,
-    touch_ground,
 )
 
 FRICTION = 0.4
@@ -148,20 +149,10 @@ def resolve(
     tick_s: float,
     impulses: Vector,
 ) -> tuple[Vec, Vec]:
-    """Return the velocities of a body without motion into its contacts.
+    """Return velocity [m/s] and angular velocity [rad/s] of a body without motion into contacts.
 
-    Args:
-        v: Velocity after the tick's forces, NED [m/s].
-        spin: Angular velocity after the tick's forces, NED [rad/s].
-        q: Attitude body -> NED.
-        contacts: (MOST, ROW) contacts in the format of `box.ROW`.
-        count: Number of contacts.
-        airframe: Mass and inertia.
-        tick_s: Length of the tick [s].
-        impulses: (MOST,) output: normal impulses [N s].
-
-    Returns:
-        Velocity [m/s] and angular velocity [rad/s], both NED.
+    `v` and `spin` are the velocities after the tick's forces, `contacts` (MOST, ROW) are rows of
+    `convex.ROW`; writes the normal impulses (MOST,) [N s].
     """
     rows = np.zeros((3 * count, _WIDTH))
     change = np.zeros(6)
@@ -288,25 +279,14 @@ def advance(
     state: ContactState,
     row: Vector,
 ) -> int:
-    """Move the vehicle by one tick.
+    """Move the vehicle by one tick; arguments up to `moving_us` as `PlantBody.move`.
 
-    Args:
-        at: Position, NED [m].
-        force: All forces except gravity and contacts, NED [N].
-        torque: NED [N m].
-        before: (16,) motion before the tick.
-        moving_us: Time since the moving obstacles started, at the end of the tick [µs].
-        airframe: (15,) fields of `Airframe`.
-        half: (3,) half extents of the collision box [m].
-        box: Half diagonal of the box, and distance below which bodies are close [m].
-        obstacle_speed: Maximum speed of a moving obstacle [m/s].
-        tick_s: Length of the tick [s].
-        solids: Walls and obstacles.
-        state: Contacts stored between ticks.
-        row: (16,) output: motion after the tick.
+    `half` (3,) are the half extents of the collision box [m], `box` its half diagonal and the
+    distance below which bodies are close [m], `obstacle_speed` is the maximum of moving obstacles
+    [m/s].
 
-    Returns:
-        Number of contacts, in `state.rows` and `state.impulses`.
+    Writes the motion after the tick to `row` (16,). Returns the number of contacts, in `state.rows`
+    and `state.impulses`.
     """
     a, q = airframe_of(airframe), quaternion(before)
     radius, close = box

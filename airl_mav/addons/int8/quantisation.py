@@ -17,9 +17,8 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.evaluation import LearnedPilots, fly_seeds
-from airl_mav.envs.navigation import Navigation
 from airl_mav.experiments.gap import training_environment
-from airl_mav.experiments.gym_flier import environment_of
+from airl_mav.experiments.gym_flier import navigation_of
 from airl_mav.policy.actions import discrete_actions
 from airl_mav.policy.card import (
     ONNX_FILE,
@@ -174,14 +173,7 @@ def frames_of(folder: Path, *, flights: int = FLIGHTS) -> tuple[Encoded, str, in
     loaded = scenario.fresh_policy(FIRST_SEED)
     assert isinstance(loaded, LearnedPolicy)  # noqa: S101 (it has a card)
     witness = _Witness(LearnedPilots(loaded, action_generator), loaded)
-    navigation = Navigation(
-        environment_of(scenario),
-        min(scenario.scenario.slots, flights),
-        vehicle=scenario.vehicle,
-        arena=scenario.arena,
-        injection=scenario.injection,
-        computer_w=scenario.computer.onboard_watts,
-    )
+    navigation = navigation_of(scenario, min(scenario.scenario.slots, flights))
     for _ in fly_seeds(navigation, witness, list(scenario.seeds)):
         pass
     keys = witness.seen[0]
