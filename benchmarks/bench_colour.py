@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from airl_mav.addons.colour.picture import ColourArrays, Work, render_colour
+from airl_mav.addons.colour.textures import atlas
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import Meshes
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import ColourArrays, Work, render_colour
-from airl_mav.camera.projection import Bent
-from airl_mav.camera.shading import Gloss
-from airl_mav.camera.textures import atlas
+from airl_mav.camera.projection import LensConstants, Scene, lens_of
+from airl_mav.camera.render import scene_of
 from airl_mav.core.kernels import kernel
 
 SIZES = ((32, 24), (64, 48), (128, 96))
@@ -37,49 +37,30 @@ def colour_all(
     work: Work,
     position: NDArray[np.float64],
     attitude: NDArray[np.float64],
-    focal: float,
-    cx: float,
-    cy: float,
-    bounds: NDArray[np.float64],
-    shape: NDArray[np.int8],
-    center: NDArray[np.float64],
-    half: NDArray[np.float64],
-    yaw: NDArray[np.float64],
+    lens: LensConstants,
+    scene: Scene,
     meshes: Meshes | None,
-    texture: NDArray[np.int8],
-    per_m: NDArray[np.float32],
-    offset: NDArray[np.float32],
-    albedo: NDArray[np.float32],
-    gloss: Gloss | None,
-    lights: NDArray[np.float32],
+    look: ColourArrays,
     patterns: NDArray[np.float32],
-    bent: Bent | None,
 ) -> None:
     for i in range(len(position)):
         p, q = position[i], attitude[i]
-        render_colour(
-            rgb, depth, seen, work, (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]), focal, cx, cy,
-            False, bounds, shape, center, half, yaw, meshes, texture, per_m, offset, albedo, gloss,
-            lights, patterns, bent,
-        )  # fmt: skip
+        pose = (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3])
+        render_colour(rgb, depth, seen, work, pose[0], pose[1], lens, scene, meshes, look, patterns)
 
 
 def rates(arena: Arena, k: Intrinsics, poses: tuple[np.ndarray, np.ndarray]) -> tuple[float, float]:
     """Return depth and colour images a second: of each the best of rounds taken in turns."""
-    o, look, shape = arena.obstacles, ColourArrays.of(arena.look), (k.height, k.width)
+    look, shape = ColourArrays.of(arena.look)._replace(gloss=None), (k.height, k.width)
     depth, seen = np.empty(shape, np.float32), np.empty(shape, np.int32)
-    rgb, patterns = np.empty((*shape, 3), np.uint8), atlas()
-    work = Work.of(k.width, k.height, False)
-    lens, bounds = (k.focal, k.cx, k.cy), arena.bounds.as_array()
-    bodies = (*poses, *lens, bounds, o.shape, o.center, o.half_size, o.yaw, None)
-    surfaces = (look.texture, look.per_m, look.offset, look.albedo, None, look.lights, patterns)
-    coloured = (*bodies, *surfaces)
+    rgb, work = np.empty((*shape, 3), np.uint8), Work.of(k)
+    bodies = (*poses, lens_of(k, RANGE_M), scene_of(arena, arena.obstacles.center), None)
     times: tuple[list[float], list[float]] = ([], [])
     for _ in range(ROUNDS):
         start = time.perf_counter()
-        render_all(depth, *bodies, None)
+        render_all(depth, *bodies)
         middle = time.perf_counter()
-        colour_all(rgb, depth, seen, work, *coloured, None)
+        colour_all(rgb, depth, seen, work, *bodies, look, atlas())
         times[0].append(middle - start)
         times[1].append(time.perf_counter() - middle)
     return POSES / min(times[0]), POSES / min(times[1])

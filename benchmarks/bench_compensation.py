@@ -18,7 +18,7 @@ from rich.table import Table
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.observation import Kinematics
-from airl_mav.prediction.compensator import REMEMBERED, Compensator
+from airl_mav.prediction import REMEMBERED, Compensator
 from airl_mav.profiles.vehicle import load_vehicle
 
 CALLS, WARM_UP = 2000, 100

@@ -21,9 +21,9 @@ from rich.table import Table
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera.bvh import Meshes
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.projection import Bent
+from airl_mav.camera.projection import LensConstants, Scene, lens_of
 from airl_mav.camera.raycast import render_depth
-from airl_mav.camera.render import render
+from airl_mav.camera.render import render, scene_of
 from airl_mav.core.frames import (
     ned_to_enu,
     quat_from_euler,
@@ -65,36 +65,13 @@ def render_all(
     out: NDArray[np.float32],
     position: NDArray[np.float64],
     attitude: NDArray[np.float64],
-    focal: float,
-    cx: float,
-    cy: float,
-    bounds: NDArray[np.float64],
-    shape: NDArray[np.int8],
-    center: NDArray[np.float64],
-    half: NDArray[np.float64],
-    yaw: NDArray[np.float64],
+    lens: LensConstants,
+    scene: Scene,
     meshes: Meshes | None,
-    bent: Bent | None,
 ) -> None:
     for i in range(len(position)):
         p, q = position[i], attitude[i]
-        render_depth(
-            out,
-            (p[0], p[1], p[2]),
-            (q[0], q[1], q[2], q[3]),
-            focal,
-            cx,
-            cy,
-            False,
-            RANGE_M,
-            bounds,
-            shape,
-            center,
-            half,
-            yaw,
-            meshes,
-            bent,
-        )
+        render_depth(out, (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]), lens, scene, meshes)
 
 
 def rate(work: Callable[[], int]) -> float:
@@ -109,11 +86,12 @@ def rate(work: Callable[[], int]) -> float:
 
 
 def in_compiled_loop(arena: Arena, k: Intrinsics, poses: tuple[np.ndarray, np.ndarray]) -> float:
-    o, out = arena.obstacles, np.empty((k.height, k.width), np.float32)
+    out = np.empty((k.height, k.width), np.float32)
+
+    lens, scene = lens_of(k, RANGE_M), scene_of(arena, arena.obstacles.center)
 
     def work() -> int:
-        render_all(out, *poses, k.focal, k.cx, k.cy, arena.bounds.as_array(),
-                   o.shape, o.center, o.half_size, o.yaw, None, None)  # fmt: skip
+        render_all(out, *poses, lens, scene, None)
         return POSES
 
     return rate(work)

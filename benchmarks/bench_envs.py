@@ -79,11 +79,11 @@ def in_turn(rows: Sequence[Row], hz: float) -> list[Result]:
 def measure_ours() -> list[Result]:
     from airl_mav.arena.generate import generate
     from airl_mav.camera.intrinsics import Intrinsics
+    from airl_mav.camera.projection import lens_of
     from airl_mav.camera.render import Mount
     from airl_mav.core.constants import TICK_S, TICK_US
     from airl_mav.envs.arena_batch import batch_of
     from airl_mav.envs.cameras import Eye, render_images
-    from airl_mav.envs.colour_images import lens_of
     from airl_mav.envs.fleet import FlightStatus, Rules, hover, new_fleet, vehicle_of
     from airl_mav.envs.fleet_step import advance
     from airl_mav.profiles.arena import ArenaSpec

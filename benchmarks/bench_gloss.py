@@ -11,11 +11,11 @@ import time
 
 import numpy as np
 
+from airl_mav.addons.colour.picture import render_picture
+from airl_mav.addons.colour.profile import Appearance
 from airl_mav.arena.generate import generate
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import render_picture
 from airl_mav.core.frames import quat_from_euler
-from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 

@@ -19,7 +19,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from airl_mav.experiments.quantisation import export_int8, quantised
+from airl_mav.addons.int8.quantisation import export_int8, quantised
 from airl_mav.policy.card import ONNX_FILE, OnnxRuntime, PolicyFacts, load_card, read_card
 from airl_mav.policy.card_writing import write_template
 from airl_mav.policy.layouts import Encoded, boxes

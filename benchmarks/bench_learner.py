@@ -20,14 +20,15 @@ from torch import nn
 from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.vector import NavigationVectorEnv
-from airl_mav.training.algorithms import BATCH, make_model
-from airl_mav.training.config import AlgorithmSpec, NetworkSpec
+from airl_mav.training.algorithms import make_model
+from airl_mav.training.config import ALGORITHMS, AlgorithmSpec, NetworkSpec
 from airl_mav.training.dqn import DoubleDQN
 
 SIZES = ((32, 24), (64, 48))
 NETWORKS = {"small": NetworkSpec(), "appendix": NetworkSpec(kind="appendix")}
 VEHICLES = 32
 SECONDS = 1.5  # of each measurement
+BATCH = ALGORITHMS["dqn"].batch
 
 
 def fastest(model: DoubleDQN) -> float:

@@ -21,24 +21,23 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
 from bench_colour import colour_all
-from bench_depth import FOV, POSES, make_arena, make_poses, render_all
+from bench_depth import FOV, POSES, RANGE_M, make_arena, make_poses, render_all
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from airl_mav.addons.colour.picture import ColourArrays, Work
+from airl_mav.addons.colour.textures import atlas
 from airl_mav.arena.geometry import Arena, PlacedMesh
 from airl_mav.arena.triangles import Triangles, encoded, triangles_of
 from airl_mav.camera.bvh import meshes_of
-from airl_mav.camera.intrinsics import Intrinsics, rays_of
-from airl_mav.camera.picture import ColourArrays, Work
-from airl_mav.camera.projection import bent_of
-from airl_mav.camera.render import render
-from airl_mav.camera.textures import atlas
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.projection import lens_of
+from airl_mav.camera.render import render, scene_of
 from airl_mav.core.frames import quat_to_matrix
 from airl_mav.profiles.assets import MeshFile
 
@@ -84,24 +83,20 @@ def rates(
     """Return depth and colour images a second of each: the best of rounds taken in turns."""
     shape = (k.height, k.width)
     depth, seen = np.empty(shape, np.float32), np.empty(shape, np.int32)
-    rgb, work = np.empty((*shape, 3), np.uint8), Work.of(k.width, k.height, False)
-    lens = (k.focal, k.cx, k.cy)
+    rgb, work = np.empty((*shape, 3), np.uint8), Work.of(k)
     calls = []
     for arena in arenas:
-        o, look = arena.obstacles, ColourArrays.of(arena.look)
-        bodies: tuple[Any, ...] = (*poses, *lens, arena.bounds.as_array())
-        bodies += (o.shape, o.center, o.half_size, o.yaw, meshes_of(arena.meshes, len(o)))
-        surfaces: tuple[Any, ...] = (look.texture, look.per_m, look.offset, look.albedo)
-        surfaces += (None, look.lights, atlas())
-        calls.append((bodies, surfaces))
-    last: tuple[Any, ...] = (bent_of(k),)
+        o, look = arena.obstacles, ColourArrays.of(arena.look)._replace(gloss=None)
+        meshes = meshes_of(arena.meshes, len(o))
+        bodies = (*poses, lens_of(k, RANGE_M), scene_of(arena, o.center), meshes)
+        calls.append((bodies, (look, atlas())))
     best = np.full((len(arenas), 2), math.inf)
     for _ in range(ROUNDS + 1):  # the first one compiles
         for each, (bodies, surfaces) in enumerate(calls):
             start = time.perf_counter()
-            render_all(depth, *bodies, *last)
+            render_all(depth, *bodies)
             middle = time.perf_counter()
-            colour_all(rgb, depth, seen, work, *bodies, *surfaces, *last)
+            colour_all(rgb, depth, seen, work, *bodies, *surfaces)
             took = middle - start, time.perf_counter() - middle
             best[each] = np.minimum(best[each], took)
     return [(POSES / d, POSES / c) for d, c in best.tolist()]
@@ -125,7 +120,7 @@ def traced(
     mesh: trimesh.Trimesh, k: Intrinsics, position: np.ndarray, attitude: np.ndarray
 ) -> NDArray[np.float64]:
     """Return the depth image of a mesh by trimesh's rays [m]; infinity: it is not hit."""
-    rays = rays_of(k).reshape(3, -1).T @ quat_to_matrix(attitude).T
+    rays = k.rays.reshape(3, -1).T @ quat_to_matrix(attitude).T
     sees = np.flatnonzero(rays.any(axis=1))
     places, which, _ = mesh.ray.intersects_location(
         np.broadcast_to(position, rays[sees].shape), rays[sees], multiple_hits=False

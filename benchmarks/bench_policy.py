@@ -26,9 +26,8 @@ from airl_mav.policy.learned import load_learned
 from airl_mav.policy.observation import Kinematics, encode
 from airl_mav.policy.registry import find_policy
 from airl_mav.scenario.model import DEFAULT_POLICY
-from airl_mav.training.algorithm_table import ALGORITHMS
 from airl_mav.training.algorithms import make_model
-from airl_mav.training.config import AlgorithmSpec, TrainingConfig
+from airl_mav.training.config import ALGORITHMS, AlgorithmSpec, TrainingConfig
 from airl_mav.training.export import network_of
 from airl_mav.training.onnx_export import random_inputs
 

@@ -11,12 +11,13 @@ from typing import get_args
 
 import numpy as np
 
-from airl_mav.envs.experts import Expert
+from airl_mav.addons.imitation.imitation import Expert
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.spec import EnvironmentSpec, ExpertName
+from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.statistics import wilson
 from airl_mav.policy.actions import commands
+from airl_mav.training.config import ExpertName
 
 VEHICLES = 50
 """Side by side."""

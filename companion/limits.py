@@ -17,7 +17,6 @@ from airl_mav.camera.frame import Frame
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Goal, goal_height_m
 from airl_mav.policy.observation import Kinematics
-from airl_mav.profiles.projections import sees_to, undistorted
 from airl_mav.scenario.model import LimitSettings, PilotSettings
 from companion.frame_source import ReceivedFrame
 from companion.link_interface import FRAMES_LATE, TELEMETRY_FROZEN, VehicleStatus
@@ -350,11 +349,7 @@ def ground_in_view(
     """Return True if flat ground must be in view: the lowest middle ray hits within `GROUND_M`."""
     lens = frame.intrinsics
     # Angle below the optical axis of the lowest middle pixel.
-    below_rad = math.atan2(lens.height - 1 - lens.cy, lens.focal)
-    if lens.projection == "fisheye":
-        edge = np.array(max(lens.height - 1 - lens.cy, 0.0) / lens.focal)
-        # Infinite if the image is higher than the lens's circle, where a row sees nothing.
-        below_rad = min(float(undistorted(edge, lens.distortion)), sees_to(lens.distortion))
+    below_rad = lens.model.angle_at(lens, lens.height - 1 - lens.cy)
     w, x, y, z = state.quaternion
     # Rise of the body direction below the optical axis; for a camera ahead, the pitch.
     ahead, aside = 2.0 * (w * y - z * x), -2.0 * (y * z + w * x)

@@ -16,7 +16,7 @@ from airl_mav.core.frames import Goal
 from airl_mav.latency.injection import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import CameraBound, Policy, RigBound
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction import Compensator
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.stand_alone import Start as PilotedStart
 from companion.frame_source import FrameSource

@@ -24,7 +24,7 @@ from airl_mav.latency.stamps import NO_STAMP, DecisionLog
 from airl_mav.policy.actions import Action, AnyAction, Policy, flyable, vertical_speed
 from airl_mav.policy.observation import Kinematics, Observation, observe, views_of
 from airl_mav.policy.observation_spec import MOST_FRAMES
-from airl_mav.prediction.compensator import Compensator, DecisionMemory
+from airl_mav.prediction import Compensator, DecisionMemory
 from airl_mav.scenario.model import PilotSettings
 from companion.frame_source import FrameSource, ReceivedFrame
 from companion.limits import Limits

@@ -25,8 +25,9 @@ from airl_mav.latency.injection import latency_generator
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import InFlight, Kinematics, observe, views_of
 from airl_mav.policy.registry import camera_refused, find_policy
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction import Compensator
 from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.projections import PROJECTIONS
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario import checks
 from airl_mav.scenario.model import PilotSettings
@@ -86,7 +87,7 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
     vehicle, compensator = load_vehicle(asked.vehicle), None
     needs = {
         "gives depth": vehicle.camera.kind == "depth",
-        "is a pinhole or a cylinder": vehicle.camera.projection != "fisheye",
+        "is a pinhole or a cylinder": not PROJECTIONS[vehicle.camera.projection].tabled,
         "looks ahead (camera.yaw_deg = 0)": vehicle.camera.yaw_deg == 0.0,
     }
     for need, met in needs.items():

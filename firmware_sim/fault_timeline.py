@@ -150,7 +150,7 @@ class FaultTimeline:
 
 
 class ClientFaults:
-    """Fault injection by clients into the faults of an episode. Implements `port.Failures`."""
+    """Fault injection by clients into the faults of an episode."""
 
     def __init__(self, timeline: Callable[[], FaultTimeline]) -> None:
         """Set the function that returns the episode's faults, at the present time.

@@ -18,8 +18,9 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
 from airl_mav.profiles.projections import SLOW, Renderer
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import AutopilotState, OperatorText, Severity
+from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
 from firmware_sim.fault_timeline import FailingLink
 from firmware_sim.interfaces import ULOG_SUFFIX, FlightController, TrueState
@@ -185,7 +186,7 @@ class BuiltinFlightStack:
             return
         self._save_us = None
         if not self._autopilot.parameters.save():
-            self._autopilot.report(OperatorText(Severity.CRITICAL, "Parameters could not be saved"))
+            self._autopilot.say(OperatorText(Severity.CRITICAL, "Parameters could not be saved"))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ a hundred times real time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -170,6 +170,42 @@ class TrueState(NamedTuple):
     angular_velocity: Vector  # (3,) FRD [rad/s]
     power_w: float
     battery_remaining: float
+
+
+class LogEntry(NamedTuple):
+    """Flight log on board."""
+
+    utc_s: int
+    """Start or completion time of the log [s since 1970]."""
+    size_bytes: int
+
+
+class OpenLog(NamedTuple):
+    """Log currently being written."""
+
+    number: int
+    """Index in `LogStore.entries`."""
+    head_bytes: int
+    """Size of the log header: format, parameters."""
+    size_bytes: int
+    """Current size, at a message boundary."""
+
+
+class LogStore:
+    """Flight logs on board; a log's number is its index in `entries`. This one is empty."""
+
+    def entries(self) -> Sequence[LogEntry]:
+        """Return the logs, oldest first."""
+        return ()
+
+    def read(self, number: int, offset: int, count: int) -> bytes:
+        """Return up to `count` bytes of a log, fewer at its end; none if the log does not exist."""
+        del number, offset, count
+        return b""
+
+    def open_log(self) -> OpenLog | None:
+        """Return the log currently being written; None = no open log."""
+        return None
 
 
 class FirmwareLostError(Exception):

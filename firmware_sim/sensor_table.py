@@ -19,7 +19,7 @@ from firmware_sim.interfaces import SensorSample
 
 if TYPE_CHECKING:
     from airl_mav.profiles.vehicle import Sensors
-    from firmware_sim.autopilot.autopilot_state import AutopilotState
+    from firmware_sim.autopilot.snapshot import AutopilotState
 
 Values = tuple[Any, ...]
 """Values of a message's or a topic's fields, in their order."""

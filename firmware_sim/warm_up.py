@@ -24,7 +24,7 @@ from firmware_sim.autopilot.estimator import aiding
 from firmware_sim.autopilot.failsafes.watch import is_calm
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 from firmware_sim.engine.controller import Controller
-from firmware_sim.engine.record import FLOWN_TICK, RISING
+from firmware_sim.engine.record import FLOWN_TICK, RISING, new_controller
 from firmware_sim.engine.ticks import detect_record
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
@@ -124,6 +124,6 @@ def _fly_every_kind(value: Callable[[str], float]) -> None:
 
 def _fuse_in_the_air() -> None:
     """Fuse a velocity in flight into the yaw estimator; a real climb takes ten times as long."""
-    estimator = YawEstimator()
+    estimator = YawEstimator(new_controller())
     estimator.feel(np.zeros(3), HOVER)
     estimator.observe(np.zeros(3), 0.5, np.zeros(3), flying=True)

@@ -8,8 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from airl_mav.arena.finishes import Statics
-from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
+from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Statics, Tour
 from airl_mav.arena.ground import Ground
 from airl_mav.arena.placed_assets import AssetBodies, Things, draw_bodies, draw_things, generate_own
 from airl_mav.arena.placement import (

@@ -3,103 +3,33 @@
 Frame: local NED, origin at the vehicle's start on the floor, x north. The floor is z = 0; heights
 are negative z. The four walls are at the edges of `bounds`. Hills rise above the floor if `ground`
 is set.
-
-A camera without global illumination needs the mean irradiance of floor and walls. The balance of
-floor, walls and ceiling is solved for a square room with the same height and the same share of
-walls (radiosity method: Goral et al., Modeling the interaction of light between diffuse surfaces,
-SIGGRAPH 1984). The ceiling reflects nothing.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import (
-    FLOOR,
-    LUMINANCE,
-    OBSTACLE,
-    SURFACES,
-    WALLS,
-    Drawn,
-    Floats,
-    Inside,
-    Light,
-    Statics,
-    draw_appearance,
-)
 from airl_mav.arena.ground import Ground
+from airl_mav.core.addons import entries, load, load_entry
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.fields import ArrayField
 from airl_mav.core.frames import Goal
-from airl_mav.profiles.appearance import DEFAULT, Appearance
+from airl_mav.profiles.arena import DEFAULT_APPEARANCE, Appearance
 from airl_mav.profiles.assets import MeshFile
 
-
-def indoors(look: Drawn, floor_m2: float, walls: tuple[tuple[int, float], ...]) -> Drawn:
-    """Return an appearance lit by a ceiling of the sky's colour, without a sun.
-
-    The mean luminance on the floor equals the luminance of a level surface outdoors, including
-    interreflections of walls and floor. `walls` are row in the `Finish` and visible area [m²] of
-    each wall surface.
-    """
-    light, albedo = look.light, look.finish.albedo.mean(axis=1)
-    areas = np.array([area for _, area in walls])
-    of_walls = areas @ albedo[[row for row, _ in walls]] / areas.sum()
-    floor, upright = _irradiances(albedo[FLOOR], of_walls, floor_m2, float(areas.sum()))
-    luminance = float(LUMINANCE @ light.sky)
-    # Without sky light the ceiling is white.
-    colour = light.sky / luminance if luminance > 0.0 else np.ones(3)
-    # The brightness of the ceiling that gives the floor its outdoor luminance.
-    glow = colour * luminance / float(LUMINANCE @ (colour * floor))
-    inside = Light(
-        to_sun=light.to_sun,
-        sun=np.zeros(3),
-        zenith=glow,
-        horizon=glow,
-        extinction=light.extinction,
-        inside=Inside(floor * glow, upright * glow),
-    )
-    return replace(look, light=inside)
-
-
-def _irradiances(
-    floor_albedo: Floats, wall_albedo: Floats, floor_m2: float, walls_m2: float
-) -> tuple[Floats, Floats]:
-    """Return mean irradiance (3,) of floor and walls for a ceiling of radiosity 1."""
-    across = seen_across(4.0 * floor_m2 / walls_m2)
-    # Reciprocity of view factors: floor area times factor equals wall area times factor.
-    to_floor = (1.0 - across) * floor_m2 / walls_m2
-    # A wall sees floor and ceiling alike; the rest of its view is walls.
-    among = 1.0 - 2.0 * to_floor
-    # floor = across + (1 - across) wall_albedo walls
-    # walls = to_floor + to_floor floor_albedo floor + among wall_albedo walls
-    gain = to_floor * floor_albedo
-    walls = (to_floor + gain * across) / (
-        1.0 - among * wall_albedo - gain * (1.0 - across) * wall_albedo
-    )
-    return across + (1.0 - across) * wall_albedo * walls, walls
-
-
-def seen_across(x: float) -> float:
-    """Return the view factor between two squares, of side / distance `x`, one above the other.
-
-    Howell and Menguc, A catalog of radiation heat transfer configuration factors, C-11.
-    """
-    square, root = x * x, math.sqrt(1.0 + x * x)
-    log = 0.5 * math.log((1.0 + square) ** 2 / (1.0 + 2.0 * square))
-    turns = 2.0 * x * root * math.atan(x / root) - 2.0 * x * math.atan(x)
-    return 2.0 / (math.pi * square) * (log + turns)
-
-
+Floats = NDArray[np.float64]
 Numbers = Annotated[Floats, ArrayField(np.float64)]
 Points = Annotated[Floats, ArrayField(np.float64, 3)]
+
+
+GREY = (160, 160, 160)
+"""sRGB colour of obstacles without an appearance."""
 
 
 class Shape(IntEnum):
@@ -199,7 +129,7 @@ class Arena:
     """All obstacles; the last `len(tours)` of them move."""
     tours: tuple[Tour, ...]
     goal: Numbers  # (2,) north, east [m] from the start
-    appearance: Appearance = DEFAULT
+    appearance: Appearance = DEFAULT_APPEARANCE
     """Distribution of the appearance. Geometry is independent of it, and depth except for glass."""
     statics: Statics | None = None
     """Groups of static primitives; None = every primitive is separate."""
@@ -221,39 +151,22 @@ class Arena:
         return (north, east) if self.goal_height_m is None else (north, east, -self.goal_height_m)
 
     @cached_property
-    def look(self) -> Drawn:
+    def look(self) -> Any:
         """Materials of all surfaces, and the light; drawn on first access."""
-        look = draw_appearance(
-            self.appearance,
-            self.seed,
-            self.n_static,
-            len(self.tours),
-            self.wall_colour,
-            self.statics,
-        )
-        return self._indoors(look) if self.bounds.ceiling else look
+        return load_entry("airl_mav", "COLOUR", "look", ("appearance", self.name), "colour")(self)
 
     @cached_property
     def clear(self) -> NDArray[np.bool_] | None:
         """Mask (n,) of glass obstacles, which depth cameras see through; None = no glass."""
-        parts = () if self.statics is None else self.statics.materials
-        # The appearance is drawn only if a material can be glass.
-        if not self.appearance.may_have("glass", (name for name in parts if name is not None)):
-            return None
-        glass = self.look.finish.surface[OBSTACLE:] == SURFACES.index("glass")
-        return glass if glass.any() else None
+        clear_of = entries("airl_mav", "COLOUR").get("clear")
+        return None if clear_of is None else load(clear_of)(self)
 
-    def _indoors(self, look: Drawn) -> Drawn:
-        """Return an appearance with the light below the ceiling."""
-        b, n = self.bounds, self.n_static
-        length, width = b.north_max - b.north_min, b.east_max - b.east_min
-        walls = [(WALLS, 2.0 * (length + width) * b.height)]
-        boxes = 0 if self.building is None else self.building.boxes
-        for i in range(n - boxes, n):
-            # Both sides are visible.
-            half = self.obstacles.half_size[i]
-            walls.append((OBSTACLE + i, float(8.0 * half[:2].max() * half[2])))
-        return indoors(look, length * width, tuple(walls))
+    def colour_of(self, i: int) -> tuple[int, int, int]:
+        """Return the sRGB colour 0-255 of obstacle i seen from far away; grey without colours."""
+        if not entries("airl_mav", "COLOUR"):
+            return GREY
+        colour: tuple[int, int, int] = self.look.colour_of(i)
+        return colour
 
     def mesh_of(self, i: int) -> PlacedMesh | None:
         """Return the mesh that cameras render in place of obstacle i, or None."""
@@ -281,3 +194,17 @@ class Arena:
             centers[i, 0] = np.interp(t, tour.times_s, tour.points[:, 0])
             centers[i, 1] = np.interp(t, tour.times_s, tour.points[:, 1])
         return centers
+
+
+@dataclass(frozen=True)
+class Statics:
+    """Owners of the static primitives, where some are parts of one asset."""
+
+    names: tuple[str, ...]  # (k,) name of the shape or asset of each owner
+    of: Annotated[NDArray[np.int64], ArrayField(np.int64)]
+    """(n_static,) index of the owner of each primitive, ascending."""
+    materials: tuple[str | None, ...]  # (n_static,) None = the owner's drawn material
+
+    def name_of(self, i: int) -> str:
+        """Return the name of the owner of primitive i."""
+        return self.names[int(self.of[i])]

@@ -9,14 +9,18 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import Statics
-from airl_mav.arena.geometry import Arena, Obstacles, PlacedMesh, Shape
+from airl_mav.arena.geometry import Arena, Obstacles, PlacedMesh, Shape, Statics
 from airl_mav.arena.placement import Floats, bounding_half
 from airl_mav.core import plugins
 from airl_mav.core.errors import UsageError
 from airl_mav.core.kernels import kernel
-from airl_mav.profiles.appearance import DEFAULT
-from airl_mav.profiles.arena import SHAPES, SPHERE_OFFSET, ArenaSpec, StaticObstacles
+from airl_mav.profiles.arena import (
+    DEFAULT_APPEARANCE,
+    SHAPES,
+    SPHERE_OFFSET,
+    ArenaSpec,
+    StaticObstacles,
+)
 from airl_mav.profiles.assets import Asset, MeshFile
 
 _BOX, _SPHERE = int(Shape.BOX), int(Shape.SPHERE)
@@ -145,7 +149,9 @@ def generate_own(
         raise UsageError(f"{told}: makes {type(arena).__name__}; accepted: airl_mav's Arena")
     if (problem := _problem(arena)) is not None:
         raise UsageError(f"{told}: {problem}")
-    if arena.appearance == DEFAULT:  # The generator set no appearance: use the profile's.
+    if (
+        arena.appearance == DEFAULT_APPEARANCE
+    ):  # The generator set no appearance: use the profile's.
         return replace(arena, appearance=spec.appearance)
     return arena
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import PlacedMesh
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.assets import GREATEST_M, MOST_TRIANGLES, MeshFile, read_checked
+from airl_mav.profiles.assets import GREATEST_M, MOST_TRIANGLES, MeshFile
+from airl_mav.profiles.loading import read_checked
 
 KEPT = 16
 """Meshes cached in a process."""

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import Statics
-from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Statics
 from airl_mav.arena.placement import Boxes, Floats
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.arena import ArenaSpec

@@ -15,8 +15,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import FLOOR as FLOOR_ROW
-from airl_mav.arena.finishes import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.geometry import PlacedMesh
 from airl_mav.arena.ground import Ground, Relief, no_relief
 from airl_mav.arena.relief import plane_at
@@ -303,13 +301,6 @@ class Meshes(NamedTuple):
 def count_of(meshes: Meshes | None) -> int:
     """Return the number of meshes."""
     return 0 if meshes is None else len(meshes.first)
-
-
-@borrowing_kernel
-def material_row(meshes: Meshes, k: int) -> int:
-    """Return the row of mesh k's material in `Finish`."""
-    first = meshes.first[k]
-    return FLOOR_ROW if first == GROUND_FIRST else OBSTACLE_ROW + first
 
 
 @borrowing_kernel

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import io
-import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -16,6 +15,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.projections import (
     MOST_COEFFICIENT,
+    PROJECTIONS,
     UNDISTORTED,
     CameraKind,
     Distortion,
@@ -67,39 +67,33 @@ def image_of(data: bytes, height: int, width: int, channels: int) -> NDArray[np.
     return np.ascontiguousarray(pixels.reshape(height, width, channels))
 
 
-MAGICS: dict[tuple[CameraKind, Projection], bytes] = {
-    ("depth", "pinhole"): b"ADF1",
-    ("depth", "cylindrical"): b"ADC1",
-    ("rgb", "pinhole"): b"ARF1",
-    ("rgb", "cylindrical"): b"ARC1",
-    ("grey", "pinhole"): b"AGF1",
-    ("grey", "cylindrical"): b"AGC1",
-    ("depth", "fisheye"): b"ADE1",
-    ("rgb", "fisheye"): b"ARE1",
-    ("grey", "fisheye"): b"AGE1",
-}
-"""Magic numbers of a frame: air-learning depth, RGB or grey; frame, cylinder, or equidistant
-fisheye; version 1."""
+_LETTERS: Final[dict[CameraKind, str]] = {"depth": "D", "rgb": "R", "grey": "G"}
 
-JPEG_MAGICS: dict[tuple[CameraKind, Projection], bytes] = {
-    ("rgb", "pinhole"): b"JRF1",
-    ("rgb", "cylindrical"): b"JRC1",
-    ("grey", "pinhole"): b"JGF1",
-    ("grey", "cylindrical"): b"JGC1",
-    ("rgb", "fisheye"): b"JRE1",
-    ("grey", "fisheye"): b"JGE1",
-}
+
+def _magics(first: str, kinds: Iterable[CameraKind], letter: str) -> dict[Camera, bytes]:
+    """Return magic numbers: format, kind, letter of the projection by an attribute, version 1."""
+    return {
+        (kind, name): f"{first}{_LETTERS[kind]}{getattr(model, letter)}1".encode()
+        for kind in kinds
+        for name, model in PROJECTIONS.items()
+        if getattr(model, letter)
+    }
+
+
+Camera = tuple[CameraKind, Projection]
+
+MAGICS: Final = _magics("A", _LETTERS, "magic")
+"""Magic numbers of a frame: air-learning depth, RGB or grey; projection; version 1."""
+
+JPEG_MAGICS: Final = _magics("J", ("rgb", "grey"), "magic")
 """Magic numbers of frames with a JPEG file after the header instead of pixels."""
 
-_DISTORTED: dict[bytes, bytes] = {
-    b"ADE1": b"ADK1",
-    b"ARE1": b"ARK1",
-    b"AGE1": b"AGK1",
-    b"JRE1": b"JRK1",
-    b"JGE1": b"JGK1",
+_DISTORTED: Final = {
+    plain[camera]: magic
+    for plain, first, kinds in ((MAGICS, "A", tuple(_LETTERS)), (JPEG_MAGICS, "J", ("rgb", "grey")))
+    for camera, magic in _magics(first, kinds, "distorted_magic").items()
 }
-"""Magic numbers of fisheye frames with four coefficients between header and pixels (Kannala and
-Brandt's lens)."""
+"""Magic numbers of frames with four distortion coefficients between header and pixels."""
 
 _CAMERA_OF = {magic: camera for camera, magic in MAGICS.items()}
 _JPEG_CAMERA_OF = {magic: camera for camera, magic in JPEG_MAGICS.items()}
@@ -142,9 +136,6 @@ MAX_MM = 65_535
 
 LEAST_PX, MOST_PX = 1e-3, 1e6
 """Limits of the focal length, and of the offset of the optical axis from the image corner [px]."""
-
-_TURN = 1.0 + 1e-9
-"""Maximum width of a cylinder's image, in turns; above 1 for rounding."""
 
 
 class FrameError(ValueError):
@@ -259,8 +250,8 @@ class Frame:
         # Written so that NaN fails.
         if not (LEAST_PX <= focal <= MOST_PX and abs(cx) <= MOST_PX and abs(cy) <= MOST_PX):
             raise FrameError(f"focal {focal}, centre {cx}, {cy}: no {projection} camera")
-        if projection == "cylindrical" and width > _TURN * 2.0 * math.pi * focal:
-            raise FrameError(f"focal {focal}, {width} px wide: a cylinder of more than one turn")
+        if (problem := PROJECTIONS[projection].problem(width, focal)) is not None:
+            raise FrameError(problem)
         lens = Intrinsics(width, height, focal, cx, cy, projection, kind, distortion)
         if compressed:
             jpeg = data[begins:]

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.profiles.projections import (
+    PROJECTIONS,
     UNDISTORTED,
     CameraKind,
     Distortion,
     Projection,
-    distorted,
-    sees_to,
+    ProjectionModel,
     shape_of,
-    undistorted,
 )
 
 if TYPE_CHECKING:
@@ -30,21 +29,7 @@ class Intrinsics:
 
     Equality of two cameras includes `kind`.
 
-    In the optical frame (right, down, forward) a pixel (u, v) looks along
-
-    - pinhole, RealSense convention: ((u - cx) / focal, (v - cy) / focal, 1). Depth is measured
-      along the optical axis.
-    - cylindrical: (sin a, (v - cy) / focal, cos a) with a = (u - cx) / focal [rad], clockwise seen
-      from above. Depth is measured in the camera's horizontal plane, perpendicular to the axis of
-      the cylinder. Upright edges are upright in the image. The column of the optical axis
-      equals a pinhole's with the same focal length.
-    - fisheye: (sin b cos c, sin b sin c, cos b), at the angle b [rad] from the optical axis given
-      by r / focal and `profiles.distortion`, with r the distance from (cx, cy) to the pixel and c
-      its direction. Without coefficients b = r / focal (equidistant). Depth is measured along that
-      unit vector. Pixels more than 95 degrees from the axis are empty, as are pixels beyond the
-      valid angle of the coefficients.
-
-    In all models the visible point is this vector times depth.
+    The classes of `profiles.projections.PROJECTIONS` describe the ray and the depth of a pixel.
     """
 
     width: int
@@ -73,10 +58,7 @@ class Intrinsics:
         The maximum is pi for a pinhole, 2 pi for a cylinder and 190 degrees for a fisheye. The
         field of view spans the image from edge to edge.
         """
-        if projection != "pinhole":
-            focal = width / (2.0 * distorted(0.5 * horizontal_fov, distortion))
-        else:
-            focal = 0.5 * width / math.tan(0.5 * horizontal_fov)
+        focal = PROJECTIONS[projection].focal(width, horizontal_fov, distortion)
         # Pixel centres are integers, so the middle of the image is (n - 1) / 2.
         cx, cy = 0.5 * (width - 1), 0.5 * (height - 1)
         return cls(width, height, focal, cx, cy, projection, kind, distortion)
@@ -104,33 +86,19 @@ class Intrinsics:
         return np.uint16 if self.kind == "depth" else np.uint8
 
     @property
-    def cylindrical(self) -> bool:
-        """True if the image is cylindrical."""
-        return self.projection == "cylindrical"
+    def model(self) -> ProjectionModel:
+        """Projection of directions to the image."""
+        return PROJECTIONS[self.projection]
 
     @property
     def horizontal_fov_rad(self) -> float:
         """Horizontal field of view [rad], from edge to edge of the image."""
-        if self.distortion != UNDISTORTED:
-            half = undistorted(np.array(0.5 * self.width / self.focal), self.distortion)
-            return 2.0 * min(float(half), sees_to(self.distortion))
-        if self.projection != "pinhole":
-            return self.width / self.focal
-        return 2.0 * math.atan2(0.5 * self.width, self.focal)
+        return self.model.fov(self)
 
-
-def rays_of(camera: Intrinsics) -> NDArray[np.float64]:
-    """Return rays (3, h, w) forward, right, down at a depth of 1; 0 outside a fisheye's circle."""
-    if camera.projection == "fisheye":
-        return fisheye_rays(camera)
-    rays = np.ones((3, camera.height, camera.width))
-    across = (np.arange(camera.width) - camera.cx) / camera.focal
-    if camera.cylindrical:
-        rays[0], rays[1] = np.cos(across), np.sin(across)
-    else:
-        rays[1] = across
-    rays[2] = ((np.arange(camera.height) - camera.cy) / camera.focal)[:, None]
-    return rays
+    @property
+    def rays(self) -> NDArray[np.float64]:
+        """Rays (3, h, w) forward, right, down at a depth of 1; 0 in pixels without a direction."""
+        return self.model.rays(self)
 
 
 def finer(camera: Intrinsics, side: int) -> Intrinsics:
@@ -145,29 +113,3 @@ def finer(camera: Intrinsics, side: int) -> Intrinsics:
         cx=side * (k.cx + 0.5) - 0.5,
         cy=side * (k.cy + 0.5) - 0.5,
     )
-
-
-def fisheye_rays(camera: Intrinsics) -> NDArray[np.float64]:
-    """Return unit rays (3, h, w) forward, right, down of a fisheye; 0 outside the circle."""
-    across = (np.arange(camera.width) - camera.cx) / camera.focal
-    down = ((np.arange(camera.height) - camera.cy) / camera.focal)[:, None]
-    out = np.hypot(across, down)
-    off = undistorted(out, camera.distortion)
-    # `undistorted` returns infinity beyond the valid angle.
-    outside = np.isinf(off)
-    off[outside] = 0.0
-    # sin(off) / out, which is 1 in the middle.
-    share = np.sinc(off / math.pi) * np.divide(off, out, out=np.ones_like(out), where=out > 0.0)
-    rays = np.stack([np.cos(off), across * share, down * share])
-    rays[:, outside] = 0.0
-    return rays
-
-
-def fisheye_places(camera: Intrinsics, points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return columns and rows of points (3, ...); infinity outside the circle."""
-    aside = np.hypot(points[1], points[2])
-    off = np.arctan2(aside, points[0])
-    scale = camera.focal * distorted(off, camera.distortion) / np.maximum(aside, 1e-9)
-    scale = np.where(off > sees_to(camera.distortion), np.inf, scale)
-    with np.errstate(invalid="ignore"):
-        return points[1] * scale + camera.cx, points[2] * scale + camera.cy

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.intrinsics import Intrinsics, fisheye_rays
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.profiles.projections import Distortion, distorted, sees_to
 from airl_mav.vehicle.rotation import Vec
@@ -58,7 +58,7 @@ class Pose(NamedTuple):
 
 
 class Bent(NamedTuple):
-    """Unit rays of a fisheye in `Pose`'s axes; zero in pixels outside the field of view."""
+    """Unit rays of a tabled projection in `Pose`'s axes; zero outside the field of view."""
 
     forward: NDArray[np.float64]  # (n, m)
     across: NDArray[np.float64]  # (n, m)
@@ -66,6 +66,25 @@ class Bent(NamedTuple):
     distortion: Distortion
     sees_to: float
     """Maximum visible angle from the optical axis [rad]."""
+    whole: bool
+    """True if every body may appear anywhere in the image: the projection has no other bound."""
+
+
+class LensConstants(NamedTuple):
+    """Constants of a camera; a tuple, because compiled loops require one."""
+
+    focal: float
+    """Focal length [px] of a pinhole, columns per angle [px/rad] of a cylinder."""
+    cx: float
+    """Column of the optical axis [px]; pixel centres are at whole numbers."""
+    cy: float
+    """Row of the optical axis [px]."""
+    range_m: float
+    """Maximum depth of a return [m]."""
+    cylindrical: bool = False
+    """True if the image is cylindrical."""
+    bent: Bent | None = None
+    """Rays of a tabled projection; None = affine along the lines of the image."""
 
 
 class Optics(NamedTuple):
@@ -82,9 +101,9 @@ class Optics(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """Room and the n obstacles of an arena, as arguments of `render_depth`."""
+    """Room and the n obstacles of an arena for kernels; fields of `Bounds` and `Obstacles`."""
 
-    bounds: NDArray[np.float64]  # (6,)
+    bounds: NDArray[np.float64]  # (6,) `Bounds.as_array()`
     shape: NDArray[np.int8]  # (n,)
     center: NDArray[np.float64]  # (n, 3)
     half_size: NDArray[np.float64]  # (n, 3)
@@ -269,7 +288,7 @@ def fisheye_rectangle(
     if (distance - radius) * view.s_min > 1.0:
         return 0, 0, 0, 0
     # The camera is inside the enclosing sphere.
-    if distance <= radius:
+    if distance <= radius or bent.whole:
         return 0, out.shape[0], 0, out.shape[1]
     off, spread = math.atan2(aside, z), math.asin(radius / distance)
     inner, outer = _way_out(view, bent, off - spread), _way_out(view, bent, off + spread)
@@ -312,14 +331,19 @@ def _reached(first: float, last: float, inner: float, outer: float) -> tuple[flo
     )
 
 
-def bent_of(camera: Intrinsics) -> Bent | None:
-    """Return the rays of a fisheye; None for other cameras."""
-    return _bent_of(camera) if camera.projection == "fisheye" else None
-
-
 @lru_cache(maxsize=64)
 def _bent_of(camera: Intrinsics) -> Bent:
-    forward, right, down = np.ascontiguousarray(fisheye_rays(camera))
+    """Return the rays of a camera whose projection is tabled."""
+    forward, right, down = np.ascontiguousarray(camera.rays)
     # Plain floats, so that only one variant is compiled.
     k1, k2, k3, k4 = (float(each) for each in camera.distortion)
-    return Bent(forward, down, right, (k1, k2, k3, k4), sees_to(camera.distortion))
+    rim, whole = sees_to(camera.distortion), not camera.model.radial
+    return Bent(forward, down, right, (k1, k2, k3, k4), rim, whole)
+
+
+def lens_of(camera: Intrinsics, range_m: float) -> LensConstants:
+    """Return the lens of a camera with a range [m], as an argument of kernels."""
+    k, model = camera, camera.model
+    # Plain floats, so that only one variant is compiled.
+    constants = (float(k.focal), float(k.cx), float(k.cy), float(range_m))
+    return LensConstants(*constants, model.cylindrical, _bent_of(k) if model.tabled else None)

@@ -44,6 +44,7 @@ from airl_mav.camera.projection import (
     Bent,
     Image,
     ImageProjection,
+    LensConstants,
     Line,
     Lines,
     Optics,
@@ -129,8 +130,10 @@ def invert(out: Image) -> None:
 
 
 @borrowing_kernel
-def blank(out: Image, bent: Bent) -> None:
-    """Write 0 into fisheye pixels outside the field of view."""
+def blank(out: Image, bent: Bent | None) -> None:
+    """Write 0 into pixels of a tabled projection outside the field of view."""
+    if bent is None:
+        return
     for v in range(out.shape[0]):
         for u in range(out.shape[1]):
             i, j, k = bent.forward[v, u], bent.across[v, u], bent.along[v, u]
@@ -143,16 +146,12 @@ def aim(
     lines: Lines,
     xs: Line,
     quaternion: Quat | NDArray[np.float64],
-    focal: float,
-    cx: float,
-    cy: float,
-    cylindrical: bool,
-    max_range: float,
+    lens: LensConstants,
 ) -> tuple[ImageProjection, Pose]:
     """Write the rays of an image's lines; return the view, and camera axes without a centre.
 
     `lines` (n, 2) receives the components of each line's first ray on the forward axis and the axis
-    across, `xs` (m,) each ray's component on the axis along; other arguments as in `render_depth`.
+    across, `xs` (m,) each ray's component on the axis along.
     """
     q = (quaternion[0], quaternion[1], quaternion[2], quaternion[3])
     forward, right, down = (
@@ -160,7 +159,8 @@ def aim(
         rotate(q, (0.0, 1.0, 0.0)),
         rotate(q, (0.0, 0.0, 1.0)),
     )
-    s_min = max(1.0 / max_range, TINY)
+    focal, cx, cy, cylindrical = lens.focal, lens.cx, lens.cy, lens.cylindrical
+    s_min = max(1.0 / lens.range_m, TINY)
     nowhere = (0.0, 0.0, 0.0)
     # The lines of a cylinder are columns: across is right, along is down.
     if cylindrical:
@@ -232,18 +232,9 @@ def render_depth(
     out: Image,
     position: Vec | NDArray[np.float64],
     quaternion: Quat | NDArray[np.float64],
-    focal: float,
-    cx: float,
-    cy: float,
-    cylindrical: bool,
-    max_range: float,
-    bounds: NDArray[np.float64],
-    shape: NDArray[np.int8],
-    center: NDArray[np.float64],
-    half_size: NDArray[np.float64],
-    yaw: NDArray[np.float64],
+    lens: LensConstants,
+    scene: Scene,
     meshes: Meshes | None,
-    bent: Bent | None,
 ) -> None:
     """Render the depth image of an arena.
 
@@ -256,25 +247,22 @@ def render_depth(
     `out` (height, width) is depth [m], written; 0 = no return. It is measured along the optical
     axis of a pinhole, in the camera's horizontal plane of a cylinder, along the ray of a fisheye.
     The camera is at `position` NED [m]. Its x axis by `quaternion` (camera -> NED) is the optical
-    axis; y points to the right of the image, z to its bottom. `focal`, `cx`, `cy` and `cylindrical`
-    are fields of `Intrinsics`, `bent` the rays of a fisheye (`bent_of`), None for others. `bounds`
-    (6,) is `Bounds.as_array()`; the obstacles' arrays (n, ...) are fields of `Obstacles`. `meshes`
-    contains the visible meshes, hills included; None has no cost.
+    axis; y points to the right of the image, z to its bottom. `meshes` contains the visible meshes,
+    hills included; None has no cost.
     """
     camera = raised(meshes, position)
     height, width = out.shape
+    cylindrical, bent = lens.cylindrical, lens.bent
     xs = np.empty(height if cylindrical else width)
     lines = np.empty((width if cylindrical else height, 2))
-    view, axes = aim(lines, xs, quaternion, focal, cx, cy, cylindrical, max_range)
+    view, axes = aim(lines, xs, quaternion, lens)
     # Columns of a cylinder are drawn into contiguous memory, then transposed into `out`.
     drawn = np.empty((width, height), np.float32) if cylindrical else out
     optics = Optics(lines, xs, bent, view, axes, camera)
-    scene = Scene(bounds, shape, center, half_size, yaw)
     inside = draw_bodies(drawn, None, None, optics, scene, meshes, None)
     if inside >= 0:
         out[:, :] = MIN_DEPTH_M
-        if bent is not None:
-            blank(out, bent)
+        blank(out, bent)
         return
     invert(drawn)
     if cylindrical:

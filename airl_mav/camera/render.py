@@ -1,21 +1,27 @@
-"""Depth camera on a vehicle: mounting, pose and rendering."""
+"""Cameras of a vehicle: mounting, pose, and images of any kind, without noise."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import meshes_of
+from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.projection import bent_of
+from airl_mav.camera.projection import Scene, lens_of
 from airl_mav.camera.raycast import render_depth
+from airl_mav.core.addons import load_entry
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.camera import Camera
+from airl_mav.profiles.projections import Renderer
 from airl_mav.vehicle.rotation import Quat, Vec, exponential, multiply, rotate
+
+RANGE_M: Final = 10_000.0
+"""Range of a colour camera [m]; exceeds every arena."""
 
 
 class Mount(NamedTuple):
@@ -88,6 +94,12 @@ def pose_of(
     return (north, east, down), (w, x, y, z)
 
 
+def scene_of(arena: Arena, centers: NDArray[np.float64]) -> Scene:
+    """Return room and obstacles of an arena for kernels, with centres (n, 3) NED [m]."""
+    o = arena.obstacles
+    return Scene(arena.bounds.as_array(), o.shape, centers, o.half_size, o.yaw)
+
+
 def render(
     arena: Arena,
     centers: NDArray[np.float64],
@@ -102,20 +114,63 @@ def render(
     result of `Arena.centers_at`. The pose is the camera's, NED [m], camera -> NED. Raises
     UsageError if a mesh's file is missing or has changed.
     """
-    k, obstacles = intrinsics, arena.obstacles
-    image = np.empty((k.height, k.width), np.float32)
-    render_depth(
-        image,
-        *pose_of(position, quaternion),
-        *(float(k.focal), float(k.cx), float(k.cy)),
-        k.cylindrical,
-        float(max_range),
-        arena.bounds.as_array(),
-        obstacles.shape,
-        centers,
-        obstacles.half_size,
-        obstacles.yaw,
-        meshes_of(arena.meshes, len(obstacles), arena.ground, arena.clear),
-        bent_of(k),
-    )
+    image = np.empty((intrinsics.height, intrinsics.width), np.float32)
+    meshes = meshes_of(arena.meshes, len(arena.obstacles), arena.ground, arena.clear)
+    pose = pose_of(position, quaternion)
+    render_depth(image, *pose, lens_of(intrinsics, max_range), scene_of(arena, centers), meshes)
+    return image
+
+
+class Exposure(Protocol):
+    """Interface of image functions; see `expose`."""
+
+    def __call__(
+        self,
+        arena: Arena,
+        centers: NDArray[np.float64],
+        intrinsics: Intrinsics,
+        max_range: float,
+        position: Vec | NDArray[np.float64],
+        quaternion: Quat | NDArray[np.float64],
+        number: int = 0,
+    ) -> NDArray[Any]:
+        """Return the image."""
+
+
+def colour(name: str) -> Any:
+    """Return a part of colour cameras. Raises UsageError without the add-on that renders colour.
+
+    Parts: `expose` renders an image, `sensor` is the class of image formation, `batch` renders the
+    images of n vehicles and `looks` holds the appearance of their arenas, `look` and `clear` are an
+    arena's appearance and its mask of glass.
+    """
+    return load_entry("airl_mav", "COLOUR", name, ("camera.kind", "rgb or grey"), "colour")
+
+
+def exposure_by(renderer: Renderer, name: str = "") -> Exposure:
+    """Return the image function of a camera for a renderer; "" is the main camera."""
+    if renderer == "raycast":
+        return expose
+    option = "renderer", renderer
+    path_tracing = load_entry("airl_mav", "RENDERERS", renderer, option, "colour")
+    made: Exposure = path_tracing.images_of(name)
+    return made
+
+
+def expose(
+    arena: Arena,
+    centers: NDArray[np.float64],
+    intrinsics: Intrinsics,
+    max_range: float,
+    position: Vec | NDArray[np.float64],
+    quaternion: Quat | NDArray[np.float64],
+    number: int = 0,  # noqa: ARG001 (nothing is drawn by lot)
+) -> NDArray[Any]:
+    """Return a camera's image of an arena, as in `Frame.image`; see `render.render`.
+
+    Colour has no maximum depth. `number`: image number in the episode, for renderers with noise.
+    """
+    if intrinsics.kind == "depth":
+        return depth_to_z16(render(arena, centers, intrinsics, max_range, position, quaternion))
+    image: NDArray[Any] = colour("expose")(arena, centers, intrinsics, position, quaternion)
     return image

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -12,9 +13,9 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
+from airl_mav.core.addons import load_entry
 from airl_mav.core.errors import FieldError
 from airl_mav.core.progress import new_console
-from airl_mav.experiments.quantisation import export_int8
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard
 from airl_mav.policy.card_writing import copy_policy
 from airl_mav.policy.registry import find_policy
@@ -114,9 +115,12 @@ def _export_int8(options: ExportOptions) -> PolicyCard:
     if options.with_torch:
         raise FieldError("with_torch", problem="not with --int8: policy.pt2 would be in floats")
     name = options.policy_name
+    write: Callable[..., PolicyCard] = load_entry(
+        "airl_mav", "EXPORTS", "int8", ("int8", True), "int8"
+    )
     if options.own_module or Path(options.model).is_file():
         with TemporaryDirectory(prefix="airl-export-") as scratch:
             folder = Path(scratch) / name
             _export(options.model_copy(update={"out": folder}))
-            return export_int8(folder, options.out, name=name)
-    return export_int8(_policy_folder(options), options.out, name=name)
+            return write(folder, options.out, name=name)
+    return write(_policy_folder(options), options.out, name=name)

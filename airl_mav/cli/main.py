@@ -32,7 +32,6 @@ SUBCOMMANDS: dict[str, str] = {
     "export": "turn a stable-baselines3 model into a policy folder",
     "report": "a run's tables and page again, or a comparison of several runs",
     "arena": "look at an arena, or at what its profile draws",
-    "asset": "an arena whose obstacles are a mesh of yours (STL, OBJ, GLB)",
     "parameters": "a vehicle's parameters as a file for firmware that you start",
     "computers": "computer profiles: what each was timed with, by whom, and how late it decides",
     "list": "shipped vehicles, arenas, policies, computers, sweeps",

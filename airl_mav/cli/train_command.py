@@ -20,7 +20,7 @@ from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.first_start import compile_shown
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.live_view import ViewError, view_part
-from airl_mav.training.training_folder import Exported, TrainingBar, TrainRequest
+from airl_mav.training.training_folder import Exported, TrainingProgress, TrainRequest
 
 if TYPE_CHECKING:
     from airl_mav.rehearsal.live_view import ViewRequest
@@ -87,7 +87,7 @@ def run(
                     out,
                     name=options.name or stem,
                     resume=options.resume,
-                    progress=TrainingBar(progress, config.steps),
+                    progress=TrainingProgress(progress, config.steps),
                     command=command_line or shlex.join(["airl", *sys.argv[1:]]),
                     view=None if viewer is None else viewer.ends,
                 )

@@ -4,7 +4,10 @@ The `__init__` of an add-on is light and may define tables, which the core reads
 `airl_mav.addons`:
 
     COMMANDS: {command of `airl`: (purpose, module with OPTIONS and run)}
+    COLOUR: {part of colour cameras, see `camera.render.colour`: object}
     EXECUTORS: {value of `--executor`: module with `connected`}
+    EXPORTS: {option of `airl export`: function from a policy's folder to a new policy}
+    ALGORITHMS: {name in training files: `Algorithm` of `training.algorithm_table`}
     VIEW: {part of the live view: its class or function} (`rehearsal.live_view`)
     RECORDINGS: {suffix of a flight's recording: function that makes a run folder of it}
     FORENSICS: {`examine` or `section`: function for the causes of a run's failed flights}
@@ -12,6 +15,8 @@ The `__init__` of an add-on is light and may define tables, which the core reads
     LIGHT: the commands can be imported without the simulator
     ENVIRONMENTS: {id of a Gymnasium environment: class}
     LOCKSTEP: {"firmware" or "companion": function that flies one side of two processes}
+    PROFILE_SECTIONS: {section of a profile such as "arena.appearance": its model}
+    RENDERERS: {value of `--renderer`: factory of its images by camera, with a method `check`}
     SITL_OPTIONS: {option of `airl sitl`: function to a context manager around the flights}
 
 In `companion.addons`:
@@ -23,6 +28,7 @@ In `companion.addons`:
 In `firmware_sim.addons`:
 
     FIRMWARE: {value of `--firmware`: `firmware_sim.external.programs.FirmwareKind`}
+    BODIES: {value of `--plant`: class of the vehicle's `plant.body.PlantBody`}
     AIDING: {any name: class of the `estimator.Aiding` that fuses further sensors}
     FLIGHT_MODES: {name of a `flight_modes.Mode`: module with its `FlightMode`}
     SENSORS: {name in `profiles.vehicle.Sensors`: its `sensor_table.Sensor`}

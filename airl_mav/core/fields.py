@@ -13,7 +13,14 @@ from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    ValidationError,
+    model_validator,
+)
 from pydantic.fields import FieldInfo
 from pydantic_core import (
     CoreSchema,
@@ -23,6 +30,7 @@ from pydantic_core import (
     core_schema,
 )
 
+from airl_mav.core.addons import entries, load
 from airl_mav.core.errors import FieldError, UsageError, shown
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -53,6 +61,24 @@ class ProfileModel(BaseModel):
     """Base of all profile models: immutable, unknown fields rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def section(name: str) -> type[ProfileModel]:
+    """Return the model of a profile's section that an add-on defines; without it, an empty one."""
+    if (place := entries("airl_mav", "PROFILE_SECTIONS").get(name)) is not None:
+        return load(place)  # type: ignore[no-any-return]
+
+    class Absent(ProfileModel):
+        """Section that no add-on reads."""
+
+        @model_validator(mode="before")
+        @classmethod
+        def _is_left_out(cls, value: object) -> object:
+            if value != {} and not isinstance(value, cls):
+                raise ValueError("accepted: left out; its add-on is not in airl_mav/addons")
+            return value
+
+    return Absent
 
 
 class ArrayField:

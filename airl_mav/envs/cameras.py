@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
-from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import DepthNoise, noise_of, noisy_frame
+from airl_mav.camera.projection import LensConstants, Scene, lens_of
 from airl_mav.camera.raycast import render_depth
-from airl_mav.camera.render import Motion, Mount, camera_pose
+from airl_mav.camera.render import Motion, Mount, camera_pose, colour
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arena_batch import ArenaBatch, move_obstacles, relief_of
-from airl_mav.envs.colour_images import ColourImages, LensConstants, Looks, lens_of
 from airl_mav.envs.decision import FrameTimes
 from airl_mav.envs.faults import delays_of, later_us, twin_faults
 from airl_mav.envs.fleet import Fleet, FramePoses
@@ -54,7 +53,7 @@ class Eyes:
         n: int,
         camera: Camera,
         noise: SensorNoise,
-        looks: Looks | None,
+        looks: Any,
         meshes: MeshesSeen | None,
         name: str = "",
     ) -> None:
@@ -66,18 +65,18 @@ class Eyes:
         self._mount = Mount.of(camera)
         self._lens = lens_of(self.intrinsics, camera.range_m)
         self._meshes = MeshesSeen(0) if meshes is None else meshes
-        self._colour: ColourImages | None = None
+        self._colour: Any = None
         """Renderer of colour images; None for depth cameras."""
         if self.intrinsics.kind != "depth":
             # Colour needs the appearance of an arena, which the depth kernels do not have.
             assert looks is not None  # noqa: S101 - colour cameras require arenas
-            self._colour = ColourImages(self.intrinsics, self._mount, looks, self._meshes)
-        self._formed: ImageFormation | None = None
+            self._colour = colour("batch")(self.intrinsics, self._mount, looks, self._meshes)
+        self._formed: Any = None
         """Image formation for single images, as in the rehearsal; None without a table `imaging`.
-        It keeps no state between images (`imaging_checks.check_twin_imaging`), so it serves all
+        It keeps no state between images (`check_twin_imaging`), so it serves all
         vehicles."""
         if camera.imaging is not None and looks is not None:
-            self._formed, self._looks = ImageFormation(camera, name), looks
+            self._formed, self._looks = colour("sensor")(camera, name), looks
 
     @property
     def eye(self) -> Eye | None:
@@ -138,7 +137,7 @@ class Cameras(Stateful):
         transport_us: int,
         noise: SensorNoise,
         faults: Sequence[Fault] = (),
-        looks: Looks | None = None,
+        looks: Any = None,
         meshes: MeshesSeen | None = None,
         further: Mapping[str, Camera] | None = None,
     ) -> None:
@@ -299,6 +298,14 @@ def _make_noisy(
         image[i] = noisy_frame(image[i], noise, int(seeds[i]), int(frames[i]))
 
 
+@kernel
+def scene_in(arenas: ArenaBatch, i: int) -> Scene:
+    """Return room and obstacles of arena i."""
+    n = arenas.n_obstacles[i]
+    shape, center = arenas.shape[i, :n], arenas.center[i, :n]
+    return Scene(arenas.bounds[i], shape, center, arenas.half_size[i, :n], arenas.yaw[i, :n])
+
+
 @large_kernel
 def render_images(
     fleet: Fleet | FramePoses, arenas: ArenaBatch, who: NDArray[np.bool_], eye: Eye | None
@@ -314,7 +321,6 @@ def render_images(
     """
     if eye is None:
         return
-    lens = eye.lens
     image = np.empty(eye.image.shape[1:], np.float32)
     for i in range(len(who)):
         # `_to_z16` overwrites the same buffer for each vehicle.
@@ -323,23 +329,9 @@ def render_images(
         move_obstacles(arenas, i, fleet.time_us[i])
         count = arenas.n_obstacles[i]
         position, quaternion = camera_pose(fleet.position[i], fleet.quaternion[i], eye.mount)
-        render_depth(
-            image,
-            position,
-            quaternion,
-            lens.focal,
-            lens.cx,
-            lens.cy,
-            lens.cylindrical,
-            lens.range_m,
-            arenas.bounds[i],
-            arenas.shape[i, :count],
-            arenas.center[i, :count],
-            arenas.half_size[i, :count],
-            arenas.yaw[i, :count],
-            meshes_in(eye.meshes, i, count, relief_of(arenas, i)),
-            lens.bent,
-        )
+        scene = scene_in(arenas, i)
+        meshes = meshes_in(eye.meshes, i, count, relief_of(arenas, i))
+        render_depth(image, position, quaternion, eye.lens, scene, meshes)
         _to_z16(image, eye.image[i])
 
 

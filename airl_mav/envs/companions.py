@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.policy.observation import CameraView, Earlier, InFlight, Kinematics, Rows
-from airl_mav.prediction.compensator import Compensator, DecisionMemory
+from airl_mav.prediction import Compensator, DecisionMemory
 
 Times = NDArray[np.int64]
 """(n,) [µs]."""

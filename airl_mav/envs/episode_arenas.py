@@ -13,9 +13,9 @@ import numpy as np
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.arena.placement import zone_radius_m
+from airl_mav.camera.render import colour
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.arena_batch import batch_of, put_arena, with_room
-from airl_mav.envs.colour_images import Looks
 from airl_mav.envs.mesh_batch import MeshesSeen
 from airl_mav.envs.spec import Curriculum, EnvironmentSpec
 from airl_mav.profiles.arena import ArenaSpec
@@ -149,7 +149,7 @@ class EpisodeArenas:
         """(n,) True if an episode has started."""
         self.batch = batch_of([])
         """Arenas for the kernels; replaced when an arena exceeds their capacity."""
-        self.looks = Looks(n) if looks else None
+        self.looks = colour("looks")(n) if looks else None
         """Appearance of the arenas; None if not needed."""
         self.meshes = MeshesSeen(n)
         """Meshes visible to cameras."""

@@ -51,7 +51,7 @@ from airl_mav.policy.images import Bytes, body_bytes
 from airl_mav.policy.layouts import GOAL, VELOCITY, Encoded, encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, Rows, observe
 from airl_mav.policy.observation_spec import ObservationSpec
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction import Compensator
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.conditions import Payload, check_spread, equipped
@@ -66,6 +66,24 @@ if TYPE_CHECKING:
 
 EVERYONE = slice(None)
 """Rows of all n vehicles."""
+
+
+class Commands(NamedTuple):
+    """Kind of commands."""
+
+    least: int
+    """Minimum number of columns of commands."""
+    setpoint: tuple[int, ...]
+    """Columns of `Fleet.setpoint` with these numbers."""
+    expire: bool
+    """True if a command that is not replaced in time ends in a stop."""
+
+
+COMMANDS: dict[CommandKind, Commands] = {
+    "velocity": Commands(3, (0, 1, 3), expire=False),
+    "body_rates": Commands(4, (0, 1, 2, 3), expire=True),
+}
+"""Kinds of commands of the vectorized simulator."""
 
 
 class WholeTruth(NamedTuple):
@@ -122,8 +140,8 @@ class Navigation(Stateful):
         """
         self.spec = spec
         self.n = n
-        self.by_rates: bool = (commands or spec.action_spec.commands) == "body_rates"
-        """True for body rate and thrust commands, False for velocities."""
+        self.commands = COMMANDS[commands or spec.action_spec.commands]
+        """Kind of the commands of `fly`."""
         if vehicle is None:
             vehicle, computer = equipped(spec.vehicle, spec.delay.computer, Payload())
             computer_w = computer.onboard_watts
@@ -147,9 +165,10 @@ class Navigation(Stateful):
         self._transport_us = round(spec.delay.transport_ms * US_PER_MS)
         self._link_us = round(spec.delay.link_ms * US_PER_MS)
         width_m, looks = self.vehicle.body.width_m, sight.coloured
-        self._places = EpisodeArenas(spec, self.arena_spec, n, width_m, arena_seed, looks=looks)
-        self.stages, self.arenas = self._places.stages, self._places.present
-        self.seeds, self.zones = self._places.seeds, self._places.zones
+        self.places = EpisodeArenas(spec, self.arena_spec, n, width_m, arena_seed, looks=looks)
+        """Arenas of the flights; `prepare` generates likely next ones ahead."""
+        self.stages, self.arenas = self.places.stages, self.places.present
+        self.seeds, self.zones = self.places.seeds, self.places.zones
         self.fleet, self._calm_start = new_fleet(n), new_fleet(1)
         # The calm start is the same for all seeds, so it is computed once.
         hover(self._calm_start, 0, rules.altitude_m, self._vehicle, battery=battery_charge)
@@ -169,7 +188,7 @@ class Navigation(Stateful):
         pipelined = spec.decisions == "pipelined"
         check_twin(faults, pipelined=pipelined)
         self._winds = Winds(n, spec.wind, faults)
-        seen = (self._places.looks, self._places.meshes, sight.further)
+        seen = (self.places.looks, self.places.meshes, sight.further)
         self.cameras = Cameras(n, self.camera, self._transport_us, randomisation, faults, *seen)
         self._uplink = twin_faults(faults, "uplink")
         self._decision = new_decision(self._times(pipelined=pipelined), self._telemetry.errors)
@@ -221,7 +240,7 @@ class Navigation(Stateful):
             )
         # Negative: velocity setpoints do not time out.
         timeout_us = -TICK_US
-        if self.by_rates:
+        if self.commands.expire:
             held_s = 0.0 if pipelined else rules.hold_s
             timeout_us = round((rules.decision_timeout_s or held_s + UPRIGHT_S) * US_PER_S)
         return Timing(
@@ -253,7 +272,7 @@ class Navigation(Stateful):
         Raises:
             UsageError: Arena generation failed for a seed, or the zone is out of range.
         """
-        self._places.check_zone(zone)
+        self.places.check_zone(zone)
         who = np.zeros(self.n, np.bool_)
         for i, seed in zip(slots, seeds, strict=True):
             self._begin(i, int(seed), zone)
@@ -266,16 +285,8 @@ class Navigation(Stateful):
         self._take_frames(who)
         self._look_ahead(who)
 
-    def prepare(self, seeds: Sequence[int], zone: int | None = None) -> None:
-        """Generate the arenas of likely next episodes; see `EpisodeArenas`."""
-        self._places.prepare(seeds, zone)
-
-    def prepared(self, seeds: Sequence[int], zone: int | None = None) -> bool:
-        """Return True if all of these arenas were generated ahead."""
-        return self._places.prepared(seeds, zone)
-
     def _begin(self, i: int, seed: int, zone: int | None) -> None:
-        self._places.begin(i, seed, zone)
+        self.places.begin(i, seed, zone)
         randomisation = self.spec.randomisation
         airframe = None
         if spreads(randomisation):
@@ -312,7 +323,7 @@ class Navigation(Stateful):
             image, state = known.foreseen(rows)
         else:
             image, state = self.cameras.image[rows], self.kinematics(rows)
-        goal = self._places.batch.goal[rows]
+        goal = self.places.batch.goal[rows]
         # Goals without a height have two coordinates.
         if np.isnan(goal[:, 2]).all():
             goal = goal[:, :2]
@@ -345,7 +356,7 @@ class Navigation(Stateful):
         """Return the status of all flights; it is never modified."""
         if self._status is None:
             numbers, whole = self._room_for_status()
-            status(self.fleet, self._places.batch.goal, numbers, whole)
+            status(self.fleet, self.places.batch.goal, numbers, whole)
             self._status = FlightArrays(*whole[:2], *numbers[:-1])
         return self._status
 
@@ -357,23 +368,23 @@ class Navigation(Stateful):
 
     def whole_truth(self) -> WholeTruth:
         """Return the twin's complete state: live arrays, read-only by convention."""
-        if self._places.begun.any():  # Before the first episode there is no arena.
-            move_all_obstacles(self._places.batch, self.fleet.time_us)
-        return WholeTruth(self.fleet, self._places.batch, self._vehicle)
+        if self.places.begun.any():  # Before the first episode there is no arena.
+            move_all_obstacles(self.places.batch, self.fleet.time_us)
+        return WholeTruth(self.fleet, self.places.batch, self._vehicle)
 
     def fly(self, commands: NDArray[np.float64], *, encode: bool = False) -> None:
         """Fly one decision of every flight that has not ended.
 
         Args:
             commands: (n, 3) forward, right [m/s], yaw rate [rad/s] with altitude hold; or (n, 4)
-                with an additional downward speed [m/s], NaN = altitude hold. With `by_rates`, (n,
-                4) body rates FRD [rad/s] and thrust 0..1.
+                with an additional downward speed [m/s], NaN = altitude hold. Of the kind body_rates
+                (n, 4) body rates FRD [rad/s] and thrust 0..1.
             encode: True if `observe` is called next.
 
         Raises:
             ValueError: Wrong number or width of commands.
         """
-        least = 4 if self.by_rates else 3
+        least = self.commands.least
         if commands.ndim != 2 or len(commands) != self.n or not least <= commands.shape[1] <= 4:
             accepted = " or ".join(f"({self.n}, {width})" for width in range(least, 5))
             raise ValueError(f"commands of shape {commands.shape}: accepted: {accepted}")
@@ -408,7 +419,7 @@ class Navigation(Stateful):
                 self._decision.pause_us[:] = self._next_stop_us()
             waiting = decide(world, commands, resumed, numbers, whole, seen)
             if self._stops:
-                self.cameras.freeze(self.fleet, self._places.batch, self.seeds)
+                self.cameras.freeze(self.fleet, self.places.batch, self.seeds)
                 if self._trace is not None:
                     self._trace.sample(self.fleet)
             resumed = True
@@ -475,7 +486,7 @@ class Navigation(Stateful):
         """Return the kernels' arguments, rebuilt after changes of arenas or meshes."""
         eye = self.cameras.eye
         self._world = World(
-            *(self.fleet, self._places.batch, self._vehicle, self._rules, self._decision),
+            *(self.fleet, self.places.batch, self._vehicle, self._rules, self._decision),
             *(self._delays.block, self._extra_us, self._number, self._winds.air, self._drift),
             *(eye, self._encoding, self._reward, self.spec.episode.hold_s),
         )
@@ -484,7 +495,7 @@ class Navigation(Stateful):
     def compile_dynamics(self) -> None:
         """Compile or load the flight kernels; no vehicle moves."""
         fly(
-            *(self.fleet, self._places.batch, np.zeros(self.n, np.int64), self._vehicle),
+            *(self.fleet, self.places.batch, np.zeros(self.n, np.int64), self._vehicle),
             *(self._rules, self._winds.air, self._decision),
         )
 
@@ -496,12 +507,12 @@ class Navigation(Stateful):
 
     def _held(self) -> Mapping[str, Any]:
         # Keeps velocity checkpoints compatible with versions before body rates.
-        unsaved = ("room",) if self.by_rates else ("room", "by_rates")
+        unsaved = ("room",) if self.commands.expire else ("room", "by_rates")
         held: dict[str, Any] = {
             "navigation": {
                 "seeds": self.seeds,
                 "zones": self.zones,
-                "begun": self._places.begun,
+                "begun": self.places.begun,
                 "decision": self._number,
                 "extra_us": self._extra_us,
             },
@@ -518,7 +529,7 @@ class Navigation(Stateful):
         timing: dict[str, Any] = {}
         if self._decision.timing.pipelined:
             timing = {"left": decision.left, "in_flight": decision.in_flight}
-        if self.by_rates:
+        if self.commands.expire:
             rates = (decision.newest, decision.wanted, decision.sent_us)
             timing["rates"] = dict(zip(("newest", "wanted", "sent_us"), rates, strict=True))
         if timing:
@@ -533,7 +544,7 @@ class Navigation(Stateful):
             UsageError: The state is from another environment.
         """
         super().set_state(state)
-        self._places.restore()
+        self.places.restore()
         # 0 forces a contact check in the next tick.
         self.fleet.room[:] = 0.0
         self._before_draw, self._world, self._status = 0, None, None
@@ -541,7 +552,7 @@ class Navigation(Stateful):
 
     def _take_frames(self, who: NDArray[np.bool_]) -> None:
         """Capture the frames of vehicles in `who` (n,) at their poses when the frames were due."""
-        seen, arenas = self._decision.seen, self._places.batch
+        seen, arenas = self._decision.seen, self.places.batch
         if self.cameras.may_freeze and (seen.time_us[who] == 0).any():
             self.cameras.freeze(self.fleet, arenas, self.seeds)
         self.cameras.capture(seen, arenas, who, self.seeds)

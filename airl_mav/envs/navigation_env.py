@@ -100,13 +100,12 @@ class FleetDecisions:
         # The fleet's setpoint is overwritten by the decision.
         last = None
         if self._charged:
-            flown = navigation.fleet.setpoint
-            last = flown.copy() if navigation.by_rates else flown[:, (0, 1, 3)]
+            last = navigation.fleet.setpoint[:, navigation.commands.setpoint]
         navigation.fly(chosen, encode=True)
         now = self._before = navigation.flights()
         reward, ending = navigation.paid, navigation.ending
         if self._own or last is not None:
-            level = chosen if navigation.by_rates else chosen[:, :3]
+            level = chosen[:, : navigation.commands.least]
             step = Step(before, now, level, self.environment.episode.hold_s)
             if self._own:
                 reward = self._reward(step)

@@ -270,7 +270,7 @@ def encode_body(
 def heading_told(quaternion: Quat, turn: Vec) -> tuple[float, float]:
     """Return cosine and sine of the heading that telemetry reports for an attitude, body -> NED.
 
-    `turn` is the attitude error [rad], as in `estimation.perturbed`.
+    `turn` is the attitude error [rad], as in `draws.perturbed`.
     """
     angle = math.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
     # The same operations as `np.sinc`, so that the result has the same bits.
@@ -279,6 +279,10 @@ def heading_told(quaternion: Quat, turn: Vec) -> tuple[float, float]:
     error = (math.cos(0.5 * angle), share * turn[0], share * turn[1], share * turn[2])
     yaw = yaw_of(multiply(error, quaternion))
     return math.cos(yaw), math.sin(yaw)
+
+
+LENS = ("projection", "horizontal_fov_deg", "distortion", "range_m", "kind")
+"""Fields of a camera that the layout of an observation contains."""
 
 
 class Sight(NamedTuple):
@@ -314,17 +318,10 @@ def sight_of(spec: EnvironmentSpec, vehicle: VehicleProfile) -> Sight:
     """
     camera = spec.camera.of(vehicle.camera)
     observation = ObservationSpec(
-        layout=spec.layout,
+        **{name: getattr(spec, name) for name in ("layout", "frames", "in_flight", "goal_height")},
+        **{name: getattr(camera, name) for name in LENS},
         height_px=spec.image_height_px,
         width_px=spec.image_width_px,
-        projection=camera.projection,
-        horizontal_fov_deg=camera.horizontal_fov_deg,
-        distortion=camera.distortion,
-        range_m=camera.range_m,
-        kind=camera.kind,
-        frames=spec.frames,
-        in_flight=spec.in_flight,
-        goal_height=spec.goal_height,
         cameras=further_seen(spec, vehicle),
     )
     sight = Sight(camera, {name: vehicle.cameras[name] for name in spec.cameras}, observation)
@@ -353,13 +350,9 @@ def further_seen(spec: EnvironmentSpec, vehicle: VehicleProfile) -> dict[str, Se
             problem = f"vehicle {spec.vehicle} has no such camera; accepted: {has}"
             raise FieldError(f"cameras.{name}", problem=problem)
         found[name] = SeenCamera(
+            **{field: getattr(camera, field) for field in LENS},
             height_px=asked.image_height_px or camera.height_px,
             width_px=asked.image_width_px or camera.width_px,
-            projection=camera.projection,
-            horizontal_fov_deg=camera.horizontal_fov_deg,
-            distortion=camera.distortion,
-            range_m=camera.range_m,
-            kind=camera.kind,
             frames=asked.frames,
         )
     return found

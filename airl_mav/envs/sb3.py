@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
@@ -12,9 +13,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.experts import Expert
 from airl_mav.envs.saved_state import Stateful
-from airl_mav.envs.spec import ExpertName
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.layouts import Encoded
 
@@ -43,6 +42,14 @@ class Watcher(Protocol):
         """
 
 
+class Expert(Stateful):
+    """Expert that labels the flown states, for imitation learning."""
+
+    @abstractmethod
+    def begin(self, slots: Sequence[int]) -> None:
+        """Start episodes in slots."""
+
+
 class NavigationVecEnv(Stateful, VecEnv):
     """Adapter of `NavigationVectorEnv`: SB3's auto-reset, `terminal_observation`, `episode`.
 
@@ -69,10 +76,9 @@ class NavigationVecEnv(Stateful, VecEnv):
         self._return = np.zeros(env.num_envs)
         self._length = np.zeros(env.num_envs, np.int64)
 
-    def teach(self, name: ExpertName) -> Expert:
-        """Return an expert that labels the flown states, for imitation learning."""
-        self._expert = Expert(name, self.env.navigation)
-        return self._expert
+    def teach(self, expert: Expert) -> None:
+        """Tell an expert that labels the flown states when episodes start, and save its state."""
+        self._expert = expert
 
     def reset(self) -> Encoded:
         """Start n episodes with the settings of `seed()` and `set_options()`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
@@ -38,10 +38,6 @@ SHIPPED_REWARDS = ("shaped", "timed", "progress", "paced", "paper-scaled", "pape
 """See `envs.rewards`."""
 
 RewardName = Annotated[str, part_name(REWARDS, SHIPPED_REWARDS)]
-
-
-ExpertName = Literal["greedy", "planner", "gates"]
-"""See `envs.experts`."""
 
 
 class EpisodeRules(ProfileModel):

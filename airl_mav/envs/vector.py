@@ -201,10 +201,10 @@ class NavigationVectorEnv(FleetDecisions, Stateful, VectorEnv[Encoded, NDArray[A
     def _next_seeds(self, n: int) -> list[int]:
         """Draw the seeds of n episodes; if their arenas are missing, generate more ahead."""
         zone, seeds = self._present_zone, draw_seeds(self.np_random, n)
-        if not self.navigation.prepared(seeds, zone):
+        if not self.navigation.places.prepared(seeds, zone):
             # From a copy of the generator, so the same seeds will be drawn later.
             following = draw_seeds(deepcopy(self.np_random), AHEAD)
-            self.navigation.prepare([*seeds, *following], zone)
+            self.navigation.places.prepare([*seeds, *following], zone)
         return seeds
 
     def _final(

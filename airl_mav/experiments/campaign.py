@@ -1,26 +1,45 @@
-"""Campaigns: evaluations of an experiment, flown by one executor, with separate run folders."""
+"""Campaigns: evaluations or trainings that belong together, in one resumable folder.
+
+    campaign.json   the declaration: cells, comparisons, settings
+    <cell>/         run folder of an evaluation, or training folder of a trial
+
+The declaration is written first and atomically. Progress is derived from the cells' folders.
+`run_cells` flies evaluations by one executor.
+"""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, nullcontext
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, nullcontext
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.compiling import COMPILING
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import read_typed, write_json
 from airl_mav.core.first_start import compile_first
+from airl_mav.core.machine import provenance
 from airl_mav.core.progress import Progress
-from airl_mav.experiments.campaign_store import CampaignStore
 from airl_mav.experiments.executors import Executor, Flier, FlyEpisodes, Stop, WorkerError, never
 from airl_mav.experiments.live import Ended
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.observer import Tally
-from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, locked
+from airl_mav.rehearsal.run_folder import (
+    CAMPAIGN_FILE,
+    FlownEpisode,
+    RunFolder,
+    another_config,
+    check_folder,
+    locked,
+)
 from airl_mav.scenario.resolve import PlannedEpisode, ResolvedScenario, plan_of
 
 INTERVAL_S = 2.0
@@ -214,7 +233,7 @@ def run_cell(
 
 
 def run_cells(
-    store: CampaignStore,
+    root: Path,
     cells: Sequence[Cell],
     executor: Executor,
     *,
@@ -222,14 +241,14 @@ def run_cells(
     stop: Stop = never,
     ended: Callable[[CellRun], None] = lambda _: None,
 ) -> CampaignRun:
-    """Fly the rest of a campaign until `stop`, which is polled several times per second.
+    """Fly the rest of a campaign in `root` until `stop`, polled several times per second.
 
     `cells` have unique names; cells with the same flights share a run folder. `ended` is called for
     each complete cell, also if it was complete before.
     """
     first_of = shared_flights(cells)
     unique = [cell for cell in cells if first_of[cell.name] is cell]
-    paths = {cell.name: store.cell_path(cell.name) for cell in unique}
+    paths = {cell.name: root.absolute() / cell.name for cell in unique}
     run = _run(paths, unique, executor, progress or Progress(), stop, ended)
     flown = {each.cell.name: each for each in run.cells}
     shown = [
@@ -410,3 +429,105 @@ def _run(
     elif not complete or stop():
         ended = "interrupted"
     return CampaignRun(tuple(runs), complete, ended, error)
+
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class DeclaredCell:
+    """One evaluation or one training trial."""
+
+    title: str
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Settings of the flights or the training, which identify the cell."""
+    folder: str | None = None
+    """Cell with the same flights, whose folder is shared; None = a separate folder."""
+    role: str = ""
+    """Role in the comparison: `reference`, `target`, a latency, a level."""
+    group: str = ""
+    """Group of cells that are compared with each other."""
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """Contents of a campaign."""
+
+    kind: str
+    """Kind of experiment: gap, ladder, sweep, ..."""
+    settings: dict[str, Any]
+    cells: dict[str, DeclaredCell]
+    """Cells by name, which is the name of the cell's folder."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a cell name that is not a valid folder name."""
+        for name in self.cells:
+            if Path(name).name != name or name in ("", "..", CAMPAIGN_FILE):
+                raise ValueError(f"cell {name!r}: accepted: the name of a folder")
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Content of `campaign.json`."""
+
+    declaration: Declaration
+    made: dict[str, Any]
+    """Provenance at creation: `created_utc`, `command`, `versions`, `machine`, `git`."""
+    schema: int = SCHEMA
+
+
+_CAMPAIGN = TypeAdapter(Campaign)
+
+
+def load_campaign(path: Path) -> Campaign:
+    """Read the declaration of the campaign in a folder. Raises UsageError."""
+    return read_typed(path / CAMPAIGN_FILE, _CAMPAIGN, SCHEMA, "campaign")
+
+
+@contextmanager
+def open_campaign(
+    path: Path,
+    declaration: Declaration,
+    *,
+    command: str,
+    free: Collection[str] = (),
+    growing: Collection[str] = (),
+    say: Callable[[str], None] = lambda _: None,
+) -> Iterator[Campaign]:
+    """Open and lock a campaign's folder, new or to resume; cells may be added or left for later.
+
+    Settings in `free`, or in tables named there, may differ on resumption. Numeric cell settings in
+    `growing` may grow. `say` is called when another process has locked the folder. Raises
+    UsageError for other content or changed settings.
+    """
+    path = path.absolute()
+    with locked(path, say):
+        check_folder(path, CAMPAIGN_FILE)
+        held = load_campaign(path) if (path / CAMPAIGN_FILE).exists() else None
+        if held and (difference := _difference(held.declaration, declaration, free, growing)):
+            raise UsageError(
+                f"--out {path}: holds a campaign with {difference}; accepted: another folder, or "
+                "the same settings to go on"
+            )
+        campaign = Campaign(declaration, held.made if held else provenance(command))
+        if campaign != held:
+            write_json(path / CAMPAIGN_FILE, asdict(campaign))
+        yield campaign
+
+
+def _difference(
+    held: Declaration, asked: Declaration, free: Collection[str], growing: Collection[str]
+) -> str | None:
+    """Return a description of the first difference, or None."""
+    if held.kind != asked.kind:
+        return f"kind = {held.kind!r}, not {asked.kind!r}"
+    if difference := another_config(held.settings, asked.settings, free):
+        return difference
+    for name, cell in asked.cells.items():
+        if (theirs := held.cells.get(name)) is None:
+            continue
+        old, new = theirs.settings, cell.settings
+        grown = {each for each in growing if old.get(each, 0) < new.get(each, 0)}
+        if difference := another_config(old, new, {*free, *grown}):
+            return f"another cell {name}: {difference}"
+    return None

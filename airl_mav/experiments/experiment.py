@@ -22,15 +22,12 @@ from airl_mav.experiments.campaign import (
     CampaignRun,
     Cell,
     CellRun,
-    run_cell,
-    run_cells,
-    shared_flights,
-)
-from airl_mav.experiments.campaign_store import (
-    CampaignStore,
     Declaration,
     DeclaredCell,
     open_campaign,
+    run_cell,
+    run_cells,
+    shared_flights,
 )
 from airl_mav.experiments.executors import Executor, open_executor
 from airl_mav.experiments.live import Ended, FlownRun, fly_live, tell_end
@@ -194,12 +191,12 @@ def run_experiment(experiment: Experiment, out: Path | None, progress: Progress)
         free=free_fields("gym"),
         growing=("episodes",),
         say=lambda text: progress.note(text, "yellow"),
-    ) as store:
+    ):
         for level, group in groupby(
             experiment.cells, key=lambda cell: cell.scenario.scenario.level
         ):
             fly = _fly_live if level == "sitl" else _fly_by_workers
-            flown = fly(store, tuple(group), progress, tell)
+            flown = fly(root, tuple(group), progress, tell)
             runs += flown.cells
             state, problem = flown.ended, flown.error or ""
             if state != "complete":
@@ -211,7 +208,7 @@ def run_experiment(experiment: Experiment, out: Path | None, progress: Progress)
 
 
 def _fly_by_workers(
-    store: CampaignStore,
+    root: Path,
     cells: Sequence[Cell],
     progress: Progress,
     tell: Callable[[CellRun], None],
@@ -219,11 +216,11 @@ def _fly_by_workers(
     asked = cells[0].scenario.scenario
     in_process = asked.level == "gym"
     with stop_on_signals() as stop, open_executor(asked, in_process=in_process) as executor:
-        return run_cells(store, cells, executor, progress=progress, stop=stop, ended=tell)
+        return run_cells(root, cells, executor, progress=progress, stop=stop, ended=tell)
 
 
 def _fly_live(
-    store: CampaignStore,
+    root: Path,
     cells: Sequence[Cell],
     progress: Progress,
     tell: Callable[[CellRun], None],
@@ -234,7 +231,7 @@ def _fly_live(
         if (first := first_of[cell.name]) is not cell:
             runs.append(replace(next(run for run in runs if run.cell is first), cell=cell))
             continue
-        flown = fly_live(cell.scenario, store.cell_path(cell.name), progress, name=cell.name)
+        flown = fly_live(cell.scenario, root.absolute() / cell.name, progress, name=cell.name)
         runs.append(CellRun(cell, flown.path, flown.episodes, flown.new))
         if flown.ended != "complete":
             return CampaignRun(tuple(runs), False, flown.ended, flown.problem)

@@ -29,7 +29,8 @@ from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import measure_quality
 from airl_mav.policy.learned import LearnedPolicy
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.policy.observation_spec import ObservationSpec, SeenCamera
+from airl_mav.prediction import Compensator
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.scenario.checks import action_generator
 from airl_mav.scenario.resolve import PlannedEpisode, ResolvedScenario
@@ -49,44 +50,33 @@ def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
         if scenario.policy.program is not None:
             shape["cameras"] = {name: {} for name in scenario.vehicle.cameras}
     else:
+        seen, actions = card.observation, card.actions
         shape = {
-            "layout": card.observation.layout,
-            "image_width_px": card.observation.width_px,
-            "image_height_px": card.observation.height_px,
-            "frames": card.observation.frames,
-            "in_flight": card.observation.in_flight,
-            "goal_height": card.observation.goal_height,
-            "actions": card.actions.set,
-            "max_speed_m_s": card.actions.max_speed_m_s,
-            "max_rate_deg_s": card.actions.max_rate_deg_s,
-            "cameras": {
-                name: {
-                    "image_width_px": seen.width_px,
-                    "image_height_px": seen.height_px,
-                    "frames": seen.frames,
-                }
-                for name, seen in card.observation.cameras.items()
-            },
+            **_image_of(seen),
+            **{name: getattr(seen, name) for name in ("layout", "in_flight", "goal_height")},
+            "actions": actions.set,
+            "max_speed_m_s": actions.max_speed_m_s,
+            "max_rate_deg_s": actions.max_rate_deg_s,
+            "cameras": {name: _image_of(each) for name, each in seen.cameras.items()},
         }
     pilot = scenario.pilot
+    episode = {
+        "goal_radius_m": pilot.goal_radius_m,
+        "time_limit_s": asked.time_limit_s,
+        "hold_s": pilot.hold_s,
+        "hover_after_s": scenario.watchdog.hover_after_s,
+        "altitude_m": pilot.altitude_m,
+    }
     # The vectorized simulator repeats velocity commands without a timeout.
-    by_rates = pilot.commands == "body_rates"
+    if pilot.commands == "body_rates":
+        episode["decision_timeout_s"] = scenario.watchdog.decision_timeout_s
     return spec_of(
         None,
         {
             "vehicle": asked.vehicle,
             "arena": asked.arena,
             **shape,
-            "episode": {
-                "goal_radius_m": pilot.goal_radius_m,
-                "time_limit_s": asked.time_limit_s,
-                "hold_s": pilot.hold_s,
-                "hover_after_s": scenario.watchdog.hover_after_s,
-                **(
-                    {"decision_timeout_s": scenario.watchdog.decision_timeout_s} if by_rates else {}
-                ),
-                "altitude_m": pilot.altitude_m,
-            },
+            "episode": episode,
             "delay": {
                 "computer": asked.computer,
                 "workload": asked.workload,
@@ -98,6 +88,12 @@ def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
             "randomisation": asked.spread.model_dump() | asked.sensors.model_dump(),
         },
     )
+
+
+def _image_of(seen: ObservationSpec | SeenCamera) -> dict[str, int]:
+    """Return size and number of images of a camera, as fields of an environment."""
+    width_px, height_px = seen.width_px, seen.height_px
+    return {"image_width_px": width_px, "image_height_px": height_px, "frames": seen.frames}
 
 
 def navigation_of(

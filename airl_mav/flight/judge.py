@@ -223,21 +223,21 @@ def host_figures(
     tick. `decisions` has stamps by column, as in `latency.npz`. `excused` are intervals in which
     requested faults or slow images may delay decisions: faults of the camera, a link or a process.
     """
-    kept = None
-    if wall_s and speed:
-        kept = flight_us / US_PER_S / (wall_s * speed)
-    whole_us = flight_us + slipped_us
-    late_us = LATE_FRAMES * frame_period_us
+    whole_us, late_us = flight_us + slipped_us, LATE_FRAMES * frame_period_us
+    began_us, held_us = decisions.get("infer_start_us"), decisions.get("held_until_us")
+    stale = late = None
+    if began_us is not None and "capture_us" in decisions:
+        stale = _share_beyond(decisions["capture_us"], began_us, late_us, excused)
+    if began_us is not None and held_us is not None:
+        # The end of each hold time, and the start of the next decision.
+        late = _share_beyond(held_us[:-1], began_us[1:], late_us, excused)
+    ticks = lateness_us.size
     return HostFigures(
         given_up=slipped_us / whole_us if whole_us > 0 else 0.0,
-        tick_lateness_ms=float(np.percentile(lateness_us, 99.0)) / US_PER_MS
-        if lateness_us.size
-        else None,
-        speed=kept,
-        stale_frames=_share_beyond(decisions, "capture_us", "infer_start_us", late_us, excused),
-        late_decisions=_share_beyond(
-            _shifted(decisions), "held_until_us", "infer_start_us", late_us, excused
-        ),
+        tick_lateness_ms=float(np.percentile(lateness_us, 99.0)) / US_PER_MS if ticks else None,
+        speed=flight_us / US_PER_S / (wall_s * speed) if wall_s and speed else None,
+        stale_frames=stale,
+        late_decisions=late,
     )
 
 
@@ -254,27 +254,13 @@ def host_faults(figures: HostFigures, strangers: Sequence[str] = ()) -> tuple[st
     return tuple(faults)
 
 
-def _shifted(decisions: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Return the end of each hold time beside the start of the next decision."""
-    if "held_until_us" not in decisions or "infer_start_us" not in decisions:
-        return {}
-    return {
-        "held_until_us": decisions["held_until_us"][:-1],
-        "infer_start_us": decisions["infer_start_us"][1:],
-    }
-
-
 def _share_beyond(
-    stamps: Mapping[str, NDArray[Any]],
-    start: str,
-    end: str,
+    first: NDArray[np.int64],
+    last: NDArray[np.int64],
     limit_us: float,
     excused: Sequence[tuple[int, int]],
 ) -> float | None:
     """Return the share of intervals over a limit, without excused times; None: no interval."""
-    if start not in stamps or end not in stamps:
-        return None
-    first, last = stamps[start], stamps[end]
     both = (first != NO_STAMP) & (last != NO_STAMP)
     for from_us, to_us in excused:
         both &= (last < from_us) | (first > to_us)

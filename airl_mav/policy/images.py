@@ -5,7 +5,7 @@ return at about the camera's height. A planar lidar on a level platform measures
 MAVLink's OBSTACLE_DISTANCE carries it. Earlier scans are compensated for the vehicle's own motion:
 static objects keep their position in the newest scan, moving ones do not.
 
-This is the numpy version of the companion; `envs.encoding` has the same as compiled loops.
+This is the numpy version of the companion; `envs.observations` has the same as compiled loops.
 """
 
 from __future__ import annotations
@@ -172,11 +172,13 @@ class Scanning(NamedTuple):
 @cache
 def rays_of(camera: Intrinsics) -> ScanRays:
     """Return the rays of a pinhole or cylindrical camera. Raises UsageError for a fisheye."""
-    if camera.projection == "fisheye":
-        raise UsageError("a fisheye gives no level scan; accepted: a pinhole or a cylinder")
+    if camera.model.tabled:
+        raise UsageError(
+            f"a {camera.projection} gives no level scan; accepted: a pinhole or a cylinder"
+        )
     columns: Floats = (np.arange(camera.width, dtype=np.float64) - camera.cx) / camera.focal
     down: Floats = (np.arange(camera.height, dtype=np.float64) - camera.cy) / camera.focal
-    if camera.cylindrical:
+    if camera.model.cylindrical:
         return ScanRays(np.cos(columns), np.sin(columns), down, camera.horizontal_fov_rad)
     return ScanRays(np.ones(camera.width), columns, down, camera.horizontal_fov_rad)
 

@@ -39,7 +39,7 @@ from airl_mav.policy.images import (
     scans_of,
 )
 from airl_mav.policy.observation import Observation
-from airl_mav.profiles.projections import CHANNELS, KINDS
+from airl_mav.profiles.projections import CHANNELS, KINDS, PROJECTIONS
 
 if TYPE_CHECKING:
     from airl_mav.policy.observation_spec import ObservationSpec, SeenCamera
@@ -315,8 +315,9 @@ class ScanLayout(Layout):
 
     def problem(self, spec: ObservationSpec) -> str | None:
         """Return why the layout does not support a specification; rejects a fisheye."""
-        if (problem := super().problem(spec)) is None and spec.projection == "fisheye":
-            return "projection = 'fisheye': accepted: pinhole or cylindrical with layout 'scan'"
+        if (problem := super().problem(spec)) is None and PROJECTIONS[spec.projection].tabled:
+            accepted = "pinhole or cylindrical with layout 'scan'"
+            return f"projection = {spec.projection!r}: accepted: {accepted}"
         return problem
 
     def image_shape(self, spec: ObservationSpec) -> tuple[int, int, int]:

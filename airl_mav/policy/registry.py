@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.intrinsics import fisheye_rays
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.plugins import POLICIES as DOOR
@@ -278,11 +277,11 @@ def near_points(observation: Observation, band_m: float) -> NDArray[np.float64]:
     z = depth[seen].astype(np.float64)
     right, down = (u - k.cx) / k.focal * z, (v - k.cy) / k.focal * z
     ahead = z
-    if k.cylindrical:
+    if k.model.cylindrical:
         angle = (u - k.cx) / k.focal
         ahead, right = np.cos(angle) * z, np.sin(angle) * z
-    elif k.projection == "fisheye":
-        ahead, right, down = fisheye_rays(k)[:, v, u] * z
+    elif k.model.tabled:
+        ahead, right, down = k.rays[:, v, u] * z
     # Heading frame from body: R_y(pitch) R_x(roll).
     cr, sr = math.cos(observation.roll), math.sin(observation.roll)
     cp, sp = math.cos(observation.pitch), math.sin(observation.pitch)

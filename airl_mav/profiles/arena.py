@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args
 
 from pydantic import (
     Field,
@@ -14,11 +14,18 @@ from pydantic import (
     model_validator,
 )
 
-from airl_mav.core.fields import Each, ProfileModel, later_field, quantity
+from airl_mav.core.fields import Each, ProfileModel, later_field, quantity, section
 from airl_mav.core.plugins import GENERATORS, part_name
-from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.assets import ASSETS, Asset
 from airl_mav.profiles.walls import HEADROOM_M, Gates, Rooms, check_gates, check_rooms
+
+if TYPE_CHECKING:
+    Appearance: TypeAlias = Any
+else:
+    Appearance = section("arena.appearance")
+
+DEFAULT_APPEARANCE = Appearance()
+"""Appearance of an arena whose profile does not define one."""
 
 LEAST_RELIEF_M = 0.2
 """Minimum height of the highest hill [m]."""

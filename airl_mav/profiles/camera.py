@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.util import find_spec
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
 from pydantic import (
     BeforeValidator,
-    SerializerFunctionWrapHandler,
     ValidationError,
-    model_serializer,
     model_validator,
 )
 
-from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.addons import load_entry
+from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import Each, ProfileModel, later_field, optional, quantity, switch
+from airl_mav.core.fields import Each, ProfileModel, later_field, quantity, section
 from airl_mav.profiles.projections import (
     CYLINDER_MOST_DEG,
     MOST_COEFFICIENT,
+    PROJECTIONS,
     UNDISTORTED,
     CameraKind,
     Distortion,
@@ -35,130 +34,9 @@ if TYPE_CHECKING:
     from airl_mav.profiles.arena import ArenaSpec
     from airl_mav.profiles.conditions import SensorNoise
 
-
-class AutoExposure(ProfileModel):
-    """A gain that follows the brightness of the image; see `camera.imaging`."""
-
-    target: float = quantity(
-        "mean light of the image that it aims at; 1 is white", "1", ge=0.01, le=0.9, default=0.18
-    )
-    time_constant_s: float = quantity(
-        "time in which it covers 63 % of the way to the gain that is due; 0: it is there at once,"
-        " which is all that the batch twin has",
-        "s",
-        ge=0,
-        le=10,
-        default=0.3,
-    )
-    least_gain: float = quantity("least gain", "1", ge=0.001, le=1, default=0.05)
-    most_gain: float = quantity("greatest gain", "1", ge=1, le=1000, default=16.0)
-
-
-class Imaging(ProfileModel):
-    """Image formation from light to pixel values; every effect is off by default."""
-
-    exposure_ms: float = quantity(
-        "exposure time, in which motion blurs the image; the frame's stamp is its middle. No longer"
-        " than the time between two frames",
-        "ms",
-        ge=0,
-        le=1000,
-        default=0.0,
-    )
-    samples: int = quantity("images of which an exposure is the mean", "1", ge=1, le=64, default=8)
-    readout_ms: float = quantity(
-        "readout time of a rolling shutter: of h rows, row r is exposed r / h of it later than the"
-        " first. The frame's stamp is the middle of it. 0: a global shutter. No longer than the"
-        " time between two frames",
-        "ms",
-        ge=0,
-        le=1000,
-        default=0.0,
-    )
-    readout_bands: int = quantity(
-        "bands of rows that are exposed together, at most one for each row: a row's moment is right"
-        " to readout_ms / (2 readout_bands), and an image takes so many times as long; only matters"
-        " with readout_ms",
-        "1",
-        ge=1,
-        le=480,
-        default=16,
-    )
-    gain: float = quantity(
-        "times this the light; 1: a white surface under the irradiance 1 is white",
-        "1",
-        ge=0.001,
-        le=1000,
-        default=1.0,
-    )
-    gain_spread_ev: float = quantity(
-        "the gain, or what auto exposure aims at, is off by a power of two from minus to plus this,"
-        " drawn with every episode",
-        "1",
-        ge=0,
-        le=8,
-        default=0.0,
-    )
-    auto_exposure: AutoExposure | None = optional(
-        "how the gain follows the light; left out: it is `gain`"
-    )
-    vignetting: float = quantity(
-        "share of the light that the farthest corner lacks; it grows with the square of the"
-        " distance from the optical axis",
-        "1",
-        ge=0,
-        le=1,
-        default=0.0,
-    )
-    full_well_e: float | None = quantity(
-        "electrons that a white pixel holds at a gain of 1 or less, which set the noise of photons;"
-        " left out: no noise",
-        "1",
-        ge=10,
-        le=1_000_000,
-        default=None,
-    )
-    read_noise_e: float = quantity(
-        "noise of reading a pixel, sd in electrons; only with full_well_e",
-        "1",
-        ge=0,
-        le=10_000,
-        default=0.0,
-    )
-    bayer: bool = switch(
-        "whether each pixel measures one colour (mosaic RGGB) and the others are"
-        " interpolated bilinearly; only of kind rgb"
-    )
-    jpeg_quality: int | None = quantity(
-        "images are compressed as JPEG of this quality, by libjpeg's scale; left out: they are not",
-        "1",
-        ge=1,
-        le=100,
-        default=None,
-    )
-
-    @model_serializer(mode="wrap")
-    def _without_the_default(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Profiles with a global shutter keep their digests.
-        data: dict[str, Any] = dump(self)
-        if not self.readout_ms:
-            data.pop("readout_ms", None)
-            data.pop("readout_bands", None)
-        return data
-
-    @model_validator(mode="after")
-    def _goes_together(self) -> Imaging:
-        if self.read_noise_e and self.full_well_e is None:
-            raise ValueError(
-                f"read_noise_e = {self.read_noise_e:g}: accepted: 0 without full_well_e"
-            )
-        if self.gain != 1.0 and self.auto_exposure is not None:
-            raise ValueError(f"gain = {self.gain:g}: accepted: 1 with a table auto_exposure")
-        return self
-
-
-LEAST_ROWS = 6
-"""Minimum rows of an image, except with a cylindrical projection."""
+    Imaging: TypeAlias = Any
+else:
+    Imaging = section("camera.imaging")
 
 Coefficients = Annotated[Distortion, Each(-MOST_COEFFICIENT, MOST_COEFFICIENT)]
 """Distortion coefficients of a fisheye."""
@@ -266,7 +144,7 @@ class Camera(ProfileModel):
             "camera.distortion", self.projection, self.horizontal_fov_deg, self.distortion
         )
         check_rows("camera.height_px", self)
-        if self.stereo is not None and self.projection != "pinhole":
+        if self.stereo is not None and not PROJECTIONS[self.projection].planar:
             raise FieldError(
                 "camera.stereo", self.projection, "left out where the projection is not pinhole"
             )
@@ -288,7 +166,7 @@ def check_matched(field: str, camera: Camera) -> None:
             problem="with a table camera.imaging; accepted: rgb or grey with one",
         )
     if camera.imaging is not None:
-        _check_imaging(camera.imaging, camera)
+        camera.imaging.check(camera)
     if camera.ranging is not None and (camera.kind != "depth" or camera.stereo is not None):
         problem = (
             "with a table camera.ranging; accepted: 'depth' with one, and without camera.stereo"
@@ -302,22 +180,10 @@ def check_matched(field: str, camera: Camera) -> None:
 
 def check_rows(field: str, camera: Camera) -> None:
     """Raise FieldError, naming the field, for an image with too few rows for its projection."""
-    if camera.height_px < LEAST_ROWS and camera.projection != "cylindrical":
-        accepted = f"value >= {LEAST_ROWS} px with projection {camera.projection!r}"
+    least = PROJECTIONS[camera.projection].least_rows
+    if camera.height_px < least:
+        accepted = f"value >= {least} px with projection {camera.projection!r}"
         raise FieldError(field, camera.height_px, accepted)
-
-
-def _check_imaging(imaging: Imaging, camera: Camera) -> None:
-    """Raise FieldError for settings that the camera's kind or rate does not support."""
-    if imaging.bayer and camera.kind != "rgb":
-        accepted = f"false with a camera of kind {camera.kind!r}"
-        raise FieldError("camera.imaging.bayer", True, accepted)
-    period_ms = camera.period_us / US_PER_MS
-    times = (("exposure_ms", imaging.exposure_ms), ("readout_ms", imaging.readout_ms))
-    for name, value in times:
-        if value > period_ms:
-            accepted = f"value <= {period_ms:.4g} ms, the time between two frames"
-            raise FieldError(f"camera.imaging.{name}", value, accepted)
 
 
 # --- additional cameras: by name, all triggered with the main one
@@ -428,22 +294,9 @@ def check_renderer(
     """Raise FieldError for cameras or arenas that a renderer does not support."""
     if renderer == "raycast":
         return
+    drawn = load_entry("airl_mav", "RENDERERS", renderer, ("renderer", renderer), "colour")
     for each in (camera, *further):
-        _check_drawn(each, renderer, arena)
-
-
-def _check_drawn(camera: Camera, renderer: Renderer, arena: ArenaSpec) -> None:
-    accepted = None
-    if camera.kind == "depth":
-        accepted = "raycast with a depth camera; mitsuba draws colour"
-    elif camera.imaging is not None:
-        accepted = "raycast with a camera that has a table imaging"
-    elif arena.appearance.fog.drawn:
-        accepted = "raycast in an arena with fog"
-    elif find_spec("mitsuba") is None:
-        accepted = "raycast: mitsuba is not installed (pip install 'airl-mav[render]')"
-    if accepted is not None:
-        raise FieldError("renderer", renderer, accepted)
+        drawn.check(each, arena)
 
 
 def check_twin_imaging(camera: Camera, name: str = "") -> None:

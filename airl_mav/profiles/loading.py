@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import sys
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel
+from pydantic import (
+    BaseModel,
+    Field,
+    SerializationInfo,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+)
 
 from airl_mav.core.errors import UsageError, shown, usage_errors
-from airl_mav.core.fields import validated
+from airl_mav.core.fields import ProfileModel, validated
 from airl_mav.core.files import DEEPEST, deeper_than
-from airl_mav.profiles.assets import CONTENT, CheckedFile, read_checked
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -67,11 +74,11 @@ def load_profile(kind: Kind, name: str, model: type[Model]) -> Model:
     path = _path(kind, name)
     data = _read(kind, path, ())
     profile = validated(model, data, path)
-    for asset in getattr(profile, "assets", {}).values():
-        if asset.mesh is not None:
-            _check_file(asset.mesh, path, "assets")
-    for image in getattr(getattr(profile, "appearance", None), "images", ()):
-        _check_file(image, path, "appearance.materials")
+    for table, named in _checked_files(profile, ""):
+        try:
+            read_checked(named)
+        except UsageError as error:
+            raise UsageError(f"{path}: {table}: {error}") from None
     return profile
 
 
@@ -101,7 +108,7 @@ def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     if kind == "vehicles":
         _name_power_model(data, path)
     if kind == "arenas":
-        _anchor_files(data, path)
+        _anchor_files(data, path.parent.absolute())
     base = data.pop("base", None)
     if base is None:
         return data
@@ -128,25 +135,28 @@ def read_toml(path: Path) -> dict[str, Any]:
     return found
 
 
-def _anchor_files(data: dict[str, Any], path: Path) -> None:
-    """Make paths to meshes and images absolute: they are relative to the profile's folder."""
-    look = data.get("appearance")
-    for owners, field in (
-        (data.get("assets"), "mesh"),
-        (look.get("materials") if isinstance(look, dict) else None, "image"),
-    ):
-        for owner in owners.values() if isinstance(owners, dict) else ():
-            named = owner.get(field) if isinstance(owner, dict) else None
-            if isinstance(named, dict) and isinstance(file := named.get("file"), str) and file:
-                named["file"] = str(path.parent.absolute() / file)
+def _anchor_files(data: object, folder: Path) -> None:
+    """Make the paths of a table's `CheckedFile`s absolute: they are relative to its folder."""
+    if not isinstance(data, dict):
+        return
+    if "sha256" in data and isinstance(file := data.get("file"), str) and file:
+        data["file"] = str(folder / file)
+    for value in data.values():
+        _anchor_files(value, folder)
 
 
-def _check_file(named: CheckedFile, path: Path, table: str) -> None:
-    """Raise UsageError, naming the profile, if a file is missing or its digest differs."""
-    try:
-        read_checked(named)
-    except UsageError as error:
-        raise UsageError(f"{path}: {table}: {error}") from None
+def _checked_files(value: object, table: str) -> Iterator[tuple[str, CheckedFile]]:
+    """Yield the files of a profile, each with the name of its innermost table of named entries."""
+    if isinstance(value, CheckedFile):
+        yield table, value
+    elif isinstance(value, BaseModel):
+        for name, field in value:
+            inner = f"{table}.{name}" if table else name
+            if isinstance(field, Mapping):
+                for each in field.values():
+                    yield from ((inner, file) for _, file in _checked_files(each, ""))
+            else:
+                yield from _checked_files(field, inner)
 
 
 def _name_power_model(data: dict[str, Any], path: Path) -> None:
@@ -183,3 +193,56 @@ def _overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
         else:
             merged[key] = value
     return merged
+
+
+MOST_FILE_BYTES = 1 << 27
+"""Maximum size of a file."""
+
+
+CONTENT = {"content": True}
+"""Context of a serialisation of content without file paths."""
+
+
+class CheckedFile(ProfileModel):
+    """A file beside a profile, verified by its digest."""
+
+    file: str = Field(min_length=1, description="a path from the profile's folder")
+    sha256: str = Field(description="SHA-256 of that file, hexadecimal")
+
+    @field_validator("sha256")
+    @classmethod
+    def _is_a_digest(cls, value: str) -> str:
+        if len(value) != 64 or set(value) - set("0123456789abcdef"):
+            raise ValueError(f"{value!r}; accepted: 64 hexadecimal digits")
+        return value
+
+    @model_serializer(mode="wrap")
+    def _without_place(
+        self, dump: SerializerFunctionWrapHandler, info: SerializationInfo
+    ) -> dict[str, Any]:
+        """Omit the path if only content counts: the digest identifies the file."""
+        data: dict[str, Any] = dump(self)
+        if info.context == CONTENT:
+            del data["file"]
+        return data
+
+
+def read_checked(named: CheckedFile) -> bytes:
+    """Return the bytes of a file. Raises UsageError if missing or the digest differs."""
+    path = Path(named.file)
+    try:
+        if path.exists() and not path.is_file():
+            raise UsageError(f"{named.file}: no file")
+        with path.open("rb") as file:
+            data = file.read(MOST_FILE_BYTES + 1)
+    except OSError as error:
+        raise UsageError(f"{named.file}: {error.strerror}") from None
+    if len(data) > MOST_FILE_BYTES:
+        raise UsageError(f"{named.file}: accepted: a file of at most {MOST_FILE_BYTES:,} bytes")
+    found = hashlib.sha256(data).hexdigest()
+    if found != named.sha256:
+        raise UsageError(
+            f"{named.file}: changed since its arena was made: SHA-256 {found[:16]}...; accepted: "
+            f"{named.sha256[:16]}..."
+        )
+    return data

@@ -1,5 +1,9 @@
 """Kinds of cameras: the content of their pixels, their projection, and a fisheye's distortion.
 
+A projection is an object in the table `PROJECTIONS`: limits, focal length, rays, positions in the
+image, optical flow and export. To add one, write a `ProjectionModel` and enter it there; cameras,
+policies, frames and pictures then accept its name.
+
 A fisheye has the model of Kannala and Brandt ("A generic camera model and calibration method for
 conventional, wide-angle, and fish-eye lenses", 2006) as in OpenCV's `fisheye` and ROS's
 `equidistant`: a ray at an angle theta [rad] from the optical axis is at the distance r = focal
@@ -16,22 +20,29 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, Final, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core.addons import entries
 from airl_mav.core.errors import FieldError
+
+if TYPE_CHECKING:
+    from airl_mav.camera.intrinsics import Intrinsics
 
 CameraKind = Literal["depth", "rgb", "grey"]
 """`depth`: uint16 (h, w), Z16 in millimetres. `rgb`: uint8 (h, w, 3), sRGB. `grey`: uint8
 (h, w, 1), luma of the sRGB numbers."""
 
-Renderer = Literal["raycast", "mitsuba"]
-"""Renderer of images: the ray caster, or Mitsuba's path tracer as the reference for colour."""
+SLOW: Final = frozenset(entries("airl_mav", "RENDERERS"))
+"""Renderers of add-ons, which need longer than a tick for an image."""
 
-SLOW: Final[frozenset[Renderer]] = frozenset({"mitsuba"})
-"""Renderers that need longer than a tick for an image."""
+if TYPE_CHECKING:
+    Renderer: TypeAlias = str
+else:
+    Renderer = Literal[("raycast", *sorted(SLOW))]
+"""Renderer of images: the ray caster, or one of an add-on."""
 
 KINDS: Final[tuple[CameraKind, ...]] = get_args(CameraKind)
 
@@ -44,41 +55,13 @@ def shape_of(kind: CameraKind, height: int, width: int) -> tuple[int, ...]:
     return (height, width) if kind == "depth" else (height, width, CHANNELS[kind])
 
 
-Projection = Literal["pinhole", "cylindrical", "fisheye"]
-"""Projection of directions to the image; `camera.intrinsics.Intrinsics` has the formulas."""
-
-PROJECTIONS: tuple[Projection, ...] = get_args(Projection)
-
-PINHOLE_BELOW_DEG, CYLINDER_MOST_DEG, FISHEYE_MOST_DEG = 170.0, 360.0, 190.0
-"""Limit of a pinhole's horizontal field of view, exclusive, and of the others, inclusive [deg].
-
-A fisheye sees up to half its field of view from the optical axis, in any direction."""
-
-
-def check_fov(field: str, projection: Projection, horizontal_fov_deg: float) -> None:
-    """Raise FieldError, naming the field, for a field of view [deg] beyond a projection's limit."""
-    beyond = {
-        "pinhole": horizontal_fov_deg >= PINHOLE_BELOW_DEG,
-        "cylindrical": horizontal_fov_deg > CYLINDER_MOST_DEG,
-        "fisheye": horizontal_fov_deg > FISHEYE_MOST_DEG,
-    }
-    if beyond[projection]:
-        raise FieldError(
-            field,
-            horizontal_fov_deg,
-            f"value < {PINHOLE_BELOW_DEG:g} deg with projection 'pinhole', value <="
-            f" {CYLINDER_MOST_DEG:g} deg with 'cylindrical', value <= {FISHEYE_MOST_DEG:g} deg with"
-            " 'fisheye'",
-        )
-
-
 Distortion = tuple[float, float, float, float]
 """k1, k2, k3, k4."""
 
 UNDISTORTED: Final[Distortion] = (0.0, 0.0, 0.0, 0.0)
 """Coefficients of an equidistant lens."""
 
-MOST_OFF_RAD: Final = math.radians(0.5 * FISHEYE_MOST_DEG)
+MOST_OFF_RAD: Final = math.radians(95.0)
 """Maximum angle from the optical axis for any lens [rad]."""
 
 _MOST_STEPS: Final = 100
@@ -90,6 +73,16 @@ _ROUNDING: Final = 1e-12
 MOST_COEFFICIENT: Final = 100.0
 """Maximum magnitude of a coefficient; real lenses are below 10."""
 
+CYLINDER_MOST_DEG: Final = 360.0
+"""Maximum horizontal field of view of any projection [deg]."""
+
+_TURN: Final = 1.0 + 1e-9
+"""Maximum width of a cylinder's image, in turns; above 1 for rounding."""
+
+_ON_AXIS: Final = 1e-9
+"""Distance from the optical axis below which 1 / z replaces theta_d / aside [m]."""
+
+Floats = NDArray[np.float64]
 Angle = TypeVar("Angle", float, NDArray[Any])
 
 
@@ -142,27 +135,6 @@ def undistorted(theta_d: NDArray[Any], k: Distortion) -> NDArray[np.float64]:
     return np.where(aim > rim * (1.0 + _ROUNDING), np.inf, theta)
 
 
-def check_distortion(
-    field: str, projection: Projection, horizontal_fov_deg: float, k: Distortion
-) -> None:
-    """Raise FieldError, naming the field, for invalid coefficients."""
-    if k == UNDISTORTED:
-        return
-    shown = [float(each) for each in k]
-    if projection != "fisheye":
-        raise FieldError(
-            field, shown, f"left out with projection {projection!r}, only of a fisheye"
-        )
-    reached_deg, half_deg = math.degrees(sees_to(k)), 0.5 * horizontal_fov_deg
-    if reached_deg < half_deg:
-        raise FieldError(
-            field,
-            shown,
-            "coefficients with which theta_d increases over the whole field of view, to"
-            f" {half_deg:g} deg from the axis; with these it does to {reached_deg:.4g} deg",
-        )
-
-
 def _crossings(polynomial: list[float], end: float) -> list[float]:
     """Return the sign changes of a polynomial, lowest power first, between 0 and an end.
 
@@ -192,3 +164,261 @@ def _value(polynomial: list[float], x: float) -> float:
     for factor in reversed(polynomial):
         value = value * x + factor
     return value
+
+
+class ProjectionModel:
+    """Projection of directions to the image of a camera `k`; base class of `PROJECTIONS`.
+
+    Points and rays are arrays (3, ...) forward, right and down in the camera's axes. The visible
+    point of a pixel is its ray times its depth. Pixel centres are at whole numbers.
+    """
+
+    magic = ""
+    """Letter of the magic numbers of its frames."""
+    distorted_magic = ""
+    """Letter of frames with distortion coefficients; "" = it has none."""
+    accepted_fov = ""
+    """Accepted horizontal field of view, as text."""
+    least_rows = 6
+    """Minimum rows of an image."""
+    planar = False
+    """True if depth is along the optical axis and rays are affine along rows."""
+    cylindrical = False
+    """True if depth is in the horizontal plane and rays are affine along columns."""
+    radial = False
+    """True if the distance from the optical axis in the image follows `distorted`."""
+    calibration: str | None = None
+    """Distortion model of an exported camera calibration; None = it has no calibration."""
+
+    @property
+    def tabled(self) -> bool:
+        """True if each pixel has a separate unit ray, and depth is along it."""
+        return not (self.planar or self.cylindrical)
+
+    def accepts(self, fov_deg: float) -> bool:
+        """Return whether a horizontal field of view [deg] is within the limit."""
+        raise NotImplementedError
+
+    def focal(self, width: int, fov: float, distortion: Distortion) -> float:
+        """Return the focal length [px] for a horizontal field of view [rad] of the whole width."""
+        return float(width / (2.0 * distorted(0.5 * fov, distortion)))
+
+    def fov(self, k: Intrinsics) -> float:
+        """Return the horizontal field of view [rad], from edge to edge of the image."""
+        return k.width / k.focal
+
+    def problem(self, width: int, focal: float) -> str | None:  # noqa: ARG002 (of a cylinder)
+        """Return why no image has this width and focal length [px], or None."""
+        return None
+
+    def rays(self, k: Intrinsics) -> Floats:
+        """Return the rays (3, h, w) at a depth of 1; 0 in pixels without a direction."""
+        raise NotImplementedError
+
+    def places(self, k: Intrinsics, points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return columns and rows of points; infinity beyond the field of view. Only if tabled."""
+        raise NotImplementedError
+
+    def flow(self, k: Intrinsics, points: Floats, moves: Floats) -> tuple[Floats, Floats]:
+        """Return the image velocity [px/s] of points (3, ...) with velocities `moves` [m/s]."""
+        raise NotImplementedError
+
+    def finest(self, k: Intrinsics) -> float:  # noqa: ARG002 (of a fisheye)
+        """Return the maximum pixels per angle, relative to the focal length."""
+        return 1.0
+
+    def angle_at(self, k: Intrinsics, side: float) -> float:
+        """Return the angle from the optical axis [rad] at a distance from it in the image [px]."""
+        return math.atan2(side, k.focal)
+
+
+class Pinhole(ProjectionModel):
+    """RealSense convention: a pixel (u, v) has the ray (1, (u - cx) / focal, (v - cy) / focal)."""
+
+    magic, accepted_fov, planar, calibration = "F", "value < 170 deg", True, ""
+
+    def accepts(self, fov_deg: float) -> bool:
+        """Return whether a horizontal field of view [deg] is within the limit."""
+        return fov_deg < 170.0
+
+    def focal(self, width: int, fov: float, distortion: Distortion) -> float:  # noqa: ARG002
+        """Return the focal length [px] for a horizontal field of view [rad] of the whole width."""
+        return 0.5 * width / math.tan(0.5 * fov)
+
+    def fov(self, k: Intrinsics) -> float:
+        """Return the horizontal field of view [rad], from edge to edge of the image."""
+        return 2.0 * math.atan2(0.5 * k.width, k.focal)
+
+    def rays(self, k: Intrinsics) -> Floats:
+        """Return the rays (3, h, w) at a depth of 1."""
+        rays = np.ones((3, k.height, k.width))
+        rays[1], rays[2] = _scaled_grid(k)
+        return rays
+
+    def flow(self, k: Intrinsics, points: Floats, moves: Floats) -> tuple[Floats, Floats]:
+        """Return the image velocity [px/s] of points (3, ...) with velocities `moves` [m/s]."""
+        (z, x, y), (dz, dx, dy), f = points, moves, k.focal
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return f * (dx - x / z * dz) / z, f * (dy - y / z * dz) / z
+
+
+class Cylinder(ProjectionModel):
+    """Panorama: the ray of (u, v) is (cos a, sin a, (v - cy) / focal) with a = (u - cx) / focal.
+
+    The angle a is clockwise seen from above. Depth is perpendicular to the axis of the cylinder.
+    Upright edges are upright in the image. The column of the optical axis equals a pinhole's with
+    the same focal length.
+    """
+
+    magic, accepted_fov, least_rows, cylindrical = "C", "value <= 360 deg", 1, True
+
+    def accepts(self, fov_deg: float) -> bool:
+        """Return whether a horizontal field of view [deg] is within the limit."""
+        return fov_deg <= CYLINDER_MOST_DEG
+
+    def problem(self, width: int, focal: float) -> str | None:
+        """Return why no image has this width and focal length [px], or None."""
+        if width > _TURN * 2.0 * math.pi * focal:
+            return f"focal {focal}, {width} px wide: a cylinder of more than one turn"
+        return None
+
+    def rays(self, k: Intrinsics) -> Floats:
+        """Return the rays (3, h, w) at a depth of 1."""
+        rays = np.empty((3, k.height, k.width))
+        angle, rays[2] = _scaled_grid(k)
+        rays[0], rays[1] = np.cos(angle), np.sin(angle)
+        return rays
+
+    def flow(self, k: Intrinsics, points: Floats, moves: Floats) -> tuple[Floats, Floats]:
+        """Return the image velocity [px/s] of points (3, ...) with velocities `moves` [m/s]."""
+        (z, x, y), (dz, dx, dy), f = points, moves, k.focal
+        # Derivatives of focal * atan2(x, z) and focal * y / hypot(x, z).
+        with np.errstate(invalid="ignore", divide="ignore"):
+            square = x * x + z * z
+            away = np.sqrt(square)
+            receding = (x * dx + z * dz) / square
+            return f * (z * dx - x * dz) / square, f * (dy - y * receding) / away
+
+
+class Fisheye(ProjectionModel):
+    """The ray of a pixel is (cos b, sin b cos c, sin b sin c), at the angle b from the axis.
+
+    The angle is given by r / focal and `undistorted`, with r the distance from (cx, cy) to the
+    pixel and c its direction. Without coefficients b = r / focal (equidistant). Pixels more than 95
+    degrees from the axis are empty, as are pixels beyond the valid angle of the coefficients.
+    """
+
+    magic, distorted_magic, accepted_fov = "E", "K", "value <= 190 deg"
+    radial, calibration = True, "kannala_brandt"
+
+    def accepts(self, fov_deg: float) -> bool:
+        """Return whether a horizontal field of view [deg] is within the limit."""
+        return fov_deg <= math.degrees(2.0 * MOST_OFF_RAD)
+
+    def fov(self, k: Intrinsics) -> float:
+        """Return the horizontal field of view [rad], from edge to edge of the image."""
+        if k.distortion == UNDISTORTED:
+            return k.width / k.focal
+        return 2.0 * self.angle_at(k, 0.5 * k.width)
+
+    def rays(self, k: Intrinsics) -> Floats:
+        """Return unit rays (3, h, w); 0 outside the circle."""
+        across, down = _scaled_grid(k)
+        out = np.hypot(across, down)
+        off = undistorted(out, k.distortion)
+        # `undistorted` returns infinity beyond the valid angle.
+        outside = np.isinf(off)
+        off[outside] = 0.0
+        # sin(off) / out, which is 1 in the middle.
+        share = np.sinc(off / math.pi) * np.divide(off, out, out=np.ones_like(out), where=out > 0.0)
+        rays = np.stack([np.cos(off), across * share, down * share])
+        rays[:, outside] = 0.0
+        return rays
+
+    def places(self, k: Intrinsics, points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return columns and rows of points (3, ...); infinity outside the circle."""
+        aside = np.hypot(points[1], points[2])
+        off = np.arctan2(aside, points[0])
+        scale = k.focal * distorted(off, k.distortion) / np.maximum(aside, 1e-9)
+        scale = np.where(off > sees_to(k.distortion), np.inf, scale)
+        with np.errstate(invalid="ignore"):
+            return points[1] * scale + k.cx, points[2] * scale + k.cy
+
+    def flow(self, k: Intrinsics, points: Floats, moves: Floats) -> tuple[Floats, Floats]:
+        """Return the image velocity [px/s] of points (3, ...) with velocities `moves` [m/s]."""
+        (z, x, y), (dz, dx, dy), f = points, moves, k.focal
+        # On the optical axis `aside` is 0; `np.where` selects the limit there.
+        with np.errstate(invalid="ignore", divide="ignore"):
+            aside = np.hypot(x, y)
+            off = np.arctan2(aside, z)
+            growing = (x * dx + y * dy) / aside
+            # Columns and rows are f c x and f c y, with c = theta_d / aside: 1 / z on the axis.
+            share = np.where(aside > _ON_AXIS, distorted(off, k.distortion) / aside, 1.0 / z)
+            opening = (z * growing - aside * dz) / (aside * aside + z * z)
+            opening = steepness(off, k.distortion) * opening
+            on_axis = -dz / (z * z)
+            changing = np.where(aside > _ON_AXIS, (opening - share * growing) / aside, on_axis)
+            return f * (changing * x + share * dx), f * (changing * y + share * dy)
+
+    def finest(self, k: Intrinsics) -> float:
+        """Return the maximum pixels per angle, relative to the focal length."""
+        # The slope of the lens polynomial is sampled over half the field of view.
+        angles = np.linspace(0.0, min(0.5 * self.fov(k), sees_to(k.distortion)), 65)
+        return float(np.max(steepness(angles, k.distortion)))
+
+    def angle_at(self, k: Intrinsics, side: float) -> float:
+        """Return the angle from the optical axis [rad] at a distance from it in the image [px]."""
+        # `undistorted` is infinite if the image is larger than the lens's circle.
+        off = undistorted(np.array(max(side, 0.0) / k.focal), k.distortion)
+        return min(float(off), sees_to(k.distortion))
+
+
+def _scaled_grid(k: Intrinsics) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return columns (w,) and rows (h, 1) from the optical axis, in focal lengths."""
+    across = (np.arange(k.width) - k.cx) / k.focal
+    down = (np.arange(k.height) - k.cy) / k.focal
+    return across, down[:, None]
+
+
+PROJECTIONS: Final[dict[str, ProjectionModel]] = {
+    "pinhole": Pinhole(),
+    "cylindrical": Cylinder(),
+    "fisheye": Fisheye(),
+}
+"""Projections by the name in profiles, cards and options."""
+
+if TYPE_CHECKING:
+    Projection: TypeAlias = str
+else:
+    Projection = Literal[tuple(PROJECTIONS)]
+"""Projection of directions to the image, a name in `PROJECTIONS`."""
+
+
+def check_fov(field: str, projection: Projection, horizontal_fov_deg: float) -> None:
+    """Raise FieldError, naming the field, for a field of view [deg] beyond a projection's limit."""
+    if PROJECTIONS[projection].accepts(horizontal_fov_deg):
+        return
+    limits = [f"{model.accepted_fov} with {name!r}" for name, model in PROJECTIONS.items()]
+    accepted = ", ".join(limits).replace(" with ", " with projection ", 1)
+    raise FieldError(field, horizontal_fov_deg, accepted)
+
+
+def check_distortion(
+    field: str, projection: Projection, horizontal_fov_deg: float, k: Distortion
+) -> None:
+    """Raise FieldError, naming the field, for invalid coefficients."""
+    if k == UNDISTORTED:
+        return
+    shown = [float(each) for each in k]
+    if not PROJECTIONS[projection].distorted_magic:
+        raise FieldError(
+            field, shown, f"left out with projection {projection!r}, only of a fisheye"
+        )
+    reached_deg, half_deg = math.degrees(sees_to(k)), 0.5 * horizontal_fov_deg
+    if reached_deg < half_deg:
+        raise FieldError(
+            field,
+            shown,
+            "coefficients with which theta_d increases over the whole field of view, to"
+            f" {half_deg:g} deg from the axis; with these it does to {reached_deg:.4g} deg",
+        )

@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.exposure import expose
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import RANGE_M
-from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.camera.render import RANGE_M, Mount, camera_pose, expose
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import Arrays
@@ -33,7 +31,7 @@ from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.policy.registry import find_policy
-from airl_mav.prediction.compensator import Compensator, DecisionMemory
+from airl_mav.prediction import Compensator, DecisionMemory
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo

@@ -29,7 +29,7 @@ from airl_mav.latency.injection import (
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import PolicyInfo, camera_refused, find_policy
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction import Compensator
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import check_noise, check_renderer
 from airl_mav.profiles.computer import ComputerProfile

@@ -20,7 +20,8 @@ ActionKind = Literal["discrete", "continuous"]
 Declared = tuple[Any, Any]
 
 
-def _number(kind: Any, meaning: str, **bounds: Any) -> Declared:
+def number(kind: Any, meaning: str, **bounds: Any) -> Declared:
+    """Return an optional number with its meaning and bounds."""
     return kind | None, quantity(meaning, "1", default=None, **bounds)
 
 
@@ -36,100 +37,90 @@ _AUTO_ENTROPY = _choice(
 _ROLLOUT = "steps of each vehicle a rollout; left out: "
 
 _OPTIONS: dict[str, Declared] = {
-    "cg_damping": _number(float, "damping of the Hessian's products", ge=0, le=10),
-    "cg_max_steps": _number(int, "most steps of the conjugate gradient", ge=1, le=1000),
-    "clip_range": _number(float, "greatest change of an action's odds in a rollout", gt=0, le=1),
-    "clip_range_vf": _number(
+    "cg_damping": number(float, "damping of the Hessian's products", ge=0, le=10),
+    "cg_max_steps": number(int, "most steps of the conjugate gradient", ge=1, le=1000),
+    "clip_range": number(float, "greatest change of an action's odds in a rollout", gt=0, le=1),
+    "clip_range_vf": number(
         float, "greatest change of a value in a rollout; left out: any", gt=0, le=1e6
     ),
     "enable_critic_lstm": _choice(bool, "the value has an LSTM of its own"),
-    "ent_coef": _number(float, "weight of the entropy; left out: 0.005", ge=0, le=10),
-    "expert_share_final": _number(float, "the same in the end; left out: 0", ge=0, le=1),
-    "expert_share_fraction": _number(
-        float, "share of the training in which it falls; left out: 0.3", gt=0, le=1
-    ),
-    "expert_share_initial": _number(
-        float,
-        "share of the decisions that the expert flies at first; left out: 1",
-        ge=0,
-        le=1,
-    ),
-    "exploration_final_eps": _number(float, "last share of random actions", ge=0, le=1),
-    "exploration_fraction": _number(
+    "ent_coef": number(float, "weight of the entropy; left out: 0.005", ge=0, le=10),
+    "exploration_final_eps": number(float, "last share of random actions", ge=0, le=1),
+    "exploration_fraction": number(
         float, "share of the training in which exploration falls", gt=0, le=1
     ),
-    "exploration_initial_eps": _number(float, "first share of random actions", ge=0, le=1),
-    "gae_lambda": _number(float, "lambda of the generalised advantage estimate", ge=0, le=1),
-    "gradient_steps": _number(
+    "exploration_initial_eps": number(float, "first share of random actions", ge=0, le=1),
+    "gae_lambda": number(float, "lambda of the generalised advantage estimate", ge=0, le=1),
+    "gradient_steps": number(
         int, "updates a round; -1: as many as steps were flown", ge=-1, le=10**6
     ),
-    "line_search_max_iter": _number(int, "most steps of the line search", ge=1, le=1000),
-    "line_search_shrinking_factor": _number(
+    "line_search_max_iter": number(int, "most steps of the line search", ge=1, le=1000),
+    "line_search_shrinking_factor": number(
         float, "by which a step shrinks in the line search", gt=0, lt=1
     ),
-    "log_std_init": _number(
+    "log_std_init": number(
         float,
         "logarithm of the first standard deviation of continuous actions, whose range is -1 to 1;"
         " left out: 0",
         ge=-5,
         le=2,
     ),
-    "lstm_hidden_size": _number(int, "units of the LSTM; left out: 128", ge=1, le=2048),
-    "max_grad_norm": _number(
+    "lstm_hidden_size": number(int, "units of the LSTM; left out: 128", ge=1, le=2048),
+    "max_grad_norm": number(
         float, "greatest norm of a gradient; greater ones are scaled down", gt=0, le=1e6
     ),
-    "n_critic_updates": _number(int, "updates of the value a rollout", ge=1, le=1000),
-    "n_critics": _number(int, "critics", ge=1, le=20),
-    "n_epochs": _number(int, "passes over a rollout; left out: 4", ge=1, le=1000),
-    "n_lstm_layers": _number(int, "layers of the LSTM", ge=1, le=8),
-    "n_quantiles": _number(int, "quantiles of a value", ge=1, le=1000),
-    "n_steps": _number(int, f"{_ROLLOUT}4096 of all together, in whole batches", ge=1, le=10**6),
+    "n_critic_updates": number(int, "updates of the value a rollout", ge=1, le=1000),
+    "n_critics": number(int, "critics", ge=1, le=20),
+    "n_epochs": number(int, "passes over a rollout; left out: 4", ge=1, le=1000),
+    "n_lstm_layers": number(int, "layers of the LSTM", ge=1, le=8),
+    "n_quantiles": number(int, "quantiles of a value", ge=1, le=1000),
+    "n_steps": number(int, f"{_ROLLOUT}4096 of all together, in whole batches", ge=1, le=10**6),
     "normalize_advantage": _choice(bool, "scale the advantages of a batch to mean 0, deviation 1"),
-    "policy_delay": _number(int, "updates of the critics for one of the actor", ge=1, le=1000),
-    "rms_prop_eps": _number(float, "added to RMSprop's denominator", gt=0, le=1),
-    "sde_sample_freq": _number(
+    "policy_delay": number(int, "updates of the critics for one of the actor", ge=1, le=1000),
+    "rms_prop_eps": number(float, "added to RMSprop's denominator", gt=0, le=1),
+    "sde_sample_freq": number(
         int, "steps between two draws of gSDE's noise; -1: once a rollout", ge=-1, le=10**6
     ),
     "shared_lstm": _choice(
         bool, "the value takes the actor's LSTM; needs enable_critic_lstm false"
     ),
-    "stats_window_size": _number(int, "episodes that the logged means are of", ge=1, le=10**6),
-    "sub_sampling_factor": _number(
+    "stats_window_size": number(int, "episodes that the logged means are of", ge=1, le=10**6),
+    "sub_sampling_factor": number(
         int, "so many-th of a rollout are the samples of the step's direction", ge=1, le=1000
     ),
     "target_entropy": _choice(
         float | Literal["auto"], "entropy that ent_coef 'auto' aims at; 'auto': -2"
     ),
-    "target_kl": _number(
+    "target_kl": number(
         float, "KL divergence that ends the passes over a rollout; left out: none", gt=0, le=100
     ),
-    "target_noise_clip": _number(float, "greatest such noise", ge=0, le=10),
-    "target_policy_noise": _number(
+    "target_noise_clip": number(float, "greatest such noise", ge=0, le=10),
+    "target_policy_noise": number(
         float, "standard deviation of the noise on the target's actions", ge=0, le=10
     ),
-    "target_update_interval": _number(
+    "target_update_interval": number(
         int, "updates between two of the target network", ge=1, le=10**6
     ),
-    "tau": _number(
+    "tau": number(
         float, "share of the online network in an update of the target network", gt=0, le=1
     ),
-    "top_quantiles_to_drop_per_net": _number(
+    "top_quantiles_to_drop_per_net": number(
         int, "highest quantiles of each critic that count for nothing", ge=0, le=999
     ),
-    "train_freq": _number(
+    "train_freq": number(
         int, "steps of each vehicle between two rounds of updates", ge=1, le=10**6
     ),
     "use_rms_prop": _choice(bool, "RMSprop, or else Adam"),
     "use_sde": _choice(bool, "explore with gSDE; continuous actions"),
     "use_sde_at_warmup": _choice(bool, "gSDE in place of uniform actions before learning_starts"),
-    "vf_coef": _number(float, "weight of the value's loss", ge=0, le=100),
+    "vf_coef": number(float, "weight of the value's loss", ge=0, le=100),
 }
-"""Options under the names of stable-baselines3 and sb3-contrib; `_options` may replace some."""
+"""Options under the names of stable-baselines3 and sb3-contrib; `options_of` may replace some."""
 
 
-def _options(names: str, **others: Declared) -> type[ProfileModel]:
-    """Return the model of an algorithm's options."""
-    declared = {name: others.get(name, _OPTIONS[name]) for name in names.split()}
+def options_of(names: str, **others: Declared) -> type[ProfileModel]:
+    """Return the model of an algorithm's options, by names; `others` declares special ones."""
+    declared = {name: (_OPTIONS | others)[name] for name in names.split()}
     fields: dict[str, Any] = {name: (kind, copy(field)) for name, (kind, field) in declared.items()}
     return create_model("Options", __base__=ProfileModel, **fields)
 
@@ -168,41 +159,38 @@ class Algorithm:
     policy: str = "MultiInputPolicy"
 
 
-def _same(*names: str) -> dict[str, str]:
+def same(*names: str) -> dict[str, str]:
+    """Return fields whose arguments have the same names."""
     return {name: name for name in names}
 
 
-_ANY = _same("learning_rate", "gamma")
-_BATCHES = _same("learning_rate", "gamma", "batch_size")
-_REPLAY = _same("learning_rate", "gamma", "batch_size", "buffer_size", "learning_starts")
-_IMITATION = "airl_mav.training.imitation.Imitation"
-_IMITATED = _same("learning_rate", "batch_size", "buffer_size", "learning_starts") | _same(
-    "env_steps_per_update", "expert"
-)
+_ANY = same("learning_rate", "gamma")
+_BATCHES = same("learning_rate", "gamma", "batch_size")
+_REPLAY = same("learning_rate", "gamma", "batch_size", "buffer_size", "learning_starts")
 _PPO: dict[str, Any] = {"n_epochs": 4, "ent_coef": 0.005}
 
-ALGORITHMS: dict[str, Algorithm] = {
+CORE_ALGORITHMS: dict[str, Algorithm] = {
     # Mnih et al., Nature 518 (2015)
     "dqn": Algorithm(
         "airl_mav.training.dqn.DoubleDQN",
         _REPLAY
-        | _same("n_step", "double", "env_steps_per_update", "exploration_fraction", "precision")
+        | same("n_step", "double", "env_steps_per_update", "exploration_fraction", "precision")
         | {
             "target_interval": "target_update_interval",
             "exploration_initial": "exploration_initial_eps",
             "exploration_final": "exploration_final_eps",
         },
-        _options(f"tau {_WINDOW}max_grad_norm"),
+        options_of(f"tau {_WINDOW}max_grad_norm"),
         "discrete",
     ),
     # Dabney et al., arXiv 1710.10044
     "qr-dqn": Algorithm(
         "sb3_contrib.QRDQN",
         _REPLAY,
-        _options(
+        options_of(
             f"{_UPDATES}{_WINDOW}target_update_interval exploration_fraction"
             " exploration_initial_eps exploration_final_eps max_grad_norm n_quantiles",
-            target_update_interval=_number(
+            target_update_interval=number(
                 int, "steps between two updates of the target network", ge=1, le=10**9
             ),
         ),
@@ -213,7 +201,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "ppo": Algorithm(
         "stable_baselines3.PPO",
         _BATCHES,
-        _options(_PPO_OPTIONS),
+        options_of(_PPO_OPTIONS),
         to_policy=("log_std_init",),
         defaults=_PPO,
         batch=256,
@@ -223,7 +211,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "recurrent-ppo": Algorithm(
         "sb3_contrib.RecurrentPPO",
         _BATCHES,
-        _options(f"{_PPO_OPTIONS} lstm_hidden_size n_lstm_layers shared_lstm enable_critic_lstm"),
+        options_of(f"{_PPO_OPTIONS} lstm_hidden_size n_lstm_layers shared_lstm enable_critic_lstm"),
         to_policy=(
             "log_std_init",
             "lstm_hidden_size",
@@ -240,7 +228,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "sac": Algorithm(
         "stable_baselines3.SAC",
         _REPLAY,
-        _options(_SAC_OPTIONS, ent_coef=_AUTO_ENTROPY),
+        options_of(_SAC_OPTIONS, ent_coef=_AUTO_ENTROPY),
         "continuous",
         to_policy=("n_critics",),
     ),
@@ -248,68 +236,46 @@ ALGORITHMS: dict[str, Algorithm] = {
     "tqc": Algorithm(
         "sb3_contrib.TQC",
         _REPLAY,
-        _options(
+        options_of(
             f"{_SAC_OPTIONS} top_quantiles_to_drop_per_net n_quantiles",
             ent_coef=_AUTO_ENTROPY,
-            n_quantiles=_number(int, "quantiles of a critic", ge=1, le=1000),
+            n_quantiles=number(int, "quantiles of a critic", ge=1, le=1000),
         ),
         "continuous",
         to_policy=("n_critics", "n_quantiles"),
-    ),
-    # Behaviour cloning
-    "bc": Algorithm(
-        _IMITATION,
-        _IMITATED,
-        _options(f"{_WINDOW}max_grad_norm"),
-        defaults={"expert_share_final": 1.0},
-        batch=256,
-    ),
-    # Ross et al., arXiv 1011.0686
-    "dagger": Algorithm(
-        _IMITATION,
-        _IMITATED,
-        _options(
-            f"{_WINDOW}max_grad_norm expert_share_initial expert_share_final expert_share_fraction"
-        ),
-        batch=256,
     ),
     # Mnih et al., arXiv 1602.01783
     "a2c": Algorithm(
         "stable_baselines3.A2C",
         _ANY,
-        _options(
+        options_of(
             f"{_SDE}{_WINDOW}n_steps gae_lambda ent_coef vf_coef max_grad_norm rms_prop_eps"
             " use_rms_prop normalize_advantage",
-            n_steps=_number(int, f"{_ROLLOUT}5", ge=1, le=10**6),
-            ent_coef=_number(float, "weight of the entropy", ge=0, le=10),
+            n_steps=number(int, f"{_ROLLOUT}5", ge=1, le=10**6),
+            ent_coef=number(float, "weight of the entropy", ge=0, le=10),
         ),
     ),
     # Lillicrap et al., arXiv 1509.02971
-    "ddpg": Algorithm("stable_baselines3.DDPG", _REPLAY, _options(_UPDATES), "continuous"),
+    "ddpg": Algorithm("stable_baselines3.DDPG", _REPLAY, options_of(_UPDATES), "continuous"),
     # Fujimoto et al., arXiv 1802.09477
     "td3": Algorithm(
         "stable_baselines3.TD3",
         _REPLAY,
-        _options(f"{_UPDATES}{_WINDOW}policy_delay target_policy_noise target_noise_clip"),
+        options_of(f"{_UPDATES}{_WINDOW}policy_delay target_policy_noise target_noise_clip"),
         "continuous",
     ),
     # Schulman et al., arXiv 1502.05477
     "trpo": Algorithm(
         "sb3_contrib.TRPO",
         _BATCHES,
-        _options(
+        options_of(
             f"{_SDE}{_WINDOW}n_steps gae_lambda cg_max_steps cg_damping"
             " line_search_shrinking_factor line_search_max_iter n_critic_updates"
             " normalize_advantage target_kl sub_sampling_factor",
-            target_kl=_number(float, "KL divergence that a step may reach", gt=0, le=100),
+            target_kl=number(float, "KL divergence that a step may reach", gt=0, le=100),
         ),
         batch=256,
         rollouts=True,
     ),
 }
-"""Algorithms that take Dict observations and need no action mask."""
-
-
-def fitting(kind: ActionKind) -> list[str]:
-    """Return the names of the algorithms that support a kind of action set."""
-    return [name for name, row in ALGORITHMS.items() if row.actions in (None, kind)]
+"""Algorithms of the core; they take Dict observations and need no action mask."""

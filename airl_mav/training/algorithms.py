@@ -24,10 +24,8 @@ from airl_mav.core.plugins import NETWORKS, load_part
 from airl_mav.policy.card import first_line
 from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, image_key
 from airl_mav.training import config
-from airl_mav.training.algorithm_table import ALGORITHMS, Algorithm
-from airl_mav.training.config import NetworkSpec
-
-BATCH = ALGORITHMS["dqn"].batch
+from airl_mav.training.algorithm_table import Algorithm
+from airl_mav.training.config import ALGORITHMS, NetworkSpec
 
 ROLLOUT = 4096
 """Steps of all vehicles in a rollout of `ppo` and `trpo`."""
@@ -199,23 +197,15 @@ def further_images(observation_space: spaces.Dict) -> list[str]:
     return sorted(key for key in found if key != main)
 
 
-DepthExtractor = ImageExtractor
-"""Name in models saved before colour support."""
-
-
 def policy_arguments(spec: NetworkSpec) -> dict[str, Any]:
     """Return the `policy_kwargs` of a MultiInputPolicy; FieldError for a missing extractor."""
+    extractor: Any = ImageExtractor
     if spec.own:
-        return {
-            "features_extractor_class": load_part(NETWORKS, spec.kind, _is_extractor),
-            "features_extractor_kwargs": dict(spec.options),
-            "net_arch": list(spec.dense or OWN_DENSE),
-            "activation_fn": nn.ReLU,
-        }
+        extractor = load_part(NETWORKS, spec.kind, _is_extractor)
     return {
-        "features_extractor_class": ImageExtractor,
-        "features_extractor_kwargs": {"spec": spec},
-        "net_arch": dense_units(spec),
+        "features_extractor_class": extractor,
+        "features_extractor_kwargs": dict(spec.options) if spec.own else {"spec": spec},
+        "net_arch": list(spec.dense or OWN_DENSE) if spec.own else dense_units(spec),
         "activation_fn": nn.ReLU,
     }
 

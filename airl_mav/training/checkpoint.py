@@ -38,8 +38,6 @@ from airl_mav.core.files import (
     sync,
     sync_folder,
 )
-from airl_mav.training.dqn import DoubleDQN
-from airl_mav.training.imitation import Imitation
 
 COUNTERS = (
     "num_timesteps",
@@ -181,8 +179,9 @@ def _below(prefix: str, arrays: Arrays) -> Arrays:
 
 def _get_replay(model: BaseAlgorithm) -> Arrays:
     """Return the filled part of a learner's replay memory by name; empty without replay memory."""
-    if isinstance(model, DoubleDQN | Imitation):
-        return model.replay.get_state()
+    if (own := getattr(model, "replay", None)) is not None:
+        state: Arrays = own.get_state()
+        return state
     buffer = _stock_buffer(model)
     if buffer is None:
         return {}
@@ -193,8 +192,8 @@ def _get_replay(model: BaseAlgorithm) -> Arrays:
 
 def _set_replay(model: BaseAlgorithm, saved: Mapping[str, NDArray[Any]]) -> None:
     """Restore the data of `_get_replay`. Raises ValueError if the size differs."""
-    if isinstance(model, DoubleDQN | Imitation):
-        model.replay.set_state(saved)
+    if (own := getattr(model, "replay", None)) is not None:
+        own.set_state(saved)
         return
     buffer = _stock_buffer(model)
     if buffer is None:

@@ -8,20 +8,27 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
+from airl_mav.core.addons import entries, load
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
 from airl_mav.core.plugins import NETWORKS, part_name
-from airl_mav.envs.spec import EnvironmentSpec, ExpertName
+from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.actions import SHIPPED, ActionSpec, discrete_actions
 from airl_mav.profiles.computer import load_computer
-from airl_mav.training.algorithm_table import ALGORITHMS, ActionKind, fitting
+from airl_mav.training.algorithm_table import CORE_ALGORITHMS, ActionKind, Algorithm
 
 SELECTION_SEED = 500_000
 """First seed of the selection episodes; training starts at a million, evaluation at one."""
 
+ALGORITHMS: dict[str, Algorithm] = CORE_ALGORITHMS | {
+    name: load(place) for name, place in entries("airl_mav", "ALGORITHMS").items()
+}
+"""Learning algorithms of the core and of add-ons."""
+
 SHIPPED_NETWORKS = ("small", "appendix", "template")
 NetworkKind = Annotated[str, part_name(NETWORKS, SHIPPED_NETWORKS)]
 Precision = Literal["float32", "bfloat16"]
+ExpertName = Literal["greedy", "planner", "gates"]
 Option = bool | int | float | str | list[int | float | str]
 
 
@@ -186,11 +193,12 @@ def check_actions(name: str, kind: ActionKind) -> None:
     wanted = ALGORITHMS[name].actions
     if wanted not in (None, kind):
         sets = ", ".join(ACTION_SETS[wanted])
+        suited = [each for each, row in ALGORITHMS.items() if row.actions in (None, kind)]
         raise FieldError(
             "algorithm.name",
             name,
             f"a {wanted} action set (environment.actions: {sets}), and this one is {kind}; "
-            f"with it: {', '.join(fitting(kind))}",
+            f"with it: {', '.join(suited)}",
         )
 
 

@@ -48,31 +48,72 @@ class Batch(NamedTuple):
     next_observations: Encoded
 
 
-class NStepReplay:
+Shapes = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]
+"""Shape and type of each array of an observation."""
+
+
+def shapes_of(space: spaces.Space[Any]) -> Shapes:
+    """Return the shapes of the observations of a Dict space."""
+    assert isinstance(space, spaces.Dict)  # noqa: S101 (MultiInputPolicy's)
+    boxes = {k: cast("spaces.Box", v) for k, v in space.spaces.items()}
+    return {k: (box.shape, box.dtype) for k, box in boxes.items()}
+
+
+class Ring:
+    """Ring buffer of observations and actions, a row per step of all vehicles."""
+
+    def __init__(self, shapes: Shapes, actions: NDArray[Any]) -> None:
+        """Use zero-filled `actions` (rows, vehicles, ...), with observations of these shapes."""
+        self.rows, self.vehicles = int(actions.shape[0]), int(actions.shape[1])
+        size = self.rows, self.vehicles
+        self.head = 0
+        self.filled = 0
+        self._actions = actions
+        self._observations = {k: np.zeros((*size, *s), t) for k, (s, t) in shapes.items()}
+
+    def _store(self, observations: Mapping[str, NDArray[Any]], actions: NDArray[Any]) -> None:
+        """Write the present row, and go on to the next one."""
+        for key, array in self._observations.items():
+            array[self.head] = observations[key]
+        self._actions[self.head] = actions
+        self.head = (self.head + 1) % self.rows
+        self.filled = min(self.filled + 1, self.rows)
+
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """Return the complete memory by name; views, not copies."""
+        state = {name: array[: self.filled] for name, array in self._named().items()}
+        return state | {"head": np.array(self.head)}
+
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Restore the state from `get_state`; ValueError for other shapes."""
+        named = self._named()
+        for name, array in named.items():
+            saved = state[name]
+            if saved.shape[1:] != array.shape[1:] or len(saved) > self.rows:
+                raise ValueError(f"replay {name}: {saved.shape} does not fit {array.shape}")
+        for name, array in named.items():
+            array[: len(state[name])] = state[name]
+        self.filled, self.head = len(state["actions"]), int(state["head"])
+
+    def _named(self) -> dict[str, NDArray[Any]]:
+        seen = {f"observations/{key}": array for key, array in self._observations.items()}
+        return {"actions": self._actions} | seen
+
+
+class NStepReplay(Ring):
     """Replay memory of `steps` transitions, in rows of `vehicles`.
 
-    `shapes` contains shape and type of each array of an observation. A chain has at most `n_step`
-    rewards.
+    A chain has at most `n_step` rewards.
     """
 
     def __init__(
-        self,
-        steps: int,
-        vehicles: int,
-        shapes: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]],
-        n_step: int,
-        gamma: float,
+        self, steps: int, vehicles: int, shapes: Shapes, n_step: int, gamma: float
     ) -> None:
         # A sample needs the next n rows.
-        self.rows = max(steps // vehicles, 1) + n_step
-        self.vehicles = vehicles
+        size = max(steps // vehicles, 1) + n_step, vehicles
+        super().__init__(shapes, np.zeros(size, np.int64))
         self.n_step = n_step
         self.gamma = gamma
-        self.head = 0
-        self.filled = 0
-        size = (self.rows, vehicles)
-        self._observations = {k: np.zeros((*size, *s), t) for k, (s, t) in shapes.items()}
-        self._actions = np.zeros(size, np.int64)
         self._rewards = np.zeros(size, np.float32)
         self._ends = np.zeros(size, np.uint8)
         self._slots = np.full(size, NOT_ASIDE, np.int32)
@@ -98,9 +139,6 @@ class NStepReplay:
         row = self.head
         used = self._slots[row]
         self._free += used[used != NOT_ASIDE].tolist()
-        for key, array in self._observations.items():
-            array[row] = observations[key]
-        self._actions[row] = actions
         self._rewards[row] = rewards
         self._ends[row] = RUNNING
         self._slots[row] = NOT_ASIDE
@@ -110,8 +148,7 @@ class NStepReplay:
             self._ends[row, vehicle] = TRUNCATED if truncated else TERMINATED
             if truncated:
                 self._slots[row, vehicle] = self._put_aside(info["terminal_observation"])
-        self.head = (row + 1) % self.rows
-        self.filled = min(self.filled + 1, self.rows)
+        self._store(observations, actions)
 
     def sample(self, batch: int, generator: np.random.Generator) -> Batch:
         """Draw transitions uniformly, with replacement."""
@@ -147,35 +184,21 @@ class NStepReplay:
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Return the complete memory by name; views, not copies."""
-        named = self._named_rows()
-        state = {name: array[: self.filled] for name, array in named.items()}
-        state |= {f"last/{key}": array for key, array in self._last.items()}
+        state = super().get_state()
+        state |= {f"last/{key}": each for key, each in self._last.items()}
         state["free"] = np.array(self._free, np.int32)
-        state["head"] = np.array(self.head)
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Restore the state from `get_state`; ValueError for other shapes."""
-        named = self._named_rows()
-        for name, array in named.items():
-            saved = state[name]
-            if saved.shape[1:] != array.shape[1:] or len(saved) > self.rows:
-                raise ValueError(f"replay {name}: {saved.shape} does not fit {array.shape}")
-        self.head = int(state["head"])
-        self.filled = len(state["rewards"])
-        for name, array in named.items():
-            array[: self.filled] = state[name]
+        super().set_state(state)
         self._last = {key: state[f"last/{key}"].copy() for key in self._last}
         self._free = state["free"].tolist()
 
-    def _named_rows(self) -> dict[str, NDArray[Any]]:
-        named: dict[str, NDArray[Any]] = {
-            "actions": self._actions,
-            "rewards": self._rewards,
-            "ends": self._ends,
-            "slots": self._slots,
-        }
-        return named | {f"observations/{key}": array for key, array in self._observations.items()}
+    def _named(self) -> dict[str, NDArray[Any]]:
+        named = super()._named()
+        named |= {"rewards": self._rewards, "ends": self._ends, "slots": self._slots}
+        return named
 
     def _put_aside(self, observation: Mapping[str, NDArray[Any]]) -> int:
         """Store an episode's last observation and return its slot."""
@@ -227,9 +250,7 @@ class DoubleDQN(DQN):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        assert isinstance(self.observation_space, spaces.Dict)  # noqa: S101 (MultiInputPolicy's)
-        boxes = {k: cast("spaces.Box", v) for k, v in self.observation_space.spaces.items()}
-        shapes = {k: (box.shape, box.dtype) for k, box in boxes.items()}
+        shapes = shapes_of(self.observation_space)
         self.replay = NStepReplay(self.buffer_size, self.n_envs, shapes, self.n_step, self.gamma)
         # The base class only passes it between methods that are overridden below.
         self.replay_buffer = cast("ReplayBuffer", self.replay)

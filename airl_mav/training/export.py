@@ -31,15 +31,9 @@ from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.profiles.projections import CHANNELS, KINDS
 from airl_mav.training import export_request, onnx_export
-from airl_mav.training.onnx_export import RecurrentNetwork, RecurrentOfAny
+from airl_mav.training.onnx_export import RecurrentNetwork
 
-DEPTH = "depth"
-"""Key of the image of a depth camera."""
-
-VECTORS = (VELOCITY, GOAL)
-"""Inputs of the shipped layouts besides the image, without additional inputs."""
-
-USUAL = (DEPTH, *VECTORS)
+USUAL = ("depth", VELOCITY, GOAL)
 """Inputs of most networks."""
 
 CHECKED = 64
@@ -49,40 +43,7 @@ _LIBRARIES = ("airl_mav.training.dqn", "stable_baselines3", "sb3_contrib")
 
 
 class _Network(nn.Module):
-    """Adapter from the three inputs to SB3's Dict of observations."""
-
-    def __init__(self, inner: nn.Module) -> None:
-        super().__init__()
-        self.inner = inner
-
-    def forward(
-        self, depth: torch.Tensor, velocity: torch.Tensor, goal: torch.Tensor
-    ) -> torch.Tensor:
-        found: torch.Tensor = self.inner({DEPTH: depth, VELOCITY: velocity, GOAL: goal})
-        return found
-
-
-class _ToldNetwork(nn.Module):
-    """Adapter like `_Network`, with the additional inputs."""
-
-    def __init__(self, inner: nn.Module) -> None:
-        super().__init__()
-        self.inner = inner
-
-    def forward(
-        self,
-        depth: torch.Tensor,
-        velocity: torch.Tensor,
-        goal: torch.Tensor,
-        in_flight: torch.Tensor,
-    ) -> torch.Tensor:
-        seen = {DEPTH: depth, VELOCITY: velocity, GOAL: goal, IN_FLIGHT: in_flight}
-        found: torch.Tensor = self.inner(seen)
-        return found
-
-
-class _AnyNetwork(nn.Module):
-    """Adapter like `_Network`, for any arrays in the order of their keys."""
+    """Adapter from arrays in the order of their keys to SB3's Dict of observations."""
 
     def __init__(self, inner: nn.Module, keys: Sequence[str]) -> None:
         super().__init__()
@@ -152,10 +113,7 @@ def network_of(
         return export_request.Normalised(inner, learned)
 
     def network(inner: nn.Module) -> nn.Module:
-        inner = normalised(inner)
-        if keys == USUAL:
-            return _Network(inner)
-        return _ToldNetwork(inner) if keys == (*USUAL, IN_FLIGHT) else _AnyNetwork(inner, keys)
+        return _Network(normalised(inner), keys)
 
     if hasattr(policy, "quantile_net"):
         return network(_MeanOfQuantiles(policy.quantile_net))
@@ -179,9 +137,7 @@ def network_of(
         if hasattr(policy, "lstm_actor"):
             head = nn.Sequential(hidden, policy.action_net, last)
             parts = (normalised(_Actor(policy, extractor)), policy.lstm_actor, head)
-            if keys[1:] == VECTORS:
-                return RecurrentNetwork(*parts, keys[0])
-            return RecurrentOfAny(*parts, keys)
+            return RecurrentNetwork(*parts, keys)
         return network(_Actor(policy, extractor, hidden, policy.action_net, last))
     raise UsageError(f"{type(model).__name__}: its {type(policy).__name__} cannot be exported")
 
@@ -316,9 +272,9 @@ def load_module(name: str, weights: Path | None, keys: Sequence[str] = USUAL) ->
         names = [each.name for each in taken]
         if names != list(keys) and sorted(names) == sorted(keys):
             # A custom layout has sorted arrays; the module may name its arguments in any order.
-            return _AnyNetwork(_ByName(module, names), keys)
+            return _Network(_ByName(module, names), keys)
         return module
-    return _Network(module) if tuple(keys) == USUAL else _AnyNetwork(module, keys)
+    return _Network(module, keys)
 
 
 def _load_weights(module: nn.Module, path: Path) -> None:

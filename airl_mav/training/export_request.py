@@ -18,7 +18,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import optional, switch, validated
 from airl_mav.core.machine import package_versions
 from airl_mav.core.plugins import names_code
-from airl_mav.envs.observations import further_seen
+from airl_mav.envs.observations import LENS, further_seen
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.policy.actions import (
@@ -289,24 +289,13 @@ def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
     """Return the metadata that an environment defines for its policies."""
     vehicle = load_vehicle(spec.vehicle)
     camera = spec.camera.of(vehicle.camera)
+    shared = [name for name in DEFAULTS if name != "cameras" and name in type(spec).model_fields]
     return {
-        "layout": spec.layout,
         "image": f"{spec.image_width_px}x{spec.image_height_px}",
-        "frames": spec.frames,
-        "kind": camera.kind,
-        "projection": camera.projection,
-        "horizontal_fov_deg": camera.horizontal_fov_deg,
-        "distortion": camera.distortion,
-        "range_m": camera.range_m,
-        "in_flight": spec.in_flight,
-        "goal_height": spec.goal_height,
         "cameras": further_seen(spec, vehicle),
-        "actions": spec.actions,
-        "max_speed_m_s": spec.max_speed_m_s,
-        "max_rate_deg_s": spec.max_rate_deg_s,
+        **{name: getattr(spec, name) for name in shared},
+        **{name: getattr(camera, name) for name in LENS},
         **{name: getattr(spec.episode, name) for name in FLOWN},
-        "decisions": spec.decisions,
-        "compensate": spec.compensate,
     }
 
 

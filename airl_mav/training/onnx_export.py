@@ -42,7 +42,7 @@ from airl_mav.policy.card import (
     first_line,
 )
 from airl_mav.policy.card_writing import write_card
-from airl_mav.policy.layouts import GOAL, VELOCITY, Encoded, boxes
+from airl_mav.policy.layouts import Encoded, boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 
 OPSET = 18
@@ -99,7 +99,7 @@ def export_network(
     `goal` (n, 3) float32, or (n, 4) with the goal's height. The output is a score per discrete
     action (n, k), or the continuous action (n, 2), in three dimensions (n, 3). The network scales
     the image itself. Memory is passed as additional inputs and outputs, with shapes in the
-    attribute `state` (`recurrent.RecurrentNetwork`).
+    attribute `state` (`RecurrentNetwork`).
 
     Nothing is written unless ONNX Runtime and torch agree. After a kill there is no card, or an old
     card that rejects the new policy: never a card for the wrong one. Raises UsageError if the
@@ -283,61 +283,30 @@ class LstmStep(nn.Module):
 
 
 class RecurrentNetwork(nn.Module):
-    """From the three inputs, hidden and cell to the outputs, the next hidden and the next cell."""
+    """From arrays in the order of their keys, hidden and cell to outputs, next hidden and cell."""
 
     def __init__(
-        self, features: nn.Module, lstm: nn.LSTM, head: nn.Module, image: str = "depth"
+        self, features: nn.Module, lstm: nn.LSTM, head: nn.Module, keys: Sequence[str]
     ) -> None:
-        """Connect features of Dict observations, with the image's key, LSTM and output head."""
+        """Connect features of Dict observations, LSTM and output head."""
         super().__init__()
-        self.image = image
+        self.keys = tuple(keys)
         self.features = features
         self.steps = nn.ModuleList(LstmStep(lstm, layer) for layer in range(lstm.num_layers))
         self.head = head
-        self.state: Shapes = {
-            HIDDEN: (lstm.num_layers, lstm.hidden_size),
-            CELL: (lstm.num_layers, lstm.hidden_size),
-        }
+        shape = (lstm.num_layers, lstm.hidden_size)
+        self.state: Shapes = {HIDDEN: shape, CELL: shape}
 
-    def forward(
-        self,
-        image: torch.Tensor,
-        velocity: torch.Tensor,
-        goal: torch.Tensor,
-        hidden: torch.Tensor,
-        cell: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def forward(self, *arrays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return the outputs (n, k), and hidden and cell (n, layers, units) after the decision."""
-        seen = {self.image: image, VELOCITY: velocity, GOAL: goal}
-        return self.decided(seen, hidden, cell)
-
-    def decided(
-        self, seen: dict[str, torch.Tensor], hidden: torch.Tensor, cell: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the outputs of `forward` for observations by key."""
-        found = self.features(seen)
+        *seen, hidden, cell = arrays
+        found = self.features(dict(zip(self.keys, seen, strict=True)))
         hiddens, cells = [], []
         for layer, step in enumerate(self.steps):
             found, kept = step(found, hidden[:, layer], cell[:, layer])
             hiddens.append(found)
             cells.append(kept)
         return self.head(found), torch.stack(hiddens, dim=1), torch.stack(cells, dim=1)
-
-
-class RecurrentOfAny(RecurrentNetwork):
-    """Recurrent network for any arrays, in the order of their keys."""
-
-    def __init__(
-        self, features: nn.Module, lstm: nn.LSTM, head: nn.Module, keys: Sequence[str]
-    ) -> None:
-        """Initialize as `RecurrentNetwork`, with keys."""
-        super().__init__(features, lstm, head)
-        self.keys = tuple(keys)
-
-    def forward(self, *arrays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the outputs (n, k), and hidden and cell (n, layers, units) after the decision."""
-        *seen, hidden, cell = arrays
-        return self.decided(dict(zip(self.keys, seen, strict=True)), hidden, cell)
 
 
 class GreedyDecisions:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,7 +14,7 @@ from airl_mav.core.fields import optional, switch
 from airl_mav.core.machine import provenance
 from airl_mav.core.progress import Event, Progress
 from airl_mav.profiles.loading import load_profile
-from airl_mav.training.config import TrainingConfig
+from airl_mav.training.config import TrainingConfig, check_fields, configured
 
 SCHEMA = 1
 CONFIG_FILE = "train.json"
@@ -49,23 +49,6 @@ class Evaluation:
 
 
 _EVALUATION = TypeAdapter(Evaluation)
-
-
-class TrainingProgress:
-    """Progress callbacks of a training run; the base class does nothing."""
-
-    def waiting(self, why: str) -> None:
-        """Called while another process holds the folder's lock."""
-
-    def trained(self, steps: int, success: float | None, zone: int | None) -> None:
-        """Called after each step of all vehicles, with their decisions so far.
-
-        `success` is the rate of the newest episodes, None before the first; `zone` is the open
-        curriculum zone.
-        """
-
-    def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
-        """Called after an evaluation; `best`: better than all previous ones."""
 
 
 class TrainingFolder:
@@ -203,9 +186,6 @@ class TrainRequest(BaseModel):
 
     def configured(self) -> TrainingConfig:
         """Return the configuration with the given changes. Raises UsageError."""
-        # Imported here, as it needs optional packages, which are checked first.
-        from airl_mav.training.config import TrainingConfig, check_fields, configured
-
         loaded = load_profile("training", self.config, TrainingConfig)
         try:
             check_fields(loaded.algorithm)
@@ -248,49 +228,39 @@ class Exported(Event):
     path: str
 
 
-class TrainingBar(TrainingProgress):
-    """A bar with the success rate, a line for every evaluation. A `TrainingProgress`."""
+class TrainingProgress:
+    """Progress of a training: a bar with the success rate, and a line for every evaluation."""
 
-    def __init__(self, progress: Progress, steps: int) -> None:
-        self._progress = progress
-        self._bar = progress.bar("training", steps, unit="decisions")
+    def __init__(self, progress: Progress | None = None, steps: int = 0) -> None:
+        """Show a training of `steps` decisions; without `progress` nothing is shown."""
+        self._progress = progress or Progress()
+        self._bar = self._progress.bar("training", steps, unit="decisions")
 
     def waiting(self, why: str) -> None:
-        """Print a line."""
+        """Show why the training waits: another process holds the folder's lock."""
         self._progress.note(why)
 
     def trained(self, steps: int, success: float | None, zone: int | None) -> None:
-        """Draw the bar."""
+        """Show the decisions of all vehicles so far; called after each step.
+
+        `success` is the rate of the newest episodes, None before the first; `zone` is the open
+        curriculum zone.
+        """
         text = "" if success is None else f"success {success:.0%} in training"
         text += "" if zone is None else f", zone {zone}"
         figures = {"training_success": success, "zone": zone}
         self._bar.update(completed=steps, postfix=text, figures=figures)
 
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
-        """Print a line, and report the evaluation to programs."""
-        self._progress.tell(
-            Evaluated(
-                steps=evaluation.steps,
-                episodes=evaluation.episodes,
-                success_rate=evaluation.success_rate,
-                collision_rate=evaluation.collision_rate,
-                flight_time_s=evaluation.flight_time_s,
-                zone=evaluation.zone,
-                best=best,
-            )
-        )
+        """Show an evaluation, and report it to programs; `best`: better than all earlier ones."""
+        shared = (each.name for each in fields(Evaluated) if each.name != "best")
+        self._progress.tell(Evaluated(**{n: getattr(evaluation, n) for n in shared}, best=best))
         time = "" if evaluation.flight_time_s is None else f"{evaluation.flight_time_s:6.2f} s"
         zone = "" if evaluation.zone is None else f"  zone {evaluation.zone}"
-        zone += _of_training(evaluation)
+        rate, training = evaluation.success_rate, evaluation.training_success
+        if training is not None and training - rate >= FLOWN_BY_CHANCE:
+            zone += f"  ({training:.1%} with training's random actions)"
         self._progress.note(
             f"{evaluation.steps:>11,} decisions {evaluation.seconds:7.0f} s  success "
-            f"{evaluation.success_rate:6.1%}  {time}{zone}{'  best so far' if best else ''}"
+            f"{rate:6.1%}  {time}{zone}{'  best so far' if best else ''}"
         )
-
-
-def _of_training(evaluation: Evaluation) -> str:
-    """Return the training success if random actions make it differ from the evaluation."""
-    success = evaluation.training_success
-    if success is None or success - evaluation.success_rate < FLOWN_BY_CHANCE:
-        return ""
-    return f"  ({success:.1%} with training's random actions)"

@@ -24,7 +24,6 @@ from airl_mav.vehicle.atmosphere import altitude_m
 from airl_mav.vehicle.rotation import Quat, rotate
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.engine.record import GPS, MAG, PRESSURE, Record
-from firmware_sim.interfaces import SensorSample
 
 STRENGTH_GAUSS = float(np.linalg.norm(MAGNETIC_FIELD_NED))
 INCLINATION_RAD = math.asin(MAGNETIC_FIELD_NED[2] / STRENGTH_GAUSS)
@@ -59,11 +58,9 @@ class FieldCheck(NamedTuple):
         )
 
     def disturbed(self, field: Vector, attitude: Quat) -> bool:
-        """Return whether the field differs from the earth's field.
+        """Return whether a measured field (3,) FRD [gauss] differs from the earth's field.
 
-        Args:
-            field: Measured field (3,) FRD [gauss].
-            attitude: Rotation from body to world; its heading has no effect.
+        The heading of the attitude, body to world, has no effect.
         """
         strength = float(np.linalg.norm(field))
         # Written with "not <=" so that a NaN counts as disturbed.
@@ -111,21 +108,11 @@ class Alignment:
     """Alignment that waits for the required sensors and for the vehicle to be at rest."""
 
     def __init__(self, value: Callable[[str], float], record: Record) -> None:
-        """Start without samples.
-
-        Args:
-            value: Look-up for EKF2_* parameters by name.
-            record: Flight controller's record, which holds the sums of all samples.
-        """
+        """Start without samples. The flight controller's record holds the sums of all samples."""
         self._value = value
         self._record = record
         self.field: Vector | None = None
         """Mean field (3,) FRD [gauss], also set if the field is too disturbed to use."""
-
-    def take(self, sample: SensorSample) -> None:
-        """Add one tick's sensors, already stored in the record, to the sums."""
-        measured = MAG * (sample.mag is not None) | PRESSURE * (sample.pressure_hpa is not None)
-        add_record(self._record, measured | GPS * (sample.gps is not None))
 
     def finish(self) -> Aligned | None:
         """Return the alignment, or None until there are enough samples."""

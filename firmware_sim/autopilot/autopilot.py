@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Gains, RateDemand
 from airl_mav.control.loops import Motors
@@ -12,7 +12,6 @@ from airl_mav.core.constants import TICK_HZ
 from airl_mav.core.frames import Geodetic, Vector
 from firmware_sim.autopilot.autopilot_state import (
     UNTOLD,
-    AutopilotState,
     OperatorText,
     Result,
     Setpoint,
@@ -52,24 +51,30 @@ from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator, Whereabouts
 from firmware_sim.autopilot.navigation.plan import NavigationState, Plans
 from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
-from firmware_sim.autopilot.snapshot import Parts, Snapshot
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.controller import Controller
 from firmware_sim.engine.record import LANDING, LIFT_OFF, NOTHING
 from firmware_sim.engine.ticks import ALIGN, CLIMBED, REPEATED_BITS, control_record, detect_record
 from firmware_sim.interfaces import (
     ActuatorControls,
+    LogStore,
     SensorSample,
     TrueState,
 )
+
+if TYPE_CHECKING:
+    from firmware_sim.fault_timeline import ClientFaults
 
 # Bound once: looking up an enum member in every tick is slow.
 _GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR
 
 
 class BuiltinAutopilot:
-    """Autopilot: `FlightController` towards the plant, `port.AutopilotPort` towards MAVLink."""
+    """Autopilot: `FlightController` towards the plant, commands in and state out towards MAVLink.
+
+    Every call happens between two ticks, on one thread.
+    """
 
     rate_hz = TICK_HZ
 
@@ -85,7 +90,7 @@ class BuiltinAutopilot:
         self.record = record = self.estimator.record
         """Record of samples, estimate and control loops."""
         self._state = self.estimator.state
-        self._guidance = Guidance(value, self._say, record)
+        self._guidance = Guidance(value, self.say, record)
         self._navigator = Navigator(self.plans, value, self)
         self._guidance.context.return_place = self._return_place
         self._guidance.context.missions = self._navigator.missions
@@ -127,26 +132,14 @@ class BuiltinAutopilot:
             ),
             self._newest,
             self._state,
-            self._say,
-        )
-        self._parts = Parts(
-            self.estimator,
-            self._commander,
-            self.supervisor,
-            self._guidance,
-            self._navigator,
-            self._controller,
-            self._newest,
-            self._home,
-            self.plans,
-            value,
+            self.say,
         )
         self._snapshot: AutopilotState | None = None
         self._unfused: set[str] = set()
         """Kinds of client sensors that were reported as not fused."""
-        self.failures: Failures | None = None
-        """Failure injection for client requests. Set by the simulation."""
-        self.logs: LogStore = NoLogs()
+        self.failures: ClientFaults | None = None
+        """Failure injection for client requests; None: not supported. Set by the simulation."""
+        self.logs = LogStore()
         """Flight logs for clients. Set by the log writer."""
         self.on_setpoint: Callable[[Wire, int], None] | None = None
         """Callback for accepted setpoints: setpoint as received, time of receipt [µs]."""
@@ -323,11 +316,9 @@ class BuiltinAutopilot:
             self._due_us = min(self._due_us, self._taken_us + DECIDE_US)
 
     def fuse(self, sample: SensorSample, left: int) -> None:
-        """Fuse the measurements that a compiled tick leaves to Python.
+        """Fuse the measurements of a sample that a compiled tick leaves to Python.
 
-        Args:
-            sample: Sensors of the tick.
-            left: Bits of the remaining work, as returned by `engine.ticks.estimate`.
+        `left` has the bits of the remaining work, from `engine.ticks.estimate`.
         """
         sensors = self.supervisor.sensors
         sensors.repeated(sample.time_us, left, left >> REPEATED_BITS)
@@ -336,9 +327,7 @@ class BuiltinAutopilot:
     def flown(self, read: Callable[[], SensorSample], event: int) -> bool:
         """Process the results of compiled ticks; return whether the commander's state has changed.
 
-        Args:
-            read: Returns the newest sample, which is already in the estimate.
-            event: Event that ended the ticks (`engine.ticks`).
+        `read` returns the newest sample, which is already in the estimate; `event` ended the ticks.
         """
         before, self._snapshot = self._commander.flight, None
         self._taken_us = self.estimator.flown()
@@ -402,7 +391,8 @@ class BuiltinAutopilot:
             self.supervisor.watch.reports.mission_missing = not valid
         self._commander.look()
 
-    def _say(self, message: OperatorText) -> None:
+    def say(self, message: OperatorText) -> None:
+        """Send a text to the operator."""
         self._messages.append(message)
         if message.event is not None:
             self._events.append(message.event)
@@ -418,7 +408,7 @@ class BuiltinAutopilot:
 
     def _say_all(self, messages: Sequence[OperatorText]) -> None:
         for message in messages:
-            self._say(message)
+            self.say(message)
 
     @property
     def flight(self) -> CommanderState:
@@ -434,7 +424,7 @@ class BuiltinAutopilot:
     def _now_us(self) -> int:
         return max(0, self._taken_us)
 
-    # --- towards MAVLink (port.AutopilotPort)
+    # --- towards MAVLink
 
     @property
     def attitude(self) -> Vector:
@@ -461,10 +451,6 @@ class BuiltinAutopilot:
 
     def close(self) -> None:
         """Do nothing: there are no resources to release."""
-
-    def report(self, message: OperatorText) -> None:
-        """Send a text to the operator that does not come from flying."""
-        self._say(message)
 
     def take_messages(self) -> list[OperatorText]:
         """Return texts for the operator since the last call."""
@@ -505,7 +491,10 @@ class BuiltinAutopilot:
         return self._commander.handle(CommanderEvent.KILL if force else CommanderEvent.DISARM)
 
     def takeoff(self, altitude_m: float | None, place: tuple[float, float] | None = None) -> Result:
-        """Request a take-off to a height above home [m] and a place; None = default."""
+        """Request a take-off to a height above home [m] and a place, local NED north, east [m].
+
+        Default height: MIS_TAKEOFF_ALT; default place: straight up.
+        """
         flying = self.flight.phase is _AIR
         self._guidance.take_off_to(altitude_m, place, self._state, flying=flying)
         return self._ask(Mode.TAKEOFF)
@@ -513,7 +502,10 @@ class BuiltinAutopilot:
     def set_mode(
         self, mode: Mode, request: ModeRequest | None = None, *, commanded: bool = False
     ) -> Result:
-        """Request a mode with its optional arguments; see `port.AutopilotPort`."""
+        """Request a mode with its optional arguments.
+
+        `commanded` is True for a specific command (NAV_LAND), whose acceptance is reported.
+        """
         if mode is Mode.TAKEOFF:
             return self.takeoff(None)
         return self._ask(mode, request, COMMANDED.get(mode) if commanded else None)
@@ -522,7 +514,7 @@ class BuiltinAutopilot:
         self, mode: Mode, request: ModeRequest | None = None, granted: OperatorText | None = None
     ) -> Result:
         if not self._guidance.flies(mode):
-            self._say(unavailable(mode))
+            self.say(unavailable(mode))
             return Result.TEMPORARILY_REJECTED
         self._look_anew(mode)
         # The geofence may forbid the place of the request.
@@ -553,10 +545,6 @@ class BuiltinAutopilot:
         return Result.ACCEPTED
 
     # --- towards the mission (navigation.plan.Crew)
-
-    def say(self, message: OperatorText) -> None:
-        """Send a text to the operator."""
-        self._say(message)
 
     def set_home(self, place: Geodetic | None) -> Result:
         """Move home; None = the current position."""
@@ -596,7 +584,11 @@ class BuiltinAutopilot:
     def offer_attitude(
         self, demand: AttitudeDemand | RateDemand, time_us: int, wire: Wire = UNTOLD
     ) -> None:
-        """Pass on an offboard setpoint of attitude or body rates, received at `time_us`."""
+        """Pass on an offboard setpoint of attitude or body rates, received at `time_us`.
+
+        `wire` identifies it in latency analysis: roll, pitch, yaw [rad] or their rates [rad/s], and
+        thrust.
+        """
         self._guidance.context.offer(demand)
         self.supervisor.setpoint(None, time_us)
         if self.on_setpoint is not None:
@@ -620,14 +612,14 @@ class BuiltinAutopilot:
             return
         if takes_over and self.flight.phase is _AIR and flown is not Mode.ORBIT:
             self._commander.handle(Ask(Mode.POSITION))
-            self._say(OperatorText.of(Severity.INFO, events.PILOT_TOOK_OVER))
+            self.say(OperatorText.of(Severity.INFO, events.PILOT_TOOK_OVER))
 
     def receive(self, name: str, reading: Any) -> None:
         """Pass on a reading of a client's sensor: odometry, distance or flow."""
         fused, self._snapshot = self.estimator.receive(name, reading), None
         if not fused and name not in self._unfused:
             self._unfused.add(name)
-            self._say(OperatorText(Severity.WARNING, f"No add-on fuses the sensor: {name}"))
+            self.say(OperatorText(Severity.WARNING, f"No add-on fuses the sensor: {name}"))
 
     def see_obstacles(self, obstacles: ObstacleBins) -> None:
         """Pass on the distances to obstacles."""
@@ -655,5 +647,5 @@ class BuiltinAutopilot:
         # Without findings and ESC reports, only `_told` can change logged data.
         calm = self.supervisor.is_calm and self._newest.esc_outputs is None
         revision = self._told if calm else None
-        self._snapshot = Snapshot(self._parts, self._taken_us, self._demand, revision)
+        self._snapshot = AutopilotState(self, status, self._taken_us, self._demand, revision)
         return self._snapshot

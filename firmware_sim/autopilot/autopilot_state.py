@@ -1,4 +1,4 @@
-"""State of the autopilot: plain data for MAVLink, the recorder and tests.
+"""Plain data of the autopilot's state for MAVLink, the recorder and tests.
 
 Types created for every snapshot are named tuples, which are faster than dataclasses.
 """
@@ -6,19 +6,15 @@ Types created for every snapshot are named tuples, which are faster than datacla
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.events.definition import Definition, MavlinkEvent
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import Sticks
-from firmware_sim.interfaces import BatterySample, GpsFix, Received
 
 Vector = NDArray[np.float64]
 
@@ -219,138 +215,3 @@ class Health(NamedTuple):
     battery: bool = True
     armable: bool = True
     """No check prevents arming in the current mode."""
-
-
-class AutopilotState(Protocol):
-    """State of the autopilot after its newest tick; valid until the next tick.
-
-    Implementations compute a property when it is read, as most ticks need only a few.
-    """
-
-    @property
-    def time_us(self) -> int:
-        """Simulated time of the tick [µs]."""
-
-    @property
-    def revision(self) -> object:
-        """Same object while log data outside the tick's log is unchanged; None = unknown."""
-
-    @property
-    def estimate(self) -> StateEstimate:
-        """The estimator's output."""
-
-    @property
-    def status(self) -> CommanderStatus:
-        """State of the commander."""
-
-    @property
-    def setpoint(self) -> Setpoint:
-        """Setpoint of the position controller, in every mode."""
-
-    @property
-    def attitude_setpoint(self) -> Vector:
-        """(4,) body -> NED."""
-
-    @property
-    def rate_setpoint(self) -> Vector:
-        """(3,) FRD [rad/s]."""
-
-    @property
-    def thrust_setpoint(self) -> float:
-        """Collective, 0..1."""
-
-    @property
-    def motors(self) -> tuple[float, float, float, float]:
-        """Motor commands, 0..1."""
-
-    @property
-    def accel(self) -> Vector:
-        """(3,) newest raw sample, FRD [m/s²]."""
-
-    @property
-    def gyro(self) -> Vector:
-        """(3,) newest raw sample, FRD [rad/s]."""
-
-    @property
-    def mag(self) -> Vector:
-        """(3,) newest raw sample, FRD [gauss]."""
-
-    @property
-    def pressure_hpa(self) -> float:
-        """Newest static pressure [hPa]."""
-
-    @property
-    def temperature_c(self) -> float:
-        """Air temperature [°C]."""
-
-    @property
-    def battery(self) -> BatterySample:
-        """Report of the power module."""
-
-    @property
-    def gps(self) -> GpsFix | None:
-        """Newest fix; None before the first."""
-
-    @property
-    def home(self) -> Geodetic | None:
-        """Home position; set with the estimator's origin and at arming, None before."""
-
-    @property
-    def origin(self) -> Geodetic | None:
-        """Geodetic origin of local NED; None before the first fix."""
-
-    @property
-    def load(self) -> float:
-        """Share of the tick spent computing, 0..1."""
-
-    @property
-    def armed_us(self) -> int:
-        """Time of arming [µs], 0 while disarmed."""
-
-    @property
-    def takeoff_us(self) -> int:
-        """Time of take-off [µs], 0 before."""
-
-    @property
-    def mission(self) -> MissionProgress:
-        """Progress of the mission."""
-
-    @property
-    def fence(self) -> FenceStatus:
-        """Violated limits of the geofence."""
-
-    @property
-    def orbit(self) -> OrbitStatus | None:
-        """Active circle in Orbit mode."""
-
-    @property
-    def health(self) -> Health:
-        """Usability of sensors and estimates."""
-
-    @property
-    def hover_thrust(self) -> float:
-        """Collective thrust in hover, 0..1."""
-
-    @property
-    def destination(self) -> tuple[float, float, float] | None:
-        """Destination of an automatic mode, local NED [m]; None in other modes."""
-
-    @property
-    def home_yaw(self) -> float:
-        """Heading at home [rad]."""
-
-    @property
-    def sticks(self) -> Sticks | None:
-        """Pilot's sticks; None = no pilot."""
-
-    @property
-    def esc_outputs(self) -> tuple[float, float, float, float] | None:
-        """Motor outputs reported by the speed controllers; None: outputs equal commands."""
-
-    @property
-    def readings(self) -> Mapping[str, Received]:
-        """Newest readings of further sensors by name (`sensor_table.Sensor.reading`)."""
-
-    @property
-    def clearance(self) -> Clearance | None:
-        """Height above the ground; None before the first range."""

@@ -69,14 +69,9 @@ def new_state() -> Vector:
 
 @kernel
 def propagate(row: Vector, gyro: Vector, accel: Vector, transition: Vector, dt: float) -> None:
-    """Advance the nominal state by one IMU sample; write the error's transition matrix.
+    """Advance the nominal state by an IMU sample, gyro [rad/s] and specific force [m/s²] FRD.
 
-    Args:
-        row: Nominal state (ROW_SIZE,), updated.
-        gyro: Sample (3,) FRD [rad/s].
-        accel: Sample (3,), specific force FRD [m/s²].
-        transition: (16, 16), updated where it differs from the identity.
-        dt: Time step [s].
+    Writes the error's transition matrix (16, 16) where it differs from the identity.
     """
     # Subtract the estimated biases: rates and specific force in body axes.
     wx = gyro[0] - row[GYRO_BIAS]
@@ -155,13 +150,8 @@ def observe_heading(
 ) -> bool:
     """Write the heading's innovation (1,) and its Jacobian (1, 16); False = not observable.
 
-    Args:
-        row: Nominal state.
-        field: Magnetometer sample (3,) FRD.
-        declination: Angle from true to magnetic north [rad].
-        by_turn: Change of the innovation by a turn about each world axis (3,).
-        innovation: Written.
-        h: Written.
+    `field` is a magnetometer sample (3,) FRD, `declination` the angle from true to magnetic north
+    [rad], `by_turn` the change of the innovation by a turn about each world axis (3,).
     """
     w, x, y, z = q = attitude(row)
     # 2 (w y - z x) is the sine of the pitch.
@@ -361,14 +351,9 @@ class ErrorFilter(Protocol):
     def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
         """Correct the nominal state by one measurement, unless it fails the gate.
 
-        Args:
-            state: Nominal state.
-            innovation: Measured minus expected (m,).
-            h: Jacobian of the expected measurement by the error (m, 16).
-            variance: Variances of the independent noises (m,).
-
-        Returns:
-            Test ratio: 1 = at the gate; above 1, or NaN, nothing was corrected.
+        The innovation (m,) is measured minus expected, `h` (m, 16) the Jacobian of the expected
+        measurement by the error, `variance` (m,) that of the independent noises. Returns the test
+        ratio: 1 = at the gate; above 1, or NaN, nothing was corrected.
         """
 
 
@@ -382,13 +367,10 @@ class Measurement:
     def __init__(
         self, name: str, ratio: int, h: Vector, fused: NDArray[np.int64] | None = None
     ) -> None:
-        """Allocate the buffers.
+        """Allocate the buffers of a measurement with Jacobian h (m, 16).
 
-        Args:
-            name: Name of the measurement.
-            ratio: Index in the estimate's test ratios.
-            h: Jacobian (m, 16).
-            fused: (1,) array for the time of the newest fusion [µs]; None = a new array.
+        `ratio` is its index in the estimate's test ratios, `fused` a (1,) array for the time of the
+        newest fusion [µs]; None = a new array.
         """
         self.name = name
         self.slot = RATIO + ratio

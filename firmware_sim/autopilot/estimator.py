@@ -25,7 +25,7 @@ from airl_mav.core.frames import (
 )
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.alignment import Alignment, FieldCheck
+from firmware_sim.autopilot.alignment import Alignment, FieldCheck, add_record
 from firmware_sim.autopilot.autopilot_state import Clearance, StateEstimate
 from firmware_sim.autopilot.error_state import (
     FusionHorizon,
@@ -37,7 +37,10 @@ from firmware_sim.autopilot.error_state import (
 from firmware_sim.autopilot.recovery import Recovery, RecoveryState
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 from firmware_sim.engine.record import (
+    GPS,
+    MAG,
     OFF,
+    PRESSURE,
     SUSPECT,
     TRUSTED,
     Record,
@@ -119,6 +122,14 @@ class Aiding:
         return False
 
 
+def _in_record(name: str, kind: type) -> Any:
+    """Return a property that is a field of the flight controller's record."""
+    return property(
+        lambda self: kind(self.record[name].item(0)),
+        lambda self, value: self.record.__setitem__(name, value),
+    )
+
+
 def aiding() -> type[Aiding]:
     """Return the installed fusion of further sensors."""
     for place in entries("firmware_sim", "AIDING").values():
@@ -136,12 +147,9 @@ class Estimator:
         new_filter: NewFilter = KernelFilter,
         record: Record | None = None,
     ) -> None:
-        """Start unaligned.
+        """Start unaligned, with a look-up for EKF2_* parameters and a factory of the filter.
 
-        Args:
-            value: Look-up for EKF2_* parameters by name.
-            new_filter: Factory for the covariance filter.
-            record: Flight controller's record with state and covariance; None = a new record.
+        `record` is the flight controller's, with state and covariance; None = a new record.
         """
         self.record = record = new_controller() if record is None else record
         """Record of the flight controller."""
@@ -203,32 +211,14 @@ class Estimator:
         self.is_changed = True
         """True if Python has changed inputs of compiled ticks; see `prepare`."""
 
-    @property
-    def healthy(self) -> bool:
-        """True if converged: the vehicle may arm and fly."""
-        return bool(self.record["healthy"].item(0))
-
-    @healthy.setter
-    def healthy(self, healthy: bool) -> None:
-        self.record["healthy"] = healthy
-
-    @property
-    def flying(self) -> bool:
-        """True if the vehicle is in the air; set by the caller."""
-        return bool(self.record["flying"].item(0))
-
-    @flying.setter
-    def flying(self, flying: bool) -> None:
-        self.record["flying"] = flying
-
-    @property
-    def _origin_altitude_baro(self) -> float:
-        """Barometer altitude of local NED's origin [m]."""
-        return self.record["baro_origin_m"].item(0)
-
-    @_origin_altitude_baro.setter
-    def _origin_altitude_baro(self, altitude: float) -> None:
-        self.record["baro_origin_m"] = altitude
+    healthy: bool = _in_record("healthy", bool)
+    """True if converged: the vehicle may arm and fly."""
+    flying: bool = _in_record("flying", bool)
+    """True if the vehicle is in the air; set by the caller."""
+    aligned: bool = _in_record("aligned", bool)
+    """True if the attitude is known: the sensors have been averaged at rest."""
+    _origin_altitude_baro: float = _in_record("baro_origin_m", float)
+    """Barometer altitude of local NED's origin [m]."""
 
     def step(self, sample: SensorSample) -> None:
         """Process one tick's sensors."""
@@ -236,7 +226,8 @@ class Estimator:
         # Alignment and logs read the newest samples from the record.
         self._note(sample)
         if not self.aligned:
-            self._alignment.take(sample)
+            measured = MAG * (sample.mag is not None) | PRESSURE * (sample.pressure_hpa is not None)
+            add_record(self.record, measured | GPS * (sample.gps is not None))
             self.align()
         else:
             self._predict(sample)
@@ -401,15 +392,6 @@ class Estimator:
             or self._recent(self.gps_vertical, now_us, longest_us)
             or self.aiding.knows_height(now_us, longest_us)
         )
-
-    @property
-    def aligned(self) -> bool:
-        """True if the attitude is known: the sensors have been averaged at rest."""
-        return bool(self.record["aligned"].item(0))
-
-    @aligned.setter
-    def aligned(self, aligned: bool) -> None:
-        self.record["aligned"] = aligned
 
     @property
     def knows_place(self) -> bool:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.parameters import SPEC_BY_NAME, SPECS, flown_values, parameter_values
-from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
-from firmware_sim.autopilot.port import ParameterValue
+from firmware_sim.autopilot.autopilot_state import (
+    OperatorText,
+    Severity,
+)
 
 _INDEX = {spec.name: i for i, spec in enumerate(SPECS)}
 FLOAT32_RELATIVE = 1e-6
@@ -29,7 +32,7 @@ class Keeper(Protocol):
 
 
 class Parameters:
-    """Parameters of a vehicle. Implements `port.ParameterStore`.
+    """Parameters of a vehicle.
 
     As in PX4, values are stored as given. Flight code reads them clipped to supported limits.
     """
@@ -41,14 +44,9 @@ class Parameters:
     ) -> None:
         """Start from the defaults.
 
-        Args:
-            overrides: Values of a vehicle profile, checked by `parameter_values`; this vehicle's
-                defaults.
-            keeper: Persistent storage of the user's values; None: no storage. Unknown names and
-                values of the wrong type are ignored.
-
-        Raises:
-            UsageError: An override is unknown or out of range, or the storage cannot be read.
+        `overrides` of a vehicle profile, checked by `parameter_values`, are this vehicle's
+        defaults. `keeper` stores the user's values; unknown names and values of the wrong type are
+        ignored. Raises UsageError for an invalid override, or if the storage cannot be read.
         """
         values = parameter_values(overrides or {})
         self._defaults = dict(values)
@@ -184,3 +182,13 @@ class Parameters:
     def _bounded_text(self, name: str) -> OperatorText:
         value, flown = self._values[_INDEX[name]], self._flown[name]
         return OperatorText(Severity.WARNING, f"{name} {value:g} is flown as {flown:g}")
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterValue:
+    """Parameter as stored."""
+
+    name: str
+    value: int | float
+    """Value: int for INT32 parameters, float for REAL32."""
+    index: int

@@ -81,10 +81,7 @@ class EmergencyYaw:
     def is_due(self, time_us: int, yaw: YawEstimator, fused_us: int | None) -> bool:
         """Return whether a suspected heading must be reset now.
 
-        Args:
-            time_us: Current time [µs].
-            yaw: Yaw estimator.
-            fused_us: Time of the last GPS velocity within the gate; None = never.
+        `fused_us` is the time of the last GPS velocity within the gate; None = never.
         """
         refused = fused_us is not None and time_us - fused_us >= REFUSED_US
         doubted = self.is_doubted(time_us)
@@ -97,13 +94,7 @@ def turn_to(state: Vector, covariance: Vector, yaw: float, variance: float) -> V
     """Turn the nominal state about the world's down axis to a heading; return its covariance.
 
     Correlations learned with the wrong heading are cleared. The uncertainty of velocity and biases
-    returns to at least the initial values.
-
-    Args:
-        state: Nominal state, updated.
-        covariance: Covariance of the error (16, 16).
-        yaw: Heading [rad].
-        variance: Variance of the heading [rad²].
+    returns to at least the initial values. The heading is `yaw` [rad], its variance [rad²].
     """
     # Half angles make the quaternion.
     half = 0.5 * (yaw - yaw_of(es.attitude(state)))
@@ -140,12 +131,9 @@ class Recovery:
     """Monitor of velocities and headings that restarts the filter after faults."""
 
     def __init__(
-        self, state: Vector, error_filter: ErrorFilter, yaw: YawEstimator, record: Any = None
+        self, state: Vector, error_filter: ErrorFilter, yaw: YawEstimator, record: Any
     ) -> None:
-        """Store the nominal state, its filter (both updated), and the yaw estimator.
-
-        `record` is the flight controller's record; None = a new one.
-        """
+        """Store the nominal state and its filter, both updated, yaw estimator and record."""
         self._state, self._filter, self._yaw = state, error_filter, yaw
         self.consistency = Consistency(record)
         """Detector of inertial sensor faults."""
@@ -195,15 +183,9 @@ class Recovery:
     ) -> None:
         """Reset heading to the yaw estimator and motion to GPS, and disable the compass.
 
-        Tilt and biases learned since a restart are discarded.
-
-        Args:
-            place: Measured position (3,) NED [m].
-            velocity: Measured velocity (3,) NED [m/s].
-            then: Filter's position and velocity (6,) at the time of the measurement.
-            r_p: Variance of the position [m²].
-            r_v: Variance of the velocity [m²/s²].
-            now: Time and flight state.
+        Tilt and biases learned since a restart are discarded. `place` and `velocity` are measured,
+        (3,) NED, with variances `r_p` [m²] and `r_v` [m²/s²]; `then` are the filter's position and
+        velocity (6,) at the time of the measurement.
         """
         state = self._state
         if self.doubts_inertial(now.time_us):
@@ -290,27 +272,6 @@ _OUTLIER = 12.0
 """Upper limit of a sample's contribution: one outlier, which differs twice, is not yet noise."""
 
 
-class SigmaLimits(NamedTuple):
-    """Minimum and maximum standard deviation after a restart."""
-
-    least: float
-    greatest: float
-
-    def bound(self, sigma: float) -> float:
-        """Return a standard deviation clipped to the limits."""
-        return min(max(sigma, self.least), self.greatest)
-
-
-VELOCITY = SigmaLimits(0.3, 10.0)
-"""[m/s]"""
-ATTITUDE = SigmaLimits(0.1, 0.3)
-"""[rad]"""
-ACCEL_BIAS = SigmaLimits(0.5, 5.0)
-"""[m/s²]"""
-GYRO_BIAS = SigmaLimits(0.04, 0.2)
-"""2.3 to 11 °/s [rad/s]"""
-
-
 class Restart(NamedTuple):
     """Standard deviations of the filter's errors after a restart."""
 
@@ -318,6 +279,11 @@ class Restart(NamedTuple):
     attitude_rad: float
     accel_bias_m_s2: float
     gyro_bias_rad_s: float
+
+
+LEAST = Restart(0.3, 0.1, 0.5, 0.04)
+GREATEST = Restart(10.0, 0.3, 5.0, 0.2)
+"""Limits of the standard deviations; those of the gyro bias are 2.3 and 11 °/s."""
 
 
 def restart_for(velocity_m_s: float, seconds: float) -> Restart:
@@ -328,12 +294,9 @@ def restart_for(velocity_m_s: float, seconds: float) -> Restart:
     """
     acceleration = abs(velocity_m_s) / seconds
     tilt = acceleration / GRAVITY_M_S2
-    return Restart(
-        VELOCITY.bound(abs(velocity_m_s)),
-        ATTITUDE.bound(tilt),
-        ACCEL_BIAS.bound(acceleration),
-        GYRO_BIAS.bound(tilt / seconds),
-    )
+    sigmas = Restart(abs(velocity_m_s), tilt, acceleration, tilt / seconds)
+    bounded = zip(sigmas, LEAST, GREATEST, strict=True)
+    return Restart._make(min(max(sigma, least), greatest) for sigma, least, greatest in bounded)
 
 
 class InnovationCounter:
@@ -409,10 +372,7 @@ class Compass:
 def note_velocity(record: Any, deviations: Vector, acceleration: Vector) -> None:
     """Record a velocity's noise and the vehicle's acceleration in a flight controller's record.
 
-    Args:
-        record: Updated.
-        deviations: Innovation in standard deviations (3,).
-        acceleration: Estimate (3,) NED [m/s²].
+    `deviations` (3,) are the innovation in standard deviations; `acceleration` (3,) is NED [m/s²].
     """
     square, slot = 0.0, record.fixes % LOOK_BACK
     for i in range(3):
@@ -434,12 +394,8 @@ def _note_velocity(records: Any, deviations: Vector, acceleration: Vector) -> No
 class Consistency:
     """Monitor for the innovations of velocity and heading."""
 
-    def __init__(self, record: Any = None) -> None:
-        """Use the record of a flight controller; None = a new record."""
-        if record is None:
-            from firmware_sim.engine.record import new_controller
-
-            record = new_controller()
+    def __init__(self, record: Any) -> None:
+        """Use the record of a flight controller."""
         self._record = record
         self.restarts = 0
         """Number of filter restarts."""
@@ -467,16 +423,10 @@ class Consistency:
     def velocity(
         self, innovation: Vector, sigma: Vector, acceleration: Vector, time_us: int
     ) -> Restart | None:
-        """Check a GPS velocity.
+        """Check a GPS velocity; return the standard deviations of a filter restart; None = none.
 
-        Args:
-            innovation: Measured minus expected (3,) NED [m/s].
-            sigma: Expected standard deviation of the innovation (3,) [m/s].
-            acceleration: Estimate (3,) NED [m/s²].
-            time_us: Current time [µs].
-
-        Returns:
-            Standard deviations for a filter restart; None: no restart needed.
+        The innovation (3,) is measured minus expected, NED [m/s], `sigma` (3,) its expected
+        standard deviation, `acceleration` (3,) the estimate [m/s²].
         """
         deviations = innovation / sigma
         if not np.isfinite(deviations).all():

@@ -22,7 +22,7 @@ from airl_mav.core.frames import HOME, Vector, local_to_geodetic
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import MavlinkEvent, SensorFailure, SensorType
-from firmware_sim.engine.record import CHANGED, FIRST, GPS_ROW, SEEN, WATCHES, Record
+from firmware_sim.engine.record import CHANGED, FIRST, GPS_ROW, SEEN, Record
 from firmware_sim.engine.record import GPS as GPS_BIT
 from firmware_sim.engine.record import MAG as MAG_BIT
 from firmware_sim.engine.record import PRESSURE as PRESSURE_BIT
@@ -170,9 +170,9 @@ class Valid(NamedTuple):
 class SensorMonitor:
     """Monitor of all sensors of the vehicle."""
 
-    def __init__(self, watch: NDArray[np.int64] | None = None) -> None:
-        """Start without samples, in `watch` (`engine.record`); None = a new array."""
-        self._times = times = np.full((WATCHES, 3), -1) if watch is None else watch
+    def __init__(self, watch: NDArray[np.int64]) -> None:
+        """Start without samples, in `watch` (`engine.record`)."""
+        self._times = times = watch
         self.gyro, self.accel, self.mag, self.baro, self.gps = self.all = tuple(
             SensorWatch(kind, row)
             for kind, row in zip((GYRO, ACCEL, MAG, BARO, GPS), times, strict=True)
@@ -196,12 +196,9 @@ class SensorMonitor:
             self._take(self.gps, sample)
 
     def repeated(self, time_us: int, measured: int, repeated: int) -> None:
-        """Process the slow sensors of a compiled tick, including repeated values.
+        """Process the slow sensors of a compiled tick at `time_us`.
 
-        Args:
-            time_us: Time of the tick [µs].
-            measured: Bits of the sensors with data, as in `engine.record`.
-            repeated: Bits of the sensors with repeated data.
+        The bits of sensors with data, and with repeated data, are those of `engine.record`.
         """
         self.distrusted = False
         for bit, watch in ((MAG_BIT, self.mag), (PRESSURE_BIT, self.baro), (GPS_BIT, self.gps)):

@@ -1,34 +1,34 @@
-"""State of the built-in autopilot for clients, the recorder and tests."""
+"""State of the autopilot for MAVLink, the recorder and tests."""
 
-# ruff: noqa: D102 (properties are documented in `AutopilotState`)
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from airl_mav.control.demand import AnyDemand
-from airl_mav.core.frames import Vector
+from airl_mav.core.frames import Geodetic, Vector
 from firmware_sim.autopilot.autopilot_state import (
     NO_MISSION,
+    Clearance,
     CommanderStatus,
+    FenceStatus,
     Health,
     MissionProgress,
     OrbitStatus,
     Setpoint,
+    StateEstimate,
 )
-from firmware_sim.autopilot.estimator import Estimator
-from firmware_sim.autopilot.failsafes.supervisor import Supervisor
-from firmware_sim.autopilot.flight_commander import FlightCommander
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.guidance import Guidance, Home
-from firmware_sim.autopilot.navigation.navigator import Navigator
+from firmware_sim.autopilot.inputs import Sticks
 from firmware_sim.autopilot.navigation.plan import MissionType, Plans
-from firmware_sim.autopilot.sensor_monitor import NewestSensors
-from firmware_sim.engine.controller import Controller, ControlSetpoints
 from firmware_sim.engine.record import POSITION, TRAJECTORY
-from firmware_sim.interfaces import SensorSample
+from firmware_sim.interfaces import BatterySample, GpsFix, Received
+
+if TYPE_CHECKING:
+    from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+    from firmware_sim.engine.controller import ControlSetpoints
 
 
 def progress(plans: Plans) -> MissionProgress:
@@ -42,11 +42,9 @@ def progress(plans: Plans) -> MissionProgress:
 
 
 def setpoint_of(tick: Any, velocity: Vector) -> Setpoint:
-    """Return the controller's setpoint in a tick.
+    """Return the controller's setpoint in a tick of its record or log (`engine.record`).
 
-    Args:
-        tick: Element of the record of the flight controller or of its log (`engine.record`).
-        velocity: Setpoint of the velocity loop (3,) NED [m/s].
+    `velocity` is the setpoint of the velocity loop (3,) NED [m/s].
     """
     kind, demand = tick["demand_kind"], tick["demand"].copy()
     # Other kinds have no position setpoint: log the present position instead.
@@ -57,102 +55,144 @@ def setpoint_of(tick: Any, velocity: Vector) -> Setpoint:
     return Setpoint(demand[:3], velocity, float(demand[yaw]), float(demand[yaw + 1]))
 
 
-class Parts(NamedTuple):
-    """Components of the autopilot that the snapshot reads."""
+class AutopilotState:
+    """State of the autopilot after its newest tick; valid until the next tick.
 
-    estimator: Estimator
-    commander: FlightCommander
-    supervisor: Supervisor
-    guidance: Guidance
-    navigator: Navigator
-    controller: Controller
-    newest: NewestSensors
-    home: Home
-    plans: Plans
-    value: Callable[[str], float]
-    """Look-up for parameters by name."""
+    Values are computed when they are read (`_READ`), as most ticks need only a few.
+    """
 
+    __slots__ = ("_autopilot", "_demand", "_health", "_loops", "revision", "status", "time_us")
 
-class Snapshot:
-    """Implementation of `AutopilotState` that reads components on access."""
-
-    load = 0.0
-
-    __slots__ = ("_controlled", "_demand", "_health", "_parts", "revision", "status", "time_us")
+    time_us: int
+    """Simulated time of the tick [µs]."""
+    revision: object
+    """Same object while log data outside the tick's log is unchanged; None = unknown."""
+    estimate: StateEstimate
+    """The estimator's output."""
+    status: CommanderStatus
+    """State of the commander."""
+    setpoint: Setpoint
+    """Setpoint of the position controller, in every mode."""
+    attitude_setpoint: Vector
+    """(4,) body -> NED."""
+    rate_setpoint: Vector
+    """(3,) FRD [rad/s]."""
+    thrust_setpoint: float
+    """Collective, 0..1."""
+    motors: tuple[float, float, float, float]
+    """Motor commands, 0..1."""
+    accel: Vector
+    """(3,) newest raw sample, FRD [m/s²]."""
+    gyro: Vector
+    """(3,) newest raw sample, FRD [rad/s]."""
+    mag: Vector
+    """(3,) newest raw sample, FRD [gauss]."""
+    pressure_hpa: float
+    """Newest static pressure [hPa]."""
+    temperature_c: float
+    """Air temperature [°C]."""
+    battery: BatterySample
+    """Report of the power module."""
+    gps: GpsFix | None
+    """Newest fix; None before the first."""
+    home: Geodetic | None
+    """Home position; set with the estimator's origin and at arming, None before."""
+    origin: Geodetic | None
+    """Geodetic origin of local NED; None before the first fix."""
+    load: float
+    """Share of the tick spent computing, 0..1."""
+    armed_us: int
+    """Time of arming [µs], 0 while disarmed."""
+    takeoff_us: int
+    """Time of take-off [µs], 0 before."""
+    mission: MissionProgress
+    """Progress of the mission."""
+    fence: FenceStatus
+    """Violated limits of the geofence."""
+    orbit: OrbitStatus | None
+    """Active circle in Orbit mode."""
+    health: Health
+    """Usability of sensors and estimates."""
+    hover_thrust: float
+    """Collective thrust in hover, 0..1."""
+    destination: tuple[float, float, float] | None
+    """Destination of an automatic mode, local NED [m]; None in other modes."""
+    home_yaw: float
+    """Heading at home [rad]."""
+    sticks: Sticks | None
+    """Pilot's sticks; None = no pilot."""
+    esc_outputs: tuple[float, float, float, float] | None
+    """Motor outputs reported by the speed controllers; None: outputs equal commands."""
+    readings: Mapping[str, Received]
+    """Newest readings of further sensors by name (`sensor_table.Sensor.reading`)."""
+    clearance: Clearance | None
+    """Height above the ground; None before the first range."""
 
     def __init__(
-        self, parts: Parts, time_us: int, demand: AnyDemand | None, revision: object
+        self,
+        autopilot: BuiltinAutopilot,
+        status: CommanderStatus,
+        time_us: int,
+        demand: AnyDemand | None,
+        revision: object,
     ) -> None:
-        """Take a snapshot after a tick.
-
-        Args:
-            parts: Components of the autopilot.
-            time_us: Time of the tick [µs].
-            demand: Active demand; None = the motors are stopped.
-            revision: See `AutopilotState`.
-        """
+        """Take a snapshot after a tick at `time_us`; demand None = the motors are stopped."""
         # No copies: most snapshots are read only in part.
-        self._parts, self.time_us, self._demand = parts, time_us, demand
-        self.revision = revision
-        self.status: CommanderStatus = parts.commander.status
-        self._controlled: ControlSetpoints | None = None
+        self._autopilot, self._demand = autopilot, demand
+        self.status, self.time_us, self.revision = status, time_us, revision
+        self._loops: ControlSetpoints | None = None
         self._health: Health | None = None
-
-    motors = property(attrgetter("_parts.controller.motors"))
-    estimate = property(lambda self: self._parts.estimator.estimate())
-
-    @property
-    def setpoint(self) -> Setpoint:
-        return setpoint_of(self._parts.estimator.record[0], self._setpoints.velocity)
-
-    attitude_setpoint = property(attrgetter("_setpoints.attitude"))
-    rate_setpoint = property(attrgetter("_setpoints.rates"))
-    thrust_setpoint = property(attrgetter("_setpoints.thrust"))
-    accel = property(attrgetter("_sample.accel"))
-    gyro = property(attrgetter("_sample.gyro"))
-    mag = property(attrgetter("_parts.newest.mag"))
-    pressure_hpa = property(attrgetter("_parts.newest.pressure_hpa"))
-    temperature_c = property(attrgetter("_sample.temperature_c"))
-    battery = property(attrgetter("_sample.battery"))
-    gps = property(attrgetter("_parts.newest.gps"))
-    home = property(attrgetter("_parts.home.place"))
-    origin = property(attrgetter("_parts.estimator.origin"))
-    armed_us = property(attrgetter("_parts.commander.armed_us"))
-    takeoff_us = property(attrgetter("_parts.commander.takeoff_us"))
-    mission = property(lambda self: progress(self._parts.plans))
-    fence = property(attrgetter("_parts.navigator.fence.status"))
-
-    @property
-    def orbit(self) -> OrbitStatus | None:
-        flies = self._parts.commander.flight.mode is Mode.ORBIT
-        return self._parts.guidance.context.orbit if flies else None
-
-    @property
-    def health(self) -> Health:
-        if self._health is None:
-            self._health = self._parts.supervisor.health(self.time_us)
-        return self._health
-
-    hover_thrust = property(lambda self: self._parts.value("MPC_THR_HOVER"))
-
-    @property
-    def destination(self) -> tuple[float, float, float] | None:
-        return None if self._demand is None else self._parts.guidance.destination
-
-    home_yaw = property(attrgetter("_parts.guidance.context.home_yaw"))
-    sticks = property(attrgetter("_parts.guidance.context.sticks"))
-    esc_outputs = property(attrgetter("_parts.newest.esc_outputs"))
-    readings = property(attrgetter("_parts.estimator.readings"))
-    clearance = property(attrgetter("_parts.estimator.aiding.ground"))
-
-    @property
-    def _sample(self) -> SensorSample:
-        sample = self._parts.newest.sample
-        assert sample is not None  # noqa: S101 (a snapshot is taken after a tick)
-        return sample
 
     @property
     def _setpoints(self) -> ControlSetpoints:
-        if self._controlled is None:
-            self._controlled = self._parts.controller.setpoints()
-        return self._controlled
+        if self._loops is None:
+            self._loops = self._autopilot._controller.setpoints()
+        return self._loops
+
+    def _checked(self) -> Health:
+        if self._health is None:
+            self._health = self._autopilot.supervisor.health(self.time_us)
+        return self._health
+
+    def _circle(self) -> OrbitStatus | None:
+        autopilot = self._autopilot
+        return autopilot._guidance.context.orbit if autopilot.flight.mode is Mode.ORBIT else None
+
+
+_READ: dict[str, Callable[[Any], Any]] = {
+    "estimate": lambda state: state._autopilot.estimator.estimate(),
+    "setpoint": lambda state: setpoint_of(state._autopilot.record[0], state._setpoints.velocity),
+    "attitude_setpoint": attrgetter("_setpoints.attitude"),
+    "rate_setpoint": attrgetter("_setpoints.rates"),
+    "thrust_setpoint": attrgetter("_setpoints.thrust"),
+    "motors": attrgetter("_autopilot._controller.motors"),
+    "accel": attrgetter("_autopilot._newest.sample.accel"),
+    "gyro": attrgetter("_autopilot._newest.sample.gyro"),
+    "mag": attrgetter("_autopilot._newest.mag"),
+    "pressure_hpa": attrgetter("_autopilot._newest.pressure_hpa"),
+    "temperature_c": attrgetter("_autopilot._newest.sample.temperature_c"),
+    "battery": attrgetter("_autopilot._newest.sample.battery"),
+    "gps": attrgetter("_autopilot._newest.gps"),
+    "home": attrgetter("_autopilot._home.place"),
+    "origin": attrgetter("_autopilot.estimator.origin"),
+    "load": lambda _state: 0.0,
+    "armed_us": attrgetter("_autopilot._commander.armed_us"),
+    "takeoff_us": attrgetter("_autopilot._commander.takeoff_us"),
+    "mission": lambda state: progress(state._autopilot.plans),
+    "fence": attrgetter("_autopilot._navigator.fence.status"),
+    "orbit": AutopilotState._circle,
+    "health": AutopilotState._checked,
+    "hover_thrust": lambda state: state._autopilot.parameters.value("MPC_THR_HOVER"),
+    "destination": lambda state: (
+        None if state._demand is None else state._autopilot._guidance.destination
+    ),
+    "home_yaw": attrgetter("_autopilot._guidance.context.home_yaw"),
+    "sticks": attrgetter("_autopilot._guidance.context.sticks"),
+    "esc_outputs": attrgetter("_autopilot._newest.esc_outputs"),
+    "readings": attrgetter("_autopilot.estimator.readings"),
+    "clearance": attrgetter("_autopilot.estimator.aiding.ground"),
+}
+"""Sources of the values of `AutopilotState`."""
+
+for _name, _read in _READ.items():
+    setattr(AutopilotState, _name, property(_read))

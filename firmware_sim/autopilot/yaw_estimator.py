@@ -48,68 +48,13 @@ EXCUSED = 2.0
 
 @kernel
 def note_motion(record: Any, north: float, east: float, accuracy: float) -> None:
-    """Record a fix in the record of a flight controller.
-
-    Args:
-        record: Updated; its yaw estimator holds the IMU-only velocity up to a constant.
-        north: GPS velocity [m/s].
-        east: GPS velocity [m/s].
-        accuracy: Standard deviation of each component [m/s].
-    """
+    """Record a GPS velocity [m/s] with its standard deviation per axis (`accuracy`)."""
     slot = record.motions % WINDOW
     record.felt_motion[slot, 0] = record.yaw_shared[FELT]
     record.felt_motion[slot, 1] = record.yaw_shared[FELT + 1]
     record.seen_motion[slot, 0], record.seen_motion[slot, 1] = north, east
     record.motions += 1
     record.motion_variance = accuracy * accuracy
-
-
-class TurnedMotion:
-    """Newest velocities from IMU and GPS."""
-
-    def __init__(self, record: Any) -> None:
-        """Use the record of a flight controller."""
-        self._record = record
-
-    def restart(self) -> None:
-        """Discard all velocities."""
-        self._record["motions"] = 0
-
-    @property
-    def _seen(self) -> Vector:
-        return self._complex("seen_motion")
-
-    def _complex(self, name: str) -> Vector:
-        """Return the newest velocities as complex numbers, north and east."""
-        record = self._record
-        rows = record[name][0, : min(record["motions"].item(0), WINDOW)]
-        velocities: Vector = rows[:, 0] + 1j * rows[:, 1]
-        return velocities
-
-    def explained(self, turn: float) -> float:
-        """Return the share of the disagreement that another heading would explain.
-
-        Args:
-            turn: Angle from the IMU velocity's axes to the tested heading [rad].
-
-        Returns:
-            0 to 1; 0 if there is no disagreement.
-        """
-        w = self._seen
-        if not len(w):
-            return 0.0
-        # Complex numbers: a turn is a factor, and the best turn has the phase of the product.
-        u = self._complex("felt_motion") * cmath.exp(1j * turn)
-        # Without the means the unknown constant velocity cancels.
-        u, w = u - u.mean(), w - w.mean()
-        common = complex(np.vdot(u, w))
-        power = float(np.vdot(u, u).real + np.vdot(w, w).real)
-        # GPS noise explains a part of the power: 2 components per fix.
-        rest = power - 2.0 * EXCUSED * self._record["motion_variance"].item(0) * len(w)
-        # Rest at the best angle, and rest at the tested angle.
-        turned = max(rest - 2.0 * abs(common), 0.0)
-        as_they_are = rest - 2.0 * common.real
-        return 1.0 - turned / as_they_are if as_they_are > turned else 0.0
 
 
 N_MODELS = 5
@@ -254,14 +199,9 @@ def _add_change(shared: Vector, north: float, east: float) -> None:
 
 @large_kernel
 def advance(models: Vector, shared: Vector, gyro: Vector, accel: Vector, dt: float) -> None:
-    """Advance all models by IMU samples.
+    """Advance all models by n IMU samples (3 n,): gyro [rad/s] and specific force [m/s²], FRD.
 
-    Args:
-        models: (N_MODELS, MODEL_SIZE), updated.
-        shared: (SHARED_SIZE,), updated.
-        gyro: Samples (3 n,), FRD [rad/s].
-        accel: Samples (3 n,), specific force FRD [m/s²].
-        dt: Time step [s].
+    Updates `models` (N_MODELS, MODEL_SIZE) and `shared` (SHARED_SIZE,); `dt` is the time step [s].
     """
     # Low-pass for the specific force, ten times faster than the tilt correction.
     share = min(ACCEL_FILTER * dt * TILT_GAIN, 1.0)
@@ -354,14 +294,9 @@ def _correct(m: Vector, north: float, east: float, variance: float) -> float:
 
 @large_kernel
 def fuse(models: Vector, shared: Vector, north: float, east: float, accuracy: float) -> None:
-    """Fuse a GPS velocity, and write heading and variance of the sum.
+    """Fuse a GPS velocity [m/s], and write heading and variance of the sum.
 
-    Args:
-        models: (N_MODELS, MODEL_SIZE), updated.
-        shared: (SHARED_SIZE,), updated.
-        north: Velocity [m/s].
-        east: Velocity [m/s].
-        accuracy: Standard deviation of each component [m/s].
+    Updates `models` and `shared`; `accuracy` is the standard deviation of each component [m/s].
     """
     if shared[ALIGNED] == 0.0:
         return
@@ -449,14 +384,9 @@ class YawEstimator:
     separate predictions, with the same result.
     """
 
-    def __init__(self, record: Any = None) -> None:
-        """Start without a tilt, in the record of a flight controller; None = a new record."""
-        if record is None:
-            from firmware_sim.engine.record import new_controller
-
-            record = new_controller()
+    def __init__(self, record: Any) -> None:
+        """Start without a tilt, in the record of a flight controller."""
         self._record = record
-        self._motion = TurnedMotion(record)
         self.models = record["yaw_models"][0]
         """Models (N_MODELS, MODEL_SIZE)."""
         # Identity attitude until `advance` aligns the tilt.
@@ -489,21 +419,41 @@ class YawEstimator:
     ) -> None:
         """Process a GPS velocity; on the ground, without information on heading, restart.
 
-        Args:
-            velocity: NED (3,) [m/s].
-            accuracy: Standard deviation of an axis [m/s].
-            gyro_bias: Estimated gyro bias (3,) [rad/s], copied on the ground.
-            flying: True if the vehicle is in the air.
+        The velocity is NED (3,) [m/s], `accuracy` its standard deviation per axis; the estimated
+        gyro bias (3,) [rad/s] is copied on the ground.
         """
         self._record["flying"] = flying
         self._record["state"][0, _GYRO_BIAS : _GYRO_BIAS + 3] = gyro_bias
         _observe(self._record, velocity.item(0), velocity.item(1), accuracy)
 
+    def motion(self, name: str) -> Vector:
+        """Return the newest velocities of `felt_motion` (IMU) or `seen_motion` (GPS).
+
+        They are complex numbers: north and east [m/s].
+        """
+        rows = self._record[name][0, : min(self._record["motions"].item(0), WINDOW)]
+        velocities: Vector = rows[:, 0] + 1j * rows[:, 1]
+        return velocities
+
     def explained(self, yaw: float) -> float:
         """Return the share of the disagreement of GPS and a heading [rad] that another explains.
 
-        The range is 0 to 1; see `TurnedMotion`.
+        The range is 0 to 1; 0 if there is no disagreement.
         """
-        # The axes of the IMU-only velocity: model 0 without the turns by GPS.
-        along = self.models.item(0, YAW) - self._shared.item(TURNED)
-        return self._motion.explained(yaw - along)
+        w = self.motion("seen_motion")
+        if not len(w):
+            return 0.0
+        # From the axes of the IMU-only velocity: model 0 without the turns by GPS.
+        turn = yaw - (self.models.item(0, YAW) - self._shared.item(TURNED))
+        # Complex numbers: a turn is a factor, and the best turn has the phase of the product.
+        u = self.motion("felt_motion") * cmath.exp(1j * turn)
+        # Without the means the unknown constant velocity cancels.
+        u, w = u - u.mean(), w - w.mean()
+        common = complex(np.vdot(u, w))
+        power = float(np.vdot(u, u).real + np.vdot(w, w).real)
+        # GPS noise explains a part of the power: 2 components per fix.
+        rest = power - 2.0 * EXCUSED * self._record["motion_variance"].item(0) * len(w)
+        # Rest at the best angle, and rest at the tested angle.
+        turned = max(rest - 2.0 * abs(common), 0.0)
+        as_they_are = rest - 2.0 * common.real
+        return 1.0 - turned / as_they_are if as_they_are > turned else 0.0

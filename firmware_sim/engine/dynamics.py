@@ -75,16 +75,9 @@ def force(row: Vector) -> Vec:
 
 @kernel
 def write(p: Vec, v: Vec, q: Quat, omega: Vec, before: Vector, tick_s: float, row: Vector) -> None:
-    """Write a motion as a row.
+    """Write a motion as a row (16,): position [m], velocity [m/s], attitude, rates [rad/s].
 
-    Args:
-        p: Position NED [m].
-        v: Velocity NED [m/s].
-        q: Attitude body -> NED.
-        omega: Angular velocity FRD [rad/s].
-        before: (16,) previous motion, from which the acceleration is differenced.
-        tick_s: Length of the tick [s].
-        row: (16,) output.
+    The acceleration is differenced from the motion `before` (16,) a tick earlier.
     """
     # Acceleration is differenced, so that it includes contacts.
     accel = (
@@ -111,19 +104,10 @@ def from_bullet(
     tick_s: float,
     row: Vector,
 ) -> None:
-    """Write pybullet's state as a row, in NED / FRD.
+    """Write pybullet's state, in ENU with attitude FLU -> ENU, xyzw, as a row in NED / FRD.
 
     The attitude NED <- FRD is (half a turn about (1,1,0)) q_enu_flu (half a turn about x); the
-    products are expanded.
-
-    Args:
-        at: Position ENU [m].
-        orientation: FLU -> ENU, xyzw.
-        linear: Velocity ENU [m/s].
-        angular: Angular velocity ENU [rad/s].
-        before: (16,) previous motion.
-        tick_s: Length of the tick [s].
-        row: (16,) output.
+    products are expanded. `before` (16,) is the motion a tick earlier.
     """
     x, y, z, w = orientation
     h = math.sqrt(0.5)
@@ -159,19 +143,13 @@ def pack_row(battery: Battery) -> tuple[float, ...]:
 def actuate(
     speeds: Speeds, motors: Speeds, row: Vector, wind: Vector, airframe: Vector, left: float
 ) -> tuple[Speeds, Vec, Vec, Vec]:
-    """Convert motor commands to the force and torque on the body for one tick.
+    """Convert motor commands 0..1 to the force and torque on the body for one tick.
 
-    Args:
-        speeds: Rotor speeds.
-        motors: Commands, 0..1.
-        row: (16,) motion of the vehicle.
-        wind: (3,) NED [m/s].
-        airframe: (15,) fields of `Airframe`.
-        left: Fraction of a speed error that remains after a tick (`airframe.lag`).
+    `row` (16,) is the motion, `wind` (3,) NED [m/s], `airframe` (15,) the fields of `Airframe`,
+    `left` the fraction of a speed error that remains after a tick (`airframe.lag`).
 
-    Returns:
-        Rotor speeds after the tick; in NED the centre of mass [m], the force without gravity [N]
-            and the torque [N m].
+    Returns rotor speeds after the tick; in NED the centre of mass [m], the force without gravity
+    [N] and the torque [N m].
     """
     a = airframe_of(airframe)
     s = (
@@ -216,23 +194,13 @@ def absorb(
 ) -> tuple[float, Vec, Supply, float]:
     """Compute the power used in a tick and the remaining charge.
 
-    Args:
-        before: (16,) motion before the tick.
-        row: (16,) motion after the tick.
-        wind: (3,) NED [m/s].
-        speeds: Rotor speeds.
-        standing: True in contact with anything.
-        acceleration: Acceleration in the power model before the tick (`power.felt`) [m/s²].
-        charge: State of charge before the tick, 0..1.
-        airframe: (15,) fields of `Airframe`.
-        power: (17,) fields of `PowerModel`.
-        pack: (4,) values of `pack_row`.
-        computer_w: Power of the onboard computer from the pack [W].
-        tick_s: Length of the tick [s].
+    `before` and `row` (16,) are the motion before and after the tick, `standing` is True in contact
+    with anything, `acceleration` is that of the power model before the tick (`power.felt`) [m/s²],
+    `charge` 0..1 before the tick, `pack` the values of `pack_row`, `computer_w` the power of the
+    onboard computer from the pack [W]; `airframe` and `power` are fields of their models.
 
-    Returns:
-        Power over the tick [W], without the computer; the acceleration, the battery monitor's
-            reading and the state of charge after the tick.
+    Returns the power over the tick [W], without the computer; the acceleration, the battery
+    monitor's reading and the state of charge after the tick.
     """
     m, a = power_model_of(power), airframe_of(airframe)
     thrust, _ = wrench(speeds[0], speeds[1], speeds[2], speeds[3], a)

@@ -142,8 +142,7 @@ def _store(out: Output, c: Fields) -> None:
 def control(c: Fields) -> None:
     """Compute motor commands from estimate and demand: one tick of the cascade.
 
-    Args:
-        c: Fields of a flight controller; `output`, `motors` and `memory` are updated.
+    Updates `output`, `motors` and `memory` of a flight controller.
     """
     kind, s, d = c.demand_kind, c.state, c.demand
     # Stopped motors: the loops do not run, and integrators stay at rest.
@@ -207,9 +206,7 @@ def detect_record(controller: Record) -> bool:
 def command(c: Fields, flown: Fields) -> None:
     """Compute and log the motor commands of a tick, and update the land detector.
 
-    Args:
-        c: Fields of a flight controller, updated.
-        flown: Row of the log (`record.FLOWN_TICK`), written except for the aircraft's battery.
+    Writes a row of the log (`record.FLOWN_TICK`), except for the aircraft's battery.
     """
     control(c)
     log_flown(c, flown)
@@ -403,13 +400,9 @@ def sense(
 ) -> None:
     """Sample the accelerometer, the gyro, and the slower sensors that are due.
 
-    Args:
-        a: Fields of an aircraft; biases, drifts and schedules are updated.
-        sample: Fields of its sensors, written.
-        inertial: (n, 12) white noise: accelerometer, gyro, their biases.
-        compass: (n, 3) white noise.
-        barometer: (n, 2) white noise: drift, sample.
-        gps: (n, 9) white noise: correlated error, position, velocity.
+    Updates biases, drifts and schedules of an aircraft, and writes its sample. White noise:
+    inertial (n, 12) for accelerometer, gyro, their biases; compass (n, 3); barometer (n, 2) for
+    drift and sample; GPS (n, 9) for correlated error, position, velocity.
     """
     row, sigma, now_us = a.motion, a.imu_sigma, a.time_us
     # One row of white noise per sample, drawn in blocks by Python.
@@ -618,12 +611,8 @@ def _await_alignment(c: Fields, sample: Fields) -> bool:
 def estimate(c: Fields, sample: Fields) -> int:
     """Predict with the newest IMU sample, and fuse the other measurements of the tick.
 
-    Args:
-        c: Fields of an aligned flight controller, updated.
-        sample: Fields of the aircraft's sensors, read.
-
-    Returns:
-        Bits of the measurements that Python must fuse, as in `measured`, and of repeated samples.
+    Returns the bits of the measurements that Python must fuse, as in `measured`, and of repeated
+    samples.
     """
     # The IMU runs every tick, so most ticks end after the prediction.
     _take_inertial(c, sample)
@@ -736,24 +725,13 @@ def stretch(
     truths: Record,
     flown: Record,
 ) -> int:
-    """Fly up to `ticks` ticks at a constant demand.
+    """Fly up to `ticks` ticks, at least 1, at a constant demand, and update the three records (1,).
 
-    Args:
-        aircraft: (1,) aircraft, updated.
-        sample: (1,) sensors, updated.
-        controller: (1,) aligned flight controller, updated.
-        ticks: Maximum number of ticks, at least 1.
-        inertial: Noise, see `sense`, as for the next three.
-        compass: (n, 3).
-        barometer: (n, 2).
-        gps: (n, 9).
-        wind: (n, 3) NED [m/s] of the coming ticks; a single row is constant wind.
-        truths: (ticks,) log of the aircraft, written.
-        flown: (ticks,) log of the flight controller, written.
+    `inertial` to `gps` are noise (`sense`), `wind` (n, 3) is NED [m/s] in the coming ticks; a
+    single row is constant wind. Writes the logs of aircraft and flight controller (ticks,).
 
-    Returns:
-        Complete ticks and event: `ticks << EVENT_BITS | event`. After `FUSE` one more tick is flown
-            and logged, and its measurements wait in the sample.
+    Returns complete ticks and event: `ticks << EVENT_BITS | event`. After `FUSE` one more tick is
+    flown and logged, and its measurements wait in the sample.
     """
     a, seen, c = aircraft[0], sample[0], controller[0]
     after, at, steady = np.empty(WIDTH), a.noise_at, len(wind) == 1

@@ -1,5 +1,5 @@
 """MAVLink: endpoints, codec, streams, one file per microservice.
 
 `server.MavlinkServer` is the entry point: links (`link.Link`) over endpoints (`endpoint`), fed by
-an `AutopilotPort`. Everything runs on one thread, in simulated time.
+an `BuiltinAutopilot`. Everything runs on one thread, in simulated time.
 """

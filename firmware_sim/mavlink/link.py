@@ -15,7 +15,7 @@ import numpy as np
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.signing import Signing
-from firmware_sim.autopilot.autopilot_state import AutopilotState
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
 from firmware_sim.mavlink.codec import (
     SYSTEM_ID,

@@ -14,8 +14,8 @@ from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.signing import Signing, StoredSigning
 from firmware_sim import sensor_table
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import OperatorText
-from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.engine.record import Record
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.clients import Allowance, Client, Clients, Complaints, TickTime
@@ -76,7 +76,7 @@ class MavlinkServer:
     def __init__(
         self,
         links: Sequence[LinkConfig],
-        port: AutopilotPort | None = None,
+        port: BuiltinAutopilot | None = None,
         *,
         boot_unix_us: int,
         clock: Clock | None = None,
@@ -93,7 +93,7 @@ class MavlinkServer:
             signing: Stored key, required on all links; None = no key until a client sets one, which
                 is lost when the server closes.
         """
-        self._port: AutopilotPort | None = None
+        self._port: BuiltinAutopilot | None = None
         self._has_sample = False
         """True if the autopilot has received a sample."""
         self._tick_time = TickTime(clock)
@@ -140,7 +140,7 @@ class MavlinkServer:
         if port is not None:
             self.attach(port)
 
-    def attach(self, port: AutopilotPort, truth: Callable[[], TrueState] | None = None) -> None:
+    def attach(self, port: BuiltinAutopilot, truth: Callable[[], TrueState] | None = None) -> None:
         """Replace the autopilot between two episodes; `truth` returns the true state for clients.
 
         Keeps clients and the rates they have set. Drops running parameter lists and messages for
@@ -372,7 +372,7 @@ class MavlinkServer:
 
         return Clients(config.name, config.endpoint, welcome, self._tick_time, self._signing)
 
-    def _connect(self, client: Client, port: AutopilotPort) -> None:
+    def _connect(self, client: Client, port: BuiltinAutopilot) -> None:
         client.link.identify(self._system_id)
         # Ends transfers that refer to the old autopilot.
         client.close()
@@ -476,7 +476,7 @@ def _share(requests: Sequence[int]) -> int:
     return max(1, STREAMS_PER_TICK // 2 // sum(1 for number in requests if number))
 
 
-def _system_id(port: AutopilotPort) -> int:
+def _system_id(port: BuiltinAutopilot) -> int:
     """Return MAV_SYS_ID, which PX4 reads at boot."""
     stored = port.parameters.by_name("MAV_SYS_ID")
     return SYSTEM_ID if stored is None else int(stored.value)

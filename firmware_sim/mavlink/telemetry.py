@@ -25,8 +25,9 @@ from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.vehicle import atmosphere
 from airl_mav.vehicle.rotation import rotate, yaw_of
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
+from firmware_sim.autopilot.autopilot_state import Arming
 from firmware_sim.autopilot.failsafes import detectors
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import FLOWN_TICK, POSITION, TRAJECTORY, Fields, Record
 from firmware_sim.mavlink.codec import COMPONENT_ID, dialect, message_id
 from firmware_sim.mavlink.streams import units

@@ -15,9 +15,8 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import BodyProfile
-from airl_mav.vehicle.rotation import Quat, Vec
+from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
 from firmware_sim.engine.dynamics import quaternion
-from firmware_sim.plant.contacts.convex import reach_along
 
 WALL_THICKNESS_M = 0.2
 
@@ -53,17 +52,11 @@ class PlantBody(Protocol):
         """Contacts in the newest tick."""
 
     def move(self, at: Vec, force: Vec, torque: Vec, before: Vector, moving_us: int) -> Vector:
-        """Move the body by one tick.
+        """Move the body by one tick; return the motion (16,) after it, a new array.
 
-        Args:
-            at: Position, NED [m].
-            force: All forces except gravity and contacts, NED [N].
-            torque: NED [N m].
-            before: (16,) motion before the tick.
-            moving_us: Time since the moving obstacles started, at the end of the tick [µs].
-
-        Returns:
-            (16,) motion after the tick, see `engine.dynamics`; a new array.
+        Position [m], force without gravity and contacts [N] and torque [N m] are NED; `before`
+        (16,) is the motion before the tick (`engine.dynamics`), `moving_us` the time since the
+        moving obstacles started, at the end of the tick [µs].
         """
 
     def follow(self, motion: Vector) -> None:
@@ -80,11 +73,7 @@ class PlantBody(Protocol):
     ) -> Vector:
         """Place the body in a motion and clear its contacts; return the motion (16,).
 
-        Args:
-            position: NED [m].
-            velocity: NED [m/s].
-            quaternion: Body -> NED.
-            rates: Angular velocity FRD [rad/s].
+        Position [m] and velocity [m/s] are NED, the attitude body -> NED, rates FRD [rad/s].
         """
 
     def close(self) -> None:
@@ -137,14 +126,10 @@ def tour_arrays(arena: Arena) -> tuple[Vector, Vector]:
 def place_at(
     time_us: int, times_s: Vector, points: Vector, leg: NDArray[np.int64], i: int
 ) -> tuple[float, float]:
-    """Return north, east [m] of moving obstacle i.
+    """Return north, east [m] of moving obstacle i, `time_us` [µs] after the start of the episode.
 
-    Args:
-        time_us: Time since the start of the episode [µs].
-        times_s: (n, 1 + k) from `tour_arrays`.
-        points: (n, k, 2) from `tour_arrays`.
-        leg: (n,) index of the last waypoint passed; updated.
-        i: Index of the obstacle.
+    `times_s` and `points` are from `tour_arrays`; `leg` (n,), the index of the last waypoint
+    passed, is updated.
     """
     # Tours repeat with their period.
     t = (time_us / US_PER_S) % times_s[i, 0]
@@ -256,11 +241,9 @@ class Room:
         return lowest_m - self._top_m
 
     def among_solids_m(self, motion: Vector, moving_us: int) -> float:
-        """Return a lower bound of the distance to walls and obstacles [m].
+        """Return a lower bound of the distance to walls and obstacles [m] in a motion (16,).
 
-        Args:
-            motion: (16,) motion of the vehicle.
-            moving_us: Time since the moving obstacles started [µs].
+        `moving_us` is the time since the moving obstacles started [µs].
         """
         room: float = _among_solids(self._solids, motion, self.reach_m, moving_us)
         return room
@@ -280,3 +263,16 @@ def _among_solids(solids: Solids, motion: Vector, radius: float, moving_us: int)
         solids.center[n - moving + i, 0] = north
         solids.center[n - moving + i, 1] = east
     return room_among(solids, (motion[0], motion[1], motion[2]), radius)
+
+
+BREAKING_SHARE = 0.02
+"""Distance below which bodies are close, as a fraction of the box's half diagonal (Bullet's
+gContactBreakingThreshold)."""
+
+
+@kernel
+def reach_along(q: Quat, half: Vector, n: Vec) -> float:
+    """Return the extent [m] of a box at attitude q from its centre along a unit vector."""
+    a = rotate(conjugate(q), n)
+    reach: float = abs(a[0]) * half[0] + abs(a[1]) * half[1] + abs(a[2]) * half[2]
+    return reach

@@ -113,18 +113,9 @@ def _due(
 ) -> int:
     """Find moving obstacles near the vehicle, by their current or by their last updated position.
 
-    Args:
-        time_us: Time since the start of the episode [µs].
-        vehicle: (>= 2,) north, east [m].
-        times_s: (n, 1 + k) period of the tour, then the times of its waypoints [s].
-        points: (n, k, 2) waypoints north, east [m].
-        leg: (n,) index of the last waypoint passed; updated.
-        reach: (n,) maximum horizontal distance of a possible contact [m].
-        place: (n, 2) north, east of the bodies [m]; updated for the obstacles found.
-        due: (n,) output: indices of the obstacles found.
-
-    Returns:
-        Number of obstacles found.
+    `vehicle` is north, east [m], `reach` (n,) the maximum horizontal distance of a possible contact
+    [m], the next three are arguments of `place_at`. Updates `place` (n, 2), north, east of the
+    bodies found, writes their indices to `due`, and returns their number.
     """
     count = 0
     for i in range(len(leg)):
@@ -153,13 +144,9 @@ class Movers:
     def __init__(
         self, arena: Arena, bodies: Sequence[int], attitudes: Sequence[Xyzw], radius_m: float
     ) -> None:
-        """Store the bodies, which are at the arena's positions for time 0.
+        """Store the bodies, which are at the arena's positions for time 0, and their attitudes.
 
-        Args:
-            arena: Tours and sizes.
-            bodies: pybullet's numbers of the moving obstacles, in the arena's order.
-            attitudes: Attitudes of the bodies, FLU -> ENU.
-            radius_m: Maximum distance of any part of the vehicle from its centre [m].
+        `radius_m` is the maximum distance of any part of the vehicle from its centre [m].
         """
         obstacles, first, n = arena.obstacles, arena.n_static, len(bodies)
         self._bodies, self._attitudes = list(bodies), list(attitudes)
@@ -455,7 +442,7 @@ class BulletBody:
             linearDamping=0.0,
             angularDamping=0.0,
             restitution=0.0,
-            # pybullet multiplies it with the other body's 0.5; see `contacts.solver.FRICTION`.
+            # pybullet multiplies it with the other body's 0.5; see `kernel_body.FRICTION`.
             lateralFriction=0.8,
             rollingFriction=0.0,
             # A sleeping body does not move.

@@ -14,7 +14,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cached_property
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -27,12 +26,10 @@ import zmq
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.exposure import exposure_by
 from airl_mav.camera.frame import Frame, FurtherImage
-from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import noise_of, noisy_frame
-from airl_mav.camera.render import Motion, Mount, camera_pose
+from airl_mav.camera.render import Motion, Mount, camera_pose, colour, exposure_by
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
 from airl_mav.core.scheduling import give_way
@@ -52,7 +49,7 @@ class _Eye:
         """Store camera, arena, conditions and renderer; `name` is an additional camera's."""
         self._expose = exposure_by(renderer, name)
         self._noise = noise_of(camera, noise, name)
-        self._forming = ImageFormation(camera, name) if camera.imaging is not None else None
+        self._forming = colour("sensor")(camera, name) if camera.imaging is not None else None
         self.intrinsics = Intrinsics.of(camera)
         self._mount, self._max_range = Mount.of(camera), camera.range_m
         self._arena = arena
@@ -65,13 +62,9 @@ class _Eye:
             self._forming.restart()
 
     def take(self, elapsed_us: int, motion: Motion, seed: int, number: int) -> FurtherImage:
-        """Return an image of an episode.
+        """Return an image of an episode, `elapsed_us` [µs] after its start, in a motion.
 
-        Args:
-            elapsed_us: Time since the episode's start [µs].
-            motion: Motion of the vehicle at this time.
-            seed: Seed of the episode.
-            number: Number of the image in the episode, from the frame rate.
+        `number` counts the images of the episode, from the frame rate.
         """
         image: NDArray[Any]
         jpeg = None
@@ -144,16 +137,10 @@ class SimulatedCamera:
         renderer: Renderer = "raycast",
         further: Mapping[str, Camera] | None = None,
     ) -> None:
-        """Create the cameras of a vehicle profile.
+        """Create the main camera of a vehicle profile, and additional ones on its trigger.
 
-        Args:
-            camera: Main camera.
-            arena: Arena to render.
-            start_us: Simulated time of the first frame [µs].
-            noise: Image conditions; None = the defaults.
-            seed: Seed of the noise.
-            renderer: Renderer of the images.
-            further: Additional cameras with the same trigger, by name; None = main camera only.
+        The first frame is due at `start_us` [µs]; `noise` are the image conditions (None = the
+        defaults), `seed` is the seed of the noise.
         """
         asked = noise or SensorNoise()
         cameras = {"": camera, **(further or {})}
@@ -234,14 +221,9 @@ class CameraServer:
     def __init__(
         self, endpoint: str, context: zmq.Context[zmq.Socket[bytes]] | None = None
     ) -> None:
-        """Bind the socket.
+        """Bind the socket to an endpoint such as "tcp://127.0.0.1:5560"; port 0 or * = any.
 
-        Args:
-            endpoint: Endpoint such as "tcp://127.0.0.1:5560"; port 0 or * selects a free port.
-            context: ZeroMQ context to share; None = a new one.
-
-        Raises:
-            UsageError: The port is in use, or the endpoint is invalid.
+        Raises UsageError if the port is in use, or if the endpoint is invalid.
         """
         self._owns_context = context is None
         self._context = zmq.Context() if context is None else context
@@ -282,62 +264,26 @@ class OnboardCamera(Protocol):
     @property
     def next_us(self) -> int:
         """Earliest simulated time of the next required call [µs]."""
-        ...
 
     def restart(self, time_us: int) -> None:
         """Start an episode and its moving obstacles; a frame is due at `time_us` [µs]."""
-        ...
 
     def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
         """Take the frame due at `time_us` [µs] in a motion, and publish completed frames."""
-        ...
 
     def skip_unread(self, read_us: int) -> None:
         """Skip due frames that newer ones replace before simulated `read_us` [µs], if possible."""
 
 
-class CameraMaker(Protocol):
-    """Factory of cameras; see `SimulatedCamera`."""
-
-    def __call__(
-        self,
-        camera: Camera,
-        arena: Arena,
-        start_us: int,
-        noise: SensorNoise | None,
-        seed: int,
-        renderer: Renderer,
-        further: Mapping[str, Camera] | None = None,
-    ) -> OnboardCamera:
-        """Return the camera of a vehicle profile, with the additional cameras it triggers."""
-        ...
-
+CameraMaker = Callable[..., OnboardCamera]
+"""Factory of cameras, with the arguments of `SimulatedCamera`."""
 
 NICENESS = 10
 """Niceness of the process: images may be late, but ticks must not be."""
 
 
-@dataclass(frozen=True)
-class _Restart:
-    """Request to start an episode."""
-
-    time_us: int
-
-
-@dataclass(frozen=True)
-class _Take:
-    """Request to take a frame."""
-
-    time_us: int
-    motion: Motion
-
-
-@dataclass(frozen=True)
-class _Taken:
-    """Completed frame, and the time of the next one [µs]."""
-
-    frame: Frame
-    next_us: int
+_Taken = tuple[Frame, int]
+"""Completed frame, and the time of the next one [µs]."""
 
 
 class CameraProcess:
@@ -353,26 +299,14 @@ class CameraProcess:
         self._answers: SimpleQueue[_Taken | EOFError | None] = SimpleQueue()
         self._reading: Thread | None = None
 
-    def camera(
-        self,
-        camera: Camera,
-        arena: Arena,
-        start_us: int,
-        noise: SensorNoise | None,
-        seed: int,
-        renderer: Renderer,
-        further: Mapping[str, Camera] | None = None,
-    ) -> SlowCamera:
-        """Return an episode's camera after a first image; see `SimulatedCamera`.
+    def camera(self, camera: Camera, arena: Arena, start_us: int, *others: Any) -> SlowCamera:
+        """Return an episode's camera after a first image; arguments of `SimulatedCamera`.
 
-        The camera of the previous episode takes no further frames.
-
-        Raises:
-            FirmwareLostError: The process has ended.
+        The camera of the previous episode takes no further frames. Raises FirmwareLostError.
         """
         if self._process is None:
             self._start()
-        self.send((camera, arena, start_us, noise, seed, renderer, further))
+        self.send((camera, arena, start_us, *others))
         while self.receive() is not None:
             pass  # Frame of the previous episode, still in progress.
         return SlowCamera(self, start_us)
@@ -465,23 +399,19 @@ class SlowCamera:
     def restart(self, time_us: int) -> None:
         """Start an episode at `time_us` [µs]. A frame in progress is dropped."""
         self._taken_us, self._next_us = None, time_us
-        self._process.send(_Restart(time_us))
+        self._process.send(("restart", time_us))
 
     def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
-        """Publish a completed frame, and request the next frame if due.
-
-        Raises:
-            FirmwareLostError: The process has ended.
-        """
+        """Publish a completed frame, and request the next one if due. Raises FirmwareLostError."""
         if self._busy and self._process.answers:
             taken, self._busy = self._process.receive(), False
             # A frame of an earlier episode has another time and is dropped.
-            if taken is not None and taken.frame.capture_time_us == self._taken_us:
-                self._taken_us, self._next_us = None, taken.next_us
-                publish(taken.frame)
+            if taken is not None and taken[0].capture_time_us == self._taken_us:
+                self._taken_us, self._next_us = None, taken[1]
+                publish(taken[0])
         # At most one frame is in progress, so a slow renderer cannot build up a queue.
         if not self._busy and time_us >= self._next_us:
-            self._process.send(_Take(time_us, motion))
+            self._process.send(("take", time_us, motion))
             self._busy, self._taken_us = True, time_us
 
     def skip_unread(self, read_us: int) -> None:
@@ -489,23 +419,22 @@ class SlowCamera:
 
 
 def main(number: int) -> None:
-    """Process requests until the connection closes.
-
-    Args:
-        number: File descriptor of the connection.
-    """
+    """Process requests on a connection, given by its file descriptor, until it closes."""
     give_way(NICENESS)
     line = Connection(number)
     with suppress(EOFError, OSError):
+        # Each episode begins with its camera.
+        camera = SimulatedCamera(*line.recv())
+        line.send(None)
         while True:
-            match line.recv():
-                case tuple(episode):
-                    taking = SimulatedCamera(*episode)
-                    line.send(None)
-                case _Restart(time_us):
-                    taking.restart(time_us)
-                case _Take(time_us, motion):
-                    frame = taking.take(time_us, motion)
-                    line.send(_Taken(frame, taking.next_us))
+            request = line.recv()
+            if request[0] == "restart":
+                camera.restart(*request[1:])
+            elif request[0] == "take":
+                frame = camera.take(*request[1:])
+                line.send((frame, camera.next_us))
+            else:
+                camera = SimulatedCamera(*request)
+                line.send(None)
     # Immediate exit: shutting down a renderer's threads would only take time.
     os._exit(0)

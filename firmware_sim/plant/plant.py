@@ -8,8 +8,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.core.addons import load
+from airl_mav.core.addons import entries, load
 from airl_mav.core.constants import TICK_HZ, US_PER_S
+from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import Vector
 from airl_mav.core.streams import sensors_and_gusts
 from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
@@ -49,10 +50,13 @@ from firmware_sim.engine.ticks import (
     stretch,
 )
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, TrueState
-from firmware_sim.plant.body import FLOOR, PlantBody, Room, Touch
-from firmware_sim.plant.contacts.convex import BREAKING_SHARE
+from firmware_sim.plant.body import BREAKING_SHARE, FLOOR, PlantBody, Room, Touch
 from firmware_sim.plant.sensors import SensorSuite, SimulatedSensor, Site
 from firmware_sim.sensor_table import add_readings, fitted
+
+BODIES = {"pybullet": "firmware_sim.plant.bullet_body:BulletBody"}
+"""Classes of bodies by name; add-ons have more. Imported on first use: pybullet is not available
+everywhere, and numba compiles on import."""
 
 
 def new_body(
@@ -60,21 +64,13 @@ def new_body(
 ) -> PlantBody:
     """Return a vehicle's body at rest on the floor at the start, facing north.
 
-    Args:
-        name: Type of body.
-        arena: Arena; None = an endless floor.
-        body: Collision box.
-        airframe: Mass and inertia.
-        tick_s: Length of a tick [s].
+    Without an arena the floor is endless. Raises UsageError for an unknown name.
     """
-    # Local imports: pybullet is not available everywhere, and numba compiles on import.
-    if name == "kernel":
-        from firmware_sim.plant.contacts.solver import KernelBody
-
-        return KernelBody(arena, body, airframe, tick_s)
-    from firmware_sim.plant.bullet_body import BulletBody
-
-    return BulletBody(arena, body, airframe, tick_s)
+    place = BODIES.get(name) or entries("firmware_sim", "BODIES").get(name)
+    if place is None:
+        raise UsageError(f"--plant {name}: no add-on of firmware_sim has this plant")
+    made: PlantBody = load(place)(arena, body, airframe, tick_s)
+    return made
 
 
 REST_SPEED_M_S = 0.1
@@ -98,7 +94,6 @@ class Blowing(Protocol):
 
     def step(self) -> Vector:
         """Advance one tick and return the wind (3,) NED [m/s]; read-only."""
-        ...
 
 
 class Collision(NamedTuple):
@@ -132,8 +127,7 @@ class Plant:
             arena: Arena; None = an endless floor.
             rng: Random generator of sensors and wind.
             start_us: Simulated time of the first state [µs].
-            aircraft: Scenario settings: wind as from `wind_of_episode`, sensors, battery charge,
-                body type; None = the defaults.
+            aircraft: Scenario settings, with the wind of `wind_of_episode`; None = the defaults.
             airframe: Airframe of this vehicle; None = from the profile.
             rate_hz: Tick rate [Hz].
             computer_w: Power of the onboard computer from the pack [W].
@@ -266,16 +260,10 @@ class Plant:
     def glide(
         self, controller: Record, ticks: int, truths: Record, flown: Record
     ) -> tuple[int, int]:
-        """Fly up to `ticks` compiled ticks.
+        """Fly up to `ticks` compiled ticks with the record of a flight controller.
 
-        Args:
-            controller: Record of the flight controller.
-            ticks: Maximum number of ticks.
-            truths: (ticks,) log of the aircraft, written.
-            flown: (ticks,) log of the flight controller, written.
-
-        Returns:
-            Number of complete ticks, and the event that ended them (`engine.ticks`).
+        Writes the logs of aircraft and flight controller (ticks,). Returns the number of complete
+        ticks, and the event that ended them (`engine.ticks`).
         """
         done = flew = 0
         while True:
@@ -453,14 +441,7 @@ class Plant:
         quaternion: Quat = (1.0, 0.0, 0.0, 0.0),
         rates: Vec = (0.0, 0.0, 0.0),
     ) -> None:
-        """Place the vehicle in a motion; clears contacts and collisions.
-
-        Args:
-            position: NED [m].
-            velocity: NED [m/s].
-            quaternion: Body -> NED.
-            rates: Angular velocity FRD [rad/s].
-        """
+        """Place the vehicle in a motion (`PlantBody.put`); clears contacts and collisions."""
         self._motion[:] = self.body.put(position, velocity, quaternion, rates)
         self._touching, self._away = frozenset(), False
         self.record["room_m"] = -math.inf

@@ -83,12 +83,10 @@ class SimulatedSensor:
         return row
 
     def sense(self, time_us: int, row: Vector, elapsed_us: int) -> Any:
-        """Return the reading that is delivered after a tick; None = none.
+        """Return the reading that is delivered after a tick at `time_us`; None = none.
 
-        Args:
-            time_us: Time at the end of the tick [µs].
-            row: (16,) motion of the vehicle, see `engine.dynamics`.
-            elapsed_us: Time since the moving obstacles started [µs].
+        `row` (16,) is the motion of the vehicle (`engine.dynamics`), `elapsed_us` the time since
+        the moving obstacles started [µs].
         """
         return self.read(row, elapsed_us) if self.rate.due(time_us) else None
 
@@ -112,15 +110,10 @@ class SensorSuite:
         times: float = 1.0,
         record: Record | None = None,
     ) -> None:
-        """Initialize the sensors.
+        """Initialize the sensors in an aircraft's record; None = a new one.
 
-        Args:
-            profile: Sensor profile.
-            rng: Random generator of all noise.
-            tick_s: Length of a tick [s].
-            times: Factor of noise, biases and drifts. Does not affect the accuracy that the GPS
-                receiver reports.
-            record: Record of the aircraft, which stores the sensors' state; None = a new one.
+        `times` is a factor of noise, biases and drifts; it does not affect the accuracy that the
+        GPS receiver reports.
         """
         self._record = record = new_aircraft() if record is None else record
         self.record = new_sample()

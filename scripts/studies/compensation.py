@@ -33,7 +33,7 @@ from airl_mav.envs.evaluation import EpisodeResult, fly_seeds
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.experiments.gym_flier import navigation_of, pilots_of
 from airl_mav.flight.statistics import relative_difference, wilson
-from airl_mav.prediction.compensator import RECENT, Compensator, ExpectedLatency
+from airl_mav.prediction import RECENT, Compensator, ExpectedLatency
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.report.document import (
     NONE,

@@ -15,13 +15,13 @@ from common import StudyConfig, StudyOptions, study
 from pydantic import Field, create_model
 from rich.console import Console
 
+from airl_mav.addons.int8.quantisation import export_int8
 from airl_mav.cli.experiments import fly_and_show
 from airl_mav.cli.options import run_command, scenario_of
 from airl_mav.core.errors import UsageError
 from airl_mav.core.progress import new_console
 from airl_mav.experiments.evaluate import training_arena
 from airl_mav.experiments.experiment import Experiment, make_cell
-from airl_mav.experiments.quantisation import export_int8
 from airl_mav.policy.card import CARD_FILE
 from airl_mav.policy.registry import find_policy
 from airl_mav.scenario.model import Scenario

@@ -9,9 +9,10 @@ import pytest
 
 from airl_mav.core.frames import quat_to_euler
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
+from firmware_sim.autopilot.autopilot_state import Arming, Landed
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.parameter_store import Parameters
+from firmware_sim.autopilot.snapshot import AutopilotState
 from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
 
 FIELDS = [name for name, kind in vars(AutopilotState).items() if isinstance(kind, property)]

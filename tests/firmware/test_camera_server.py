@@ -17,12 +17,11 @@ import zmq
 from numpy.typing import NDArray
 from PIL import Image
 
+from airl_mav.addons.colour.picture import render_picture
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
-from airl_mav.camera.exposure import expose
 from airl_mav.camera.frame import MOST_BYTES, Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import render_picture
-from airl_mav.camera.render import Motion
+from airl_mav.camera.render import Motion, expose
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError

@@ -9,15 +9,15 @@ import pytest
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.recovery import (
-    ACCEL_BIAS,
-    ATTITUDE,
-    GYRO_BIAS,
+    GREATEST,
+    LEAST,
     REFUSED_US,
     Compass,
     Consistency,
     Restart,
     restart_for,
 )
+from firmware_sim.engine.record import new_controller
 
 GPS_US = 100_000
 MAG_US = 20_000
@@ -38,7 +38,7 @@ def velocities(watch: Consistency, innovations: Iterable[np.ndarray]) -> list[in
 @pytest.mark.parametrize("times", [1.0, 5.0])
 def test_noise_is_no_reason_to_restart(times: float) -> None:
     rng = np.random.default_rng(1)
-    watch = Consistency()
+    watch = Consistency(new_controller())
     noise = times * SIGMA * rng.standard_normal((20_000, 3))
     assert velocities(watch, noise) == [], "over half an hour"
     expected = 1.0 if times == 1.0 else pytest.approx(times**2, rel=0.7)
@@ -49,16 +49,16 @@ def test_an_error_that_grows_is() -> None:
     """0.5 m/s² of accelerometer: beyond three standard deviations after 0.36 s, for 0.5 s."""
     rng = np.random.default_rng(1)
     growing = [np.array([0.05 * k, 0, 0]) + SIGMA * rng.standard_normal(3) for k in range(11)]
-    (at_us,) = velocities(Consistency(), growing)
+    (at_us,) = velocities(Consistency(new_controller()), growing)
     assert at_us <= 1.0 * US_PER_S
 
 
 def test_an_outlier_is_neither() -> None:
-    watch = Consistency()
+    watch = Consistency(new_controller())
     far = [np.zeros(3)] * 20 + [np.full(3, 50.0)] + [np.zeros(3)] * 20
     assert velocities(watch, far) == []
     excess = []
-    watch = Consistency()
+    watch = Consistency(new_controller())
     for i, innovation in enumerate(far):
         watch.velocity(innovation, SIGMA, STEADY, i * GPS_US)
         excess.append(watch.velocity_excess)
@@ -68,23 +68,21 @@ def test_an_outlier_is_neither() -> None:
 
 
 def test_what_a_restart_allows_for() -> None:
-    assert restart_for(0.0, 0.5) == Restart(0.3, ATTITUDE.least, ACCEL_BIAS.least, GYRO_BIAS.least)
+    assert restart_for(0.0, 0.5) == Restart(0.3, *LEAST[1:])
     fast = restart_for(-3.0, 1.0)
     assert fast.velocity_m_s == 3.0
     assert fast.accel_bias_m_s2 == 3.0
-    assert restart_for(1e3, 0.1) == Restart(
-        10.0, ATTITUDE.greatest, ACCEL_BIAS.greatest, GYRO_BIAS.greatest
-    )
+    assert restart_for(1e3, 0.1) == Restart(10.0, *GREATEST[1:])
 
 
 def test_a_gyro_turns_the_heading_slowly_a_compass_at_once() -> None:
-    drifting = Consistency()
+    drifting = Consistency(new_controller())
     found = [
         drifting.heading(0.06 * k, k * MAG_US, within=0.06 * k <= 5.0) is not None
         for k in range(100)
     ]
     assert found.index(True) * MAG_US < 1.6 * US_PER_S
-    jumped = Consistency()
+    jumped = Consistency(new_controller())
     for k in range(500):
         assert jumped.heading(0.0 if k < 10 else 12.0, k * MAG_US, within=k < 10) is None
 
@@ -106,7 +104,7 @@ def test_a_compass_that_was_refused_must_come_back_as_close_as_it_was() -> None:
 
 def test_a_late_receiver_is_no_reason_either() -> None:
     """0.2 s behind a vehicle that brakes with 3 m/s²: 10 standard deviations, on one side."""
-    watch = Consistency()
+    watch = Consistency(new_controller())
     braking = np.array([-3.0, 0.0, 0.0])
     behind = np.array([0.6, 0.0, 0.0])
     for sample in range(20):

@@ -16,8 +16,8 @@ from firmware_sim.addons.missions.manager import destination
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import PositionYaw, Reposition
-from firmware_sim.autopilot.navigation.fence import (
-    PERIOD_US,
+from firmware_sim.autopilot.navigation.navigator import (
+    FENCE_PERIOD_US,
     Circle,
     FenceMonitor,
     Polygon,
@@ -119,7 +119,7 @@ class Watch:
     def at(
         self, north: float, east: float, up: float = 10.0, mode: Mode = Mode.OFFBOARD
     ) -> tuple[bool, bool, bool]:
-        self.now = self.now._replace(time_us=self.now.time_us + PERIOD_US)
+        self.now = self.now._replace(time_us=self.now.time_us + FENCE_PERIOD_US)
         self.monitor.step(self.now, mode, lambda: place(north, east, up))
         return self.monitor.status.breached
 

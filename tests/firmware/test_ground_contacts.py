@@ -21,10 +21,11 @@ from airl_mav.envs.arena_batch import NOTHING, touches
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from firmware_sim.addons.auxiliary_estimation.simulated_sensors import PlantRangefinder
+from firmware_sim.addons.kernel_plant.convex import MOST, ROW
+from firmware_sim.addons.kernel_plant.ground_contact import near_ground, touch_ground
 from firmware_sim.interfaces import ActuatorControls
+from firmware_sim.plant.body import BREAKING_SHARE
 from firmware_sim.plant.bullet_body import BulletWorld
-from firmware_sim.plant.contacts.convex import BREAKING_SHARE, MOST, ROW
-from firmware_sim.plant.contacts.ground_contact import near_ground, touch_ground
 from firmware_sim.plant.plant import Plant
 from firmware_sim.plant.sensors import Site
 from tests.firmware.test_kernel_body import HALF, HEIGHT, both

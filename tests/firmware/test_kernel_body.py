@@ -18,9 +18,9 @@ from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.scenario.aircraft import Aircraft
+from firmware_sim.addons.kernel_plant.convex import separation
 from firmware_sim.interfaces import ActuatorControls
 from firmware_sim.plant.bullet_body import connect
-from firmware_sim.plant.contacts.convex import separation
 from firmware_sim.plant.plant import Plant
 from tests.firmware.test_world import OFF, THROW_TICKS, VEHICLE, PlainWorld, crowd, throws
 

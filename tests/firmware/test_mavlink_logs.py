@@ -39,7 +39,7 @@ class LoggedAutopilot(KinematicAutopilot):
         self.log = FlightLog(folder / "flight-007.ulg", self.parameters, 0, BOOT_UNIX_US)
         self.folder = self.logs = self.log.folder
 
-    def step(self) -> None:
+    def step(self, _sample: Any = None, /) -> Any:
         super().step()
         sample = self.sample
         if sample is None or self.log.writer.closed:

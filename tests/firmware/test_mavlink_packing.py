@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 
 from airl_mav.core.frames import local_to_geodetic, quat_from_euler, quat_to_euler, quat_yaw
 from firmware_sim.addons.ground_station_services.information import SILENT
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Setpoint
+from firmware_sim.autopilot.autopilot_state import Arming, Setpoint
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import BatterySample
 from firmware_sim.mavlink.codec import SYSTEM_ID, Encoder, Values, WireLayout, dialect, layout
 from firmware_sim.mavlink.endpoint import MemoryEndpoint

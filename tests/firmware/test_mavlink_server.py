@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, OperatorText, Severity
+from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Severity
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.px4_links import onboard_link

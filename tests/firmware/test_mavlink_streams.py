@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import EARTH_RADIUS_M, GRAVITY_M_S2, TICK_US, US_PER_S
 from airl_mav.profiles.parameters import SPECS
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Health, Landed, Setpoint
+from firmware_sim.autopilot.autopilot_state import Arming, Health, Landed, Setpoint
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import BatterySample
 from firmware_sim.mavlink.link import OFF, StreamScheduler
 from firmware_sim.mavlink.services.commands import requested_mode

@@ -6,6 +6,7 @@ import numpy as np
 
 from airl_mav.core.constants import TICK_US, US_PER_S
 from firmware_sim.autopilot.sensor_monitor import SensorMonitor
+from firmware_sim.engine.record import WATCHES
 from firmware_sim.interfaces import BatterySample, SensorSample
 
 BATTERY = BatterySample(16.0, 1.0, 0.0, 1.0)
@@ -16,7 +17,7 @@ class Stand:
     """A vehicle at rest under watch."""
 
     def __init__(self, rng: np.random.Generator | None) -> None:
-        self.monitor = SensorMonitor()
+        self.monitor = SensorMonitor(np.full((WATCHES, 3), -1))
         self.rng = rng
         self._ticks = 0
 

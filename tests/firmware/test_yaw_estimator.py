@@ -18,6 +18,7 @@ from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.recovery import EXPLAINED, EmergencyYaw, turn_to
 from firmware_sim.autopilot.yaw_estimator import WEIGHT, YAW, YawEstimator
+from firmware_sim.engine.record import new_controller
 from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
 
 ACCURACY = 0.05
@@ -74,7 +75,7 @@ def turned(ticks: list[Tick], angle: float) -> Iterator[Tick]:
 
 def observed(ticks: Iterator[Tick]) -> Iterator[tuple[Tick, YawEstimator]]:
     """Yield an estimator after each fix."""
-    estimator = YawEstimator()
+    estimator = YawEstimator(new_controller())
     for tick in ticks:
         estimator.feel(tick.gyro, tick.accel)
         if tick.velocity is not None:
@@ -109,7 +110,7 @@ def test_a_wrong_heading_is_explained_by_another(
     wrong = [
         estimator.explained(tick.yaw + math.radians(off_deg))
         for tick, estimator in observed(turned(ticks, 1.0))
-        if tick.flying and np.std(estimator._motion._seen) > 0.9
+        if tick.flying and np.std(estimator.motion("seen_motion")) > 0.9
     ]
     assert len(wrong) > 10
     assert min(wrong) > least
@@ -117,7 +118,7 @@ def test_a_wrong_heading_is_explained_by_another(
 
 def test_a_tilt_is_not_explained_by_a_heading() -> None:
     """The vehicle goes off at 1 m/s² where the IMU feels none: no direction makes it so."""
-    estimator = YawEstimator()
+    estimator = YawEstimator(new_controller())
     rng = np.random.default_rng(3)
     for tick in range(1000):
         accel = np.array([0.0, 0.0, -GRAVITY_M_S2]) + 0.05 * rng.standard_normal(3)
@@ -131,7 +132,7 @@ def test_a_tilt_is_not_explained_by_a_heading() -> None:
 
 def test_standing_still_says_nothing() -> None:
     """Level and at rest in the air: every heading foretells the same velocity."""
-    estimator = YawEstimator()
+    estimator = YawEstimator(new_controller())
     rng = np.random.default_rng(1)
     for tick in range(2500):
         accel = np.array([0.0, 0.0, -GRAVITY_M_S2]) + 0.05 * rng.standard_normal(3)
@@ -233,7 +234,7 @@ class Reference:
 @pytest.mark.nightly
 def test_it_is_the_reference_to_rounding(ticks: list[Tick]) -> None:
     reference = Reference()
-    estimator = YawEstimator()
+    estimator = YawEstimator(new_controller())
     compared = 0
     for tick in turned(ticks[: round(12.0 / TICK_S)], 2.0):
         reference.feel(tick.gyro, tick.accel)
@@ -273,7 +274,7 @@ class Told(YawEstimator):
     """Estimator with a fixed heading error, uncertainty, and explained share of the motion."""
 
     def __init__(self, off_deg: float, sigma_deg: float, explained: float) -> None:
-        super().__init__()
+        super().__init__(new_controller())
         self._shared[5:7] = math.radians(off_deg), math.radians(sigma_deg) ** 2
         self._explained = explained
 
@@ -296,7 +297,9 @@ def test_a_heading_is_suspected_that_is_off_by_far_and_explains_the_motion(
 ) -> None:
     yaw = Told(off_deg, sigma_deg, explained)
     assert EmergencyYaw().is_suspected(es.new_state(), yaw) is suspected
-    assert not EmergencyYaw().is_suspected(es.new_state(), YawEstimator()), "nothing is known"
+    assert not EmergencyYaw().is_suspected(es.new_state(), YawEstimator(new_controller())), (
+        "nothing is known"
+    )
 
 
 @pytest.mark.parametrize(("sigma_deg", "refused", "doubted"), [(9, 1, 1), (12, 1, 0), (16, 0, 0)])

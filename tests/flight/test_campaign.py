@@ -20,15 +20,13 @@ from airl_mav.experiments.campaign import (
     CampaignRun,
     Cell,
     CellRun,
-    EpisodeSaver,
-    run_cell,
-    run_cells,
-)
-from airl_mav.experiments.campaign_store import (
     Declaration,
     DeclaredCell,
+    EpisodeSaver,
     load_campaign,
     open_campaign,
+    run_cell,
+    run_cells,
 )
 from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor, open_executor
 from airl_mav.experiments.experiment import Experiment, fly_scenario, run_experiment
@@ -54,10 +52,10 @@ def fly(
 ) -> tuple[CampaignRun, list[str]]:
     notes = Notes()
     with (
-        open_campaign(root, declared(flown), command="a test") as store,
+        open_campaign(root, declared(flown), command="a test"),
         open_executor(ExecutorSettings(workers=workers), in_process=True) as executor,
     ):
-        run = run_cells(store, flown, executor, progress=notes, **options)
+        run = run_cells(root, flown, executor, progress=notes, **options)
     return run, notes.lines
 
 
@@ -107,10 +105,10 @@ def test_live_cells_with_the_same_flights_share_them(tmp_path: Path) -> None:
     ended: list[CellRun] = []
     # The vectorized simulator replaces level sitl: the test covers sharing, not the level.
     with (
-        open_campaign(tmp_path, declared([first]), command="a test") as store,
+        open_campaign(tmp_path, declared([first]), command="a test"),
         patch.object(experiment, "fly_live", lambda *given, name: fly_scenario(*given)),
     ):
-        run = experiment._fly_live(store, [first, twin], Progress(), ended.append)
+        run = experiment._fly_live(tmp_path, [first, twin], Progress(), ended.append)
     assert [each.cell for each in ended] == [first]
     assert [each.cell for each in run.cells] == [first, twin]
     assert [each.path for each in run.cells] == [tmp_path / "a"] * 2
@@ -207,8 +205,8 @@ def test_a_job_that_loses_its_workers_ends_the_campaign_with_one_line(
     monkeypatch.setitem(campaign.FLIERS, "gym", lambda _: flier)
     with open_executor(ExecutorSettings(workers=1)) as executor:
         notes = Notes()
-        with open_campaign(tmp_path, declared(broken), command="a test") as store:
-            run = run_cells(store, broken, executor, progress=notes)
+        with open_campaign(tmp_path, declared(broken), command="a test"):
+            run = run_cells(tmp_path, broken, executor, progress=notes)
     assert not run.complete
     assert run.error == "a: seeds 7 to 8: lost 3 workers, the last one by SIGKILL"
     assert notes.lines == ["a worker was lost by SIGKILL: a: seeds 7 to 8 begins again"] * 2
@@ -288,9 +286,9 @@ def test_the_declaration_is_there_before_anything_flies_and_keeps_its_origin(
 ) -> None:
     flown = cells()
     asked = declared(flown)
-    with open_campaign(tmp_path, asked, command="the first command") as store:
+    with open_campaign(tmp_path, asked, command="the first command") as campaign_there:
         held = load_campaign(tmp_path)
-        assert held == store.campaign
+        assert held == campaign_there
         assert held.declaration == asked
         assert held.made["command"] == "the first command"
     more = replace(asked, cells=asked.cells | {"c": DeclaredCell("one more")})

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from airl_mav.addons.colour.batch import ColourImages, Looks
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion, Mount
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.arena_batch import batch_of
-from airl_mav.envs.colour_images import ColourImages, Looks
 from airl_mav.envs.mesh_batch import MeshesSeen
 from airl_mav.envs.observations import COMPILED
 from airl_mav.lockstep.lockstep_flight import fly

@@ -9,10 +9,10 @@ import pytest
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.projection import lens_of
 from airl_mav.camera.render import Motion, Mount
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.cameras import Eye, render_images
-from airl_mav.envs.colour_images import lens_of
 from airl_mav.envs.evaluation import SinglePilots, fly_seeds
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation

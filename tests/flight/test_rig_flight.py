@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
+from airl_mav.addons.colour.batch import Looks
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion
@@ -18,7 +19,6 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.cameras import Cameras
-from airl_mav.envs.colour_images import Looks
 from airl_mav.envs.fleet import new_fleet
 from airl_mav.envs.mesh_batch import MeshesSeen
 from airl_mav.envs.observations import COMPILED

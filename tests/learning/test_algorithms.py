@@ -10,9 +10,8 @@ import pytest
 from stable_baselines3 import DQN, PPO
 
 from airl_mav.core.errors import UsageError
-from airl_mav.training.algorithm_table import ALGORITHMS
 from airl_mav.training.algorithms import ROLLOUT, make_model
-from airl_mav.training.config import AlgorithmSpec, NetworkSpec, TrainingConfig
+from airl_mav.training.config import ALGORITHMS, AlgorithmSpec, NetworkSpec, TrainingConfig
 from airl_mav.training.dqn import DoubleDQN
 from tests.support.toy_fleet import ToyFleet
 

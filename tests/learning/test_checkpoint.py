@@ -20,10 +20,9 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from airl_mav.core.errors import UsageError
-from airl_mav.training.algorithm_table import ALGORITHMS
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
-from airl_mav.training.config import AlgorithmSpec, NetworkSpec
+from airl_mav.training.config import ALGORITHMS, AlgorithmSpec, NetworkSpec
 from tests.support.toy_fleet import ToyFleet
 
 ROOT = Path(__file__).resolve().parents[2]

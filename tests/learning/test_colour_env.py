@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from stable_baselines3.common.preprocessing import is_image_space
 
-from airl_mav.camera.exposure import expose
-from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.addons.imitation.imitation import Expert
+from airl_mav.camera.render import Mount, camera_pose, expose
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.envs.experts import Expert
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.navigation_env import NavigationEnv
 from airl_mav.envs.sb3 import NavigationVecEnv

@@ -29,7 +29,7 @@ from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Kinematics, Observation
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction import Compensator
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import parameter_values

@@ -178,6 +178,7 @@ class Dies(TrainingProgress):
     """Progress callback that ends the training at once, like a kill, after a number of steps."""
 
     def __init__(self, steps: int) -> None:
+        super().__init__()
         self.steps = steps
 
     def trained(self, steps: int, success: float | None, zone: int | None) -> None:

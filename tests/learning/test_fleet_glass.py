@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from airl_mav.addons.colour.profile import Appearance
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Obstacles
 from airl_mav.camera.frame import depth_to_z16
+from airl_mav.camera.projection import lens_of
 from airl_mav.camera.render import camera_pose, render
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.cameras import Eye, render_images
-from airl_mav.envs.colour_images import lens_of
 from airl_mav.envs.mesh_batch import MeshesSeen
-from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.learning.test_fleet_meshes import CAMERA, MOUNT, RANGE_M, scattered

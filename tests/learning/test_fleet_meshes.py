@@ -9,16 +9,17 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from airl_mav.addons.colour.batch import ColourImages, Looks
+from airl_mav.addons.colour.picture import render_picture
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import render_picture
+from airl_mav.camera.projection import lens_of
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.cameras import Eye, render_images
-from airl_mav.envs.colour_images import ColourImages, Looks, lens_of
 from airl_mav.envs.fleet import FramePoses
 from airl_mav.envs.mesh_batch import MeshesSeen
 from airl_mav.profiles.arena import ArenaSpec

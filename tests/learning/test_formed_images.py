@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from airl_mav.camera.imaging import ImageFormation
+from airl_mav.addons.colour.image_sensor import ImageFormation
 from airl_mav.camera.render import Motion
 from airl_mav.core.errors import FieldError
 from airl_mav.envs.evaluation import Trace
@@ -52,7 +52,7 @@ def motion_of(env: Navigation, i: int) -> Motion:
 def captured(env: Navigation) -> np.ndarray:
     """Images of where the vehicles are now."""
     everyone = np.ones(2, np.bool_)
-    env.cameras.capture(env.fleet, env._places.batch, everyone, env.seeds)
+    env.cameras.capture(env.fleet, env.places.batch, everyone, env.seeds)
     return env.cameras.image.copy()
 
 

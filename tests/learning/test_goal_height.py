@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from airl_mav.addons.imitation.imitation import Expert
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.evaluation import fly_seeds, success_rate
-from airl_mav.envs.experts import Expert
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.navigation_env import NavigationEnv

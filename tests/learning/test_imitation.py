@@ -11,6 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
+from airl_mav.addons.imitation.imitation import Expert, choices
+from airl_mav.addons.imitation.planner import PlannerBody, map_of
 from airl_mav.envs.evaluation import (
     EpisodeResult,
     fly_episodes,
@@ -18,18 +20,16 @@ from airl_mav.envs.evaluation import (
     mean_of_successes,
     success_rate,
 )
-from airl_mav.envs.experts import Expert, choices
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.planner import PlannerBody, map_of
 from airl_mav.envs.sb3 import NavigationVecEnv
-from airl_mav.envs.spec import ExpertName, spec_of
+from airl_mav.envs.spec import spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.actions import ActionSpec, commands
 from airl_mav.policy.learned import load_learned
 from airl_mav.policy.observation import Observation
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
-from airl_mav.training.config import TrainingConfig
+from airl_mav.training.config import ExpertName, TrainingConfig
 from airl_mav.training.training_run import nominal, train
 
 SMALL = {"image_width_px": 16, "image_height_px": 12}

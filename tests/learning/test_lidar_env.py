@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from airl_mav.camera.exposure import expose
 from airl_mav.camera.noise import noise_of, noisy_frame
-from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.camera.render import Mount, camera_pose, expose
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
@@ -45,7 +44,7 @@ def test_the_plant_s_ranges_are_the_twin_s() -> None:
     env.begin([0, 1], [5, 8])
     for _ in range(2):
         env.fly(np.array([[4.0, 0.0, 0.9], [2.0, 1.0, -0.7]]))
-    env.cameras.capture(env.fleet, env._places.batch, np.ones(2, np.bool_), env.seeds)
+    env.cameras.capture(env.fleet, env.places.batch, np.ones(2, np.bool_), env.seeds)
     noise = noise_of(env.camera, SensorNoise())
     assert noise is not None
     camera, frames = env.camera, env.cameras._frames(env.fleet.time_us)

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from airl_mav.core.errors import UsageError
 from airl_mav.training.algorithms import (
-    DepthExtractor,
+    ImageExtractor,
     flat_size,
     make_model,
     to_channels_last,
@@ -86,7 +86,7 @@ def test_policy_is_what_is_counted(spec: NetworkSpec, name: str) -> None:
 
 def test_extractor_convolves_the_scaled_image_and_joins_the_vectors() -> None:
     torch.manual_seed(0)
-    extractor = DepthExtractor(observation_space(), NetworkSpec())
+    extractor = ImageExtractor(observation_space(), NetworkSpec())
     rng = np.random.default_rng(0)
     seen = {
         "depth": torch.from_numpy(rng.integers(0, 256, (5, 1, HEIGHT, WIDTH), np.uint8)),
@@ -105,7 +105,7 @@ def test_extractor_convolves_the_scaled_image_and_joins_the_vectors() -> None:
 
 def test_weights_layout_changes_speed_not_values() -> None:
     torch.manual_seed(0)
-    plain = DepthExtractor(observation_space(), NetworkSpec())
+    plain = ImageExtractor(observation_space(), NetworkSpec())
     other = copy.deepcopy(plain)
     to_channels_last(other)
     seen = {

@@ -9,14 +9,14 @@ import pytest
 
 pytest.importorskip("onnx", reason="needs the [profile] extra")
 
-from airl_mav.cli import main
-from airl_mav.experiments.quantisation import (
+from airl_mav.addons.int8.quantisation import (
     FIRST_SEED,
     FRAMES,
     export_int8,
     frames_of,
     relative_error,
 )
+from airl_mav.cli import main
 from airl_mav.policy.card import ONNX_FILE, PolicyCard, load_card, open_model
 from airl_mav.policy.learned import load_learned
 from airl_mav.profiles.loading import profiles_dir

@@ -85,7 +85,7 @@ def test_the_plant_s_cameras_take_the_same_images(rig: Path, arena: str) -> None
     noise = SensorNoise(depth_noise=0.02, depth_dropout=0.02)
     env = flown(rig_env(rig, arena=arena, randomisation=noise.model_dump()))
     everyone, fleet = np.ones(2, np.bool_), env.fleet
-    env.cameras.capture(fleet, env._places.batch, everyone, env.seeds)
+    env.cameras.capture(fleet, env.places.batch, everyone, env.seeds)
     numbers = env.cameras._frames(fleet.time_us)
     for i, world in enumerate(env.arenas):
         assert world is not None

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from airl_mav.addons.roofline.page import noticed_m
+from airl_mav.addons.roofline.stopping_flights import fly_into, greatest_speed
 from airl_mav.core.errors import FieldError
 from airl_mav.envs import stopping
 from airl_mav.envs.fleet import FlightStatus
@@ -21,8 +22,6 @@ from airl_mav.envs.stopping import (
     StoppingTask,
     bounded,
     braking_of,
-    fly_into,
-    greatest_speed,
     measure_braking,
     speed_bound,
 )

@@ -29,7 +29,7 @@ from airl_mav.addons.sweep.summary import (
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.machine import provenance
-from airl_mav.experiments.campaign_store import load_campaign, open_campaign
+from airl_mav.experiments.campaign import load_campaign, open_campaign
 from airl_mav.policy.actions import ActionSpec
 from airl_mav.policy.card import OnnxRuntime
 from airl_mav.policy.card_writing import NetworkSize, build_template, template_size
@@ -309,8 +309,8 @@ def test_a_sweep_goes_on_with_more_cells_and_seeds_but_not_with_another_training
     tmp_path: Path,
 ) -> None:
     def begun(config: SweepConfig) -> dict[str, Any]:
-        with open_campaign(tmp_path, declaration(config), command="airl sweep") as store:
-            return store.campaign.made
+        with open_campaign(tmp_path, declaration(config), command="airl sweep") as campaign:
+            return campaign.made
 
     config = load_sweep("tiny")
     made = begun(config)

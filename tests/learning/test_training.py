@@ -26,7 +26,12 @@ from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.training import training_run
 from airl_mav.training.config import TrainingConfig, check_fields
-from airl_mav.training.training_folder import Evaluation, TrainingBar, TrainingFolder, TrainRequest
+from airl_mav.training.training_folder import (
+    Evaluation,
+    TrainingFolder,
+    TrainingProgress,
+    TrainRequest,
+)
 from airl_mav.training.training_run import nominal
 from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here
@@ -199,7 +204,7 @@ def test_who_flies_well_by_chance_alone_is_told(in_training: float | None, told:
             notes.append(text)
 
     evaluation = Evaluation(5_000, 60.0, 300, 0.36, 0.64, 2.4, 15.0, in_training, None)
-    TrainingBar(Noted(), 10_000).evaluated(evaluation, best=False)
+    TrainingProgress(Noted(), 10_000).evaluated(evaluation, best=False)
     assert notes == [f"      5,000 decisions      60 s  success  36.0%    2.40 s{told}"]
 
 

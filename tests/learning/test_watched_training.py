@@ -194,6 +194,19 @@ def test_what_is_shown_is_what_was_flown(decisions: str) -> None:
     assert image.shape == (spec.image_height_px, spec.image_width_px)
 
 
+def test_a_training_of_body_rates_shows_their_setpoints() -> None:
+    spec = EnvironmentSpec.model_validate(
+        {"arena": "no-obstacles", "actions": "body-rates", "decisions": "pipelined"}
+    )
+    action = np.array([0.1, -0.2, 0.3, 0.05], np.float32)
+    tape = Taped(0, 5, None, [action] * 2, [0.5, 0.5], "timeout")
+    told = [moment.message for moment in EpisodeReplay(spec).moments(tape, 0)]
+    decided = [message for message in told if isinstance(message, Decided)]
+    assert [message.commands for message in decided] == ["body_rates"] * 2
+    # Shares of 180 degrees per second, and -1 to 1 for no thrust to full thrust.
+    assert decided[0].setpoint == pytest.approx((*np.deg2rad([18.0, -36.0, 54.0]), 0.525))
+
+
 def test_a_training_that_goes_on_shows_whole_episodes() -> None:
     """Skip an episode in progress at the resume: its beginning is unknown."""
     ends = Ends()

@@ -10,12 +10,12 @@ import pytest
 from PIL import Image, ImageSequence
 from rich.console import Console
 
-from airl_mav.addons.render.camera_pictures import CameraMotion, _rates, optical_flow, velocities_of
+from airl_mav.addons.colour.image_sensor import ImageFormation
+from airl_mav.addons.colour.picture import render_picture
+from airl_mav.addons.colour.pictures import _rates, optical_flow, velocities_of
 from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.arena.generate import generate
-from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import render_picture
 from airl_mav.camera.render import Motion
 from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
@@ -47,7 +47,7 @@ def vehicle(tmp_path: Path) -> Path:
 
 def render(*words: str) -> None:
     code = carry_out(
-        "airl render", "airl_mav.addons.render.command", list(words), console=Console(quiet=True)
+        "airl render", "airl_mav.addons.colour.command", list(words), console=Console(quiet=True)
     )
     assert code == 0
 
@@ -121,7 +121,7 @@ def test_ground_truth_is_written_as_numbers(tmp_path: Path) -> None:
         found[show] = np.load(out)
     np.testing.assert_array_equal(found["depth"], picture.depth_m)
     np.testing.assert_array_equal(found["segmentation"], picture.seen)
-    motion = CameraMotion(at, north, np.array([4.0, 0.0, 0.0]), np.zeros(3))
+    motion = Motion(at, north, np.array([4.0, 0.0, 0.0]), np.zeros(3))
     flow = optical_flow(picture, k, motion, velocities_of(arena, 1_500_000))
     np.testing.assert_array_equal(found["flow"], flow)
     # As a picture, too: static surfaces are white.

@@ -10,10 +10,10 @@ import pytest
 from PIL import Image, ImageSequence
 from rich.console import Console
 
-from airl_mav.addons.render.camera_pictures import Drawn, Shown, film, moments, still, write_film
+from airl_mav.addons.colour.picture import render_picture
+from airl_mav.addons.colour.pictures import Drawn, Shown, film, moments, still, write_film
 from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import render_picture
 from airl_mav.camera.render import camera_pose
 from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
@@ -31,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def render(*words: str) -> None:
     code = carry_out(
-        "airl render", "airl_mav.addons.render.command", list(words), console=Console(quiet=True)
+        "airl render", "airl_mav.addons.colour.command", list(words), console=Console(quiet=True)
     )
     assert code == 0
 

@@ -9,14 +9,8 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from airl_mav.core.frames import heading_to_ned, quat_yaw
 from airl_mav.core.signing import Signing
-from firmware_sim.autopilot.autopilot_state import (
-    AutopilotState,
-    Landed,
-    OperatorText,
-    Result,
-    Setpoint,
-    Severity,
-)
+from firmware_sim.autopilot.autopilot_state import Landed, OperatorText, Result, Setpoint, Severity
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.link import Link

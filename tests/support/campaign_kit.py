@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from airl_mav.core.files import Arrays
-from airl_mav.experiments.campaign import Cell, run_cells
-from airl_mav.experiments.campaign_store import Declaration, DeclaredCell, open_campaign
+from airl_mav.experiments.campaign import Cell, Declaration, DeclaredCell, open_campaign, run_cells
 from airl_mav.experiments.executors import ExecutorSettings, open_executor
 from airl_mav.experiments.experiment import make_cell
 from airl_mav.rehearsal.run_folder import LoadedRun
@@ -63,10 +62,10 @@ def same_runs(one: LoadedRun, other: LoadedRun) -> bool:
 def main(path: Path, episodes: int) -> None:
     flown = cells(episodes)
     with (
-        open_campaign(path, declared(flown), command="a test") as store,
+        open_campaign(path, declared(flown), command="a test"),
         open_executor(ExecutorSettings(workers=2)) as executor,
     ):
-        run_cells(store, flown, executor)
+        run_cells(path, flown, executor)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """An autopilot for wire-level tests: perfect knowledge, no dynamics worth the name.
 
-It implements `AutopilotPort` with PX4's refusals and texts, so that MAVLink services can be
+It answers as `BuiltinAutopilot` with PX4's refusals and texts, so that MAVLink services can be
 tested without an estimator, a controller or a plant.
 """
 
@@ -10,7 +10,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -47,9 +47,16 @@ from firmware_sim.autopilot.inputs import (
     Sticks,
 )
 from firmware_sim.autopilot.navigation.plan import Plans
-from firmware_sim.autopilot.port import Failures, LogStore, NoLogs, ParameterValue
+from firmware_sim.autopilot.parameter_store import ParameterValue
 from firmware_sim.autopilot.snapshot import progress
-from firmware_sim.interfaces import BatterySample, GpsFix, Received, SensorSample
+from firmware_sim.fault_timeline import ClientFaults
+from firmware_sim.interfaces import BatterySample, GpsFix, LogStore, Received, SensorSample
+
+if TYPE_CHECKING:
+    # Stands in for it without its parts.
+    from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+else:
+    BuiltinAutopilot = object
 
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
 READY_US = 100_000
@@ -71,7 +78,7 @@ DEFAULT_PARAMETERS: dict[str, int | float] = {
 
 
 class KnownState(NamedTuple):
-    """Implements `AutopilotState` by plain values."""
+    """Answers as `AutopilotState` with plain values."""
 
     time_us: int
     estimate: StateEstimate
@@ -155,14 +162,14 @@ class Parameters:
         return True
 
 
-class KinematicAutopilot:
+class KinematicAutopilot(BuiltinAutopilot):
     """Velocity follows the setpoint with a first-order lag; attitude is level."""
 
     def __init__(self, parameters: Parameters | None = None, start_us: int = 0) -> None:
-        self.parameters = parameters or Parameters()
+        self.parameters: Any = parameters or Parameters()
         self.plans = Plans()
-        self.failures: Failures | None = None
-        self.logs: LogStore = NoLogs()
+        self.failures: ClientFaults | None = None
+        self.logs = LogStore()
         self.time_us = start_us
         self.ready_us = start_us + READY_US
         self.position = np.zeros(3)
@@ -223,17 +230,17 @@ class KinematicAutopilot:
     def arm(self, *, force: bool) -> Result:
         self.commands.append(f"arm force={force}")
         if self.arming is Arming.BOOT or (self.mode is Mode.OFFBOARD and not self._fresh()):
-            self._say(Severity.CRITICAL, "Arming denied: Resolve system health failures first")
+            self._text(Severity.CRITICAL, "Arming denied: Resolve system health failures first")
             return Result.TEMPORARILY_REJECTED
         if self.arming is not Arming.ARMED:
             self.arming = Arming.ARMED
-            self._say(Severity.INFO, "Armed by external command")
+            self._text(Severity.INFO, "Armed by external command")
         return Result.ACCEPTED
 
     def disarm(self, *, force: bool) -> Result:
         self.commands.append(f"disarm force={force}")
         if self.landed is not Landed.ON_GROUND and not force:
-            self._say(Severity.CRITICAL, "Disarming denied: not landed")
+            self._text(Severity.CRITICAL, "Disarming denied: not landed")
             return Result.TEMPORARILY_REJECTED
         if self.arming is Arming.ARMED:
             self.arming = Arming.STANDBY
@@ -265,7 +272,7 @@ class KinematicAutopilot:
         in_air = self.landed is not Landed.ON_GROUND
         if mode is Mode.POSITION or (mode is Mode.OFFBOARD and in_air and not self._fresh()):
             name = "Offboard" if mode is Mode.OFFBOARD else "Position"
-            self._say(Severity.CRITICAL, f"Switching to {name} is currently not available")
+            self._text(Severity.CRITICAL, f"Switching to {name} is currently not available")
             return Result.TEMPORARILY_REJECTED
         self.mode = mode
         self.failsafe = False
@@ -322,7 +329,7 @@ class KinematicAutopilot:
     def attitude(self) -> Vector:
         return quat_from_euler(self.roll, self.pitch, self.yaw)
 
-    def state(self) -> KnownState:
+    def state(self) -> Any:
         zero = np.zeros(3)
         estimate = StateEstimate(
             time_us=self.time_us,
@@ -369,7 +376,7 @@ class KinematicAutopilot:
 
     # --- flying ---
 
-    def step(self) -> None:
+    def step(self, _sample: Any = None, /) -> Any:
         """Advance by one tick."""
         self.time_us += TICK_US
         if self.frozen:
@@ -379,7 +386,7 @@ class KinematicAutopilot:
             self.origin = self.home = ORIGIN
         if self.mode is Mode.OFFBOARD and self.arming is Arming.ARMED and not self._fresh():
             self.mode, self.failsafe = Mode.POSITION, True
-            self._say(Severity.CRITICAL, "Failsafe activated")
+            self._text(Severity.CRITICAL, "Failsafe activated")
         elif self.failsafe and self._fresh():
             self.mode, self.failsafe = Mode.OFFBOARD, False
         wanted = self._velocity() if self.arming is Arming.ARMED else np.zeros(3)
@@ -416,7 +423,7 @@ class KinematicAutopilot:
             if self.landed is not Landed.ON_GROUND:
                 self.landed = Landed.ON_GROUND
                 self.arming = Arming.STANDBY
-                self._say(Severity.INFO, "Disarmed by landing")
+                self._text(Severity.INFO, "Disarmed by landing")
         elif self.mode is Mode.TAKEOFF:
             self.landed = Landed.TAKEOFF
         elif self.mode is Mode.LAND:
@@ -435,5 +442,5 @@ class KinematicAutopilot:
     def _setpoint_age_us(self) -> int:
         return self.time_us - self.setpoints[-1][1]
 
-    def _say(self, severity: Severity, text: str) -> None:
+    def _text(self, severity: Severity, text: str) -> None:
         self.messages.append(OperatorText(severity, text))

@@ -20,7 +20,7 @@ from airl_mav.policy.actions import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
 from airl_mav.policy.layouts import Encoded, boxes, image_key
 from airl_mav.policy.observation_spec import ObservationSpec
-from airl_mav.training.algorithms import DepthExtractor, dense_units
+from airl_mav.training.algorithms import ImageExtractor, dense_units
 from airl_mav.training.config import NetworkSpec
 from airl_mav.training.export import export_sb3
 
@@ -85,7 +85,7 @@ def parameters_of(spec: NetworkSpec, height_px: int, width_px: int, outputs: int
     )
     assert isinstance(seen.observation_space, spaces.Dict)
     with torch.device("meta"):
-        extractor = DepthExtractor(seen.observation_space, spec)
+        extractor = ImageExtractor(seen.observation_space, spec)
         head = nn.Sequential(*create_mlp(extractor.features_dim, outputs, dense_units(spec)))
     return sum(each.numel() for part in (extractor, head) for each in part.parameters())
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from airl_mav.profiles.parameters import SPECS
 from airl_mav.profiles.vehicle import VehicleProfile
-from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.autopilot.port import ParameterValue
+from firmware_sim.autopilot.parameter_store import Parameters, ParameterValue
 
 FRAME = (
     # Front right, rear left, front left, rear right.

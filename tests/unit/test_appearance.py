@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from scipy.integrate import quad
 
-from airl_mav.arena.finishes import FLOOR, OBSTACLE, TEXTURES, WALLS, linear_of, srgb_of
+from airl_mav.addons.colour.appearance import FLOOR, OBSTACLE, TEXTURES, WALLS, linear_of, srgb_of
+from airl_mav.addons.colour.profile import MATERIALS
 from airl_mav.arena.generate import generate, local_bounds
 from airl_mav.arena.geometry import Arena, Obstacles
 from airl_mav.core.plugins import GENERATORS
-from airl_mav.profiles.appearance import MATERIALS
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profile_digest
 

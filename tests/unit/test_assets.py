@@ -12,16 +12,16 @@ import pytest
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
-from airl_mav.arena.finishes import OBSTACLE, TEXTURES, Statics, linear_of
+from airl_mav.addons.colour.appearance import OBSTACLE, TEXTURES, linear_of
+from airl_mav.addons.colour.profile import MATERIALS
 from airl_mav.arena.generate import free_area_fraction, generate
-from airl_mav.arena.geometry import Arena, Shape
+from airl_mav.arena.geometry import Arena, Shape, Statics
 from airl_mav.arena.placement import Boxes, bounding_boxes, gaps_suffice
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import ned_to_enu, quat_from_euler
 from airl_mav.envs.arena_batch import NOTHING, WALL, touches
-from airl_mav.profiles.appearance import MATERIALS
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from firmware_sim.plant.bullet_body import BulletWorld

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from airl_mav.addons.colour.profile import Appearance
 from airl_mav.addons.forensics.camera_view import bearing, nearest_spot, view_obstacle, view_wall
 from airl_mav.addons.forensics.long_flights import (
     MIN_TURNS,
@@ -39,7 +40,6 @@ from airl_mav.flight.episode_record import (
 )
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory, measure_quality
-from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.policy_view import PolicyCamera
 

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from airl_mav.arena.finishes import FLOOR, OBSTACLE, TEXTURES, linear_of, srgb_of
+from airl_mav.addons.colour.appearance import FLOOR, OBSTACLE, TEXTURES, linear_of, srgb_of
+from airl_mav.addons.colour.picture import Picture, grey, render_picture, unpack
+from airl_mav.addons.colour.profile import Appearance
+from airl_mav.addons.colour.textures import PERIOD, SIDE, atlas, pattern
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera import primitives
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import Picture, grey, render_picture, unpack
 from airl_mav.camera.render import render
-from airl_mav.camera.textures import PERIOD, SIDE, atlas, pattern
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
-from airl_mav.profiles.appearance import DEFAULT, Appearance
-from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.arena import DEFAULT_APPEARANCE, ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projections import Projection
 from tests.support.lenses import AT_NIGHT_THE_FISHEYE, rays_of_fisheye
@@ -219,7 +219,7 @@ def rays_of(k: Intrinsics, attitude: NDArray[np.float64]) -> NDArray[np.float64]
     """Rays (h, w, 3) NED, as `Intrinsics` defines them."""
     v, u = np.mgrid[: k.height, : k.width]
     x, y = (u - k.cx) / k.focal, (v - k.cy) / k.focal
-    ahead, right = (np.cos(x), np.sin(x)) if k.cylindrical else (np.ones_like(x), x)
+    ahead, right = (np.cos(x), np.sin(x)) if k.model.cylindrical else (np.ones_like(x), x)
     if k.projection == "fisheye":
         ahead, right, y = np.moveaxis(np.nan_to_num(rays_of_fisheye(k)), -1, 0)
     rays: NDArray[np.float64] = np.stack([ahead, right, y], -1) @ quat_to_matrix(attitude).T
@@ -314,7 +314,7 @@ def test_every_floor_point_is_dark_where_a_way_to_the_sun_is_blocked(
 
 
 def test_a_cylinder_sees_on_its_axis_what_a_pinhole_sees() -> None:
-    scene = replace(arena(busy(1)), appearance=DEFAULT)
+    scene = replace(arena(busy(1)), appearance=DEFAULT_APPEARANCE)
     pinhole = Intrinsics(65, 49, 40.0, 32.0, 24.0)
     cylinder = Intrinsics(65, 49, 40.0, 32.0, 24.0, "cylindrical")
     for position, attitude in poses(1, 10):
@@ -418,7 +418,7 @@ def test_grey_is_the_luma_of_pillow() -> None:
 
 
 def test_same_arena_same_image() -> None:
-    scene = replace(arena(busy(0)), appearance=DEFAULT)
+    scene = replace(arena(busy(0)), appearance=DEFAULT_APPEARANCE)
     a, b = (see(replace(scene), (0.0, 0.0, -8.0)).rgb for _ in range(2))
     np.testing.assert_array_equal(a, b)
     assert len(np.unique(a.reshape(-1, 3), axis=0)) > 200

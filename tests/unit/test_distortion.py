@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from airl_mav.camera.frame import Frame, FrameError
-from airl_mav.camera.intrinsics import Intrinsics, fisheye_places, fisheye_rays
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.spec import CameraChange
 from airl_mav.policy.observation import Kinematics
@@ -88,10 +88,10 @@ SEEN: dict[Distortion, list[list[float]]] = {
 def test_points_fall_and_pixels_look_where_opencv_has_them(k: Distortion) -> None:
     camera = replace(LENS, distortion=k)
     right, down, forward = np.array(POINTS).T
-    places = np.stack(fisheye_places(camera, np.stack([forward, right, down])), axis=1)
+    places = np.stack(camera.model.places(camera, np.stack([forward, right, down])), axis=1)
     np.testing.assert_allclose(places, PROJECTED[k], rtol=1e-12)
     columns, rows = np.array(PIXELS).T
-    ahead, aside, below = fisheye_rays(camera)[:, rows, columns]
+    ahead, aside, below = camera.rays[:, rows, columns]
     # OpenCV stops as soon as a step is below 1e-8.
     np.testing.assert_allclose(np.stack([aside, below], 1) / ahead[:, None], SEEN[k], rtol=1e-7)
 
@@ -139,7 +139,7 @@ def test_the_field_of_view_ends_at_the_edges_of_the_image(k: Distortion, fov_deg
     camera = Intrinsics.of(fisheye(fov_deg, k))
     half = math.radians(0.5 * fov_deg)
     edge = np.array([[math.cos(half)], [math.sin(half)], [0.0]])
-    column, row = fisheye_places(camera, edge)
+    column, row = camera.model.places(camera, edge)
     assert column[0] == pytest.approx(camera.width - 0.5, abs=1e-9)
     assert row[0] == pytest.approx(camera.cy)
     assert camera.focal == pytest.approx(0.5 * camera.width / published(half, k))
@@ -149,12 +149,12 @@ def test_the_field_of_view_ends_at_the_edges_of_the_image(k: Distortion, fov_deg
 @pytest.mark.parametrize("k", LENSES)
 def test_points_fall_where_the_rays_begin(k: Distortion) -> None:
     camera = Intrinsics(191, 161, 50.0, 95.0, 79.0, "fisheye", distortion=k)
-    rays = fisheye_rays(camera)
+    rays = camera.rays
     sees: Any = rays.any(axis=0)
     assert sees.sum() > 5_000
     assert not sees[0, 0]
     np.testing.assert_allclose(np.linalg.norm(rays[:, sees], axis=0), 1.0, atol=1e-12)
-    u, v = fisheye_places(camera, 3.0 * rays)
+    u, v = camera.model.places(camera, 3.0 * rays)
     rows, columns = np.nonzero(sees)
     # At the rim itself rounding decides.
     inside = np.hypot(rows - 79.0, columns - 95.0) < 50.0 * distorted(sees_to(k), k) - 0.5

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from airl_mav.addons.colour.picture import render_picture
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera.frame import depth_to_z16
-from airl_mav.camera.intrinsics import Intrinsics, fisheye_places, fisheye_rays
-from airl_mav.camera.picture import render_picture
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.primitives import OBSTACLE
 from airl_mav.camera.render import render
 from airl_mav.core.errors import FieldError, UsageError
@@ -22,8 +22,8 @@ from airl_mav.policy.images import rays_of
 from airl_mav.policy.observation import Kinematics, observe
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
 from airl_mav.policy.registry import near_points
-from airl_mav.prediction.compensator import CameraPose, PosedImage, Reprojector
-from airl_mav.profiles.appearance import DEFAULT
+from airl_mav.prediction import CameraPose, PosedImage, Reprojector
+from airl_mav.profiles.arena import DEFAULT_APPEARANCE
 from airl_mav.profiles.projections import UNDISTORTED, Distortion
 from airl_mav.profiles.vehicle import load_vehicle
 from tests.support.lenses import BARREL, OPENING, published, rays_of_fisheye
@@ -81,17 +81,17 @@ def test_a_sphere_covers_the_angles_that_it_is_seen_under(
 
 
 def test_points_fall_where_the_rays_begin() -> None:
-    rays = fisheye_rays(WIDE)
+    rays = WIDE.rays
     sees: Any = rays.any(axis=0)
     np.testing.assert_allclose(np.linalg.norm(rays[:, sees], axis=0), 1.0, atol=1e-12)
-    u, v = fisheye_places(WIDE, 7.0 * rays)
+    u, v = WIDE.model.places(WIDE, 7.0 * rays)
     rows, columns = np.nonzero(sees)
     np.testing.assert_allclose(u[sees], columns, atol=1e-6)
     np.testing.assert_allclose(v[sees], rows, atol=1e-6)
     # The image's corners lie outside of the lens's circle.
     assert not sees[0, 0]
     assert sees[95, 0]
-    behind, _ = fisheye_places(WIDE, np.array([[-1.0], [0.05], [0.0]]))
+    behind, _ = WIDE.model.places(WIDE, np.array([[-1.0], [0.05], [0.0]]))
     assert not np.isfinite(behind).any()
 
 
@@ -103,8 +103,8 @@ def test_a_pixel_shows_what_a_pinhole_shows_that_looks_along_its_ray(
     """Depth, colours, shadows and textures: a small pinhole of the same pixels, turned there."""
     k = Intrinsics.from_fov(64, 48, math.radians(150.0), "fisheye", distortion=distortion)
     small = Intrinsics(3, 3, k.focal, 1.0, 1.0)
-    rays, rng = fisheye_rays(k), np.random.default_rng(2)
-    scene = replace(arena(busy(1), sun=sun(200.0, 40.0)), appearance=DEFAULT)
+    rays, rng = k.rays, np.random.default_rng(2)
+    scene = replace(arena(busy(1), sun=sun(200.0, 40.0)), appearance=DEFAULT_APPEARANCE)
     same = total = 0
     for position, attitude in poses(1, 6):
         centers, at = scene.obstacles.center, np.array(position)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from airl_mav.addons.render.camera_pictures import (
-    CameraMotion,
+from airl_mav.addons.colour.picture import Picture, render_picture
+from airl_mav.addons.colour.pictures import (
     motion_of_camera,
     optical_flow,
     velocities_of,
@@ -18,7 +18,6 @@ from airl_mav.addons.render.camera_pictures import (
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import Picture, render_picture
 from airl_mav.camera.primitives import FLOOR, OBSTACLE, SKY
 from airl_mav.camera.render import Motion, Mount
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
@@ -49,7 +48,7 @@ def places(k: Intrinsics, p: np.ndarray) -> np.ndarray:
 
 
 def followed(
-    scene: Arena, k: Intrinsics, picture: Picture, motion: CameraMotion, elapsed_us: int
+    scene: Arena, k: Intrinsics, picture: Picture, motion: Motion, elapsed_us: int
 ) -> np.ndarray:
     """Flow (h, w, 2) of the points that are seen, by differences of their places."""
     offsets = picture.depth_m[..., None] * rays_of(k, motion.quaternion)
@@ -126,7 +125,7 @@ def test_what_is_ahead_opens_from_the_middle() -> None:
     picture = Picture(np.zeros((49, 65, 3), np.uint8), depth, np.full((49, 65), 2, np.int32))
     level = quat_from_euler(0.0, 0.0, 0.7)
     ahead = quat_to_matrix(level) @ np.array([4.0, 0.0, 0.0])
-    motion = CameraMotion(np.zeros(3), level, ahead, np.zeros(3))
+    motion = Motion(np.zeros(3), level, ahead, np.zeros(3))
     flow = optical_flow(picture, k, motion, np.zeros((0, 3)))
     across = (np.arange(65) - k.cx) * 4.0 / 8.0
     np.testing.assert_allclose(flow[..., 0], np.broadcast_to(across, (49, 65)), atol=1e-5)
@@ -143,7 +142,7 @@ def test_a_pixel_that_sees_nothing_has_no_flow() -> None:
         np.zeros((64, 64), np.float32),
         np.zeros((64, 64), np.int32),
     )
-    motion = CameraMotion(np.zeros(3), np.array([1.0, 0, 0, 0]), np.ones(3), np.ones(3))
+    motion = Motion(np.zeros(3), np.array([1.0, 0, 0, 0]), np.ones(3), np.ones(3))
     flow = optical_flow(picture, k, motion, np.zeros((0, 3)))
     assert np.isnan(flow[0, 0]).all()
     assert np.isfinite(flow[32]).all()

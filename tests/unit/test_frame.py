@@ -39,7 +39,7 @@ focals = st.floats(LEAST_PX, MOST_PX)
 @st.composite
 def frames(draw: st.DrawFn) -> Frame:
     width, height = draw(st.integers(1, 12)), draw(st.integers(1, 12))
-    projection, focal = draw(st.sampled_from(PROJECTIONS)), draw(focals)
+    projection, focal = draw(st.sampled_from(list(PROJECTIONS))), draw(focals)
     if projection == "cylindrical":
         focal = max(focal, width / (2.0 * math.pi))
     kind = draw(st.sampled_from(KINDS))

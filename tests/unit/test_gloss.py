@@ -10,13 +10,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
-from airl_mav.arena.finishes import linear_of
-from airl_mav.arena.generate import generate
-from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
-from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import ColourArrays, Picture, render_picture
-from airl_mav.camera.render import camera_pose
-from airl_mav.camera.shading import (
+from airl_mav.addons.colour.appearance import linear_of
+from airl_mav.addons.colour.batch import ColourImages, Looks
+from airl_mav.addons.colour.picture import ColourArrays, Picture, render_picture
+from airl_mav.addons.colour.profile import Appearance, Material
+from airl_mav.addons.colour.shading import (
     MATT,
     SAMPLES,
     VARNISH_ADMITS,
@@ -29,11 +27,13 @@ from airl_mav.camera.shading import (
     pane_reflects,
     spread,
 )
+from airl_mav.arena.generate import generate
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.render import camera_pose
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arena_batch import batch_of
-from airl_mav.envs.colour_images import ColourImages, Looks
 from airl_mav.envs.mesh_batch import MeshesSeen
-from airl_mav.profiles.appearance import Appearance, Material
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.learning.test_fleet_meshes import MOUNT, scattered

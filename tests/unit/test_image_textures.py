@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import TypeAdapter
 
-from airl_mav.arena.finishes import OBSTACLE, TEXTURES, linear_of
+from airl_mav.addons.colour.appearance import OBSTACLE, TEXTURES, linear_of
+from airl_mav.addons.colour.batch import Looks
+from airl_mav.addons.colour.picture import ColourArrays, antialiased, render_picture
+from airl_mav.addons.colour.profile import ImageFile
+from airl_mav.addons.colour.textures import SIDE, STRIDE, atlas, texels_of
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import ColourArrays, antialiased, render_picture
 from airl_mav.camera.primitives import FLOOR
-from airl_mav.camera.textures import SIDE, STRIDE, atlas, texels_of
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
-from airl_mav.envs.colour_images import Looks
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.assets import ImageFile
 from airl_mav.profiles.loading import load_profile, profile_digest
 
 PROFILE = """
@@ -120,7 +120,7 @@ def test_the_floor_shows_the_picture_where_it_lies(arena: Arena) -> None:
 
 
 def test_images_are_those_of_mitsuba(arena: Arena) -> None:
-    mitsuba = pytest.importorskip("airl_mav.camera.mitsuba")
+    mitsuba = pytest.importorskip("airl_mav.addons.colour.mitsuba")
     pytest.importorskip("mitsuba")
     camera, attitude = Intrinsics.from_fov(96, 64, 1.5), quat_from_euler(0.03, -0.08, 0.3)
     place, centers = np.array([6.0, -6.0, -3.0]), arena.centers_at(0)

@@ -14,10 +14,7 @@ from PIL import Image
 from pydantic import ValidationError
 from scipy import stats
 
-from airl_mav.arena.geometry import Arena, Shape, Tour
-from airl_mav.camera.exposure import expose
-from airl_mav.camera.frame import Frame, FrameError, image_of, jpeg_of
-from airl_mav.camera.imaging import (
+from airl_mav.addons.colour.image_sensor import (
     LIGHT_OF,
     ImageFormation,
     codes_of,
@@ -26,12 +23,15 @@ from airl_mav.camera.imaging import (
     noisy,
     vignette,
 )
+from airl_mav.addons.colour.profile import Imaging
+from airl_mav.arena.geometry import Arena, Shape, Tour
+from airl_mav.camera.frame import Frame, FrameError, image_of, jpeg_of
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.render import Motion
+from airl_mav.camera.render import Motion, expose
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera import Camera, Imaging, check_renderer
+from airl_mav.profiles.camera import Camera, check_renderer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projections import CameraKind
 from tests.unit.test_colour import arena, bodies, sky, sun

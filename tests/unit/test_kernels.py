@@ -17,7 +17,7 @@ from numba import TypingError
 from numpy.typing import NDArray
 
 from airl_mav import camera, envs
-from airl_mav.camera.picture import Work
+from airl_mav.addons.colour.picture import Work
 from airl_mav.core import compiling, kernels
 from tests.support.processes import run_alone
 
@@ -155,7 +155,7 @@ def test_numba_refuses_a_borrowing_kernel_an_array_of_its_own() -> None:
 SAVES = """
 import sys
 import numpy as np
-from airl_mav.core import compiling, kernels
+from airl_mav.core import kernels
 from twofold import twofold
 
 values = [1, 1.0, 1j, np.float32(1.0)]

@@ -11,10 +11,10 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles
-from airl_mav.camera.exposure import expose
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import noise_of, noisy_frame, ranged_depth
+from airl_mav.camera.render import expose
 from airl_mav.core.errors import FieldError
 from airl_mav.envs.spec import CameraChange
 from airl_mav.policy.observation_spec import ObservationSpec

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
+from airl_mav.addons.meshes.mesh_boxes import MeshBoxes, boxes_of_mesh, joined
 from airl_mav.arena.generate import generate
-from airl_mav.arena.mesh_boxes import MeshBoxes, boxes_of_mesh, joined
 from airl_mav.arena.triangles import standing
 from airl_mav.cli.main import main
 from airl_mav.core.errors import FieldError, UsageError
@@ -233,7 +233,7 @@ def test_a_mesh_that_has_changed_or_gone_is_told_in_one_line(tmp_path: Path) -> 
 def test_too_many_triangles_are_refused_unless_boxes_are_seen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("airl_mav.cli.asset_command.MOST_TRIANGLES", 23)
+    monkeypatch.setattr("airl_mav.addons.meshes.command.MOST_TRIANGLES", 23)
     path = export(bracket(), tmp_path / "bracket.stl")
     with pytest.raises(SystemExit) as ended:
         main(["asset", str(path), "--out", str(tmp_path / "x.toml")])

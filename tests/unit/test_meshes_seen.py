@@ -12,16 +12,16 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from airl_mav.addons.colour.picture import render_picture
+from airl_mav.addons.colour.profile import Appearance
 from airl_mav.arena.geometry import Arena, Obstacles, PlacedMesh, Shape
 from airl_mav.arena.triangles import Triangles, decoded, encoded, triangles_of
 from airl_mav.camera.bvh import LEAF, build_bvh
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import render_picture
 from airl_mav.camera.primitives import OBSTACLE, SKY
 from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
-from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.projections import PROJECTIONS, UNDISTORTED, Projection, sees_to
 from tests.support.lenses import AT_NIGHT_THE_FISHEYE, BARREL, ENDING, OPENING, rays_of_fisheye
 from tests.support.meshes import ROOM, kept, ring, scene_of, triangles
@@ -50,7 +50,7 @@ def rays_of(k: Intrinsics, quaternion: Floats) -> Floats:
     """Return the ray (h w, 3) of each pixel, NED, of the length 1 in depth; 0: it sees nothing."""
     v, u = np.mgrid[: k.height, : k.width].reshape(2, -1)
     x, y = (u - k.cx) / k.focal, (v - k.cy) / k.focal
-    ahead, right = (np.cos(x), np.sin(x)) if k.cylindrical else (np.ones(len(x)), x)
+    ahead, right = (np.cos(x), np.sin(x)) if k.model.cylindrical else (np.ones(len(x)), x)
     own = np.stack([ahead, right, y], axis=1)
     if k.projection == "fisheye":
         own = np.nan_to_num(rays_of_fisheye(k).reshape(-1, 3))

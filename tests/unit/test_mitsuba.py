@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from airl_mav.arena.finishes import linear_of, srgb_of
+from airl_mav.addons.colour.appearance import linear_of, srgb_of
+from airl_mav.addons.colour.mitsuba import PathTracer, cube_of, resampled
+from airl_mav.addons.colour.picture import antialiased, render_picture
+from airl_mav.addons.colour.profile import Appearance
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.intrinsics import Intrinsics, fisheye_rays
-from airl_mav.camera.mitsuba import PathTracer, cube_of, resampled
-from airl_mav.camera.picture import antialiased, render_picture
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
-from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.support.lenses import BARREL
@@ -251,7 +251,7 @@ def test_cylinders_and_fisheyes_are_within_three_percent(camera: Intrinsics) -> 
     assert whole < 0.04
     # A lens that is a little wider is far off: the limits above can fail.
     wider = replace(camera, focal=0.8 * camera.focal)
-    if camera.cylindrical and camera.horizontal_fov_rad > 6.0:
+    if camera.model.cylindrical and camera.horizontal_fov_rad > 6.0:
         wider = replace(camera, cx=camera.cx + 8.0)
     centers, place = scene.centers_at(0), np.array([20.0, 5.0, -3.0])
     attitude = quat_from_euler(0.03, -0.08, 2.2)
@@ -295,7 +295,7 @@ def test_the_same_seed_draws_the_same_bent_image() -> None:
     ]
     np.testing.assert_array_equal(drawn[0], drawn[1])
     assert (drawn[0] != drawn[2]).any()
-    blind: Any = ~fisheye_rays(replace(FISHEYES[1], width=90)).any(axis=0)
+    blind: Any = ~replace(FISHEYES[1], width=90).rays.any(axis=0)
     assert blind.any()
     shown = path_traced(
         scene, scene.centers_at(0), replace(FISHEYES[1], width=90), place, level, samples=4

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from airl_mav.addons.colour.picture import render_picture
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import render_picture
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 

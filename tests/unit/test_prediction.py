@@ -17,7 +17,7 @@ from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.policy.observation import Kinematics
-from airl_mav.prediction.compensator import (
+from airl_mav.prediction import (
     LINK_US,
     RECENT,
     CameraPose,

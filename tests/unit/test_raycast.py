@@ -14,8 +14,9 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
+from airl_mav.camera import projection
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.projection import MIN_DEPTH_M
+from airl_mav.camera.projection import MIN_DEPTH_M, lens_of
 from airl_mav.camera.raycast import render_depth
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.frames import (
@@ -512,23 +513,9 @@ def test_writes_into_the_image_of_a_batch() -> None:
     scene = random_scene(np.random.default_rng(3))
     k, o = scene.intrinsics, scene.obstacles
     batch = np.full((3, k.height, k.width), 7.0, np.float32)
-    render_depth(
-        batch[1],
-        tuple(scene.position),
-        tuple(scene.quaternion),
-        k.focal,
-        k.cx,
-        k.cy,
-        k.cylindrical,
-        scene.max_range,
-        scene.bounds.as_array(),
-        o.shape,
-        o.center,
-        o.half_size,
-        o.yaw,
-        None,
-        None,
-    )
+    bodies = projection.Scene(scene.bounds.as_array(), o.shape, o.center, o.half_size, o.yaw)
+    pose = tuple(scene.position), tuple(scene.quaternion)
+    render_depth(batch[1], *pose, lens_of(k, scene.max_range), bodies, None)
     np.testing.assert_array_equal(batch[1], scene.render())
     assert np.all(batch[[0, 2]] == 7.0)
 

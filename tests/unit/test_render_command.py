@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from airl_mav.addons.colour.picture import render_picture
 from airl_mav.arena.generate import generate
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import render_picture
 from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
@@ -22,7 +22,7 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.report.theme import coloured
 from tests.support.lenses import BARREL
 
-COMMAND = "airl_mav.addons.render.command"
+COMMAND = "airl_mav.addons.colour.command"
 
 SMALL = ("--width-px", "64", "--height-px", "48")
 POSE = ("--north-m", "8", "--east-m", "-2", "--height-m", "3", "--yaw-deg", "20")
@@ -142,6 +142,6 @@ def test_mitsuba_has_neither_depth_nor_fog(tmp_path: Path) -> None:
 def test_only_png_files_are_written(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"accepted: a file name that ends in \.png or \.npy"):
         carry_out(
-            "airl render", "airl_mav.addons.render.command", ["--out", str(tmp_path / "x.jpg")]
+            "airl render", "airl_mav.addons.colour.command", ["--out", str(tmp_path / "x.jpg")]
         )
     assert not list(tmp_path.iterdir())

@@ -5,21 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from airl_mav.addons.colour import picture
+from airl_mav.addons.colour.picture import ColourArrays, Picture, render_picture
+from airl_mav.addons.colour.shading import MATT, Gloss
 from airl_mav.arena.generate import generate
 from airl_mav.arena.ground import no_relief
-from airl_mav.camera import picture
 from airl_mav.camera import render as depth_images
 from airl_mav.camera.bvh import Meshes, forest_of, meshes_of, placed_in
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import ColourArrays, Picture, render_picture
 from airl_mav.camera.render import render
-from airl_mav.camera.shading import MATT, Gloss
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
@@ -39,7 +38,7 @@ def _arrays(look: Any) -> ColourArrays:
     arrays = _of(look)
     zeros = np.zeros(len(arrays.texture), np.float32)
     matt = Gloss(np.full(len(zeros), MATT, np.int8), zeros, zeros)
-    return replace(arrays, gloss=arrays.gloss or matt)
+    return arrays._replace(gloss=arrays.gloss or matt)
 
 
 @contextmanager

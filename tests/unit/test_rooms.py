@@ -17,16 +17,16 @@ from pydantic import TypeAdapter, ValidationError
 from rich.console import Console
 from scipy import ndimage, stats
 
-from airl_mav.addons.render.camera_pictures import ROOM, coloured_segmentation
+from airl_mav.addons.colour.appearance import seen_across, srgb_of
+from airl_mav.addons.colour.picture import render_picture
+from airl_mav.addons.colour.pictures import ROOM, coloured_segmentation
 from airl_mav.arena.draw import OPENING_COLOUR, draw_arena
-from airl_mav.arena.finishes import srgb_of
 from airl_mav.arena.generate import generate, local_bounds
-from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, seen_across
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.arena.placement import bounding_boxes
 from airl_mav.arena.walls import Plan, draw_plan, over_doors
 from airl_mav.camera import primitives
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import render_picture
 from airl_mav.cli.arena_command import arena_table
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.arena_batch import CEILING, FLOOR, NOTHING, WALL, batch_of, clearance, touches

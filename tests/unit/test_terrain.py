@@ -14,6 +14,7 @@ import scipy
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 from numpy.typing import NDArray
 
+from airl_mav.addons.colour.picture import render_picture
 from airl_mav.arena.generate import generate, local_bounds
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.arena.ground import Ground, no_relief
@@ -21,7 +22,6 @@ from airl_mav.arena.placed_assets import _problem
 from airl_mav.arena.placement import Boxes, Hills, bounding_half, raster_passage
 from airl_mav.arena.relief import draw_ground, extreme_within, plane_at, stand_on
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import render_picture
 from airl_mav.camera.primitives import FLOOR, OBSTACLE, SKY
 from airl_mav.camera.render import render
 from airl_mav.core.frames import quat_from_euler

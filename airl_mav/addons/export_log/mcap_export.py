@@ -120,15 +120,10 @@ class LiveFlight(ServerListener):
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002
         """Resend the newest message of the channel; called from the server's thread."""
         with self._lock:
-            newest = self._newest.get(channel.id)
-            if newest is not None:
-                self._log(*newest)
+            if (newest := self._newest.get(channel.id)) is not None:
+                newest[0].log(newest[1], log_time=newest[2])
         self._another.set()
         self._watched.set()
-
-    @staticmethod
-    def _log(channel: foxglove.Channel, data: bytes, time_ns: int) -> None:
-        channel.log(data, log_time=time_ns)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until a viewer has subscribed to its topics; return False on timeout."""
@@ -148,7 +143,7 @@ class LiveFlight(ServerListener):
             channel = self._channels[message.channel]
             with self._lock:
                 self._newest[channel.id()] = channel, message.data, time_ns
-                self._log(channel, message.data, time_ns)
+                channel.log(message.data, log_time=time_ns)
 
     def run(self, ended: Callable[[], None], clock: Clock | None = None) -> None:
         """Publish the flight repeatedly until interrupted; `ended` is called after each."""
@@ -280,7 +275,7 @@ class FlightMessages:
         yield self._drawn(time_us, "/scene/vehicle", self._vehicle(VEHICLE, time_us))
         if self.flight.estimate is not None:
             yield self._drawn(time_us, "/scene/estimate", self._vehicle(ESTIMATE, time_us))
-        if self._camera.intrinsics.projection != "cylindrical":
+        if self._camera.intrinsics.model.calibration is not None:
             yield self._drawn(time_us, "/camera/calibration", self._calibration(time_us))
 
     def _vehicle(self, frame: str, time_us: int) -> messages.SceneUpdate:
@@ -337,15 +332,13 @@ class FlightMessages:
     def _calibration(self, time_us: int) -> messages.CameraCalibration:
         k = self._camera.intrinsics
         f, cx, cy = k.focal, k.cx, k.cy
-        # Foxglove's name for OpenCV's fisheye model; a pinhole without distortion has no model.
-        bent = k.projection == "fisheye"
         return messages.CameraCalibration(
             timestamp=timestamp(self._unix_us(time_us)),
             frame_id=CAMERA,
             width=k.width,
             height=k.height,
-            distortion_model="kannala_brandt" if bent else "",
-            D=list(k.distortion) if bent else [],
+            distortion_model=k.model.calibration or "",
+            D=list(k.distortion) if k.model.calibration else [],
             K=[f, 0.0, cx, 0.0, f, cy, 0.0, 0.0, 1.0],
             R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
             P=[f, 0.0, cx, 0.0, 0.0, f, cy, 0.0, 0.0, 0.0, 1.0, 0.0],

@@ -164,17 +164,14 @@ def _velocity_setpoints(
 ) -> Iterator[Sample]:
     path = flight.replayed.path
     velocities = commanded_velocity(path, columns, path.time_us)
-    tracked = "vehicle_local_position_setpoint"
-    for time_us, newest in _commanded(flight, _LOGGED[tracked].interval_us):
-        velocity = velocities[np.searchsorted(path.time_us, time_us)].tolist()
-        speeds = dict(zip(("vx", "vy", "vz"), velocity, strict=True))
-        turn = float(columns[SETPOINT][newest, 3])
-        yield time_us, tracked, row(tracked, **speeds, yawspeed=turn)
-    for time_us, newest in _commanded(flight, SETPOINT_US):
-        velocity = velocities[np.searchsorted(path.time_us, time_us)].tolist()
-        turn = float(columns[SETPOINT][newest, 3])
-        name = TRAJECTORY_SETPOINT.name
-        yield time_us, name, row(name, velocity=velocity, yawspeed=turn)
+    tracked, commanded = "vehicle_local_position_setpoint", TRAJECTORY_SETPOINT.name
+    for name, interval_us in ((tracked, _LOGGED[tracked].interval_us), (commanded, SETPOINT_US)):
+        for time_us, newest in _commanded(flight, interval_us):
+            velocity = velocities[np.searchsorted(path.time_us, time_us)].tolist()
+            speeds = dict(zip(("vx", "vy", "vz"), velocity, strict=True))
+            values = speeds if name == tracked else {"velocity": velocity}
+            turn = float(columns[SETPOINT][newest, 3])
+            yield time_us, name, row(name, **values, yawspeed=turn)
 
 
 def _commanded(flight: RecordedFlight, interval_us: int) -> Iterator[tuple[int, int]]:

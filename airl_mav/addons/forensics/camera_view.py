@@ -13,7 +13,7 @@ from airl_mav.arena.ground import Ground
 from airl_mav.camera.render import camera_pose, render
 from airl_mav.core.frames import quat_yaw
 from airl_mav.flight.trajectory import Trajectory, pose_at
-from airl_mav.profiles.appearance import DEFAULT
+from airl_mav.profiles.arena import DEFAULT_APPEARANCE
 from airl_mav.report.policy_view import PolicyCamera
 
 Floats = NDArray[np.float64]
@@ -101,10 +101,8 @@ def view_obstacle(
             half = np.where(clear[:, None], NOTHING_M, half)
         some = Obstacles(o.shape[keep], o.center[keep], half[keep], o.yaw[keep])
         # Without appearance and statics, all remaining obstacles are opaque.
-        bare = replace(
-            arena, obstacles=some, tours=(), meshes=meshes, ground=ground, appearance=DEFAULT,
-            statics=None,
-        )  # fmt: skip
+        bare = replace(arena, obstacles=some, tours=(), meshes=meshes, ground=ground, statics=None)
+        bare = replace(bare, appearance=DEFAULT_APPEARANCE)
         return render(bare, centers[keep], camera.intrinsics, camera.range_m, eye, attitude)
 
     whole = depth(slice(None), arena.meshes, arena.ground)

@@ -1,6 +1,6 @@
 """Fit of a vehicle's response to setpoints: dead time, time constants of velocity and yaw rate.
 
-The model of `prediction.compensator`, driven by the sent setpoints and the flown heading.
+The model of `airl_mav.prediction`, driven by the sent setpoints and the flown heading.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from airl_mav.addons.roofline.stopping_flights import greatest_speed
 from airl_mav.arena.geometry import Shape
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import G_PER_KG, MS_PER_S, TICK_S
@@ -27,7 +28,6 @@ from airl_mav.envs.stopping import (
     Braking,
     StoppingTask,
     braking_of,
-    greatest_speed,
     open_space,
     twin_of,
 )

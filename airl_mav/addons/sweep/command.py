@@ -37,7 +37,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
 from airl_mav.core.fields import optional, quantity, switch, validated
 from airl_mav.core.progress import Bar, Progress, RichProgress, new_console
-from airl_mav.experiments.campaign_store import open_campaign
+from airl_mav.experiments.campaign import open_campaign
 from airl_mav.experiments.executors import (
     Executor,
     ExecutorSettings,
@@ -55,10 +55,19 @@ from airl_mav.scenario.model import Workers
 from airl_mav.training.training_folder import TrainingFolder
 
 
-class SweepRequest(Workers):
-    """Request of an architecture search and its execution. The methods raise UsageError."""
+class SweepOptions(Workers):
+    """Search for the best network: train many networks, evaluate all, draw heat maps.
 
-    sweep: str = Field(
+    The search space is Air Learning's template: layers x filters, with several training seeds per
+    cell. The same --out resumes after any interruption.
+
+    Examples:
+        airl sweep quick
+        airl sweep full --executor ray --ray-address 192.168.1.10:6379
+        airl sweep quick --dry-run
+    """
+
+    sweep: Annotated[str, POSITIONAL] = Field(
         default="quick",
         description="quick (two cores, an hour), full (the paper's grid), paper (the same on the"
         " paper's image, for GPUs), tiny (seconds, shows nothing), or a path to a .toml",
@@ -184,11 +193,11 @@ def run_sweep(
     something else.
     """
     say = partial(progress.note, style="yellow")
-    with open_campaign(path, declaration(config), command=command, say=say) as store:
-        folder = SweepFolder(store.path, config)
+    with open_campaign(path, declaration(config), command=command, say=say) as campaign:
+        folder = SweepFolder(path.absolute(), config)
 
         def summary() -> Sweep:
-            sweep = summarize(folder, store.campaign.made, computer)
+            sweep = summarize(folder, campaign.made, computer)
             write_sweep(sweep)
             return sweep
 
@@ -266,23 +275,6 @@ class _TrialBars:
                 self._bars[trial].update(completed=last.steps, postfix=success)
         ended = self._total - len(self._left)
         self._bar.update(completed=done, postfix=f"{ended}/{self._total} trials")
-
-
-class SweepOptions(SweepRequest):
-    """Search for the best network: train many networks, evaluate all, draw heat maps.
-
-    The search space is Air Learning's template: layers x filters, with several training seeds per
-    cell. The same --out resumes after any interruption.
-
-    Examples:
-        airl sweep quick
-        airl sweep full --executor ray --ray-address 192.168.1.10:6379
-        airl sweep quick --dry-run
-    """
-
-    sweep: Annotated[str, POSITIONAL] = Field(
-        default="quick", description=SweepRequest.model_fields["sweep"].description
-    )
 
 
 OPTIONS = SweepOptions

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 from airl_mav.addons.sweep.config import SweepConfig, Trial, TrialResult, size_of, trials
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_typed, write_json
-from airl_mav.experiments.campaign_store import Declaration, DeclaredCell
+from airl_mav.experiments.campaign import Declaration, DeclaredCell
 from airl_mav.flight.statistics import CONFIDENCE, Estimate, wilson
 from airl_mav.latency.injection import ESTIMATE, choose_injection
 from airl_mav.profiles.computer import ComputerProfile, LatencyDistribution

@@ -12,9 +12,7 @@ from airl_mav.addons.sweep.config import (
     size_of,
     training_of,
 )
-from airl_mav.addons.sweep.summary import (
-    SweepFolder,
-)
+from airl_mav.addons.sweep.summary import SweepFolder
 from airl_mav.envs.evaluation import SLOTS, EpisodeResult, LearnedPilots, fly_seeds
 from airl_mav.envs.navigation import Navigation
 from airl_mav.policy.learned import load_learned

@@ -19,7 +19,7 @@ from airl_mav.core.frames import Goal
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.latency.injection import LatencySampler
 from airl_mav.policy.observation import Kinematics
-from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction import Compensator
 from airl_mav.rehearsal.channel import State, Text
 from airl_mav.rehearsal.live_view import ViewEnds
 from airl_mav.rehearsal.observer import WARNING, Observer

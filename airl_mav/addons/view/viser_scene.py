@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from airl_mav.addons.view.panel import camera_picture
 from airl_mav.addons.view.view_messages import Episode, Shown, VehicleShape, VehicleState
-from airl_mav.arena.finishes import OBSTACLE
 from airl_mav.arena.geometry import Arena, Bounds, Shape
 from airl_mav.arena.triangles import drawn, standing
 from airl_mav.core import frames
 from airl_mav.core.frames import goal_height_m
+from airl_mav.profiles.projections import PROJECTIONS
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE
 from airl_mav.report import scene
 
@@ -169,13 +169,13 @@ class FlightScene:
             self._add_surface("/arena/ground", arena.ground.points, arena.ground.faces, scene.HILLS)
         shown = drawn(arena.meshes)
         for each in shown:
-            colour = arena.look.finish.colour(OBSTACLE + each.first)
+            colour = arena.colour_of(each.first)
             self._add_surface(f"/arena/mesh/{each.first}", *standing(each), colour)
         for i in range(len(arena.obstacles)):
             if arena.mesh_of(i) in shown:
                 continue
             moves = i >= arena.n_static
-            colour = scene.MOVING if moves else arena.look.finish.colour(OBSTACLE + i)
+            colour = scene.MOVING if moves else arena.colour_of(i)
             glass = arena.clear is not None and bool(arena.clear[i])
             node = self._obstacle(arena, i, colour, scene.GLASS_OPACITY if glass else None)
             if moves:
@@ -245,7 +245,7 @@ class FlightScene:
     def _build_camera(self, shape: VehicleShape) -> None:
         pitch, yaw = map(math.radians, (shape.camera_pitch_up_deg, shape.camera_yaw_deg))
         turn = frames.quat_from_euler(0.0, pitch, yaw)
-        if shape.camera_projection == "cylindrical":
+        if PROJECTIONS[shape.camera_projection].cylindrical:
             # A 360° camera: the unrolled image is above the vehicle, centred on forward.
             self._camera = self._add(
                 "image",

@@ -23,7 +23,8 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.envs.evaluation import Trace
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.stamps import NO_STAMP, SETPOINTS
 from airl_mav.policy.actions import commands, discrete_actions
 from airl_mav.policy.layouts import Encoded, newest_frame
 from airl_mav.rehearsal.live_view import ViewEnds
@@ -207,7 +208,7 @@ class EpisodeReplay:
         """Replay a recorded episode; yield moments by time, with messages offset by `began_us`."""
         navigation, trace = self.navigation, self._trace
         navigation.begin([0], [taped.seed], taped.zone)
-        yield from (TimedMessage(0, message) for message in self._beginning(taped, began_us))
+        yield from self._beginning(taped, began_us)
         yield self._picture(began_us)
         seen, shown, decisions = navigation.observe(), 0, len(taped.actions)
         for k in range(decisions):
@@ -220,14 +221,7 @@ class EpisodeReplay:
             last = len(flown.time_us) - 1
             for row in range(shown, last + 1):
                 if row % SAMPLES == 0 or (row == last and k == decisions - 1):
-                    time_us = int(flown.time_us[row])
-                    vehicle = self._vehicle(
-                        began_us + time_us,
-                        flown.position[row],
-                        flown.velocity[row],
-                        flown.quaternion[row],
-                    )
-                    yield TimedMessage(time_us, vehicle)
+                    yield self._vehicle(flown, row, began_us)
             shown = last + 1
             seen = navigation.observe()
             yield self._picture(began_us)
@@ -236,34 +230,29 @@ class EpisodeReplay:
     def _now_us(self) -> int:
         return int(self.navigation.whole_truth().fleet.time_us[0])
 
-    def _beginning(self, taped: Taped, began_us: int) -> list[view_messages.Message]:
-        navigation = self.navigation
-        arena = navigation.arenas[0]
+    def _beginning(self, taped: Taped, began_us: int) -> list[TimedMessage]:
+        arena, seed = self.navigation.arenas[0], taped.seed
         assert arena is not None  # noqa: S101 - its episode has begun
         goal = arena.goal_point
+        episode = view_messages.Episode(
+            seed=seed,
+            started_us=began_us,
+            arena=arena,
+            vehicle=view_messages.VehicleShape.of(self.navigation.vehicle),
+            goal=goal,
+            goal_radius_m=self._environment.episode.goal_radius_m,
+        )
         return [
-            view_messages.Flight(index=taped.number, seed=taped.seed, goal=goal),
-            view_messages.Episode(
-                seed=taped.seed,
-                started_us=began_us,
-                arena=arena,
-                vehicle=view_messages.VehicleShape.of(navigation.vehicle),
-                goal=goal,
-                goal_radius_m=self._environment.episode.goal_radius_m,
-            ),
-            view_messages.PhaseStart(time_us=began_us, phase="navigating"),
+            TimedMessage(0, view_messages.Flight(index=taped.number, seed=seed, goal=goal)),
+            TimedMessage(0, episode),
+            TimedMessage(0, view_messages.PhaseStart(time_us=began_us, phase="navigating")),
         ]
 
     def _picture(self, began_us: int) -> TimedMessage:
         image = self.navigation.cameras.image[0].copy()
-        now_us = self._now_us()
-        return TimedMessage(
-            now_us,
-            view_messages.CameraImage(
-                captured_us=began_us + now_us, shape=view_messages.shape_of(image)
-            ),
-            image,
-        )
+        now_us, shape = self._now_us(), view_messages.shape_of(image)
+        taken = view_messages.CameraImage(captured_us=began_us + now_us, shape=shape)
+        return TimedMessage(now_us, taken, image)
 
     def _as_seen(self, seen: Encoded) -> view_messages.Image:
         """Return the network's image for the view: depth [mm], or colours."""
@@ -271,7 +260,7 @@ class EpisodeReplay:
         image = newest_frame(spec, seen)
         if spec.kind != "depth":
             return image if image.ndim == 3 else image[..., None]
-        far_mm = self.navigation.observation.range_m * MM_PER_M
+        far_mm = spec.range_m * MM_PER_M
         # 0 would mean "no return".
         depth: view_messages.Image = np.maximum(np.rint(image * (far_mm / 255.0)), 1.0).astype(
             np.uint16
@@ -291,13 +280,15 @@ class EpisodeReplay:
         if episode.hover_after_s is not None:
             held_s = episode.hold_s + episode.hover_after_s
             expires_us = began_us + sent + round(held_s * US_PER_S)
+        commands = self._environment.action_spec.commands
         message = view_messages.Decided(
             captured_us=began_us + stamp["capture_us"],
             began_us=began_us + began,
             ready_us=began_us + ready,
             sent_us=began_us + sent,
             expires_us=expires_us,
-            setpoint=tuple(record["setpoint"][-1].astype(float).tolist()),
+            setpoint=tuple(record[SETPOINTS[commands]][-1].tolist()),
+            commands=commands,
             compensated=self._environment.compensate,
             shape=view_messages.shape_of(image),
         )
@@ -311,46 +302,34 @@ class EpisodeReplay:
             text = ", ".join(f"{number:+.2f}" for number in np.ravel(action).tolist())
         else:
             text = f"{int(action)} of 0 to {count - 1}"
-        return TimedMessage(
-            began,
-            view_messages.Trained(
-                time_us=began_us + began,
-                action=text,
-                reward=taped.rewards[k],
-                returned=sum(taped.rewards[: k + 1]),
-            ),
+        message = view_messages.Trained(
+            time_us=began_us + began,
+            action=text,
+            reward=taped.rewards[k],
+            returned=sum(taped.rewards[: k + 1]),
         )
+        return TimedMessage(began, message)
 
-    def _vehicle(
-        self,
-        time_us: int,
-        position: NDArray[np.float64],
-        velocity: NDArray[np.float64],
-        quaternion: NDArray[np.float64],
-    ) -> view_messages.VehicleState:
-        """Return the vehicle at a time; rotors and battery are from the end of the decision."""
-        fleet = self.navigation.whole_truth().fleet
-        return view_messages.VehicleState(
-            time_us=time_us,
-            position=tuple(position.tolist()),
-            velocity=tuple(velocity.tolist()),
-            quaternion=tuple(quaternion.tolist()),
+    def _vehicle(self, flown: Trajectory, row: int, began_us: int) -> TimedMessage:
+        """Return the vehicle at a sample; rotors and battery are from the end of the decision."""
+        fleet, time_us = self.navigation.whole_truth().fleet, int(flown.time_us[row])
+        state = view_messages.VehicleState(
+            time_us=began_us + time_us,
+            position=tuple(flown.position[row].tolist()),
+            velocity=tuple(flown.velocity[row].tolist()),
+            quaternion=tuple(flown.quaternion[row].tolist()),
             rotors=tuple(fleet.rotor[0].tolist()),
             battery=float(fleet.battery[0]),
             mode=OFFBOARD,
             armed=True,
             collision=None,
         )
+        return TimedMessage(time_us, state)
 
     def _ending(self, taped: Taped, began_us: int) -> list[TimedMessage]:
         now_us = self._now_us()
         text = f"episode {taped.number}: {taped.outcome} after {now_us / US_PER_S:.1f} s, return"
-        said = f"{text} {sum(taped.rewards):+.3f}"
-        return [
-            TimedMessage(
-                now_us, view_messages.PhaseStart(time_us=began_us + now_us, phase=taped.outcome)
-            ),
-            TimedMessage(
-                now_us, view_messages.Said(time_us=began_us + now_us, severity=INFO, text=said)
-            ),
-        ]
+        said, then_us = f"{text} {sum(taped.rewards):+.3f}", began_us + now_us
+        ended = view_messages.PhaseStart(time_us=then_us, phase=taped.outcome)
+        told = view_messages.Said(time_us=then_us, severity=INFO, text=said)
+        return [TimedMessage(now_us, ended), TimedMessage(now_us, told)]

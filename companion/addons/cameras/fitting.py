@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MAX_MM
-from airl_mav.camera.intrinsics import Intrinsics, finer, rays_of
+from airl_mav.camera.intrinsics import Intrinsics, finer
 from airl_mav.core.errors import FieldError
 from airl_mav.policy.images import nearest_returns
 from airl_mav.profiles.projections import Distortion, distorted, sees_to, undistorted
@@ -61,7 +61,7 @@ class Lens:
     @classmethod
     def of(cls, k: Intrinsics) -> Lens:
         """Return the lens of a profile's camera, a pinhole or a fisheye."""
-        bent = k.distortion if k.projection == "fisheye" else None
+        bent = k.distortion if k.model.radial else None
         return cls(k.width, k.height, k.focal, k.focal, k.cx, k.cy, bent)
 
 
@@ -79,7 +79,7 @@ class Fitting:
         self._deeper: NDArray[np.float32] | None = None
         """Factors from depth along the axis to the target's depth; None = factor 1."""
         # Pinhole to pinhole is separable: one lookup per row and one per column.
-        if lens.distortion is None and wanted.projection == "pinhole":
+        if lens.distortion is None and wanted.model.planar:
             columns, off_side = _places(
                 *(wanted.width, wanted.focal, wanted.cx), *(lens.width, lens.fx, lens.cx), points
             )
@@ -93,7 +93,7 @@ class Fitting:
             """Share of the target image seen by the lens, 0 to 1."""
             return
         # Otherwise every sample ray is looked up in both dimensions.
-        rays = rays_of(finer(wanted, points))
+        rays = finer(wanted, points).rays
         row, column = _looked_up(lens, rays)
         inside = (row >= 0) & (row < lens.height) & (column >= 0) & (column < lens.width)
         # Indices outside are replaced by 0 and masked by `_unseen`.
@@ -103,7 +103,7 @@ class Fitting:
         # Rays of a fisheye target outside its image circle are zero and do not count.
         self.coverage = float(inside[rays.any(axis=0)].mean())
         # Targets other than pinholes measure along the ray, the lens along its axis.
-        if wanted.projection != "pinhole":
+        if not wanted.model.planar:
             deeper = np.divide(1.0, rays[0], out=np.ones_like(rays[0]), where=inside)
             self._deeper = deeper.astype(np.float32)
 
@@ -159,7 +159,7 @@ def _in_words(half_wide_rad: float, half_high_rad: float) -> str:
 
 def _seen_by(k: Intrinsics) -> str:
     """Return the field of view of a profile's camera, as text."""
-    bent = k.distortion if k.projection == "fisheye" else None
+    bent = k.distortion if k.model.radial else None
     return _in_words(0.5 * k.horizontal_fov_rad, _half_rad(0.5 * k.height / k.focal, bent))
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from airl_mav.core.frames import Vector, quat_to_matrix
 from airl_mav.vehicle.rotation import conjugate, multiply, normalize, yaw_of
+from firmware_sim.addons.auxiliary_estimation.terrain_filter import reset_variances
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.error_state import FusionHorizon, Measurement, selecting
 from firmware_sim.autopilot.estimator import Estimator
@@ -71,10 +72,8 @@ class ExternalVision:
     def __init__(self, estimator: Estimator, judge: Callable[[Vector, Vector], float]) -> None:
         """Start without odometry.
 
-        Args:
-            estimator: Its state and covariance are corrected or reset.
-            judge: Checks the innovation (3,) and variance (3,) of a velocity, restarts the filter
-                upon an inertial sensor fault, and returns the ratio of measured to stated variance.
+        `judge` checks the innovation (3,) and variance (3,) of a velocity, restarts the filter upon
+        an inertial sensor fault, and returns the ratio of measured to stated variance.
         """
         self._estimator, self._judge = estimator, judge
         self._value, self._state, self._fuse = estimator.value, estimator.state, estimator.fuse
@@ -102,14 +101,7 @@ class ExternalVision:
         """Callback with the downward shift [m] of a height reset to vision."""
 
     def take(self, odometry: Odometry, now_us: int, *, gps: bool, flying: bool) -> None:
-        """Fuse the selected data of a pose.
-
-        Args:
-            odometry: Pose as received.
-            now_us: Current time [µs].
-            gps: True if GPS is being fused.
-            flying: True if the vehicle is in the air.
-        """
+        """Fuse the selected data of a pose received now; `gps` is True if GPS is being fused."""
         # Bits above 15 have no meaning here.
         asked = Control(int(self._value("EKF2_EV_CTRL")) & 15)
         if self._is_stuck(odometry, now_us, flying=flying):
@@ -314,10 +306,7 @@ class ExternalVision:
         # Shift by the difference at the measurement time, so that motion since then stays.
         moved = place[:2] - self._then()[:2]
         self._state[es.P : es.P + 2] += moved
-        covariance = self._estimator.filter.covariance.copy()
-        for i in range(2):
-            _forget(covariance, es.POS + i, variance.item(i))
-        self._estimator.filter.restart(covariance)
+        reset_variances(self._estimator.filter, {es.POS + i: variance.item(i) for i in range(2)})
 
     def _put_height(self, down: float, variance: float) -> None:
         """Reset the height; the barometer offset shifts with it."""
@@ -327,9 +316,7 @@ class ExternalVision:
         self._state[es.BARO_OFFSET] += moved
         if self.on_height_moved is not None:
             self.on_height_moved(moved)
-        covariance = self._estimator.filter.covariance.copy()
-        _forget(covariance, es.POS + 2, variance)
-        self._estimator.filter.restart(covariance)
+        reset_variances(self._estimator.filter, {es.POS + 2: variance})
 
     # --- vision's frame
 
@@ -366,9 +353,3 @@ def _cross(v: Vector) -> Vector:
     """Return the matrix [v]x."""
     x, y, z = v.tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def _forget(covariance: Vector, index: int, variance: float) -> None:
-    """Set a state's variance and clear its correlations, in place."""
-    covariance[index, :] = covariance[:, index] = 0.0
-    covariance[index, index] = variance

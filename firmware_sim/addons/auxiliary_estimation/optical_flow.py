@@ -22,7 +22,7 @@ from firmware_sim.addons.auxiliary_estimation.sensors import (
     GREATEST_RAD_S,
     LEAST_HEIGHT_M,
 )
-from firmware_sim.addons.auxiliary_estimation.terrain_filter import GROUND
+from firmware_sim.addons.auxiliary_estimation.terrain_filter import GROUND, reset_variances
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.error_state import FusionHorizon, Measurement, selecting
 from firmware_sim.interfaces import FlowReading
@@ -71,11 +71,8 @@ class OpticalFlowFusion:
     ) -> None:
         """Start without measurements.
 
-        Args:
-            value: Look-up for EKF2_* parameters by name.
-            state: Nominal state in the layout of `error_state`; updated.
-            ground: Range finder with the terrain filter.
-            fuse: Fuses a measurement without terrain.
+        `ground` is the range finder with the terrain filter, `fuse` fuses a measurement without
+        terrain.
         """
         self._value, self._state = value, state
         self._ground, self._terrain = ground, ground.terrain
@@ -141,10 +138,7 @@ class OpticalFlowFusion:
     def step(self, now_us: int, *, aided: bool, flying: bool) -> None:
         """Fuse a received measurement; call once per tick.
 
-        Args:
-            now_us: Current time [µs].
-            aided: True if another sensor measures horizontal motion.
-            flying: True if the vehicle is in the air.
+        `aided` is True if another sensor measures horizontal motion.
         """
         if self._value("EKF2_OF_CTRL") != 1:
             self._stop()
@@ -350,16 +344,13 @@ class OpticalFlowFusion:
 
     def _put_velocity(self, variance: float, now_us: int) -> None:
         """Reset the horizontal velocity to the flow velocity."""
-        state, p = self._state, self._terrain.covariance.copy()
+        state = self._state
         # Rotate the smoothed body velocity to NED, without its vertical component.
         level = self._rotation[:2, :2] @ self._smoothed_velocity
         state[es.V : es.V + 2] = level
-        for i in (es.VEL, es.VEL + 1):
-            # Correlations of the old velocity do not hold for the new one.
-            p[i, :] = p[:, i] = 0.0
-            # A flow error of s [rad/s] is a velocity error of s times range.
-            p[i, i] = self._range_m**2 * variance
-        self._terrain.restart(p)
+        # A flow error of s [rad/s] is a velocity error of s times range.
+        spread = self._range_m**2 * variance
+        reset_variances(self._terrain, {es.VEL: spread, es.VEL + 1: spread})
         self._agree(now_us)
 
     def _put_ground(self, now_us: int) -> None:
@@ -405,12 +396,8 @@ def flow_by_errors(rotation: Vector, velocity: Vector, height_m: float) -> Vecto
     """Return the Jacobian (2, 17) of the flow by the 16 errors and the height of the ground.
 
     The flow about x is v_y R22 / h, about y -v_x R22 / h, with the velocity v in body axes, the
-    lower right element R22 of the attitude and the height h above ground.
-
-    Args:
-        rotation: (3, 3) body -> NED.
-        velocity: (3,) NED [m/s].
-        height_m: Height of the sensor above ground [m].
+    lower right element R22 of the attitude and the sensor's height h above ground. `rotation` is
+    body -> NED, `velocity` (3,) NED [m/s].
     """
     body = rotation.T @ velocity
     scale = rotation.item(2, 2) / height_m

@@ -12,13 +12,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from enum import IntEnum
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import rotate
-from firmware_sim.addons.auxiliary_estimation.terrain_filter import TerrainFilter
+from firmware_sim.addons.auxiliary_estimation.terrain_filter import TerrainFilter, reset_variances
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Clearance
 from firmware_sim.autopilot.error_state import Measurement
@@ -49,12 +48,8 @@ _UNUSED_US = US_PER_S
 _FILTERED_TAU_S, _GREATEST_RATIO = 0.5, 4.0
 
 
-class RangeControl(IntEnum):
-    """Values of EKF2_RNG_CTRL."""
-
-    OFF = 0
-    CONDITIONAL = 1
-    ON = 2
+_CONDITIONAL, _ALWAYS = 1, 2
+"""Values of EKF2_RNG_CTRL; 0 = off."""
 
 
 class Aids(NamedTuple):
@@ -74,14 +69,7 @@ class RangeFinder:
     def __init__(
         self, value: Callable[[str], float], state: Vector, terrain: TerrainFilter, now_us: int
     ) -> None:
-        """Start without ranges.
-
-        Args:
-            value: Look-up for EKF2_* parameters by name.
-            state: Nominal state in the layout of `error_state`; updated.
-            terrain: Terrain filter.
-            now_us: Current time [µs].
-        """
+        """Start without ranges; the nominal state and the terrain filter are updated."""
         self._value, self._state, self.terrain = value, state, terrain
         self.sensor, self.consistency = RangeSensor(), RangeConsistency()
         self.tells_height, self.tells_ground = False, False
@@ -106,10 +94,6 @@ class RangeFinder:
         """Id of the selected sensor; None = the first to send a range."""
         self._last_us = now_us
         """Time of the newest range of the selected sensor [µs]."""
-        self.reading: DistanceReading | None = None
-        """Newest reading of any distance sensor, in any direction."""
-        self.reading_us = 0
-        """Time of arrival of the reading [µs]."""
         # -1 runs the first step in any case.
         self._step = -1
         self._begin_ground()
@@ -120,7 +104,6 @@ class RangeFinder:
         The first of several such sensors is selected until it has been silent for 1 s (PX4:
         EKF2::UpdateRangeSample).
         """
-        self.reading, self.reading_us = reading, now_us
         # Upward and sideways sensors say nothing about the ground.
         if reading.orientation != DOWNWARD or not math.isfinite(reading.distance_m):
             return
@@ -134,10 +117,7 @@ class RangeFinder:
     def step(self, now_us: int, aids: Callable[[], Aids], *, flying: bool) -> None:
         """Fuse a received range and check for timeouts; call once per tick.
 
-        Args:
-            now_us: Current time [µs].
-            aids: Returns the other aids for the vehicle's motion.
-            flying: True if the vehicle is in the air.
+        `aids` returns the other aids for the vehicle's motion.
         """
         step = now_us // STEP_US
         # Timeouts need at most PX4's 100 Hz.
@@ -195,10 +175,7 @@ class RangeFinder:
             return
         self._state[es.BARO_OFFSET] += baro.innovation.item(0)
         # Restart the offset, with its initial uncertainty and no correlations.
-        covariance = self.terrain.covariance.copy()
-        covariance[es.BARO, :] = covariance[:, es.BARO] = 0.0
-        covariance[es.BARO, es.BARO] = es.INITIAL_SIGMA.item(es.BARO) ** 2
-        self.terrain.restart(covariance)
+        reset_variances(self.terrain, {es.BARO: es.INITIAL_SIGMA.item(es.BARO) ** 2})
         baro.fused_us = now_us
 
     @property
@@ -259,14 +236,12 @@ class RangeFinder:
         self.terrain.horizon.assume(value("EKF2_RNG_DELAY"))
         measured, variance = self._measure(now_us)
         goes_on = (
-            control in (RangeControl.CONDITIONAL, RangeControl.ON)
+            control in (_CONDITIONAL, _ALWAYS)
             and sensor.is_healthy
             and self.consistency.is_consistent
         )
-        conditional = (
-            self._fuses and control == RangeControl.CONDITIONAL and self._is_suitable(aids)
-        )
-        always = self._fuses and control == RangeControl.ON
+        conditional = self._fuses and control == _CONDITIONAL and self._is_suitable(aids)
+        always = self._fuses and control == _ALWAYS
         # First the use of ranges for height, then for terrain, then the fusion.
         if self.tells_height:
             if not (conditional or always):
@@ -381,23 +356,18 @@ class RangeFinder:
         self._agree(now_us)
 
     def _put_height(self, height_m: float, variance: float | None) -> None:
-        """Reset the vehicle's height; barometer offset and terrain shift with it.
+        """Reset the vehicle's height above z = 0; barometer offset and terrain shift with it.
 
-        Args:
-            height_m: Height above z = 0.
-            variance: Variance of the height [m²]; None = unchanged.
+        A variance [m²] of None leaves the covariance unchanged.
         """
-        state, p = self._state, self.terrain.covariance
+        state = self._state
         moved = -height_m - state.item(es.P + 2)
         # The barometer offset shifts by the same amount: the innovation of the barometer stays.
         state[es.P + 2] += moved
         state[es.BARO_OFFSET] += moved
         if variance is not None:
             # The new height does not depend on the old one.
-            covariance, z = p.copy(), es.POS + 2
-            covariance[z, :] = covariance[:, z] = 0.0
-            covariance[z, z] = variance
-            self.terrain.restart(covariance)
+            reset_variances(self.terrain, {es.POS + 2: variance})
         self.moved(moved)
 
     def _stop_height(self) -> None:
@@ -503,9 +473,7 @@ class RangeSensor:
     def check(self, now_us: int, cos_tilt: float) -> None:
         """Check the newest range; once per step, after `take` if there is a new range.
 
-        Args:
-            now_us: Current time [µs].
-            cos_tilt: Cosine of the angle between the ray and straight down.
+        `cos_tilt` is the cosine of the angle between the ray and straight down.
         """
         self.cos_tilt = cos_tilt
         age_us = now_us - self.range_us
@@ -594,16 +562,10 @@ class RangeConsistency:
         *,
         sideways: bool,
     ) -> None:
-        """Check a range in flight.
+        """Check a range, with its variance [m²], against the estimated downward velocity in flight.
 
-        Args:
-            dist_bottom_m: Height above ground.
-            variance: Variance of the height [m²].
-            down_m_s: Estimated downward velocity.
-            down_variance: Variance of the velocity [m²/s²].
-            gate: EKF2_RNG_K_GATE.
-            now_us: Current time [µs].
-            sideways: True if the vehicle moves horizontally over possibly uneven ground.
+        `gate` is EKF2_RNG_K_GATE; `sideways` is True if the vehicle moves horizontally over
+        possibly uneven ground.
         """
         if sideways:
             self._moved_us = now_us

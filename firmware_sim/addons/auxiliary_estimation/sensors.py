@@ -6,7 +6,7 @@ import math
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
-from firmware_sim.autopilot.autopilot_state import AutopilotState
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import DistanceReading, FlowReading, PoseFrame, VelocityFrame
 from firmware_sim.mavlink.streams import units
 from firmware_sim.sensor_table import Sensor, Stream, Topic, Values

@@ -9,8 +9,9 @@ import numpy as np
 
 from airl_mav.arena.geometry import Arena, Bounds
 from airl_mav.camera.bvh import meshes_of
+from airl_mav.camera.projection import LensConstants, Scene
 from airl_mav.camera.raycast import render_depth
-from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.camera.render import Mount, camera_pose, scene_of
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
@@ -43,20 +44,16 @@ class DownwardRay:
 
     def __init__(self, place: Vec, greatest_m: float, arena: Arena | None) -> None:
         """Mount the ray at a place in the vehicle, FRD [m], with a maximum range [m]."""
-        self._greatest_m, self._arena = greatest_m, arena
-        self._mount = Mount(place, _DOWN)
+        self._arena, self._mount = arena, Mount(place, _DOWN)
+        self._lens = LensConstants(_FOCAL_PX, 0.0, 0.0, greatest_m)
         self._image = np.empty((1, 1), np.float32)
-        bounds = _ENDLESS if arena is None else arena.bounds
-        self._bounds = bounds.as_array()
-        # Empty arrays, so that the compiled ray caster has one signature.
         if arena is None:
-            self._shapes = np.zeros(0, np.int8), np.zeros((0, 3)), np.zeros(0)
-            self._still = np.zeros((0, 3))
+            none = np.zeros((0, 3))
+            self._scene = Scene(_ENDLESS.as_array(), np.zeros(0, np.int8), none, none, np.zeros(0))
             self._meshes = None
         else:
             bodies = arena.obstacles
-            self._shapes = bodies.shape, bodies.half_size, bodies.yaw
-            self._still = bodies.center
+            self._scene = scene_of(arena, bodies.center)
             self._meshes = meshes_of(arena.meshes, len(bodies), arena.ground, arena.clear)
         # The first ray loads or compiles the kernels: better here than in flight.
         self.length_m(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), 0)
@@ -64,34 +61,15 @@ class DownwardRay:
     def length_m(self, position: Vector, quaternion: Vector, elapsed_us: int) -> float | None:
         """Return the distance to the nearest surface [m]; None = out of range.
 
-        Args:
-            position: (3,) position of the vehicle, NED [m].
-            quaternion: (4,) body -> NED.
-            elapsed_us: Time since the moving obstacles started [µs].
+        The vehicle is at a position (3,) NED [m] in an attitude (4,) body -> NED; the moving
+        obstacles started `elapsed_us` [µs] ago.
         """
-        arena, centers = self._arena, self._still
+        arena, scene = self._arena, self._scene
         if arena is not None and arena.tours:
-            centers = arena.centers_at(elapsed_us)
+            scene = scene._replace(center=arena.centers_at(elapsed_us))
         at, attitude = camera_pose(position, quaternion, self._mount)
-        shape, half_size, yaw = self._shapes
         # One pixel of the depth camera is the ray.
-        render_depth(
-            self._image,
-            at,
-            attitude,
-            _FOCAL_PX,
-            0.0,
-            0.0,
-            False,
-            self._greatest_m,
-            self._bounds,
-            shape,
-            centers,
-            half_size,
-            yaw,
-            self._meshes,
-            None,
-        )
+        render_depth(self._image, at, attitude, self._lens, scene, self._meshes)
         depth = self._image.item()
         return depth if depth > 0.0 else None
 

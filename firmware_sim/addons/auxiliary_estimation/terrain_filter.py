@@ -10,6 +10,8 @@ PX4 1.16, EKF/covariance.cpp, terrain_control.cpp and range_height_fusion.cpp.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from airl_mav.core.constants import TICK_S
@@ -31,6 +33,15 @@ _OF_RANGE = np.zeros(es.N_STATES + 1)
 _OF_RANGE[es.POS + 2], _OF_RANGE[GROUND] = -1.0, 1.0
 _OF_RANGE.setflags(write=False)
 """Jacobian of the height above ground by the errors: terrain z minus vehicle z."""
+
+
+def reset_variances(carried: ErrorFilter, variances: Mapping[int, float]) -> None:
+    """Set variances of errors by their indices, and clear the correlations of these errors."""
+    covariance = carried.covariance.copy()
+    for index, variance in variances.items():
+        covariance[index, :] = covariance[:, index] = 0.0
+        covariance[index, index] = variance
+    carried.restart(covariance)
 
 
 class TerrainFilter:
@@ -131,14 +142,9 @@ class TerrainFilter:
     def fuse_range(
         self, state: Vector, innovation: float, variance: float, *, height: bool, ground: bool
     ) -> None:
-        """Correct by a measured height above ground.
+        """Correct vehicle (`height`) or terrain (`ground`) by a measured height above ground.
 
-        Args:
-            state: Nominal state, updated.
-            innovation: Measured minus expected [m].
-            variance: Variance of the measurement [m²].
-            height: True to correct the vehicle.
-            ground: True to correct the terrain.
+        The innovation is measured minus expected [m], with the variance of the measurement [m²].
         """
         self.fuse_with_ground(state, innovation, _OF_RANGE, variance, vehicle=height, ground=ground)
 
@@ -152,15 +158,10 @@ class TerrainFilter:
         vehicle: bool,
         ground: bool,
     ) -> None:
-        """Correct by a measurement that depends on the terrain, without a gate.
+        """Correct vehicle or terrain by a measurement that depends on the terrain, without a gate.
 
-        Args:
-            state: Nominal state, updated.
-            innovation: Measured minus expected.
-            row: Jacobian by the 16 errors and the terrain (17,).
-            variance: Variance of the measurement.
-            vehicle: True to correct the vehicle.
-            ground: True to correct the terrain.
+        The innovation is measured minus expected; `row` (17,) is the Jacobian by the 16 errors and
+        the terrain.
         """
         p = self._joint()
         spread = p @ row

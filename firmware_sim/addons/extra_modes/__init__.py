@@ -6,12 +6,12 @@ Depends on: `firmware_sim.autopilot`; needs no other add-on.
 Guide: docs/reference/modes.md.
 """
 
+_HERE = "firmware_sim.addons.extra_modes"
+
 FLIGHT_MODES = {
-    name: f"firmware_sim.addons.extra_modes.{module}"
-    for module, names in {
-        "orbit": ("ORBIT", "FOLLOW", "ACRO"),
-        "precision_land": ("PRECISION_LAND",),
-        "collision_prevention": ("POSITION",),
-    }.items()
-    for name in names
+    "ORBIT": f"{_HERE}.modes",
+    "FOLLOW": f"{_HERE}.modes",
+    "ACRO": f"{_HERE}.modes",
+    "PRECISION_LAND": f"{_HERE}.modes",
+    "POSITION": f"{_HERE}.collision_prevention",
 }

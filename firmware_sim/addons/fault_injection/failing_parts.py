@@ -43,31 +43,26 @@ from firmware_sim.plant.camera import OnboardCamera
 from firmware_sim.plant.plant import Blowing, Plant
 
 
-def thrust_left(acting: Sequence[Acting]) -> dict[int, float]:
-    """Return the remaining share of thrust of each failing motor, by index from 0."""
+def motor_effects(acting: Sequence[Acting]) -> tuple[dict[int, float], dict[int, float]]:
+    """Return the remaining share of thrust, and the factor on the time constant, of faulty motors.
+
+    Both by index of the motor, from 0.
+    """
     left: dict[int, float] = {}
+    slow: dict[int, float] = {}
     for _, fault, *_ in acting:
-        if fault.kind == "slow":
-            continue
         motor = MOTORS.index(fault.part)
-        left[motor] = left.get(motor, 1.0) * _share(fault)
-    return left
+        if fault.kind == "slow":
+            slow[motor] = slow.get(motor, 1.0) * fault.amount
+        else:
+            left[motor] = left.get(motor, 1.0) * _share(fault)
+    return left, slow
 
 
 def _share(fault: Fault) -> float:
     if fault.kind == "off":
         return 0.0
     return 1.0 + fault.amount if fault.kind == "mismatch" else fault.amount
-
-
-def slowness(acting: Sequence[Acting]) -> dict[int, float]:
-    """Return the factor on the time constant of each slow motor, by index from 0."""
-    slow: dict[int, float] = {}
-    for _, fault, *_ in acting:
-        if fault.kind == "slow":
-            motor = MOTORS.index(fault.part)
-            slow[motor] = slow.get(motor, 1.0) * fault.amount
-    return slow
 
 
 def weakened(
@@ -394,8 +389,7 @@ class FailingParts:
             each.number: before.get(each.number) or self._effect_of(each) for each in sensors
         }
         self._effects = [(each.fault.part, self._memories[each.number]) for each in sensors]
-        motors = timeline.acting(*MOTORS)
-        self._left, self._slow = thrust_left(motors), slowness(motors)
+        self._left, self._slow = motor_effects(timeline.acting(*MOTORS))
         battery = timeline.acting("battery")
         for each in battery:
             if each.fault.kind == "drop" and each.number not in self._dropped:

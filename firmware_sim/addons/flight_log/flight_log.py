@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector
@@ -13,17 +13,19 @@ from firmware_sim.addons.flight_log.topics import SENSOR_COMBINED, TOPICS, Momen
 from firmware_sim.addons.flight_log.ulog_writer import UlogWriter, Values
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import (
-    AutopilotState,
-    OperatorText,
-    Setpoint,
-    StateEstimate,
-)
-from firmware_sim.autopilot.port import LogEntry, OpenLog, ParameterStore
-from firmware_sim.autopilot.snapshot import setpoint_of
+from firmware_sim.autopilot.autopilot_state import OperatorText, Setpoint, StateEstimate
+from firmware_sim.autopilot.parameter_store import Parameters
+from firmware_sim.autopilot.snapshot import AutopilotState, setpoint_of
 from firmware_sim.engine.dynamics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.engine.record import Record
-from firmware_sim.interfaces import ULOG_SUFFIX, BatterySample, TrueState
+from firmware_sim.interfaces import (
+    ULOG_SUFFIX,
+    BatterySample,
+    LogEntry,
+    LogStore,
+    OpenLog,
+    TrueState,
+)
 
 # ruff: noqa: D102 (`AutopilotState` documents the properties of `FlownState`)
 
@@ -116,7 +118,7 @@ class FlightLog:
     def __init__(
         self,
         path: Path,
-        parameters: ParameterStore,
+        parameters: Parameters,
         start_us: int,
         boot_unix_us: int,
         on_lost: Callable[[str], None] = lambda _: None,
@@ -157,9 +159,8 @@ class FlightLog:
             self.writer.sample(_SAMPLES, time_us, sensor_combined(gyro, accel))
             truth = truths[k - 1] if k else self._truth
             if time_us % GRID_US == 0 and truth is not None:
-                moment = Moment(
-                    FlownState(state, flown[k]), truth_of(truth), self._boot_unix_us + time_us
-                )
+                logged = cast(AutopilotState, FlownState(state, flown[k]))
+                moment = Moment(logged, truth_of(truth), self._boot_unix_us + time_us)
                 self._log(moment, time_us)
         self._truth = truths[-1].copy()
 
@@ -200,7 +201,7 @@ class FlightLog:
             self.writer.sample(1 + i, now_us, values)
 
 
-def _values(parameters: ParameterStore) -> Iterable[tuple[str, int | float]]:
+def _values(parameters: Parameters) -> Iterable[tuple[str, int | float]]:
     for index in range(len(parameters)):
         parameter = parameters.by_index(index)
         if parameter is not None:
@@ -211,8 +212,8 @@ OPEN_FILES = 8
 """Maximum number of log files kept open for downloads, which read a few bytes per tick."""
 
 
-class LogFolder:
-    """Complete logs by name, then the open log; rescans changed folders. Implements `LogStore`."""
+class LogFolder(LogStore):
+    """Complete logs by name, then the open log; rescans changed folders."""
 
     def __init__(self, folder: Path, current: FlightLog) -> None:
         """Set the folder and the log currently written in it."""

@@ -16,7 +16,8 @@ from airl_mav.core.frames import local_to_geodetic, quat_yaw
 from airl_mav.vehicle import atmosphere
 from firmware_sim import sensor_table
 from firmware_sim.addons.flight_log.ulog_writer import Topic, Values
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
+from firmware_sim.autopilot.autopilot_state import Arming, Landed
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import TrueState
 
 ON_CHANGE_US = 500 * US_PER_MS

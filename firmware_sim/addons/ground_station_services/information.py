@@ -12,19 +12,14 @@ import math
 
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import local_to_geodetic, quat_yaw
-from firmware_sim.autopilot.autopilot_state import (
-    Arming,
-    AutopilotState,
-    OperatorText,
-    Result,
-    Severity,
-)
+from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import (
     BY_CUSTOM_MODE,
     Mode,
     ModeSpec,
 )
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.link import OFF
 from firmware_sim.mavlink.services import (

@@ -11,9 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+from firmware_sim.autopilot.autopilot_state import Arming
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.port import AutopilotPort
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services import Context, Handlers, ServiceState, for_anyone
 
@@ -90,11 +91,11 @@ def send_pending(context: Context) -> None:
 
 # --- commands: each prints PX4's output, as far as available here
 
-Shown = Callable[[Sequence[str], AutopilotPort, int], str]
+Shown = Callable[[Sequence[str], BuiltinAutopilot, int], str]
 """Returns the output of a command, given its arguments, the autopilot, and the time [µs]."""
 
 
-def run(words: Sequence[str], port: AutopilotPort, now_us: int) -> str:
+def run(words: Sequence[str], port: BuiltinAutopilot, now_us: int) -> str:
     """Return the output of a command line, in whole lines."""
     if not words:
         return ""
@@ -107,7 +108,7 @@ def run(words: Sequence[str], port: AutopilotPort, now_us: int) -> str:
 _VERSION = "HW arch: AIRL_SITL\nPX4 version: 1.16.0 (emulated by airl-mav)\n"
 
 
-def _parameters(words: Sequence[str], port: AutopilotPort, _now_us: int) -> str:
+def _parameters(words: Sequence[str], port: BuiltinAutopilot, _now_us: int) -> str:
     """Run param show [NAME, with * and ?]."""
     # Only `show` is supported: the shell is read-only.
     if not words or words[0] != "show" or len(words) > 2:
@@ -125,7 +126,7 @@ def _parameters(words: Sequence[str], port: AutopilotPort, _now_us: int) -> str:
     return "\n".join([*lines, "", f" {len(store)}/{len(store)} parameters used.", ""])
 
 
-def _commander(words: Sequence[str], port: AutopilotPort, _now_us: int) -> str:
+def _commander(words: Sequence[str], port: BuiltinAutopilot, _now_us: int) -> str:
     if list(words) != ["status"]:
         return "usage: commander status\n"
     status = port.state().status
@@ -182,7 +183,7 @@ _TOPICS: Mapping[str, Callable[[AutopilotState], Mapping[str, float]]] = {
 }
 
 
-def _listener(words: Sequence[str], port: AutopilotPort, now_us: int) -> str:
+def _listener(words: Sequence[str], port: BuiltinAutopilot, now_us: int) -> str:
     """Run listener TOPIC: print its newest message once."""
     topic = words[0] if words else ""
     fields = _TOPICS.get(topic)

@@ -10,6 +10,6 @@ Guide: docs/reference/modes.md.
 _HERE = "firmware_sim.addons.missions"
 
 MISSIONS = {"missions": f"{_HERE}.manager:MissionManager"}
-FLIGHT_MODES = {"MISSION": f"{_HERE}.mission_mode"}
+FLIGHT_MODES = {"MISSION": f"{_HERE}.manager"}
 SERVICES = {"missions": f"{_HERE}.protocol"}
 EVENTS = {name: f"{_HERE}.{name}" for name in ("executor", "feasibility", "manager", "protocol")}

@@ -232,17 +232,16 @@ class MissionExecutor:
 
     def review(self, situation: NavigationState) -> None:
         """Check the mission after a change of mission, fence or home."""
-        revisions = tuple(
-            self._plans.stored(kind).revision for kind in (MissionType.MISSION, MissionType.FENCE)
-        )
-        if (revisions, situation.home) != self._checked_for:
+        if self._inputs(situation) != self._checked_for:
             self._validate(situation)
 
+    def _inputs(self, situation: NavigationState) -> tuple[object, ...]:
+        """Return the inputs of the feasibility check, for comparison."""
+        kinds = (MissionType.MISSION, MissionType.FENCE)
+        return *(self._plans.stored(kind).revision for kind in kinds), situation.home
+
     def _validate(self, situation: NavigationState) -> None:
-        revisions = tuple(
-            self._plans.stored(kind).revision for kind in (MissionType.MISSION, MissionType.FENCE)
-        )
-        self._checked_for = (revisions, situation.home)
+        self._checked_for = self._inputs(situation)
         verdict = self._check(situation)
         for message in verdict.messages:
             self._crew.say(message)

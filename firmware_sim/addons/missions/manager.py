@@ -1,4 +1,4 @@
-"""Missions of a vehicle: Mission mode's executor, and the destination and path of Return.
+"""Missions of a vehicle: their executors, Mission mode, and the destination and path of Return.
 
 Source of Return: PX4 1.16, RTL::findRtlDestination, RtlMissionFast, RtlMissionFastReverse and
 RtlDirectMissionLand, for a multicopter. They fly only the places of a mission, without waits and
@@ -15,15 +15,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from airl_mav.core.frames import Geodetic, local_to_geodetic
+from airl_mav.control.demand import AnyDemand
+from airl_mav.core.frames import Geodetic, Vector, local_to_geodetic
+from airl_mav.vehicle.rotation import Vec
 from firmware_sim.addons.missions.executor import MissionExecutor
 from firmware_sim.addons.missions.feasibility import FeasibilityResult, check
-from firmware_sim.addons.missions.items import STANDING, NavCommand, PlanFrame, Triplet, go_to
+from firmware_sim.addons.missions.items import (
+    STANDING,
+    NavCommand,
+    PlanFrame,
+    Triplet,
+    TripletKind,
+    go_to,
+)
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
+from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.events.definition import define
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.inputs import ModeRequest, PrecisionRequest
+from firmware_sim.autopilot.modes.automatic import gentle, landing_speed, leave_ground
+from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, optional_mode
 from firmware_sim.autopilot.modes.return_to_launch import return_height
-from firmware_sim.autopilot.navigation.fence import FenceMonitor
+from firmware_sim.autopilot.navigation.navigator import FenceMonitor
 from firmware_sim.autopilot.navigation.plan import (
     Crew,
     Missions,
@@ -33,6 +46,7 @@ from firmware_sim.autopilot.navigation.plan import (
     Plans,
     distance_m,
 )
+from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment, triple
 
 _N = NavCommand
 
@@ -96,11 +110,11 @@ def onwards(plans: Plans, index: int) -> tuple[PlanItem, ...]:
     return tuple(way)
 
 
-def climb(here: Geodetic, altitude_m: float) -> PlanItem:
-    """Return an item for a climb at a place to an altitude above mean sea level [m]."""
+def at(command: int, place: Geodetic, altitude_m: float) -> PlanItem:
+    """Return an item at a place and an altitude above mean sea level [m]."""
     params = (0.0, 0.0, 0.0, NAN)
     return PlanItem(
-        _N.WAYPOINT, PlanFrame.GLOBAL, params, here.latitude_deg, here.longitude_deg, altitude_m
+        command, PlanFrame.GLOBAL, params, place.latitude_deg, place.longitude_deg, altitude_m
     )
 
 
@@ -112,11 +126,7 @@ def _back(items: tuple[PlanItem, ...], index: int, home: Geodetic) -> tuple[Plan
             way.append(_passed(item))
         if item.command == _N.TAKEOFF:
             break
-    params = (0.0, 0.0, 0.0, NAN)
-    landing = PlanItem(
-        _N.LAND, PlanFrame.GLOBAL, params, home.latitude_deg, home.longitude_deg, home.altitude_m
-    )
-    return (*way, landing)
+    return (*way, at(_N.LAND, home, home.altitude_m))
 
 
 def _passed(item: PlanItem) -> PlanItem:
@@ -323,7 +333,7 @@ class MissionManager(Missions):
         text = f"RTL Mission land: climb to {math.ceil(altitude)} m"
         event = RTL_MISSION_LAND.event(math.ceil(altitude))
         self._crew.say(OperatorText(Severity.INFO, text, event))
-        return (climb(here, altitude), *landing)
+        return (at(_N.WAYPOINT, here, altitude), *landing)
 
     def _check_way_home(self, _now: NavigationState) -> FeasibilityResult:
         return FeasibilityResult(bool(self._way_home.mission), ())
@@ -336,3 +346,119 @@ class MissionManager(Missions):
             landed=now.landed,
             inside_fence=lambda place: self._fence.inside(place, now.home),
         )
+
+
+_TAKEOFF, _LAND, _IDLE = TripletKind.TAKEOFF, TripletKind.LAND, TripletKind.IDLE
+
+_REQUIRED = 2
+"""PRECISION_LAND_MODE: search for the target."""
+
+_MOVES_M_S = 0.5
+"""Minimum speed to turn the nose along the path [m/s] (MPC_YAW_MODE = 3)."""
+
+
+class Mission(FlightMode, modes=(Mode.MISSION,)):
+    """Mission mode: follows the triplets of missions with PX4's speeds at and between waypoints."""
+
+    def __init__(self, context: FlightContext, /) -> None:
+        self._context = context
+        self._triplet: Triplet | None = None
+        self._precision = optional_mode(Mode.PRECISION_LAND, context)
+        self._lands_precisely = False
+
+    @property
+    def _path(self) -> Triplet:
+        missions = self._context.missions
+        return missions.triplet if isinstance(missions, MissionManager) else STANDING
+
+    @property
+    def lifts(self) -> bool:
+        """True if the mission leaves the ground."""
+        return self._path.kind not in (_IDLE, _LAND)
+
+    @property
+    def destination(self) -> Vec | None:
+        """Position of the active item."""
+        return self._path.target
+
+    def enter(self, _state: Vector, _request: ModeRequest | None, /) -> None:
+        """Start; the executor supplies the waypoints."""
+        self._triplet, self._lands_precisely = None, False
+
+    def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
+        """Return the demand for the active waypoints."""
+        context = self._context
+        triplet, position, travel = self._path, triple(state, P), context.travel
+        if context.standing:
+            # The trajectory starts at the vehicle's position at lift-off.
+            return leave_ground(context, state, time_us)
+        if triplet is not self._triplet:
+            if self._triplet is None or triplet.cruise_m_s != self._triplet.cruise_m_s:
+                travel.speed_m_s = triplet.cruise_m_s
+            self._triplet = triplet
+            if triplet.precision and self._precision is None:
+                text = "Precision landing is not available without the add-on extra_modes"
+                context.say(OperatorText(Severity.CRITICAL, text))
+        if triplet.precision and self._precision is not None:
+            if not self._lands_precisely:
+                self._lands_precisely = True
+                north, east, down = *triplet.target[:2], position[2]
+                required = triplet.precision == _REQUIRED
+                self._precision.enter(state, PrecisionRequest((north, east, down), required))
+            return self._precision.demand(state, time_us)
+        self._lands_precisely = False
+        yaw = triplet.yaw if math.isfinite(triplet.yaw) else self._heading(state)
+        leg, limits = _leg(triplet, position), self._limits(state)
+        if triplet.kind is _LAND:
+            speed = landing_speed(context.value, context.height(state), context.ground_m)
+            north, east, _ = triplet.target
+            leg = PathSegment((north, east, math.nan), vertical_m_s=speed)
+        return travel.fly(state, time_us, leg, yaw=yaw, limits=limits)
+
+    def is_done(self, _state: Vector, /) -> bool:
+        """Return whether the mission has ended."""
+        return self._context.missions.over
+
+    def _limits(self, state: Vector) -> PathLimits:
+        triplet = self._path
+        limits = self._context.travel.limits()._replace(acceptance_m=triplet.acceptance_m)
+        return gentle(limits, self._context, state) if triplet.kind is _TAKEOFF else limits
+
+    def _heading(self, state: Vector) -> float:
+        """Return the heading by MPC_YAW_MODE; NaN = towards the waypoint, unchanged near it."""
+        mode, home = round(self._context.value("MPC_YAW_MODE")), self._context.home
+        if mode == 3:
+            north, east, _ = triple(state, V)
+            return math.atan2(east, north) if math.hypot(north, east) > _MOVES_M_S else math.nan
+        if mode not in (1, 2):
+            return math.nan
+        position = triple(state, P)
+        north, east = home[0] - position[0], home[1] - position[1]
+        if math.hypot(north, east) < self._path.acceptance_m:
+            return math.nan
+        return math.atan2(east, north) if mode == 1 else math.atan2(-east, -north)
+
+
+def _leg(triplet: Triplet, position: Vec) -> PathSegment:
+    """Return the leg to fly; off its line, the vehicle returns to the line first.
+
+    Source: PX4 1.16, FlightTaskAuto::_getCurrentState, _updateInternalWaypoints.
+    """
+    start, target = triplet.previous, triplet.target
+    direct = PathSegment(target, start, triplet.next)
+    if start is None:
+        return direct
+    line = [b - a for a, b in zip(start, target, strict=True)]
+    length = math.hypot(*line)
+    if length < 1e-6:
+        return direct
+    unit = [c / length for c in line]
+    along = math.fsum(u * (p - s) for u, p, s in zip(unit, position, start, strict=True))
+    if along > length:
+        return PathSegment(target, position, triplet.next)
+    if along < 0.0 and math.dist(start, position) > triplet.acceptance_m:
+        return PathSegment(start, position, target)
+    north, east, down = (s + u * along for s, u in zip(start, unit, strict=True))
+    if math.dist((north, east, down), position) > triplet.acceptance_m:
+        return PathSegment((north, east, down), position, target)
+    return direct

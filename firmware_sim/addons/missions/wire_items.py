@@ -26,12 +26,11 @@ _ROI_NONE, _ROI_WPNEXT, _ROI_WPINDEX, _ROI_LOCATION = 0, 1, 2, 3
 _Conversion = Callable[[float], float]
 
 
-def _as_is(value: float) -> float:
-    return value
+_as_is = float
 
 
-def _nothing(value: float) -> float:  # noqa: ARG001 - a parameter that PX4 does not keep
-    return 0.0
+def _nothing(_value: float) -> float:
+    return 0.0  # a parameter that PX4 does not keep
 
 
 def _flag(value: float) -> float:

@@ -21,8 +21,8 @@ from typing import Any, TypeVar
 
 from airl_mav.core.addons import entries, load
 from airl_mav.core.signing import Signing
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
-from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
 from firmware_sim.mavlink.link import Link
 from firmware_sim.mavlink.streams.sensors import Radio
@@ -72,7 +72,7 @@ class Context:
 
     link: Link
     """Replies and streams of this client."""
-    port: AutopilotPort
+    port: BuiltinAutopilot
     now_us: int
     """Simulated time [µs]."""
     announce: Callable[[OperatorText], None]

@@ -7,7 +7,7 @@ import math
 import struct
 
 from firmware_sim.autopilot.autopilot_state import Arming, Result
-from firmware_sim.autopilot.port import ParameterStore, ParameterValue
+from firmware_sim.autopilot.parameter_store import Parameters, ParameterValue
 from firmware_sim.mavlink.codec import WireMessage, crc32part, dialect, param_value, payload
 from firmware_sim.mavlink.services import (
     Action,
@@ -127,14 +127,14 @@ def _value_message(parameter: ParameterValue, count: int) -> tuple[str, bytes]:
     return "PARAM_VALUE", body
 
 
-def _hash_message(store: ParameterStore) -> tuple[str, bytes]:
+def _hash_message(store: Parameters) -> tuple[str, bytes]:
     digest = struct.pack("<I", _hash_of(store, store.revision))
     kind = dialect.MAV_PARAM_TYPE_UINT32
     return "PARAM_VALUE", param_value(HASH_NAME, digest, kind, len(store), _NO_INDEX)
 
 
 @functools.lru_cache(maxsize=1)
-def _hash_of(store: ParameterStore, _revision: int) -> int:
+def _hash_of(store: Parameters, _revision: int) -> int:
     """Return PX4's param_hash_check(): CRC-32 without inversions over all names and values.
 
     Cached for all new clients, because the computation takes most of a tick.

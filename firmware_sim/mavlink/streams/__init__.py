@@ -14,8 +14,8 @@ from functools import cache
 from types import MappingProxyType
 
 from airl_mav.core.addons import entries, load
-from firmware_sim.autopilot.autopilot_state import AutopilotState
-from firmware_sim.autopilot.port import AutopilotPort
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import SYSTEM_ID, Values
 from firmware_sim.mavlink.streams import sensors, status
@@ -71,7 +71,7 @@ def addon_builders() -> dict[str, Builder]:
 class Vehicle:
     """Source of the streams that need more than the snapshot, for any attached autopilot."""
 
-    port: AutopilotPort
+    port: BuiltinAutopilot
 
     def __init__(self, boot_unix_us: int) -> None:
         """Start without an autopilot; simulated time 0 is at `boot_unix_us` [µs since 1970]."""
@@ -81,7 +81,7 @@ class Vehicle:
         self.truth: Callable[[], TrueState] | None = None
 
     def attach(
-        self, port: AutopilotPort, truth: Callable[[], TrueState] | None, system_id: int
+        self, port: BuiltinAutopilot, truth: Callable[[], TrueState] | None, system_id: int
     ) -> None:
         """Attach another autopilot, with its vehicle's true state; None = unavailable."""
         self.port, self.truth, self.system_id = port, truth, system_id

@@ -10,8 +10,9 @@ import numpy as np
 
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.kernels import kernel
-from firmware_sim.autopilot.autopilot_state import AutopilotState, Vector
-from firmware_sim.autopilot.port import ParameterStore
+from firmware_sim.autopilot.autopilot_state import Vector
+from firmware_sim.autopilot.parameter_store import Parameters
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.streams import units
@@ -61,7 +62,7 @@ def mag_cal_report(value: Callable[[str], float]) -> Values | None:
     )
 
 
-def battery_status(state: AutopilotState, parameters: ParameterStore) -> Values:
+def battery_status(state: AutopilotState, parameters: Parameters) -> Values:
     """Return battery 0: pack voltage in the first slot (cells unmeasured), current, charge."""
     battery = state.battery
     # -1 and INT16_MAX are MAVLink's values for unknown.
@@ -82,7 +83,7 @@ def battery_status(state: AutopilotState, parameters: ParameterStore) -> Values:
     )
 
 
-def _charge_state(remaining: float, parameters: ParameterStore) -> int:
+def _charge_state(remaining: float, parameters: Parameters) -> int:
     """Return the MAV_BATTERY_CHARGE_STATE of a charge 0..1, from PX4's warning thresholds."""
     state: int = dialect.MAV_BATTERY_CHARGE_STATE_OK
     # Thresholds descend, so the last match is the most severe state.

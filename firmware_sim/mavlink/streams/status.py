@@ -14,18 +14,14 @@ import numpy as np
 
 from airl_mav.core.addons import entries
 from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local, local_to_geodetic
-from firmware_sim.autopilot.autopilot_state import (
-    Arming,
-    AutopilotState,
-    CommanderStatus,
-    Landed,
-)
+from firmware_sim.autopilot.autopilot_state import Arming, CommanderStatus, Landed
 from firmware_sim.autopilot.flight_modes import (
     MAIN_AUTO,
     WITH_STICKS,
     Mode,
 )
 from firmware_sim.autopilot.modes.return_to_launch import return_time_s
+from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams import units

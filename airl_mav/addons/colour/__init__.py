@@ -1,0 +1,32 @@
+"""Colour cameras: appearance of arenas, their rendering, image sensors, and `airl render`.
+
+Renders sRGB with sun, shadows, textures, reflections and fog in real time, or path traced by
+Mitsuba; depth, segmentation and optical flow of the same pixels; motion blur, exposure control,
+noise and JPEG of an image sensor. Used by cameras of kind rgb and grey, by the table `appearance`
+of arenas and `imaging` of cameras, and by `--renderer mitsuba`.
+Command: `airl render`.
+Depends on: the extra `render` for path tracing, `film` for videos.
+Guide: docs/how-to/camera.md.
+"""
+
+_HERE = "airl_mav.addons.colour"
+
+COMMANDS = {
+    "render": (
+        "what a colour camera sees: an arena as a picture, a flight as a film",
+        f"{_HERE}.command",
+    )
+}
+COLOUR = {
+    "batch": f"{_HERE}.batch:ColourImages",
+    "clear": f"{_HERE}.appearance:clear_of",
+    "expose": f"{_HERE}.picture:expose_colour",
+    "look": f"{_HERE}.appearance:look_of",
+    "looks": f"{_HERE}.batch:Looks",
+    "sensor": f"{_HERE}.image_sensor:ImageFormation",
+}
+PROFILE_SECTIONS = {
+    "arena.appearance": f"{_HERE}.profile:Appearance",
+    "camera.imaging": f"{_HERE}.profile:Imaging",
+}
+RENDERERS = {"mitsuba": f"{_HERE}.profile:PathTracing"}

@@ -1,0 +1,554 @@
+"""Arenas and cameras as scenes of Mitsuba 3: path tracing, the reference of `picture`, without fog.
+
+Adds ambient occlusion and colour bleeding, which the fast renderer only averages below a ceiling.
+
+Mitsuba only has pinholes, so cylinders and fisheyes are resampled in linear light from pinhole
+images of a cube's faces. A pixel is divided into `side` x `side` samples. Each sample's ray leaves
+the cube through one face and takes the value of the nearest pixel there. Only faces with rays are
+rendered, and only the rectangle that the rays cover.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.addons.colour.appearance import (
+    FLOOR,
+    OBSTACLE,
+    TEXTURES,
+    WALLS,
+    Finish,
+    Light,
+    srgb_of,
+)
+from airl_mav.addons.colour.picture import grey
+from airl_mav.addons.colour.shading import GLASS, GLOSSY, INDEX, METAL, is_smooth
+from airl_mav.addons.colour.textures import mean_of, periods, texels
+from airl_mav.arena.geometry import Arena, PlacedMesh, Shape
+from airl_mav.arena.ground import Ground
+from airl_mav.arena.triangles import standing, triangles_of
+from airl_mav.camera.intrinsics import Intrinsics, finer
+from airl_mav.camera.render import RANGE_M
+from airl_mav.core.errors import UsageError
+from airl_mav.core.frames import quat_to_matrix
+from airl_mav.vehicle.rotation import Quat, Vec
+
+Floats = NDArray[np.float64]
+
+VARIANT = "scalar_rgb"
+"""Mitsuba variant; requires neither compiler nor GPU."""
+
+MOST_BOUNCES = 8
+
+_SKY_ROWS = 256
+
+_SEEDS = 1 << 32
+"""Number of distinct seeds in Mitsuba."""
+
+
+class PathTracer:
+    """Path-traced images; reuses the last scene while nothing in it moves."""
+
+    def __init__(self, samples: int) -> None:
+        """Set the paths per pixel; approximate off the middle of a cylinder or fisheye."""
+        self._samples = samples
+        self._arena: Arena | None = None
+        self._centers: Floats = np.zeros((0, 3))
+        self._scene: Any = None
+        self._cube: tuple[Intrinsics, Cube] | None = None
+
+    def __call__(
+        self,
+        arena: Arena,
+        centers: Floats,
+        intrinsics: Intrinsics,
+        position: Floats,
+        quaternion: Floats,
+        seed: int,
+    ) -> NDArray[np.uint8]:
+        """Return the sRGB image of an arena; arguments as in `render.render`.
+
+        Raises UsageError for an arena with fog, ImportError without Mitsuba (the extra `render`).
+        """
+        if arena.look.light.extinction > 0.0:
+            raise UsageError("renderer mitsuba: accepted: an arena without appearance.fog")
+        import mitsuba as mi
+
+        mi.set_variant(VARIANT)
+        if arena is not self._arena or not np.array_equal(centers, self._centers):
+            self._arena, self._centers = arena, np.array(centers)
+            # Only `volpath` lets sunlight through glass.
+            glass = bool((arena.look.finish.surface == GLASS).any())
+            integrator = {"type": "volpath" if glass else "path", "max_depth": MOST_BOUNCES}
+            bodies = _lights(mi, arena.look.light) | _bodies(mi, arena, centers)
+            self._scene = mi.load_dict({"type": "scene", "integrator": integrator, **bodies})
+        axes, k = quat_to_matrix(quaternion).T, intrinsics
+        if k.model.planar:
+            whole = _Film(k.width, k.height, 0, 0, k.width, k.height, k.horizontal_fov_rad)
+            light = self._rendered(mi, axes, position, whole, self._samples, seed)
+        else:
+            light = self._resampled(mi, k, axes, position, seed)
+        encoded: NDArray[np.uint8] = np.rint(255.0 * srgb_of(light)).astype(np.uint8)
+        return encoded
+
+    def _rendered(
+        self, mi: Any, axes: Floats, position: Floats, film: _Film, samples: int, seed: int
+    ) -> Floats:
+        """Return the light (h, w, 3) of a pinhole camera; axes (3, 3) forward, right, down."""
+        sensor = mi.load_dict(_sensor(mi, axes, position, film, samples))
+        return np.array(mi.render(self._scene, sensor=sensor, seed=seed))[..., :3]
+
+    def _resampled(
+        self, mi: Any, k: Intrinsics, axes: Floats, position: Floats, seed: int
+    ) -> Floats:
+        """Return the light (h, w, 3) of a cylinder or fisheye camera."""
+        side = side_for(k, self._samples)
+        if self._cube is None or self._cube[0] != k:
+            self._cube = k, cube_of(k, side)
+        cube = self._cube[1]
+        # The samples of a pixel share its paths.
+        samples = math.ceil(self._samples / (side * side))
+        images = []
+        for number, face in enumerate(cube.faces):
+            cut = (face.left, face.top, face.width, face.height)
+            film = _Film(face.pixels, face.pixels, *cut, 0.5 * math.pi)
+            # Each face of each image has a different seed.
+            own = (seed * len(FACES) + number) % _SEEDS
+            images.append(self._rendered(mi, face.axes @ axes, position, film, samples, own))
+        return resampled(cube, images)
+
+
+class _Film(NamedTuple):
+    """Image size of a pinhole, and its rendered part [px]."""
+
+    width: int
+    height: int
+    left: int
+    top: int
+    drawn_width: int
+    drawn_height: int
+    fov: float
+    """Horizontal field of view of the whole image [rad]."""
+
+
+def _sensor(mi: Any, axes: Floats, position: Floats, film: _Film, samples: int) -> dict[str, Any]:
+    forward, right, down = axes
+    # Mitsuba's camera looks along +z; x points to the left of the image, y up.
+    pose = np.eye(4)
+    pose[:3, :4] = np.column_stack([-right, -down, forward, position])
+    return {
+        "type": "perspective",
+        "fov_axis": "x",
+        "fov": math.degrees(film.fov),
+        "near_clip": 0.001,
+        "far_clip": 2.0 * RANGE_M,
+        "to_world": mi.ScalarTransform4f(pose),
+        "film": {
+            "type": "hdrfilm",
+            "width": film.width,
+            "height": film.height,
+            "crop_offset_x": film.left,
+            "crop_offset_y": film.top,
+            "crop_width": film.drawn_width,
+            "crop_height": film.drawn_height,
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+        },
+        "sampler": {"type": "independent", "sample_count": samples},
+    }
+
+
+def _lights(mi: Any, light: Light) -> dict[str, Any]:
+    """Return sun and sky. A white surface reflects 1 / pi of its irradiance in each direction."""
+    # Sine of each row's elevation; 0 below the horizon.
+    sine = np.sin((0.5 - (np.arange(_SKY_ROWS) + 0.5) / _SKY_ROWS) * math.pi).clip(0.0)
+    rows = light.horizon + sine[:, None] * (light.zenith - light.horizon)
+    sky = np.repeat(rows[:, None], 2 * _SKY_ROWS, axis=1).astype(np.float32)
+    # The map's pole is +y; up is -z here.
+    turn = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], np.float64)
+    lights: dict[str, Any] = {
+        "sky": {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(sky),
+            "to_world": mi.ScalarTransform4f(turn),
+        }
+    }
+    if light.sun.any():
+        lights["sun"] = {
+            "type": "directional",
+            # Mitsuba expects the direction of the light's travel.
+            "direction": (-light.to_sun).tolist(),
+            "irradiance": {"type": "rgb", "value": (math.pi * light.sun).tolist()},
+        }
+    return lights
+
+
+def _bodies(mi: Any, arena: Arena, centers: Floats) -> dict[str, Any]:
+    b, finish, o = arena.bounds, arena.look.finish, arena.obstacles
+    north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
+    half_n, half_e, half_h = b.north_max - north, b.east_max - east, 0.5 * b.height
+    x, y, z = np.eye(3)
+    made = [
+        # Across is east, along (down in the pattern's image) is south.
+        _face(mi, finish, FLOOR, np.array([north, east, 0.0]), half_e * y, -half_n * x),
+        _ground(mi, finish),
+    ]
+    for side in (-1.0, 1.0):
+        at = np.array([north + side * half_n, east, -half_h])
+        made.append(_face(mi, finish, WALLS, at, half_e * y, half_h * z))
+        at = np.array([north, east + side * half_e, -half_h])
+        made.append(_face(mi, finish, WALLS, at, half_n * x, half_h * z))
+    if b.ceiling:
+        made.append(
+            _ceiling(mi, arena.look.light, np.array([north, east, -b.height]), half_n, half_e)
+        )
+    if arena.ground is not None:
+        made.append(_hills(mi, finish, arena.ground))
+    for each in arena.meshes:
+        made.append(_mesh(mi, finish, OBSTACLE + each.first, each))
+    for i in range(len(o)):
+        if arena.mesh_of(i) is not None:
+            continue
+        row, half, at = OBSTACLE + i, o.half_size[i], centers[i]
+        if o.shape[i] == Shape.BOX:
+            made += _box(mi, finish, row, at, half, float(o.yaw[i]))
+        elif o.shape[i] == Shape.CYLINDER:
+            made += _cylinder(mi, finish, row, at, half)
+        else:
+            made.append(_sphere(mi, finish, row, at, float(half[0])))
+    return {f"body_{k}": body for k, body in enumerate(made)}
+
+
+def _face(
+    mi: Any,
+    finish: Finish,
+    row: int,
+    center: Floats,
+    across: Floats,
+    along: Floats,
+    origin: Floats | None = None,
+) -> dict[str, Any]:
+    """Return a rectangle. Its pattern starts at the world's origin, or at `origin`."""
+    pose = np.eye(4)
+    pose[:3, :4] = np.column_stack([across, along, np.cross(across, along), center])
+    pose[:3, 2] /= np.linalg.norm(pose[:3, 2])
+    width, height = float(np.linalg.norm(across)), float(np.linalg.norm(along))
+    middle = center if origin is None else center - origin
+    first = middle @ across / width - width, middle @ along / height - height
+    per_m = _per_m(finish, row)
+    size, begin = (2.0 * width * per_m, 2.0 * height * per_m), finish.offset[row]
+    start = (float(first[0] * per_m + begin[0]), float(first[1] * per_m + begin[1]))
+    bsdf = _material(mi, finish, row, size, start)
+    return {"type": "rectangle", "to_world": mi.ScalarTransform4f(pose), "bsdf": bsdf}
+
+
+def _ceiling(mi: Any, light: Light, center: Floats, half_n: float, half_e: float) -> dict[str, Any]:
+    """Return a ceiling that emits light downwards and reflects nothing."""
+    pose = np.diag([half_n, half_e, 1.0, 1.0])
+    pose[:3, 3] = center
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f(pose),
+        "bsdf": _diffuse(np.zeros(3)),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": light.zenith.tolist()}},
+    }
+
+
+def _ground(mi: Any, finish: Finish) -> dict[str, Any]:
+    """Return the ground beyond the walls, slightly below the floor, with its mean albedo."""
+    dark, bright = finish.albedo[FLOOR]
+    mean = dark + mean_of(finish, FLOOR) * (bright - dark)
+    pose = np.diag([RANGE_M, RANGE_M, 1.0, 1.0])
+    # Down is positive, so the floor covers it.
+    pose[2, 3] = 0.01
+    return {"type": "disk", "to_world": mi.ScalarTransform4f(pose), "bsdf": _diffuse(mean)}
+
+
+def _box(
+    mi: Any, finish: Finish, row: int, center: Floats, half: Floats, yaw: float
+) -> list[dict[str, Any]]:
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    axes = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    a, b, c = half[:, None] * axes
+    faces = [(a, b, c), (b, a, c), (c, a, b)]
+    return [
+        _face(mi, finish, row, center + side * out, across, along, origin=center)
+        for out, across, along in faces
+        for side in (-1.0, 1.0)
+    ]
+
+
+def _cylinder(
+    mi: Any, finish: Finish, row: int, center: Floats, half: Floats
+) -> list[dict[str, Any]]:
+    radius, height, per_m = float(half[0]), float(half[2]), _per_m(finish, row)
+    begin = finish.offset[row]
+    # The second texture coordinate runs from end to end, here from the top down.
+    bsdf = _material(
+        mi,
+        finish,
+        row,
+        (_around(finish, row, radius), 2.0 * height * per_m),
+        (begin[0], begin[1] - height * per_m),
+    )
+    ends = [(center + np.array([0.0, 0.0, side * height])).tolist() for side in (-1.0, 1.0)]
+    side = {"type": "cylinder", "p0": ends[0], "p1": ends[1], "radius": radius, "bsdf": bsdf}
+    dark, bright = finish.albedo[row]
+    mean = _reflecting(finish, row, _rgb(dark + mean_of(finish, row) * (bright - dark)))
+    caps = []
+    for end in ends:
+        pose = np.diag([radius, radius, 1.0, 1.0])
+        pose[:3, 3] = end
+        caps.append({"type": "disk", "to_world": mi.ScalarTransform4f(pose), "bsdf": mean})
+    return [side, *caps]
+
+
+def _sphere(mi: Any, finish: Finish, row: int, center: Floats, radius: float) -> dict[str, Any]:
+    around, begin = _around(finish, row, radius), finish.offset[row]
+    # The second texture coordinate runs from the pole at +z down to the opposite pole.
+    bsdf = _material(mi, finish, row, (around, -0.5 * around), (begin[0], begin[1] + 0.25 * around))
+    return {"type": "sphere", "center": center.tolist(), "radius": radius, "bsdf": bsdf}
+
+
+def _mesh(mi: Any, finish: Finish, row: int, placed: PlacedMesh) -> Any:
+    """Return a mesh of flat triangles. Its pattern matches `surfaces.shade_meshes`."""
+    vertices, faces = standing(placed)
+    corners = placed.scale * triangles_of(placed.file).corners.astype(np.float64)
+    return _triangles(mi, finish, row, corners, vertices[faces])
+
+
+def _hills(mi: Any, finish: Finish, ground: Ground) -> Any:
+    """Return hills with the floor's pattern: across is east, along is south."""
+    corners = ground.points[ground.faces]
+    own = corners[..., [1, 0, 2]] * (1.0, -1.0, 1.0)
+    return _triangles(mi, finish, FLOOR, own, corners)
+
+
+def _triangles(mi: Any, finish: Finish, row: int, corners: Floats, placed: Floats) -> Any:
+    """Return flat triangles with a pattern as in `surfaces.shade_meshes`.
+
+    `corners` (m, 3, 3) are along the mesh's axes, `placed` (m, 3, 3) NED [m]; `row` is the
+    material.
+    """
+    normals = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    q0, q1, q2 = normals.T[..., None]
+    level = q2 >= np.maximum(q0, q1)
+    across = np.where(level | (q1 > q0), corners[..., 0], corners[..., 1])
+    along = np.where(level, corners[..., 1], corners[..., 2])
+    # Both are in periods, so the texture needs no transform.
+    places = _per_m(finish, row) * np.stack([across, along], axis=-1) + finish.offset[row]
+    properties = mi.Properties()
+    properties["mesh_bsdf"] = mi.load_dict(_material(mi, finish, row, (1.0, 1.0), (0.0, 0.0)))
+    count = len(corners)
+    # Vertices are not shared, because each triangle has its own texture coordinates.
+    mesh = mi.Mesh("mesh", 3 * count, count, has_vertex_texcoords=True, props=properties)
+    data = mi.traverse(mesh)
+    data["vertex_positions"] = placed.astype(np.float32).ravel()
+    data["vertex_texcoords"] = places.astype(np.float32).ravel()
+    data["faces"] = np.arange(3 * count, dtype=np.uint32)
+    data.update()
+    return mesh
+
+
+def _per_m(finish: Finish, row: int) -> float:
+    """Return the periods of a pattern per metre."""
+    return 1.0 / float((finish.size_m * periods(finish))[row])
+
+
+def _around(finish: Finish, row: int, radius: float) -> float:
+    """Return the periods of a pattern around a body."""
+    return max(round(2.0 * math.pi * radius * _per_m(finish, row)), 1.0)
+
+
+def _diffuse(albedo: Floats) -> dict[str, Any]:
+    return _two_sided({"type": "diffuse", "reflectance": _rgb(albedo)})
+
+
+def _rgb(albedo: Floats) -> dict[str, Any]:
+    return {"type": "rgb", "value": albedo.tolist()}
+
+
+def _two_sided(bsdf: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "twosided", "bsdf": bsdf}
+
+
+def _reflecting(finish: Finish, row: int, albedo: dict[str, Any]) -> dict[str, Any]:
+    """Return a material with an albedo, optionally a texture; optical model as in `gloss`."""
+    surface, alpha = finish.surface[row], float(finish.roughness[row] ** 2)
+    if surface == GLASS:
+        # The dielectric already has two sides.
+        return {"type": "thindielectric", "int_ior": INDEX, "specular_transmittance": albedo}
+    rough = {} if is_smooth(alpha) else {"distribution": "ggx", "alpha": alpha}
+    if surface == METAL:
+        kind = "roughconductor" if rough else "conductor"
+        return _two_sided(
+            {"type": kind, "material": "none", "specular_reflectance": albedo, **rough}
+        )
+    if surface == GLOSSY:
+        kind = "roughplastic" if rough else "plastic"
+        return _two_sided({"type": kind, "int_ior": INDEX, "diffuse_reflectance": albedo, **rough})
+    return _two_sided({"type": "diffuse", "reflectance": albedo})
+
+
+def _material(
+    mi: Any,
+    finish: Finish,
+    row: int,
+    size: tuple[float, float],
+    start: tuple[float, float],
+) -> dict[str, Any]:
+    """Return a material with a pattern from `start` over `size`, both in periods."""
+    dark, bright = finish.albedo[row]
+    if TEXTURES.index("plain") == finish.texture[row]:
+        return _reflecting(finish, row, _rgb(dark))
+    mixed = (dark + texels(finish, row) * (bright - dark)).astype(np.float32)
+    place = np.eye(4)
+    place[0, 0], place[1, 1], place[0, 3], place[1, 3] = *size, *start
+    texture = {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(mixed),
+        # Albedos are linear, so Mitsuba must not convert them from sRGB.
+        "raw": True,
+        "filter_type": "nearest",
+        "to_uv": mi.ScalarTransform4f(place),
+    }
+    return _reflecting(finish, row, texture)
+
+
+FACES = tuple((axis, sign) for axis in range(3) for sign in (1.0, -1.0))
+"""Camera axis (forward, right, down) perpendicular to a face, and the side of the face."""
+
+MOST_SIDE = 4
+"""Maximum samples along each side of a pixel."""
+
+MOST_PLACES = 1 << 24
+"""Maximum samples of an image; the search takes about a hundred bytes for each sample."""
+
+
+class Face(NamedTuple):
+    """One face of the cube: the axes of its image, and the rendered part."""
+
+    axes: Floats
+    """(3, 3) rows forward, right, down of the face's camera, in the camera's axes forward, right,
+    down."""
+    pixels: int
+    """Pixels along each side of the whole face, a pinhole of 90 degrees."""
+    left: int
+    top: int
+    width: int
+    height: int
+    places: NDArray[np.intp]
+    """(n,) indices of the samples (h side, w side), flattened, that look through this face."""
+    source: NDArray[np.intp]
+    """(n,) pixel of the rendered part, flattened, for each sample."""
+
+
+class Cube(NamedTuple):
+    """Cube faces of an image and their mapping to pixels."""
+
+    shape: tuple[int, int]
+    """Rows and columns of the image."""
+    side: int
+    faces: tuple[Face, ...]
+
+
+def side_for(camera: Intrinsics, samples: int) -> int:
+    """Return the samples along each side of a pixel for a total number of samples."""
+    side = min(MOST_SIDE, math.isqrt(samples))
+    # Large images get fewer samples, because the search holds all of them in memory.
+    while side > 1 and side * side * camera.width * camera.height > MOST_PLACES:
+        side -= 1
+    return side
+
+
+def cube_of(camera: Intrinsics, side: int) -> Cube:
+    """Return the cube faces of a camera's image with side x side samples per pixel.
+
+    Faces are coarsest in the middle, where they match the resolution of the image's middle times
+    `side`. Around it a fisheye's image is finer, by half at 90 degrees.
+    """
+    k, fine = camera, finer(camera, side)
+    rays = fine.rays
+    # A pixel outside the field of view is entirely black.
+    blind = ~k.rays.any(axis=0)
+    rays[:, np.repeat(np.repeat(blind, side, axis=0), side, axis=1)] = 0.0
+    rays = rays.reshape(3, -1)
+    # A pinhole of 90 degrees is two focal lengths wide.
+    pixels = 2 * math.ceil(fine.focal * k.model.finest(k))
+    # A ray leaves the cube through the face of its largest component.
+    across = np.abs(rays).argmax(axis=0)
+    sees = rays.any(axis=0)
+    faces = []
+    for axis, sign in FACES:
+        places = np.flatnonzero(sees & (across == axis) & (sign * rays[axis] > 0.0))
+        if len(places):
+            faces.append(_cube_face(rays[:, places], places, axis, sign, pixels))
+    return Cube((k.height, k.width), side, tuple(faces))
+
+
+def resampled(cube: Cube, images: list[Floats]) -> Floats:
+    """Return the image (h, w, channels) from faces: mean of each pixel's samples, 0 without any."""
+    height, width = cube.shape
+    side, channels = cube.side, images[0].shape[-1] if images else 3
+    light = np.zeros((height * side * width * side, channels))
+    seen = np.zeros(len(light))
+    for face, image in zip(cube.faces, images, strict=True):
+        light[face.places] = image.reshape(-1, channels)[face.source]
+        seen[face.places] = 1.0
+    blocks = (height, side, width, side)
+    total = light.reshape(*blocks, channels).sum(axis=(1, 3))
+    count = seen.reshape(blocks).sum(axis=(1, 3))
+    mean: Floats = total / np.maximum(count, 1.0)[..., None]
+    return mean
+
+
+def _cube_face(rays: Floats, places: NDArray[np.intp], axis: int, sign: float, pixels: int) -> Face:
+    """Return the face for rays (3, n) of these samples."""
+    forward, right = np.zeros(3), np.zeros(3)
+    forward[axis] = sign
+    # The rotation about the optical axis is arbitrary.
+    right[(axis + 1) % 3] = 1.0
+    axes = np.stack([forward, right, np.cross(forward, right)])
+    ahead, aside, below = axes @ rays
+    # The ratios are in -1..1 on a face; the clip catches rays on its edge.
+    column, row = (
+        np.clip(((0.5 + 0.5 * part / ahead) * pixels).astype(np.intp), 0, pixels - 1)
+        for part in (aside, below)
+    )
+    left, top = int(column.min()), int(row.min())
+    width, height = int(column.max()) - left + 1, int(row.max()) - top + 1
+    source = (row - top) * width + column - left
+    return Face(axes, pixels, left, top, width, height, places, source)
+
+
+PATHS = 16
+"""Mitsuba paths per pixel; the noise resembles a sensor in daylight."""
+
+
+class PathTraced:
+    """Colour images from Mitsuba's path tracer; each image number has different noise."""
+
+    def __init__(self, first: int = 0) -> None:
+        """Store the noise seed of image 0; later images count up from it, modulo 2^32."""
+        self._tracer = PathTracer(PATHS)
+        self._first = first
+
+    def __call__(
+        self,
+        arena: Arena,
+        centers: NDArray[np.float64],
+        intrinsics: Intrinsics,
+        max_range: float,  # noqa: ARG002 (colour has no limit)
+        position: Vec | NDArray[np.float64],
+        quaternion: Quat | NDArray[np.float64],
+        number: int = 0,
+    ) -> NDArray[Any]:
+        """Return the image; see `expose`. Raises as `mitsuba.PathTracer`."""
+        pose = np.asarray(position), np.asarray(quaternion)
+        seed = (self._first + number) % _SEEDS
+        rgb = self._tracer(arena, centers, intrinsics, *pose, seed=seed)
+        return rgb if intrinsics.kind == "rgb" else grey(rgb)[..., None]

@@ -1,0 +1,14 @@
+"""Arenas from your own meshes: boxes that cover a mesh, and the profile with both.
+
+Cameras see the mesh, plants and planners use the boxes. Reads STL, OBJ, GLB, glTF, PLY and OFF.
+Command: `airl asset`.
+Depends on: the extra `mesh` (trimesh).
+Guide: docs/how-to/arena.md.
+"""
+
+COMMANDS = {
+    "asset": (
+        "an arena whose obstacles are a mesh of yours (STL, OBJ, GLB)",
+        "airl_mav.addons.meshes.command",
+    )
+}

@@ -1,1 +1,0 @@
-"""Contacts of the vehicle's box in the kernel plant."""
