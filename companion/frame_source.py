@@ -200,7 +200,7 @@ def open_named_camera(
 ) -> OpenCamera:
     """Open a camera by name; FieldError if it is missing, sees too little or has no depth.
 
-    A name is tcp://HOST:PORT or ipc://PATH, whose images are used unchanged, or that of a driver.
+    A name is tcp://HOST:PORT or ipc://PATH (images are used unchanged), or a driver's name.
     Its images are converted to the `wanted` camera of `whose`, such as "vehicle quad".
     """
     # An address has a scheme; the publisher defines its own camera, so nothing is converted.

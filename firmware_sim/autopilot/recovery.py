@@ -283,7 +283,7 @@ class Restart(NamedTuple):
 
 LEAST = Restart(0.3, 0.1, 0.5, 0.04)
 GREATEST = Restart(10.0, 0.3, 5.0, 0.2)
-"""Limits of the standard deviations; those of the gyro bias are 2.3 and 11 °/s."""
+"""Limits of the standard deviations. For the gyro bias they are 2.3 and 11 °/s."""
 
 
 def restart_for(velocity_m_s: float, seconds: float) -> Restart:

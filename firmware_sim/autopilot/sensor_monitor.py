@@ -198,7 +198,7 @@ class SensorMonitor:
     def repeated(self, time_us: int, measured: int, repeated: int) -> None:
         """Process the slow sensors of a compiled tick at `time_us`.
 
-        The bits of sensors with data, and with repeated data, are those of `engine.record`.
+        `engine.record` defines the bits of sensors with data, and with repeated data.
         """
         self.distrusted = False
         for bit, watch in ((MAG_BIT, self.mag), (PRESSURE_BIT, self.baro), (GPS_BIT, self.gps)):

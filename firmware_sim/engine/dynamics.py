@@ -194,10 +194,11 @@ def absorb(
 ) -> tuple[float, Vec, Supply, float]:
     """Compute the power used in a tick and the remaining charge.
 
-    `before` and `row` (16,) are the motion before and after the tick, `standing` is True in contact
-    with anything, `acceleration` is that of the power model before the tick (`power.felt`) [m/s²],
-    `charge` 0..1 before the tick, `pack` the values of `pack_row`, `computer_w` the power of the
-    onboard computer from the pack [W]; `airframe` and `power` are fields of their models.
+    `before` and `row` (16,) are the motion before and after the tick. `standing` is True in contact
+    with anything. `acceleration` is the power model's before the tick (`power.felt`) [m/s²].
+    `charge` 0..1 is the state before the tick, `pack` holds the values of `pack_row`. `computer_w`
+    is the power of the onboard computer from the pack [W]. `airframe` and `power` are fields of
+    their models.
 
     Returns the power over the tick [W], without the computer; the acceleration, the battery
     monitor's reading and the state of charge after the tick.

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -95,6 +96,33 @@ def fly_without(folder: Path, removed: Sequence[str], *, whole: bool = True) -> 
     run("-c", MODULES)
     assert "success" in run("-m", "airl_mav.cli.main", "report", "run")
     assert (folder / "run" / "report.html").exists()
+
+
+def test_the_core_imports_no_addon() -> None:
+    found = []
+    for package in PACKAGES:
+        for file in (ROOT / package).rglob("*.py"):
+            if "addons" not in file.relative_to(ROOT).parts:
+                found += [
+                    f"{file.relative_to(ROOT)}:{node.lineno}"
+                    for node in imports_at_run_time(ast.parse(file.read_text()))
+                    if isinstance(node, ast.ImportFrom)
+                    and (node.module or "").split(".")[1:2] == ["addons"]
+                ]
+    assert not found
+
+
+def imports_at_run_time(tree: ast.AST) -> Iterator[ast.AST]:
+    """Yield the nodes of a tree, without blocks for type checkers."""
+    for node in ast.iter_child_nodes(tree):
+        if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)):
+            yield node
+            yield from imports_at_run_time(node)
+
+
+def test_the_documentation_lists_all_addons() -> None:
+    page = (ROOT / "docs" / "reference" / "addons.md").read_text().splitlines()
+    assert [line.removeprefix("::: ") for line in page if line.startswith("::: ")] == ADDONS
 
 
 def test_there_are_addons() -> None:

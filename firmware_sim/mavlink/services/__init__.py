@@ -177,7 +177,7 @@ SERVICES = {
     "connection": "firmware_sim.mavlink.services.connection",
     "setpoints": "firmware_sim.mavlink.services.setpoints",
 }
-"""Services of the core, as those of add-ons: loaded by the first server."""
+"""Services of the core. The first server loads them, with the services of add-ons."""
 
 
 @cache

@@ -2,7 +2,7 @@
 
 Replies and rejections follow PX4's Commander.cpp and mavlink_receiver.cpp, checked against a
 running PX4 1.16. A command to the vehicle is acknowledged to its sender, on the same link. Clients
-repeat commands, so actions are idempotent. The actions are those of all services (`ACTIONS`).
+repeat commands, so actions are idempotent. Every service adds its actions (`ACTIONS`).
 """
 
 from __future__ import annotations
