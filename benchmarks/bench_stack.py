@@ -23,9 +23,9 @@ from rich.table import Table
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_S, TICK_US, US_PER_S
-from airl_mav.lockstep.digest import FlightDigest
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.stage import ThreadPartner
+from airl_mav.lockstep.turns import FlightDigest
 from airl_mav.lockstep.vehicle import lockstep_link
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle

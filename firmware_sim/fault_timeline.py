@@ -15,8 +15,7 @@ from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.streams import Stream, stream
-from airl_mav.faults.fault import FOREVER_US, Fault, active, next_change_us
-from airl_mav.faults.kinds import Part
+from airl_mav.faults import FOREVER_US, Fault, Part, active, next_change_us
 from firmware_sim.autopilot.commander import CommanderState, FlightPhase
 from firmware_sim.mavlink.endpoint import SharedEndpoint
 

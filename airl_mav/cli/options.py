@@ -34,7 +34,7 @@ from airl_mav.core.errors import (
 from airl_mav.core.fields import range_of, validated
 from airl_mav.core.first_start import shown_by
 from airl_mav.core.progress import RichProgress, new_console
-from airl_mav.faults.fault import Fault
+from airl_mav.faults import Fault
 from airl_mav.profiles.loading import read_toml
 from airl_mav.scenario.aircraft import IN_WORDS
 from airl_mav.scenario.model import Scenario

@@ -13,10 +13,11 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 GRACE_S = 5.0
 """Timeout for a child to exit after its pipe is closed, and again after SIGTERM [wall s]."""
@@ -228,3 +229,46 @@ def _signal_group(group: int, number: int) -> None:
 
 if __name__ == "__main__":
     main()
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[Callable[[], bool]]:
+    """Yield a function that returns True after Ctrl-C or SIGTERM; a second one interrupts at once.
+
+    This allows the caller to save finished work first. Outside the main thread, where Python
+    delivers no signals, the function always returns False.
+    """
+    seen: list[int] = []
+
+    def note(number: int, _frame: object) -> None:
+        if seen:
+            raise KeyboardInterrupt
+        seen.append(number)
+
+    with signal_handlers(note, signal.SIGINT, signal.SIGTERM):
+        yield lambda: bool(seen)
+
+
+@contextmanager
+def terminated_as_interrupted() -> Iterator[None]:
+    """Treat SIGTERM as Ctrl-C in this context; does nothing outside the main thread."""
+
+    def interrupt(*_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    with signal_handlers(interrupt, signal.SIGTERM):
+        yield
+
+
+@contextmanager
+def signal_handlers(handler: Callable[[int, object], None], *numbers: int) -> Iterator[None]:
+    """Handle signals in this context; does nothing outside the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, earlier in before.items():
+            signal.signal(number, earlier)

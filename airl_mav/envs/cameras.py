@@ -26,8 +26,7 @@ from airl_mav.envs.faults import delays_of, later_us, twin_faults
 from airl_mav.envs.fleet import Fleet, FramePoses
 from airl_mav.envs.mesh_batch import MeshBatch, MeshesSeen, meshes_in
 from airl_mav.envs.saved_state import Stateful
-from airl_mav.faults.fault import Fault
-from airl_mav.faults.kinds import NOISE_SEED
+from airl_mav.faults import NOISE_SEED, Fault
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.conditions import SensorNoise
 

@@ -28,7 +28,7 @@ from airl_mav.core.streams import Stream, sensors_and_gusts, stream
 from airl_mav.envs.faults import gusts, lasting, twin_faults
 from airl_mav.envs.fleet import Fleet, FlightStatus
 from airl_mav.envs.saved_state import State, Stateful
-from airl_mav.faults.fault import Fault
+from airl_mav.faults import Fault
 from airl_mav.latency.injection import Injection, LatencySampler, latency_generator
 from airl_mav.policy.observation import Kinematics, Rows
 from airl_mav.profiles.conditions import WindSettings

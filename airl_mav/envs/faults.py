@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
-from airl_mav.faults.fault import FOREVER_US, Fault, gust_share, window_us
-from airl_mav.faults.kinds import Part
+from airl_mav.faults import FOREVER_US, Fault, Part, gust_share, window_us
 
 BEGINS = {"offboard": 0}
 """Start times of phases that have begun at the start of a flight [µs]."""

@@ -44,7 +44,7 @@ from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.spec import SHIPPED_REWARDS, EnvironmentSpec
 from airl_mav.envs.stopping import injections_of
 from airl_mav.envs.world import World, decide, status
-from airl_mav.faults.fault import Fault, check_twin
+from airl_mav.faults import Fault, check_twin
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import UPRIGHT_S
 from airl_mav.policy.images import Bytes, body_bytes

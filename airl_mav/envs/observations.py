@@ -19,7 +19,7 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.fleet import Fleet
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.faults.fault import Fault
+from airl_mav.faults import Fault
 from airl_mav.policy.images import (
     BAND_M,
     NEAREST_M,

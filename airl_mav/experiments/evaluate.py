@@ -11,7 +11,7 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.experiments import experiment
 from airl_mav.experiments.campaign import Cell
-from airl_mav.faults.fault import Fault
+from airl_mav.faults import Fault
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.card import MeasuredResult

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from airl_mav.core import addons
+from airl_mav.core.child_process import stop_on_signals
 from airl_mav.core.clock import utc_now
 from airl_mav.core.files import Arrays
 from airl_mav.core.progress import Progress, RichProgress, new_console
@@ -37,7 +38,6 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stages import Samples, pool, stage_samples
 from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
-from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.comparison_model import Comparison, Kind, RunEntry
 from airl_mav.report.document import count_outcomes
 from airl_mav.scenario.model import Scenario, free_fields

@@ -24,7 +24,7 @@ from airl_mav.envs.fleet import FlightArrays
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.experiments.executors import FlyEpisodes, Stop
-from airl_mav.faults.fault import check_twin
+from airl_mav.faults import check_twin
 from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import measure_quality

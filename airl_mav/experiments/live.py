@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from airl_mav.core.child_process import terminated_as_interrupted
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.first_start import compile_first
 from airl_mav.core.progress import Progress
@@ -19,7 +20,6 @@ from airl_mav.rehearsal.live_view import ViewEnds, ViewError, ViewRequest, view_
 from airl_mav.rehearsal.observer import LiveObserver, Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RUN_FILE, locked, open_folder
-from airl_mav.rehearsal.signals import terminated_as_interrupted
 from airl_mav.scenario.resolve import ResolvedScenario, plan_of
 from firmware_sim.external.programs import check_program
 

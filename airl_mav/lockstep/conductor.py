@@ -15,8 +15,7 @@ from typing import TypeAlias
 
 from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
-from airl_mav.lockstep.digest import FlightDigest
-from airl_mav.lockstep.turns import Partner, Turn
+from airl_mav.lockstep.turns import FlightDigest, Partner, Turn
 from airl_mav.lockstep.vehicle import VehicleEnd, acknowledged, command_of
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.interfaces import FirmwareLostError

@@ -18,11 +18,9 @@ from types import TracebackType
 from airl_mav.core.clock import Patience, SimClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.faults.fault import Fault
-from airl_mav.faults.kinds import LINKS
+from airl_mav.faults import LINKS, Fault
 from airl_mav.lockstep.conductor import Conductor
-from airl_mav.lockstep.digest import FlightDigest
-from airl_mav.lockstep.turns import COMPANION_STARTS_US, Handle, LockstepError, Turn
+from airl_mav.lockstep.turns import COMPANION_STARTS_US, FlightDigest, Handle, LockstepError, Turn
 from airl_mav.lockstep.vehicle import (
     BOOT_UNIX_US,
     ConductedVehicle,

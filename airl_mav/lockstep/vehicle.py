@@ -12,7 +12,7 @@ from typing import Protocol
 from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.faults.fault import Fault, link_fails
+from airl_mav.faults import Fault, link_fails
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from companion.frame_source import ReceivedFrame

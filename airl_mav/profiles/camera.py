@@ -30,7 +30,7 @@ from airl_mav.profiles.projections import (
 )
 
 if TYPE_CHECKING:
-    from airl_mav.faults.fault import Fault
+    from airl_mav.faults import Fault
     from airl_mav.profiles.arena import ArenaSpec
     from airl_mav.profiles.conditions import SensorNoise
 

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.faults.fault import Fault
-from airl_mav.faults.kinds import LINKS, PROCESSES
+from airl_mav.faults import LINKS, PROCESSES, Fault
 from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
 from airl_mav.flight.judge import (
     BY_HAND,

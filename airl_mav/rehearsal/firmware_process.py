@@ -22,8 +22,7 @@ from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import Geodetic, Goal, quat_yaw
 from airl_mav.core.signing import StoredSigning
-from airl_mav.faults.fault import Fault, link_fails
-from airl_mav.faults.kinds import PROCESSES
+from airl_mav.faults import PROCESSES, Fault, link_fails
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import check_noise, check_renderer
 from airl_mav.profiles.conditions import check_spread, equipped

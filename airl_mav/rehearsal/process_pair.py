@@ -18,7 +18,7 @@ from airl_mav.core.child_process import GRACE_S, ChildProcess, Exited
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.faults.fault import Fault
+from airl_mav.faults import Fault
 from airl_mav.rehearsal.channel import Begin, Compiling, Due, Event, Failed, Ready, parse_event
 
 FIRMWARE, COMPANION = "firmware", "companion"

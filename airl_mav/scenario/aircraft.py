@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from airl_mav.core.fields import ProfileModel, optional, quantity, switch
-from airl_mav.faults.fault import Fault
+from airl_mav.faults import Fault
 from airl_mav.profiles.conditions import Payload, SensorNoise, Spread, WindSettings
 from airl_mav.profiles.projections import Renderer
 

@@ -16,8 +16,7 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Goal
 from airl_mav.core.scheduling import check_permitted
-from airl_mav.faults.fault import TWIN, Fault, check_twin
-from airl_mav.faults.kinds import LINKS
+from airl_mav.faults import LINKS, TWIN, Fault, check_twin
 from airl_mav.latency.injection import Injection, select_injection
 from airl_mav.policy.actions import KINDS, Policy
 from airl_mav.policy.registry import PolicyInfo, load_policy

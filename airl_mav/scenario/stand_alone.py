@@ -12,7 +12,7 @@ from airl_mav.core.constants import LOOPBACK, US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, optional, quantity, switch
 from airl_mav.core.frames import Goal
-from airl_mav.faults.kinds import PROCESSES
+from airl_mav.faults import PROCESSES
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.checks import (

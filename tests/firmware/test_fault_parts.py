@@ -13,7 +13,7 @@ import pytest
 from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import SimClock
 from airl_mav.core.frames import HOME, geodetic_to_local
-from airl_mav.faults.fault import Fault
+from airl_mav.faults import Fault
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.addons.fault_injection.failing_link import FailingEndpoint

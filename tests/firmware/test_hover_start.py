@@ -10,7 +10,7 @@ import pytest
 from airl_mav.arena.generate import generate
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TAKEOFF_REACHED_M, US_PER_S
-from airl_mav.faults.fault import Fault
+from airl_mav.faults import Fault
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile

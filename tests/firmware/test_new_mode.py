@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from airl_mav.faults.fault import PHASES
+from airl_mav.faults import PHASES
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.flight_modes import BY_CUSTOM_MODE, Mode

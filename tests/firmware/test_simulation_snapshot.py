@@ -13,7 +13,7 @@ from airl_mav.arena.generate import generate
 from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.faults.fault import Fault
+from airl_mav.faults import Fault
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import WindSettings

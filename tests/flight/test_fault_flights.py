@@ -14,7 +14,7 @@ from airl_mav.cli import sitl_command
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.experiments.evaluate import check_plain, matrix
-from airl_mav.faults.fault import Fault
+from airl_mav.faults import Fault
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.lockstep_flight import fly

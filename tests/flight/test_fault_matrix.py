@@ -23,8 +23,7 @@ from airl_mav.addons.fault_matrix.matrix import (
     markdown,
 )
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.faults.fault import Fault
-from airl_mav.faults.kinds import Phase
+from airl_mav.faults import Fault, Phase
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.report.document import print_table
 from tests.support.flight_rig import quad

@@ -24,10 +24,9 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep import stage as stage_module
 from airl_mav.lockstep.conductor import REPEAT_US, Inbound
-from airl_mav.lockstep.digest import LANES
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.stage import LockstepStage, ThreadPartner, newest
-from airl_mav.lockstep.turns import Handle, LockstepError, Turn
+from airl_mav.lockstep.turns import LANES, Handle, LockstepError, Turn
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.profiles.conditions import WindSettings

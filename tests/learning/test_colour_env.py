@@ -17,7 +17,7 @@ from airl_mav.envs.navigation_env import NavigationEnv
 from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
-from airl_mav.faults.fault import Fault
+from airl_mav.faults import Fault
 from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.learned import load_learned

@@ -15,7 +15,7 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.observations import COMPILED
 from airl_mav.envs.spec import spec_of
-from airl_mav.faults.fault import Fault
+from airl_mav.faults import Fault
 from airl_mav.policy.images import NUMPY
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.profiles.conditions import SensorNoise

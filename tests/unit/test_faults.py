@@ -14,8 +14,17 @@ from airl_mav.cli.options import read_options, scenario_of
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
-from airl_mav.faults.fault import FOREVER_US, Fault, active, gust_share, next_change_us, window_us
-from airl_mav.faults.kinds import KINDS, Part, Phase
+from airl_mav.faults import (
+    FOREVER_US,
+    KINDS,
+    Fault,
+    Part,
+    Phase,
+    active,
+    gust_share,
+    next_change_us,
+    window_us,
+)
 from airl_mav.profiles.loading import read_toml
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve

@@ -43,12 +43,12 @@ from airl_mav.addons.conformance.telemetry import (
     plan,
 )
 from airl_mav.addons.conformance.vehicle import SetpointStream, VehicleConnection
+from airl_mav.core.child_process import terminated_as_interrupted
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
 from airl_mav.core.fields import validated
 from airl_mav.core.progress import new_console
-from airl_mav.rehearsal.signals import terminated_as_interrupted
 from companion.link_interface import LinkError
 
 

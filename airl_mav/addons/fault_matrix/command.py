@@ -17,8 +17,7 @@ from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import replace_file
 from airl_mav.core.machine import provenance, usable_cores
 from airl_mav.core.progress import RichProgress, new_console
-from airl_mav.faults.fault import Fault
-from airl_mav.faults.kinds import LINKS, PROCESSES, Phase
+from airl_mav.faults import LINKS, PROCESSES, Fault, Phase
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.document import Column, TableView, print_table
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, IN_WORDS, VehicleName

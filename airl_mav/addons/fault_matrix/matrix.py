@@ -22,8 +22,7 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json, write_json
 from airl_mav.core.frames import local_to_geodetic
-from airl_mav.faults.fault import Fault
-from airl_mav.faults.kinds import Phase
+from airl_mav.faults import Fault, Phase
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.addons.missions.items import NavCommand, PlanFrame

@@ -27,13 +27,13 @@ from airl_mav.addons.profiling.measurement import (
     Stamps,
 )
 from airl_mav.addons.profiling.policy_under_test import PolicyUnderTest, cold_start
+from airl_mav.core.child_process import signal_handlers
 from airl_mav.core.clock import NS_PER_US, WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.progress import Bar
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.policy.actions import AnyAction, Policy
 from airl_mav.policy.observation import Observation
-from airl_mav.rehearsal.signals import signal_handlers
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.link_interface import LinkError
 from companion.mavsdk_link import MavsdkLink

@@ -18,6 +18,7 @@ from airl_mav.addons.profiling.policy_under_test import BareLoop, PolicyUnderTes
 from airl_mav.addons.profiling.report import print_measurement
 from airl_mav.addons.profiling.soak import MachineReading, Soak, soak
 from airl_mav.cli.options import POSITIONAL, check_installed
+from airl_mav.core.child_process import stop_on_signals
 from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
@@ -38,7 +39,6 @@ from airl_mav.profiles.computer import (
     existing_profile,
     with_workload,
 )
-from airl_mav.rehearsal.signals import stop_on_signals
 
 BUSY_SHARE = 0.25
 """Load average over one minute, per usable core, above which a machine is not idle."""

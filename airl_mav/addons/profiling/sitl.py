@@ -17,6 +17,7 @@ from airl_mav.addons.profiling.measurement import (
     Stamps,
 )
 from airl_mav.addons.profiling.policy_under_test import PolicyUnderTest, cold_start
+from airl_mav.core.child_process import terminated_as_interrupted
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.progress import Bar, Progress
 from airl_mav.latency.stamps import STAMPS
@@ -24,7 +25,6 @@ from airl_mav.rehearsal.channel import State
 from airl_mav.rehearsal.observer import LiveObserver
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RunFolder, load
-from airl_mav.rehearsal.signals import terminated_as_interrupted
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from airl_mav.addons.remote_lockstep.turns import TokenFrameSource, TokenTurns
 from airl_mav.latency.injection import FixedSampler
-from airl_mav.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
+from airl_mav.lockstep.turns import SEEN, FlightDigest, WitnessedPolicy
 from airl_mav.scenario.checks import NATIVE_T2_US
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.conducted import ConductedClock

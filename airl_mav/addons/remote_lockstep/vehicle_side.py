@@ -17,9 +17,8 @@ from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.signing import StoredSigning
 from airl_mav.flight.judge import Referee, Task, Verdict
 from airl_mav.lockstep.conductor import Conductor
-from airl_mav.lockstep.digest import SEEN, FlightDigest
-from airl_mav.lockstep.judging import Judge
-from airl_mav.lockstep.turns import COMPANION_STARTS_US
+from airl_mav.lockstep.lockstep_flight import Judge
+from airl_mav.lockstep.turns import COMPANION_STARTS_US, SEEN, FlightDigest
 from airl_mav.lockstep.vehicle import BOOT_UNIX_US, builtin_vehicle
 from airl_mav.rehearsal.episode import EpisodeSupervisor
 from airl_mav.rehearsal.firmware_process import Listener, aircraft_of, episode_of

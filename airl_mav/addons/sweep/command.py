@@ -32,6 +32,7 @@ from airl_mav.addons.sweep.summary import (
     write_sweep,
 )
 from airl_mav.cli.options import POSITIONAL, check_installed
+from airl_mav.core.child_process import stop_on_signals
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
@@ -49,7 +50,6 @@ from airl_mav.experiments.executors import (
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
-from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.document import print_document, print_place, write_document
 from airl_mav.scenario.model import Workers
 from airl_mav.training.training_folder import TrainingFolder

@@ -14,7 +14,7 @@ import numpy as np
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
-from airl_mav.faults.kinds import Part
+from airl_mav.faults import Part
 from firmware_sim.fault_timeline import Acting, FaultTimeline
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import Peer, Sender, SharedEndpoint

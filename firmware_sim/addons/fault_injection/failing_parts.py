@@ -21,8 +21,7 @@ from airl_mav.camera.noise import DepthNoise, noisy_frame
 from airl_mav.camera.render import Motion
 from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic
-from airl_mav.faults.fault import Fault, gust_share
-from airl_mav.faults.kinds import MOTORS, NOISE_SEED, SENSORS
+from airl_mav.faults import MOTORS, NOISE_SEED, SENSORS, Fault, gust_share
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import Battery, Sensors, VehicleProfile
 from airl_mav.vehicle.airframe import Airframe, command_for, steady_speed

@@ -6,8 +6,7 @@ FailureInjector, BatterySimulator).
 
 from __future__ import annotations
 
-from airl_mav.faults.fault import Fault
-from airl_mav.faults.kinds import MOTORS, Part
+from airl_mav.faults import MOTORS, Fault, Part
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.services import Action, Context, VehicleCommand

@@ -1,1 +1,0 @@
-"""Faults of a flight: catalogue, text format and schedule."""
