@@ -63,22 +63,22 @@ class ProfileModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+class AbsentSection(ProfileModel):
+    """Section of a profile that no add-on reads."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_left_out(cls, value: object) -> object:
+        if value != {} and not isinstance(value, cls):
+            raise ValueError("accepted: left out; its add-on is not in airl_mav/addons")
+        return value
+
+
 def section(name: str) -> type[ProfileModel]:
     """Return the model of a profile's section that an add-on defines; without it, an empty one."""
     if (place := entries("airl_mav", "PROFILE_SECTIONS").get(name)) is not None:
         return load(place)  # type: ignore[no-any-return]
-
-    class Absent(ProfileModel):
-        """Section that no add-on reads."""
-
-        @model_validator(mode="before")
-        @classmethod
-        def _is_left_out(cls, value: object) -> object:
-            if value != {} and not isinstance(value, cls):
-                raise ValueError("accepted: left out; its add-on is not in airl_mav/addons")
-            return value
-
-    return Absent
+    return AbsentSection
 
 
 class ArrayField:

@@ -150,6 +150,7 @@ class Navigation(Stateful):
         sight = sight_of(spec, self.vehicle)
         self.camera: Camera = sight.camera
         self.observation: ObservationSpec = sight.observation
+        self._image_shape = self.observation.image_shape
         self.intrinsics: Intrinsics = sight.intrinsics
         known = self.arena_spec.generator == OBSTACLES
         if spec.goal_height and known and self.arena_spec.goal.height_m is None:
@@ -396,7 +397,7 @@ class Navigation(Stateful):
             self._companions.deciding(self.cameras.image, self.kinematics(), images)
         self._draw()
         world = self._world or self._made_world()
-        image = self.observation.image_shape if encode and self._encoding else (0, 0)
+        image = self._image_shape if encode and self._encoding else (0, 0)
         rows = self.n if image[0] else 0
         seen = EncodedBody(
             np.empty((rows, *image), np.uint8),

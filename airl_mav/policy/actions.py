@@ -71,7 +71,7 @@ class Action:
         The vertical speed, if present, is limited to `fastest_climb` of `speed_m_s`.
         """
         numbers = (self.forward_m_s, self.right_m_s, self.yaw_rate_rad_s)
-        forward, right, turn = (n if math.isfinite(n) else 0.0 for n in numbers)
+        forward, right, turn = [n if math.isfinite(n) else 0.0 for n in numbers]
         speed = math.hypot(forward, right)
         scale = min(1.0, speed_m_s / speed) if speed > 0.0 else 1.0
         down = self.down_m_s
@@ -446,15 +446,18 @@ class ActionSpec(ProfileModel):
 
 def set_of(spec: ActionSpec) -> ActionSet:
     """Return the action set of a specification. Raises FieldError for an unusable custom set."""
-    return ACTION_SETS.get(spec.set) or _custom(spec.set)
+    return _set_named(spec.set)
 
 
-_custom = cache(CustomSet)
+@cache
+def _set_named(name: str) -> ActionSet:
+    """Return the action set of a name; cached, as every step needs it."""
+    return ACTION_SETS.get(name) or CustomSet(name)
 
 
 def discrete_actions(spec: ActionSpec) -> int | None:
     """Return the number of discrete actions; None for a continuous set."""
-    return set_of(spec).discrete
+    return _set_named(spec.set).discrete
 
 
 def continuous_numbers(spec: ActionSpec) -> int:
@@ -479,7 +482,7 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
     clockwise positive. Sets of three dimensions append the downward speed [m/s]. `body-rates`
     returns (n, 4), as `actions.BodyRates`. Raises UsageError if a custom set returns anything else.
     """
-    return set_of(spec).commands(spec, actions)
+    return _set_named(spec.set).commands(spec, actions)
 
 
 def command(spec: ActionSpec, action: NDArray[Any]) -> AnyAction:

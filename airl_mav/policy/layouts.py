@@ -396,6 +396,7 @@ SHIPPED = tuple(LAYOUTS)
 _CUSTOM = CustomLayout()
 
 
+@cache
 def layout_of(name: str) -> Layout:
     """Return the layout of a name. Reading a specification runs no custom code."""
     return LAYOUTS.get(name, _CUSTOM)

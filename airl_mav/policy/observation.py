@@ -84,7 +84,7 @@ class CameraView:
 
     def rows(self, index: Rows) -> CameraView:
         """Return the view of one or several of n vehicles."""
-        earlier = tuple(image[index] for image in self.earlier)
+        earlier = tuple([image[index] for image in self.earlier])
         return CameraView(self.image[index], self.intrinsics, earlier)
 
 
@@ -128,8 +128,9 @@ class Observation:
             found["in_flight"] = told.rows(index)
         if self.goal_down is not None:
             found["goal_down"] = np.asarray(self.goal_down)[index]
-        found["earlier"] = tuple(image[index] for image in self.earlier)
-        found["states"] = tuple(state.rows(index) for state in self.states)
+        # Lists: a generator takes a call for each element.
+        found["earlier"] = tuple([image[index] for image in self.earlier])
+        found["states"] = tuple([state.rows(index) for state in self.states])
         found["further"] = {name: each.rows(index) for name, each in self.further.items()}
         return replace(self, **found)
 
@@ -208,7 +209,7 @@ def observe(
         pitch=pitch,
         yaw=yaw,
         in_flight=in_flight,
-        earlier=tuple(image for image, _ in earlier),
+        earlier=tuple([image for image, _ in earlier]),
         states=(state, *(then for _, then in earlier)),
         goal_down=goal[..., 2] - state.position[..., 2] if goal.shape[-1] == 3 else None,
         further=further or {},

@@ -498,6 +498,7 @@ def test_the_autopilot_imports_nothing_that_knows_the_truth() -> None:
         "airl_mav",
         "firmware_sim.autopilot",
         "firmware_sim.engine",
+        "firmware_sim.fault_timeline",  # for type checkers: faults that clients request
         "firmware_sim.interfaces",
         "numpy",
         "filterpy",

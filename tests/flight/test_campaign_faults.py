@@ -108,7 +108,7 @@ class Campaign:
     @contextmanager
     def flying(self, script: str = "") -> Iterator[Running]:
         """Run the command; other ports every time, as they decide nothing."""
-        code = f"{NO_REPORT}\n{script}\nfrom airl_mav.cli import entry\nentry.sitl()"
+        code = f"{NO_REPORT}\n{script}\nfrom airl_mav.cli import main\nmain.sitl()"
         with running(["-c", code, *self.options(choose_ports())], self.folder) as process:
             yield process
             self.look(process)
@@ -253,11 +253,11 @@ import json, os, sys
 from airl_mav.cli import main
 from airl_mav.experiments import evaluate, gym_flier
 from airl_mav.experiments import campaign
-from airl_mav.report import shown_flights
+from airl_mav.report import run_report
 from airl_mav.report import run_report
 
 campaign.INTERVAL_S, campaign.INTERVAL_PER_SAVE = 0.02, 0.0
-shown_flights.MAX_PICTURED = 1
+run_report.MAX_PICTURED = 1
 for script in json.loads(sys.argv.pop(1)):
     if (pid := os.fork()) == 0:
         exec(script)

@@ -222,10 +222,10 @@ def test_killed_harness_leaves_nobody_behind(tmp_path: Path, ground: Ground) -> 
 FEW_PICTURES = (
     "-c",
     """
-from airl_mav.cli import entry
-from airl_mav.report import shown_flights
-shown_flights.MAX_PICTURED = 0
-entry.sitl()
+from airl_mav.cli import main
+from airl_mav.report import run_report
+run_report.MAX_PICTURED = 0
+main.sitl()
 """,
     "--no-validity",
 )
@@ -572,10 +572,10 @@ def test_link_lost_one_way_does_not_fly_on(tmp_path: Path, ground: Ground) -> No
 ONCE = (
     "-c",
     """
-from airl_mav.cli import entry
+from airl_mav.cli import main
 from airl_mav.rehearsal import rehearsal
 rehearsal.MAX_ATTEMPTS = 1
-entry.sitl()
+main.sitl()
 """,
 )
 """airl-sitl that flies nothing again."""

@@ -497,16 +497,16 @@ def test_frames_of_yet_another_clock() -> None:
 FIRMWARE_THAT_TELLS_ITS_EPOCH = """
 import sys
 from airl_mav.cli.options import run_command
-from airl_mav.rehearsal import stand_alone_vehicle
+from airl_mav.rehearsal import firmware_process
 
-fly = stand_alone_vehicle.fly
+fly = firmware_process.fly_vehicle
 
 def told(firmware, *rest):
     fly(firmware, *rest)
     print("epoch_ns", firmware.epoch_ns, flush=True)
     print("slipped_us", firmware.slipped_us, flush=True)
 
-stand_alone_vehicle.fly = told
+firmware_process.fly_vehicle = told
 run_command("airl-firmware", "airl_mav.cli.firmware_command")
 """
 

@@ -23,7 +23,7 @@ from PIL import Image
 from airl_mav.cli import main
 from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
-from airl_mav.experiments import evaluate as ladder_experiment
+from airl_mav.experiments import experiment as ladder_experiment
 from airl_mav.experiments.campaign import Cell, EpisodeSaver
 from airl_mav.experiments.evaluate import declare_ladder
 from airl_mav.experiments.experiment import make_cell

@@ -36,7 +36,7 @@ sitl.conclude = lambda *_: 0
 SITL = ("-m", "airl_mav.cli.sitl_command", "--no-validity")
 SITL_WITHOUT_REPORT = (
     "-c",
-    f"{NO_REPORT}\nfrom airl_mav.cli import entry\nentry.sitl()",
+    f"{NO_REPORT}\nfrom airl_mav.cli import main\nmain.sitl()",
     "--no-validity",
 )
 

@@ -81,7 +81,7 @@ def test_an_edit_compiles_again_what_depends_on_it_and_no_more(tmp_path: Path) -
 
 
 HEARD = """
-from airl_mav.core.first_start import heard_compiling
+from airl_mav.core.compiling import heard_compiling
 from airl_mav.core.kernels import kernel
 import held
 

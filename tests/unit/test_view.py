@@ -662,7 +662,7 @@ def test_who_is_not_watched_loads_nothing(tmp_path: Path) -> None:
         "import sys\n"
         "import airl_mav.rehearsal.firmware_process, airl_mav.rehearsal.companion_process\n"
         "import airl_mav.lockstep.lockstep_flight, airl_mav.cli.sitl_command\n"
-        "views = 'airl_mav.addons.view', 'viser'\n"
+        "views = 'airl_mav.addons.view.', 'viser'\n"
         "print(sorted(name for name in sys.modules if name.startswith(views)))\n",
         tmp_path,
     )
