@@ -203,7 +203,7 @@ class Estimator:
         self.horizons = [self._horizon]
         """Horizons of delayed measurements."""
         self.is_north_known = True
-        """True if the heading is relative to north; False: relative to a frame of its own."""
+        """True if the heading is relative to north; False: relative to a local frame."""
         self.readings: dict[str, Received] = {}
         """Newest readings of further sensors by name (`sensor_table.Sensor.reading`)."""
         self.aiding = aiding()(self)

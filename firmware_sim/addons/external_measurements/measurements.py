@@ -73,7 +73,7 @@ def handle_odometry(message: WireMessage, context: Context) -> bool:
             position,
             velocity,
             _rotation(np.array(message.q)),
-            # The frame has no effect where the vector is None.
+            # Without a vector the frame has no effect.
             pose[0] if pose is not None else "ned",
             twist[0] if twist is not None else "ned",
             of_pose[:3],

@@ -53,7 +53,7 @@ class ServiceState:
 
     @property
     def forbids_arming(self) -> bool:
-        """True if PX4 rejects arming meanwhile."""
+        """True if PX4 rejects arming while it runs, such as during a calibration."""
         return False
 
     def restart(self) -> None:
