@@ -11,7 +11,7 @@ from typing import get_args
 
 import numpy as np
 
-from airl_mav.addons.imitation.imitation import Expert
+from airl_mav.addons.imitation.imitation import StatefulExpert
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
@@ -47,7 +47,7 @@ def main() -> None:
     for first in range(options.seed, options.seed + options.episodes, VEHICLES):
         seeds = range(first, min(first + VEHICLES, options.seed + options.episodes))
         navigation = Navigation(spec, len(seeds))
-        expert = Expert(options.expert, navigation)
+        expert = StatefulExpert(options.expert, navigation)
         navigation.begin(range(len(seeds)), seeds)
         expert.begin(range(len(seeds)))
         while (navigation.fleet.verdict == FlightStatus.FLYING).any():

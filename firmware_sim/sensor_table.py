@@ -25,7 +25,7 @@ Values = tuple[Any, ...]
 """Values of a message's or a topic's fields, in their order."""
 
 
-class Stream(NamedTuple):
+class SensorStream(NamedTuple):
     """MAVLink message of a sensor."""
 
     build: Callable[[AutopilotState], Values | None]
@@ -36,7 +36,7 @@ class Stream(NamedTuple):
     """Default rate on the link to the ground station."""
 
 
-class Topic(NamedTuple):
+class SensorTopic(NamedTuple):
     """uORB topic of a sensor in the flight log."""
 
     interval_ms: int
@@ -54,9 +54,9 @@ class Sensor:
     """Name of its readings: a field of `SensorSample`, or a name in `SensorSample.further`."""
     simulation: str
     """`module:class` of its `plant.sensors.SimulatedSensor`, imported only for a plant."""
-    streams: Mapping[str, Stream] = field(default_factory=dict)
+    streams: Mapping[str, SensorStream] = field(default_factory=dict)
     """MAVLink messages by name."""
-    topics: Mapping[str, Topic] = field(default_factory=dict)
+    topics: Mapping[str, SensorTopic] = field(default_factory=dict)
     """Topics of the flight log by name."""
     draws_always: bool = False
     """True: its random stream is drawn for every vehicle. Others are drawn only for vehicles with
@@ -69,7 +69,7 @@ def sensors() -> dict[str, Sensor]:
     return {name: load(place) for name, place in entries("firmware_sim", "SENSORS").items()}
 
 
-def streams() -> dict[str, Stream]:
+def streams() -> dict[str, SensorStream]:
     """Return the MAVLink messages of all sensors by name."""
     return {name: each for s in sensors().values() for name, each in s.streams.items()}
 

@@ -68,7 +68,7 @@ EVERYONE = slice(None)
 """Rows of all n vehicles."""
 
 
-class Commands(NamedTuple):
+class CommandType(NamedTuple):
     """Kind of commands."""
 
     least: int
@@ -79,9 +79,9 @@ class Commands(NamedTuple):
     """True if a command that is not replaced in time ends in a stop."""
 
 
-COMMANDS: dict[CommandKind, Commands] = {
-    "velocity": Commands(3, (0, 1, 3), expire=False),
-    "body_rates": Commands(4, (0, 1, 2, 3), expire=True),
+COMMANDS: dict[CommandKind, CommandType] = {
+    "velocity": CommandType(3, (0, 1, 3), expire=False),
+    "body_rates": CommandType(4, (0, 1, 2, 3), expire=True),
 }
 """Kinds of commands of the vectorized simulator."""
 

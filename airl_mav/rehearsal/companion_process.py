@@ -30,7 +30,7 @@ CONNECT_TIMEOUT_S = 30.0
 """Connection timeout of the flight controller [wall s]."""
 
 
-class Missions:
+class MissionRunner:
     """Flies missions; link and camera stay open between them."""
 
     def __init__(
@@ -115,7 +115,7 @@ def fly(begin: channel.Begin, harness: channel.ChildChannel) -> None:
         tap: Any = None
         if begin.view is not None:
             tap = held.enter_context(closing(view_part("companion")(begin.view, begin.scenario)))
-        missions = Missions(begin.scenario, harness, tap)
+        missions = MissionRunner(begin.scenario, harness, tap)
         # Without its rehearsal the companion must not fly: its setpoints end and the flight
         # controller's offboard-loss failsafe takes over.
         harness.listen(missions.handle, lambda: os._exit(EXIT_BROKEN))

@@ -131,11 +131,11 @@ def seen_decisions(
     needed = ("capture_us", "infer_start_us", "action_ready_us", "sent_us", column)
     if path is None or not len(path) or any(name not in stamps for name in needed):
         return
-    lens = Lens(arena, PolicyCamera.of(vehicle.camera), path, record.started_us)
+    lens = PathCamera(arena, PolicyCamera.of(vehicle.camera), path, record.started_us)
     # Only the cameras of the network's input are rendered.
     names = () if again is None else again.policy.card.observation.cameras
     further = {
-        name: _Further(Lens(arena, PolicyCamera.of(camera), path, record.started_us))
+        name: _Further(PathCamera(arena, PolicyCamera.of(camera), path, record.started_us))
         for name, camera in vehicle.cameras.items()
         if name in names
     }
@@ -164,7 +164,7 @@ def seen_decisions(
 
 
 @dataclass(frozen=True)
-class Lens:
+class PathCamera:
     """Camera along a recorded path."""
 
     arena: Arena
@@ -184,7 +184,7 @@ class Lens:
 class _Further:
     """Additional camera along a recorded path, with its images of earlier decisions."""
 
-    def __init__(self, lens: Lens) -> None:
+    def __init__(self, lens: PathCamera) -> None:
         self._lens = lens
         self._earlier: deque[NDArray[Any]] = deque(maxlen=MOST_FRAMES - 1)
 

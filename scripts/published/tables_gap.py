@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from airl_mav.profiles.published import (
-    PublishedRun,
-    PublishedTable,
-    load_published,
-    published_gap,
-)
+from airl_mav.profiles.loading import PublishedRun, PublishedTable, load_published, published_gap
 from published.blocks import DEFAULT, Records, Render, block
 from published.record import MEASURES, Figure, FlownRun, Gap, Record
 from published.text import (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from airl_mav.policy.registry import find_policy
-from airl_mav.profiles.published import load_published
+from airl_mav.profiles.loading import load_published
 from airl_mav.scenario.model import DEFAULT_POLICY
 from published.blocks import Records, block
 from published.record import FlownRun

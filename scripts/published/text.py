@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
-from airl_mav.profiles.published import PublishedRun
+from airl_mav.profiles.loading import PublishedRun
 from published.record import Figure, FlownRun, Record, out_of_date
 
 NONE = "–"

@@ -23,7 +23,7 @@ from airl_mav.core.progress import new_console
 from airl_mav.experiments.experiment import Experiment, make_cell
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.registry import find_policy
-from airl_mav.profiles.published import load_published
+from airl_mav.profiles.loading import load_published
 from airl_mav.report.document import NONE, Column, TableView, print_table
 from airl_mav.report.measures import rate_with_interval
 from airl_mav.scenario.model import Scenario

@@ -21,7 +21,7 @@ from airl_mav.core.progress import new_console
 from airl_mav.experiments.evaluate import matrix
 from airl_mav.experiments.experiment import ExperimentRun, entry_of
 from airl_mav.flight.statistics import compare_pairs
-from airl_mav.profiles.published import load_published
+from airl_mav.profiles.loading import load_published
 from airl_mav.report.document import NONE, Column, TableView, print_table, with_interval
 
 OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
-from firmware_sim.addons.flight_log.flight_log import FlightLog
+from firmware_sim.addons.flight_log.flight_log import UlogFlightLog
 from firmware_sim.addons.ground_station_services.logs import PACKETS_PER_TICK
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
@@ -79,7 +79,7 @@ def test_what_comes_piece_by_piece_is_shared_tick_by_tick(tmp_path: Path, late: 
     """In a tick that would be late with more, there is less of it."""
     (tmp_path / "flight-000.ulg").write_bytes(bytes(range(1, 256)) * 2_000)
     hub, autopilot, clock = MemoryHub(), KinematicAutopilot(), SimClock()
-    log = FlightLog(tmp_path / "flight-001.ulg", autopilot.parameters, 0, 0)
+    log = UlogFlightLog(tmp_path / "flight-001.ulg", autopilot.parameters, 0, 0)
     autopilot.logs = folder = log.folder
     server = MavlinkServer([gcs_link(hub)], autopilot, boot_unix_us=0, clock=clock)
     clients = [hub.client(port, (100 + port, 190)) for port in range(CLIENTS)]

@@ -14,7 +14,7 @@ from mavsdk.plugins.log_files import LogFiles
 from mavsdk.plugins.log_streaming import LogStreaming
 from pyulog import ULog
 
-from firmware_sim.addons.flight_log.flight_log import FlightLog
+from firmware_sim.addons.flight_log.flight_log import UlogFlightLog
 from firmware_sim.addons.ground_station_services.logs import NO_MESSAGE
 from firmware_sim.engine.record import TRUE_TICK
 from firmware_sim.mavlink.codec import dialect
@@ -36,7 +36,7 @@ class LoggedAutopilot(KinematicAutopilot):
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
-        self.log = FlightLog(folder / "flight-007.ulg", self.parameters, 0, BOOT_UNIX_US)
+        self.log = UlogFlightLog(folder / "flight-007.ulg", self.parameters, 0, BOOT_UNIX_US)
         self.folder = self.logs = self.log.folder
 
     def step(self, _sample: Any = None, /) -> Any:

@@ -40,7 +40,7 @@ SENSOR = '''\
 """Hygrometer: simulation, HYGROMETER_SENSOR and a topic of the log."""
 
 from firmware_sim.plant.sensors import SimulatedSensor
-from firmware_sim.sensor_table import Sensor, Stream, Topic
+from firmware_sim.sensor_table import Sensor, SensorStream, SensorTopic
 
 
 class SimulatedHygrometer(SimulatedSensor):
@@ -65,8 +65,8 @@ def humidity(state):
 HYGROMETER = Sensor(
     "hygrometer",
     "firmware_sim.addons.hygrometer.hygrometer:SimulatedHygrometer",
-    {"HYGROMETER_SENSOR": Stream(hygrometer_sensor, onboard_hz=5.0, gcs_hz=1.0)},
-    {"sensor_hygrometer": Topic(100, "uint64_t timestamp_sample; float humidity", humidity)},
+    {"HYGROMETER_SENSOR": SensorStream(hygrometer_sensor, onboard_hz=5.0, gcs_hz=1.0)},
+    {"sensor_hygrometer": SensorTopic(100, "uint64_t timestamp_sample; float humidity", humidity)},
 )
 '''
 

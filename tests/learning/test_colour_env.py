@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.preprocessing import is_image_space
 
-from airl_mav.addons.imitation.imitation import Expert
+from airl_mav.addons.imitation.imitation import StatefulExpert
 from airl_mav.camera.render import Mount, camera_pose, expose
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.navigation import Navigation
@@ -142,8 +142,8 @@ def test_noise_of_depth_is_no_fault_of_a_colour_camera() -> None:
 def test_the_expert_that_reads_depth_cannot_be_imitated() -> None:
     navigation = Navigation(spec_of(None, knobs()), 1)
     with pytest.raises(FieldError, match=r"greedy.*accepted: planner with a camera of kind 'rgb'"):
-        Expert("greedy", navigation)
-    assert Expert("planner", navigation) is not None
+        StatefulExpert("greedy", navigation)
+    assert StatefulExpert("planner", navigation) is not None
 
 
 @pytest.mark.nightly

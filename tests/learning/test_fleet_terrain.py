@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from airl_mav.addons.colour.batch import ColourImages, Looks
 from airl_mav.addons.colour.picture import render_picture
-from airl_mav.addons.imitation.imitation import Expert
+from airl_mav.addons.imitation.imitation import StatefulExpert
 from airl_mav.addons.imitation.planner import OVER_M, PlannerBody, map_of
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
@@ -185,7 +185,7 @@ def test_the_planner_reaches_its_goals_among_hills() -> None:
     )
     seeds = range(1, 11)
     navigation = Navigation(spec, len(seeds))
-    expert = Expert("planner", navigation)
+    expert = StatefulExpert("planner", navigation)
     navigation.begin(range(len(seeds)), seeds)
     expert.begin(range(len(seeds)))
     while (navigation.fleet.verdict == FlightStatus.FLYING).any():

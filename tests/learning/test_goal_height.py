@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from airl_mav.addons.imitation.imitation import Expert
+from airl_mav.addons.imitation.imitation import StatefulExpert
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.evaluation import fly_seeds, success_rate
 from airl_mav.envs.fleet import FlightStatus
@@ -146,10 +146,10 @@ def test_what_does_not_fit_is_refused() -> None:
         Navigation(spec_of(None, {"layout": "paper", "goal_height": True, "arena": "gates"}), 1)
     planar = Navigation(spec_with(arena="gates", actions="velocity"), 1)
     with pytest.raises(FieldError, match=r"velocity3d.* with expert gates"):
-        Expert("gates", planar)
+        StatefulExpert("gates", planar)
     steep = Navigation(spec_with(arena="gates", actions="velocity3d"), 1)
     with pytest.raises(FieldError, match="one without a vertical speed"):
-        Expert("planner", steep)
+        StatefulExpert("planner", steep)
     with pytest.raises(ValueError, match=r"accepted: \(1, 3\) or \(1, 4\)"):
         steep.fly(np.zeros((1, 5)))
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
-from airl_mav.addons.imitation.imitation import Expert, choices
+from airl_mav.addons.imitation.imitation import StatefulExpert, choices
 from airl_mav.addons.imitation.planner import PlannerBody, map_of
 from airl_mav.envs.evaluation import (
     EpisodeResult,
@@ -39,7 +39,7 @@ class Taught:
     """An expert as a pilot."""
 
     def __init__(self, navigation: Navigation, name: ExpertName) -> None:
-        self.expert, self.actions = Expert(name, navigation), navigation.spec.action_spec
+        self.expert, self.actions = StatefulExpert(name, navigation), navigation.spec.action_spec
 
     def begin(self, slot: int, seed: int) -> None:
         self.expert.begin([slot])

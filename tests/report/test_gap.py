@@ -25,7 +25,7 @@ from airl_mav.flight.statistics import (
     percent_change,
 )
 from airl_mav.flight.trajectory import Leg, Quality
-from airl_mav.profiles.published import PublishedRun, load_published, published_gap
+from airl_mav.profiles.loading import PublishedRun, load_published, published_gap
 
 # --- one gap
 

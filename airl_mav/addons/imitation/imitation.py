@@ -139,7 +139,7 @@ class Imitation(BaseAlgorithm):
         self.policy = cast("ActorCriticPolicy", policy.to(self.device))
         if not isinstance(self.env, NavigationVecEnv):
             raise UsageError(f"algorithm.expert: none for a {type(self.env).__name__}")
-        self._expert = Expert(self.expert_name, self.env.env.navigation)
+        self._expert = StatefulExpert(self.expert_name, self.env.env.navigation)
         self.env.teach(self._expert)
         shapes = shapes_of(self.observation_space)
         self.replay = Demonstrations(self.buffer_size, self.n_envs, shapes, self.action_space)
@@ -414,7 +414,7 @@ class GreedyPilots:
         return nearest
 
 
-class Expert(sb3.Expert):
+class StatefulExpert(sb3.Expert):
     """Expert and its memory, with checkpoint support."""
 
     def __init__(self, name: ExpertName, navigation: Navigation) -> None:

@@ -19,7 +19,7 @@ from airl_mav.experiments.campaign import Declaration, DeclaredCell
 from airl_mav.flight.statistics import CONFIDENCE, Estimate, wilson
 from airl_mav.latency.injection import ESTIMATE, choose_injection
 from airl_mav.profiles.computer import ComputerProfile, LatencyDistribution
-from airl_mav.profiles.published import load_published
+from airl_mav.profiles.loading import load_published
 
 SCHEMA = 1
 """Version of `sweep.json` and of `result.json`; docs/how-to/sweep.md describes them."""

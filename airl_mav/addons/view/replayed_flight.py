@@ -117,10 +117,10 @@ class ReplayedFlight:
         if self.arena is None:
             return None
         # Imported here, as it loads numba and a flight is shown before its arena.
-        from airl_mav.report.policy_view import Lens, PolicyCamera
+        from airl_mav.report.policy_view import PathCamera, PolicyCamera
 
         camera = PolicyCamera.of(self.vehicle.camera)
-        return Lens(self.arena, camera, self.path, self.record.started_us).image(time_us)
+        return PathCamera(self.arena, camera, self.path, self.record.started_us).image(time_us)
 
     def show(self, shown: Shown, seconds: float) -> None:
         """Set `shown` to a time after the reset [s]; its episode and arena remain."""

@@ -35,7 +35,7 @@ ROTOR_SHARE = 0.8
 diameter."""
 
 
-class Message(BaseModel):
+class ViewMessage(BaseModel):
     """Base class of messages."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -44,7 +44,7 @@ class Message(BaseModel):
 CAMERA_FIELDS = ("forward_m", "right_m", "up_m", "pitch_up_deg", "yaw_deg", "projection", "range_m")
 
 
-class VehicleShape(Message):
+class VehicleShape(ViewMessage):
     """Dimensions of a vehicle and mounting of its main camera [m, deg]."""
 
     arm_forward_m: float
@@ -80,7 +80,7 @@ class VehicleShape(Message):
         )
 
 
-class Episode(Message):
+class Episode(ViewMessage):
     """Start of an episode in a new arena."""
 
     kind: Literal["episode"] = "episode"
@@ -95,7 +95,7 @@ class Episode(Message):
     goal_radius_m: float
 
 
-class VehicleState(Message):
+class VehicleState(ViewMessage):
     """True state of the vehicle."""
 
     kind: Literal["vehicle"] = "vehicle"
@@ -113,7 +113,7 @@ class VehicleState(Message):
     collision: str | None
 
 
-class CameraImage(Message):
+class CameraImage(ViewMessage):
     """Newest image of the camera."""
 
     kind: Literal["picture"] = "picture"
@@ -122,7 +122,7 @@ class CameraImage(Message):
     """Height, width [px] and, for colour, channels."""
 
 
-class Decided(Message):
+class Decided(ViewMessage):
     """Decision that was sent, with the policy's input image."""
 
     kind: Literal["decided"] = "decided"
@@ -142,7 +142,7 @@ class Decided(Message):
     """Height, width [px] and, for colour, channels of the image."""
 
 
-class Flight(Message):
+class Flight(ViewMessage):
     """Start or restart of a flight of the run."""
 
     kind: Literal["flight"] = "flight"
@@ -151,7 +151,7 @@ class Flight(Message):
     goal: Goal
 
 
-class PhaseStart(Message):
+class PhaseStart(ViewMessage):
     """Phase that the companion entered, or the verdict on the flight."""
 
     kind: Literal["phase"] = "phase"
@@ -159,7 +159,7 @@ class PhaseStart(Message):
     phase: str
 
 
-class Said(Message):
+class Said(ViewMessage):
     """Text from the autopilot or the run."""
 
     kind: Literal["said"] = "said"
@@ -169,7 +169,7 @@ class Said(Message):
     text: str
 
 
-class Trained(Message):
+class Trained(ViewMessage):
     """Result of the newest decision in a training, and the training's progress."""
 
     kind: Literal["trained"] = "trained"
@@ -193,7 +193,7 @@ Told = Annotated[
 _TOLD: TypeAdapter[Told] = TypeAdapter(Told)
 
 
-class Steering(Message):
+class Steering(ViewMessage):
     """Viewers' requests to the flight; the newest message applies."""
 
     paused: bool = False
@@ -207,7 +207,7 @@ class Steering(Message):
     """True to compensate latency; None = the scenario's setting."""
 
 
-def to_parts(message: Message, image: Image | None = None) -> list[bytes]:
+def to_parts(message: ViewMessage, image: Image | None = None) -> list[bytes]:
     """Return the wire parts of a message and its image."""
     parts = [message.model_dump_json().encode()]
     if image is not None:

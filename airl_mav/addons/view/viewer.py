@@ -14,10 +14,10 @@ from pydantic import ValidationError
 
 from airl_mav.addons.view.view_messages import (
     Image,
-    Message,
     Steering,
     Told,
     ViewAnswer,
+    ViewMessage,
     ViewSettings,
     from_parts,
     to_parts,
@@ -182,7 +182,7 @@ class Feed:
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.connect(ends.told)
 
-    def send(self, message: Message, image: Image | None = None) -> None:
+    def send(self, message: ViewMessage, image: Image | None = None) -> None:
         """Send a message with its image, or drop it."""
         with suppress(zmq.Again):
             self._socket.send_multipart(to_parts(message, image), zmq.NOBLOCK)

@@ -79,7 +79,7 @@ class TimedMessage(NamedTuple):
     """Message to show at a time of a flight [simulated µs since its start]."""
 
     time_us: int
-    message: view_messages.Message
+    message: view_messages.ViewMessage
     image: view_messages.Image | None = None
 
 

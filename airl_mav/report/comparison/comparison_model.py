@@ -12,7 +12,7 @@ from airl_mav.core.files import read_typed, write_json
 from airl_mav.flight.episode_record import Setup
 from airl_mav.flight.statistics import Aggregate, PairedComparison
 from airl_mav.latency.stages import SETPOINT_TO_MOTOR, Stage, Summary
-from airl_mav.profiles.published import PublishedGap, PublishedRun
+from airl_mav.profiles.loading import PublishedGap, PublishedRun
 
 T = TypeVar("T")
 

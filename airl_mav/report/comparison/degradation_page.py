@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.statistics import Estimate
-from airl_mav.profiles.published import load_published, published_gap
+from airl_mav.profiles.loading import load_published, published_gap
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
 from airl_mav.report.comparison.build import compare, comparison_document

@@ -9,7 +9,7 @@ from typing import Any
 
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.statistics import Estimate
-from airl_mav.profiles.published import PublishedRun, load_published, published_gap
+from airl_mav.profiles.loading import PublishedRun, load_published, published_gap
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import measures
 from airl_mav.report.comparison.build import compare, comparison_document, worst_seeds

@@ -9,7 +9,7 @@ from airl_mav.core.frames import Vector
 from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import DistanceReading, FlowReading, PoseFrame, VelocityFrame
 from firmware_sim.mavlink.streams import units
-from firmware_sim.sensor_table import Sensor, Stream, Topic, Values
+from firmware_sim.sensor_table import Sensor, SensorStream, SensorTopic, Values
 
 NEW_US = 200_000
 """Maximum age of a sent measurement [µs]: the longest time that PX4's estimator waits for the next.
@@ -151,7 +151,7 @@ VISION = Sensor(
     "odometry",
     f"{_SIMULATED}:PlantVision",
     topics={
-        "vehicle_visual_odometry": Topic(
+        "vehicle_visual_odometry": SensorTopic(
             40,
             "uint64_t timestamp_sample; uint8_t pose_frame; float[3] position; float[4] q; "
             "uint8_t velocity_frame; "
@@ -166,9 +166,9 @@ VISION = Sensor(
 RANGEFINDER = Sensor(
     "distance",
     f"{_SIMULATED}:PlantRangefinder",
-    {"DISTANCE_SENSOR": Stream(distance_sensor)},
+    {"DISTANCE_SENSOR": SensorStream(distance_sensor)},
     {
-        "distance_sensor": Topic(
+        "distance_sensor": SensorTopic(
             1000,
             "uint32_t device_id; float min_distance max_distance current_distance variance; "
             "int8_t signal_quality; uint8_t type; float h_fov v_fov; float[4] q; "
@@ -181,9 +181,9 @@ RANGEFINDER = Sensor(
 OPTICAL_FLOW = Sensor(
     "flow",
     f"{_SIMULATED}:PlantOpticalFlow",
-    {"OPTICAL_FLOW_RAD": Stream(optical_flow_rad)},
+    {"OPTICAL_FLOW_RAD": SensorStream(optical_flow_rad)},
     {
-        "vehicle_optical_flow": Topic(
+        "vehicle_optical_flow": SensorTopic(
             500,
             "uint64_t timestamp_sample; uint32_t device_id; float[2] pixel_flow; "
             "float[3] delta_angle; float distance_m; uint32_t integration_timespan_us; "

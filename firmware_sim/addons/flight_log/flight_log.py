@@ -112,7 +112,7 @@ _SAMPLES = 0
 """Number of `SENSOR_COMBINED` in the file, before the topics of `TOPICS` in order."""
 
 
-class FlightLog:
+class UlogFlightLog:
     """Flight log of a vehicle in a .ulg file."""
 
     def __init__(
@@ -215,7 +215,7 @@ OPEN_FILES = 8
 class LogFolder(LogStore):
     """Complete logs by name, then the open log; rescans changed folders."""
 
-    def __init__(self, folder: Path, current: FlightLog) -> None:
+    def __init__(self, folder: Path, current: UlogFlightLog) -> None:
         """Set the folder and the log currently written in it."""
         self._folder = folder
         self._current = current
@@ -295,9 +295,9 @@ def open_flight_log(
     start_us: int,
     boot_unix_us: int,
     on_lost: Callable[[str], None],
-) -> FlightLog:
-    """Open the flight log of an autopilot, which offers it to clients; see `FlightLog`."""
-    log = FlightLog(path, autopilot.parameters, start_us, boot_unix_us, on_lost)
+) -> UlogFlightLog:
+    """Open the flight log of an autopilot, which offers it to clients; see `UlogFlightLog`."""
+    log = UlogFlightLog(path, autopilot.parameters, start_us, boot_unix_us, on_lost)
     log.stop_listening = autopilot.parameters.on_change(log.parameters_changed)
     autopilot.logs = log.folder
     return log

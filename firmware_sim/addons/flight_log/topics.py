@@ -266,7 +266,7 @@ def gps(moment: Moment) -> Values | None:
     )
 
 
-def _of_sensor(name: str, logged: sensor_table.Topic) -> Logged:
+def _of_sensor(name: str, logged: sensor_table.SensorTopic) -> Logged:
     """Return the topic of a sensor, whose values are in the flight controller's state."""
 
     def values(moment: Moment) -> Values | None:

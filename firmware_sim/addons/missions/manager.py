@@ -357,7 +357,7 @@ _MOVES_M_S = 0.5
 """Minimum speed to turn the nose along the path [m/s] (MPC_YAW_MODE = 3)."""
 
 
-class Mission(FlightMode, modes=(Mode.MISSION,)):
+class MissionMode(FlightMode, modes=(Mode.MISSION,)):
     """Mission mode: follows the triplets of missions with PX4's speeds at and between waypoints."""
 
     def __init__(self, context: FlightContext, /) -> None:
