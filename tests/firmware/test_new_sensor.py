@@ -85,7 +85,7 @@ from pyulog import ULog
 from airl_mav.core.clock import SimClock
 from airl_mav.profiles.vehicle import Hygrometer
 from firmware_sim.engine.record import TRUE_TICK
-from firmware_sim.addons.flight_log.flight_log import FlightLog
+from firmware_sim.addons.flight_log.flight_log import UlogFlightLog
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -100,7 +100,7 @@ simulation = Simulation(EpisodeSetup(quad().model_copy(update={"sensors": sensor
 autopilot, endpoint = simulation.autopilot, MemoryEndpoint()
 server = MavlinkServer([onboard_link(endpoint)], autopilot, boot_unix_us=0)
 client, path = RawClient(endpoint), Path(sys.argv[3])
-log = FlightLog(path, autopilot.parameters, 0, 0)
+log = UlogFlightLog(path, autopilot.parameters, 0, 0)
 for _ in range(500):
     server.receive(simulation.time_us)
     simulation.tick()
