@@ -56,7 +56,7 @@ from airl_mav.core.frames import quat_from_euler  # noqa: E402
 from airl_mav.profiles.arena import ArenaSpec  # noqa: E402
 from airl_mav.profiles.loading import load_profile  # noqa: E402
 from airl_mav.profiles.vehicle import load_vehicle  # noqa: E402
-from airl_mav.rehearsal.live_view import ViewEnds  # noqa: E402
+from airl_mav.rehearsal.live_view import ViewAddresses  # noqa: E402
 from tests.support.browser import Page, browser  # noqa: E402
 
 VEHICLE_US, PICTURE_US, DECISION_US = 32_000, 96_000, 512_000
@@ -259,7 +259,7 @@ def drawing_process() -> psutil.Process:
 
 
 @contextmanager
-def flying(ends: ViewEnds, seconds: float, speed: float) -> Iterator[subprocess.Popen[bytes]]:
+def flying(ends: ViewAddresses, seconds: float, speed: float) -> Iterator[subprocess.Popen[bytes]]:
     """Fly the circle in a separate process, so that counting does not slow it down."""
     words = [sys.executable, __file__, "--fly", ends.model_dump_json(), str(seconds), str(speed)]
     process = subprocess.Popen(words)  # noqa: S603 (this file)
@@ -461,7 +461,7 @@ def main() -> None:
     asked = parser.parse_args()
     if asked.fly:
         ends, seconds, speed = asked.fly
-        with closing(Feed(ViewEnds.model_validate_json(ends))) as feed:
+        with closing(Feed(ViewAddresses.model_validate_json(ends))) as feed:
             Circle().fly(feed, float(seconds), float(speed))
         return
     say(load() + ("; Python keeps no bytecode" if sys.dont_write_bytecode else ""))

@@ -40,7 +40,7 @@ from bench_view import load, say, viewed, wait_for  # noqa: E402 (from here on i
 
 from airl_mav.flight.statistics import Estimate, median_ratio  # noqa: E402
 from airl_mav.profiles.loading import load_profile  # noqa: E402
-from airl_mav.rehearsal.live_view import ViewEnds  # noqa: E402
+from airl_mav.rehearsal.live_view import ViewAddresses  # noqa: E402
 from airl_mav.scenario.model import Scenario  # noqa: E402
 from airl_mav.scenario.resolve import resolve  # noqa: E402
 from tests.support.browser import Page, browser  # noqa: E402
@@ -83,7 +83,7 @@ def measure_lockstep(folder: Path, pairs: int = 4) -> None:
         Scenario(policy="static-obstacles", level="lockstep", time_limit_s=60.0, speed=None)
     )
 
-    def lockstep(ends: ViewEnds | None) -> tuple[float, str]:
+    def lockstep(ends: ViewAddresses | None) -> tuple[float, str]:
         gc.collect()
         began = time.monotonic()
         record = fly(resolved, resolved.fresh_policy(11), 0, 11, view=ends).record
@@ -251,7 +251,7 @@ def train(config: str, out: str, ends: str | None) -> None:
     from airl_mav.training.config import TrainingConfig
     from airl_mav.training.training_run import train as learn
 
-    view = None if ends is None else ViewEnds.model_validate_json(ends)
+    view = None if ends is None else ViewAddresses.model_validate_json(ends)
     wall, cpu = time.monotonic(), time.process_time()
     learn(load_profile("training", config, TrainingConfig), Path(out), name="bench", view=view)
     print(time.monotonic() - wall, time.process_time() - cpu)

@@ -18,7 +18,7 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.progress import Event, JsonProgress, Progress, RichProgress, new_console
-from airl_mav.rehearsal.live_view import ViewRequest, check_view
+from airl_mav.rehearsal.live_view import ViewRequest
 from airl_mav.scenario.aircraft import GREATEST_PORT
 
 if TYPE_CHECKING:
@@ -103,7 +103,8 @@ def view_of(options: Viewing) -> ViewRequest | None:
                 "view_port", options.view_port, problem="accepted: together with --view"
             )
         return None
-    check_view()
+    if not entries("airl_mav", "VIEW"):
+        raise UsageError("--view: needs the add-on view (airl_mav/addons/view)")
     check_installed("view")
     return ViewRequest(options.view_port)
 

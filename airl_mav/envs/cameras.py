@@ -101,7 +101,7 @@ class Eyes:
 
         Args:
             fleet: Poses, motion and times.
-            arenas: One per vehicle.
+            arenas: Arenas (n,), an element for each vehicle.
             who: (n,) vehicles to render; other images are unchanged.
             seeds: (n,) seeds of the episodes, for the noise.
             frames: (n,) numbers of the images in the episodes.
@@ -313,7 +313,7 @@ def render_images(
 
     Args:
         fleet: Poses and times.
-        arenas: One per vehicle; moving obstacles are moved to its time.
+        arenas: Arenas (n,), an element for each vehicle; obstacles move to its time.
         who: (n,) vehicles to render; other images are unchanged.
         eye: The camera. Writes its image: depth [mm], 0 = no return, rounded and clipped as in
             `camera.frame.depth_to_z16`. None = nothing is rendered.

@@ -29,7 +29,7 @@ class Companions:
         image: Intrinsics,
         *,
         compensator: Compensator | None,
-        told: bool,
+        in_flight: bool,
         earlier: int = 0,
         further: Mapping[str, tuple[Intrinsics, int]] | None = None,
     ) -> None:
@@ -39,7 +39,7 @@ class Companions:
             n: Number of companions.
             image: Intrinsics of the main cameras.
             compensator: Predicts observations; None = no compensation.
-            told: True if past decisions are a policy input.
+            in_flight: True if past decisions are a policy input.
             earlier: Number of images of previous decisions as policy input.
             further: Additional cameras by name, with the number of their earlier images.
         """
@@ -50,7 +50,7 @@ class Companions:
             self._memory = compensator.memory
             self._image = np.zeros((n, *image.shape), image.dtype)
             self._state = Kinematics(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 4)))
-        elif told:
+        elif in_flight:
             self._memory = DecisionMemory(n)
         self._earlier = np.zeros((earlier, n, *image.shape), image.dtype)
         """Images of previous decisions, newest first; 0 = no return, black, or missing."""
@@ -161,7 +161,7 @@ class Companions:
         """Return predicted images and states for the next decisions; requires `foresee`."""
         return self._image[rows], self._state.rows(rows)
 
-    def told(self, rows: Rows) -> InFlight | None:
+    def in_flight(self, rows: Rows) -> InFlight | None:
         """Return past decisions as policy input; None without a record."""
         return None if self._memory is None else self._memory.in_flight(self._age_us).rows(rows)
 

@@ -211,7 +211,7 @@ class Navigation(Stateful):
             n,
             self.intrinsics,
             compensator=compensator,
-            told=bool(spec.in_flight),
+            in_flight=bool(spec.in_flight),
             earlier=spec.frames - 1,
             further={
                 name: (lens, spec.cameras[name].frames - 1) for name, lens in sight.lenses.items()
@@ -332,7 +332,8 @@ class Navigation(Stateful):
         lenses = {name: each.intrinsics for name, each in eyes.items()}
         views = known.views(self._further_images(), lenses, rows)
         return observe(
-            *(image, self.intrinsics, state, goal, known.told(rows), known.earlier(rows)), views
+            *(image, self.intrinsics, state, goal, known.in_flight(rows), known.earlier(rows)),
+            views,
         )
 
     def _further_images(self) -> dict[str, NDArray[Any]]:

@@ -77,7 +77,7 @@ class NavigationVecEnv(Stateful, VecEnv):
         self._length = np.zeros(env.num_envs, np.int64)
 
     def teach(self, expert: Expert) -> None:
-        """Tell an expert that labels the flown states when episodes start, and save its state."""
+        """Attach an expert that labels the flown states; its state is saved too."""
         self._expert = expert
 
     def reset(self) -> Encoded:

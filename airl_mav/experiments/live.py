@@ -16,7 +16,7 @@ from airl_mav.core.progress import Progress
 from airl_mav.core.scheduling import remove_left
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.lockstep.turns import LockstepError
-from airl_mav.rehearsal.live_view import ViewEnds, ViewError, ViewRequest, view_part
+from airl_mav.rehearsal.live_view import ViewAddresses, ViewError, ViewRequest, view_part
 from airl_mav.rehearsal.observer import LiveObserver, Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RUN_FILE, locked, open_folder
@@ -76,7 +76,7 @@ def fly_live(
         announce()
         live = LiveObserver(progress, folder.path, done, asked.episodes)
         observer: Observer = live
-        ends: ViewEnds | None = None
+        ends: ViewAddresses | None = None
         indices = {record.index for record in done}
         ended: Ended = "complete"
         problem = ""
@@ -115,7 +115,7 @@ def fly_live(
 @contextmanager
 def _watched(
     scenario: ResolvedScenario, asked: ViewRequest, onwards: Observer, progress: Progress
-) -> Iterator[tuple[ViewEnds, Observer]]:
+) -> Iterator[tuple[ViewAddresses, Observer]]:
     """Start a viewer; yield its connections and an observer that also notifies `onwards`."""
     onwards.waiting("starting the view")
     name = f"{scenario.policy.name} in {scenario.arena_name}, {scenario.level}"

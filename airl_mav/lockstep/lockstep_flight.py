@@ -31,7 +31,7 @@ from airl_mav.rehearsal.episode import (
     part_of,
 )
 from airl_mav.rehearsal.firmware_process import episode_setup, state_of
-from airl_mav.rehearsal.live_view import ViewEnds, view_part
+from airl_mav.rehearsal.live_view import ViewAddresses, view_part
 from airl_mav.rehearsal.observer import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.checks import TRANSPORT_US
@@ -55,7 +55,7 @@ def rehearse(
     folder: RunFolder,
     observer: Observer,
     done: Collection[int] = (),
-    view: ViewEnds | None = None,
+    view: ViewAddresses | None = None,
 ) -> None:
     """Fly episodes one after the other and save each one when it ends.
 
@@ -95,7 +95,7 @@ def fly(
     tlog: Path | None = None,
     log: Path | None = None,
     observer: Observer | None = None,
-    view: ViewEnds | None = None,
+    view: ViewAddresses | None = None,
 ) -> FlownEpisode:
     """Fly one episode; equal scenario, policy and seed give a bit-identical flight.
 
@@ -152,7 +152,7 @@ class LockstepFlight:
         *,
         observer: Observer | None = None,
         notes: Sequence[str] = (),
-        view: ViewEnds | None = None,
+        view: ViewAddresses | None = None,
         patience_s: float = PATIENCE_S,
         lands: bool = True,
         ticked: Callable[[Simulation, Referee, str | None], None] = lambda *_: None,

@@ -20,7 +20,7 @@ from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError
 from airl_mav.core.fields import field_error
 from airl_mav.core.frames import Goal
 from airl_mav.core.resource_use import ProcessUse
-from airl_mav.rehearsal.live_view import ViewEnds
+from airl_mav.rehearsal.live_view import ViewAddresses
 from airl_mav.scenario.resolve import ResolvedScenario
 
 
@@ -44,7 +44,7 @@ class Begin(_Line):
     scenario: ResolvedScenario
     log: str | None = None
     """File for the output of real firmware."""
-    view: ViewEnds | None = None
+    view: ViewAddresses | None = None
     """View that shows the flights; None: no view."""
 
 

@@ -1,4 +1,4 @@
-"""Live view of flights: an add-on, named by its table `VIEW`, and what flights tell it."""
+"""Access to the add-on `view`: request, addresses and parts, from its table `VIEW`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from airl_mav.core.addons import entries, load
-from airl_mav.core.errors import UsageError
 
 
 class ViewError(Exception):
@@ -23,20 +22,15 @@ class ViewRequest:
     """TCP port of the page; None = any free port."""
 
 
-class ViewEnds(BaseModel):
+class ViewAddresses(BaseModel):
     """ZeroMQ addresses of a view on this machine."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    told: str
-    asked: str
+    messages: str
+    """Address to which flights send their messages."""
+    steering: str
     """Address on which the view publishes its viewers' `Steering`."""
-
-
-def check_view() -> None:
-    """Raise UsageError if the add-on is missing."""
-    if not entries("airl_mav", "VIEW"):
-        raise UsageError("--view: needs the add-on view (airl_mav/addons/view)")
 
 
 def view_part(name: str) -> Any:

@@ -24,7 +24,7 @@ from airl_mav.rehearsal.episode import (
     disturbing,
     join_episode,
 )
-from airl_mav.rehearsal.live_view import ViewEnds
+from airl_mav.rehearsal.live_view import ViewAddresses
 from airl_mav.rehearsal.observer import WARNING, Observer
 from airl_mav.rehearsal.process_pair import (
     COMPANION,
@@ -58,7 +58,7 @@ class Rehearsal:
         folder: RunFolder,
         observer: Observer,
         keeps: Sequence[int] = (),
-        view: ViewEnds | None = None,
+        view: ViewAddresses | None = None,
     ) -> None:
         """Take the scenario without starting it. The processes inherit the locks in `keeps`."""
         self._view = view

@@ -72,7 +72,7 @@ class Ring:
         self._observations = {k: np.zeros((*size, *s), t) for k, (s, t) in shapes.items()}
 
     def _store(self, observations: Mapping[str, NDArray[Any]], actions: NDArray[Any]) -> None:
-        """Write the present row, and go on to the next one."""
+        """Write the current row and advance to the next one."""
         for key, array in self._observations.items():
             array[self.head] = observations[key]
         self._actions[self.head] = actions

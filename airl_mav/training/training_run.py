@@ -32,7 +32,7 @@ from airl_mav.envs.stopping import bounded
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
 from airl_mav.policy.layouts import SHIPPED
-from airl_mav.rehearsal.live_view import ViewEnds, view_part
+from airl_mav.rehearsal.live_view import ViewAddresses, view_part
 from airl_mav.rehearsal.run_folder import locked
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
@@ -107,7 +107,7 @@ def train(
     progress: TrainingProgress | None = None,
     device: str = "cpu",
     command: str = "airl_mav.training.training_run.train",
-    view: ViewEnds | None = None,
+    view: ViewAddresses | None = None,
 ) -> TrainingResult:
     """Train a policy to the end and export its best weights.
 

@@ -24,7 +24,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.experiments import live
 from airl_mav.experiments.live import FlownRun
 from airl_mav.rehearsal import run_folder
-from airl_mav.rehearsal.live_view import ViewEnds
+from airl_mav.rehearsal.live_view import ViewAddresses
 from airl_mav.rehearsal.observer import LiveObserver
 from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load
@@ -49,7 +49,7 @@ class Stage:
         folder: RunFolder,
         observer: LiveObserver,
         keeps: Collection[int],
-        view: ViewEnds | None,
+        view: ViewAddresses | None,
     ) -> Rehearsal:
         assert len(keeps) == 1 and view is None
         self.begun += 1

@@ -24,7 +24,7 @@ from airl_mav.addons.view.view_messages import (
 from airl_mav.addons.view.viewer import Ends
 from airl_mav.flight.judge import BY_HAND
 from airl_mav.lockstep.lockstep_flight import fly
-from airl_mav.rehearsal.live_view import ViewEnds
+from airl_mav.rehearsal.live_view import ViewAddresses
 from airl_mav.rehearsal.observer import Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal
 from airl_mav.rehearsal.run_folder import FlownEpisode, load, open_folder
@@ -46,7 +46,7 @@ class Watchers:
         self._steering, self._left = steering, steps
         self._ends, self._stop = Ends(), threading.Event()
         self._thread = threading.Thread(target=self._watch)
-        self.ends: ViewEnds = self._ends.ends
+        self.ends: ViewAddresses = self._ends.ends
 
     def _watch(self) -> None:
         while not self._stop.is_set():
@@ -76,7 +76,7 @@ class Watchers:
             self._ends.close()
 
 
-def flown(ends: ViewEnds | None = None) -> FlownEpisode:
+def flown(ends: ViewAddresses | None = None) -> FlownEpisode:
     resolved = demo_scenario()
     return fly(resolved, resolved.fresh_policy(SEED), 0, SEED, view=ends)
 

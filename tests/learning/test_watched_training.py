@@ -33,7 +33,7 @@ from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.profiles.loading import load_profile
-from airl_mav.rehearsal.live_view import ViewEnds
+from airl_mav.rehearsal.live_view import ViewAddresses
 from airl_mav.training import training_run
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.training_folder import TrainingProgress
@@ -74,7 +74,7 @@ class Watchers:
         self.shown, self.told = Shown(), list[Told]()
         self._steering = steering
         self._ends, self._stop = Ends(), threading.Event()
-        self.ends: ViewEnds = self._ends.ends
+        self.ends: ViewAddresses = self._ends.ends
 
     @contextmanager
     def watching(self) -> Iterator[Watchers]:

@@ -303,7 +303,7 @@ def test_a_paused_flight_goes_on_by_a_decision_or_for_good(ends: Ends) -> None:
 
     with Watchers(ends) as watchers:
         watchers.wanted = Steering(paused=True)
-        wait_until(lambda: pace._asked.newest(0.1).paused, "the pause")
+        wait_until(lambda: pace._steering.newest(0.1).paused, "the pause")
         thread = threading.Thread(target=fly)
         thread.start()
         watchers.wanted = Steering(paused=True, steps=1)

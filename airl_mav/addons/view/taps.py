@@ -21,7 +21,7 @@ from airl_mav.latency.injection import LatencySampler
 from airl_mav.policy.observation import Kinematics
 from airl_mav.prediction import Compensator
 from airl_mav.rehearsal.channel import State, Text
-from airl_mav.rehearsal.live_view import ViewEnds
+from airl_mav.rehearsal.live_view import ViewAddresses
 from airl_mav.rehearsal.observer import WARNING, Observer
 from airl_mav.scenario.resolve import ResolvedScenario
 from companion.pilot import SentDecision
@@ -108,7 +108,7 @@ PICTURE_EVERY_US = 100_000
 class SimulationTap:
     """Sender of the simulation's messages. Call from one thread."""
 
-    def __init__(self, ends: ViewEnds, scenario: ResolvedScenario) -> None:
+    def __init__(self, ends: ViewAddresses, scenario: ResolvedScenario) -> None:
         """Connect to a view."""
         self._feed = Feed(ends)
         self._scenario = scenario
@@ -181,7 +181,7 @@ class SimulationTap:
 class CompanionTap:
     """Sender of a companion's decisions; applies viewers' settings. Call from one thread."""
 
-    def __init__(self, ends: ViewEnds, scenario: ResolvedScenario) -> None:
+    def __init__(self, ends: ViewAddresses, scenario: ResolvedScenario) -> None:
         """Connect to a view."""
         self._feed = Feed(ends)
         self._asked = Asked(ends, messages.Steering())
@@ -238,7 +238,7 @@ INFO = 6
 class ViewObserver(Observer):
     """Reports to a view, and forwards all events to another observer."""
 
-    def __init__(self, ends: ViewEnds, onwards: Observer) -> None:
+    def __init__(self, ends: ViewAddresses, onwards: Observer) -> None:
         """Connect to a view."""
         self._feed = Feed(ends)
         self._onwards = onwards
@@ -291,7 +291,7 @@ class FlightTap:
     Call the companion's methods on its thread, all others on the waiting conductor's thread.
     """
 
-    def __init__(self, ends: ViewEnds, scenario: ResolvedScenario) -> None:
+    def __init__(self, ends: ViewAddresses, scenario: ResolvedScenario) -> None:
         """Connect to a viewer; the pace is real time until a spectator changes it."""
         self._open = ExitStack()
         self._simulation = self._open.enter_context(closing(SimulationTap(ends, scenario)))

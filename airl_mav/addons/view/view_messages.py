@@ -21,7 +21,7 @@ from airl_mav.core.constants import US_PER_MS, US_PER_S, CommandKind
 from airl_mav.core.frames import Goal, goal_distance_m
 from airl_mav.profiles.projections import Projection
 from airl_mav.profiles.vehicle import Momentum, VehicleProfile
-from airl_mav.rehearsal.live_view import ViewEnds
+from airl_mav.rehearsal.live_view import ViewAddresses
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -263,7 +263,7 @@ class ViewAnswer(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     port: int = 0
-    ends: ViewEnds | None = None
+    ends: ViewAddresses | None = None
     """ZeroMQ addresses; None = the requested port is in use."""
 
 

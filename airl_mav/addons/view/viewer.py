@@ -26,7 +26,7 @@ from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.rehearsal.live_view import ViewEnds, ViewError
+from airl_mav.rehearsal.live_view import ViewAddresses, ViewError
 from airl_mav.scenario.resolve import ResolvedScenario
 
 REAL_TIME = 1.0
@@ -44,12 +44,12 @@ class Pace:
 
     def __init__(
         self,
-        ends: ViewEnds,
+        ends: ViewAddresses,
         speed: float | None,
         new_clock: Callable[[float], WallClock] = WallClock,
     ) -> None:
         """Connect to a view; `speed` applies until the view sets another, None = unlimited."""
-        self._asked = Asked(ends, Steering(speed=speed))
+        self._steering = Asked(ends, Steering(speed=speed))
         self._new_clock = new_clock
         self._clock: WallClock | None = None
         self._steps: int | None = None
@@ -61,10 +61,10 @@ class Pace:
         """Block until the flight may continue from simulated `time_us` [µs]."""
         if self._released:
             return
-        asked = self._heard(self._asked.newest())
+        asked = self._heard(self._steering.newest())
         while asked.paused and not self._left and not self._released:
             self._clock = None
-            asked = self._heard(self._asked.newest(LOOK_S))
+            asked = self._heard(self._steering.newest(LOOK_S))
         if asked.speed is None:
             self._clock = None
             return
@@ -88,7 +88,7 @@ class Pace:
 
     def close(self) -> None:
         """Disconnect."""
-        self._asked.close()
+        self._steering.close()
 
     def _heard(self, asked: Steering) -> Steering:
         if self._steps is None or asked.steps < self._steps or not asked.paused:
@@ -137,7 +137,7 @@ class Viewer:
         except BaseException:
             self.close()
             raise
-        self.ends: ViewEnds = answer.ends
+        self.ends: ViewAddresses = answer.ends
         """Addresses for flights to connect to."""
         self.url = f"http://{LOOPBACK}:{answer.port}"
         """URL of the page for a browser."""
@@ -174,13 +174,13 @@ SILENCE_S = 5.0
 class Feed:
     """Sender of snapshots. Use from one thread at a time."""
 
-    def __init__(self, ends: ViewEnds) -> None:
+    def __init__(self, ends: ViewAddresses) -> None:
         """Connect; the view may start later or be closed."""
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PUSH)
         self._socket.setsockopt(zmq.SNDHWM, QUEUED)
         self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.connect(ends.told)
+        self._socket.connect(ends.messages)
 
     def send(self, message: ViewMessage, image: Image | None = None) -> None:
         """Send a message with its image, or drop it."""
@@ -196,7 +196,7 @@ class Feed:
 class Asked:
     """Receiver of the viewers' requests. Use from one thread at a time."""
 
-    def __init__(self, ends: ViewEnds, default: Steering, clock: Clock | None = None) -> None:
+    def __init__(self, ends: ViewAddresses, default: Steering, clock: Clock | None = None) -> None:
         """Connect to the view; `default` applies before its first message and after a timeout."""
         self._clock = clock or WallClock()
         self._heard_us = self._clock.time_us()
@@ -206,7 +206,7 @@ class Asked:
         self._socket.setsockopt(zmq.CONFLATE, 1)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.subscribe(b"")
-        self._socket.connect(ends.asked)
+        self._socket.connect(ends.steering)
 
     def newest(self, wait_s: float = 0.0) -> Steering:
         """Return the newest requests, waiting up to `wait_s` [s] for a new message."""
@@ -230,9 +230,10 @@ class Ends:
     def __init__(self) -> None:
         """Bind two free ports of the loopback address."""
         self._context = zmq.Context()
-        self._told = self._bound(zmq.PULL)
-        self._asked = self._bound(zmq.PUB)
-        self.ends = ViewEnds(told=_address(self._told), asked=_address(self._asked))
+        self._inbox = self._bound(zmq.PULL)
+        self._steering = self._bound(zmq.PUB)
+        inbox, steering = _address(self._inbox), _address(self._steering)
+        self.ends = ViewAddresses(messages=inbox, steering=steering)
         """Addresses for flights to connect to."""
 
     def _bound(self, kind: int) -> zmq.Socket[bytes]:
@@ -246,8 +247,8 @@ class Ends:
         """Return all received messages, oldest first, waiting up to `wait_s` [s] for the first."""
         found: list[tuple[Told, Image | None]] = []
         wait_ms = round(1e3 * wait_s)
-        while self._told.poll(wait_ms):
-            read = from_parts(self._told.recv_multipart())
+        while self._inbox.poll(wait_ms):
+            read = from_parts(self._inbox.recv_multipart())
             if read is not None:
                 found.append(read)
             wait_ms = 0
@@ -257,12 +258,12 @@ class Ends:
 
     def ask(self, steering: Steering) -> None:
         """Publish the requests; call repeatedly so that late subscribers receive them."""
-        self._asked.send(steering.model_dump_json().encode(), zmq.NOBLOCK)
+        self._steering.send(steering.model_dump_json().encode(), zmq.NOBLOCK)
 
     def close(self) -> None:
         """Free the ports."""
-        self._told.close(linger=0)
-        self._asked.close(linger=0)
+        self._inbox.close(linger=0)
+        self._steering.close(linger=0)
         self._context.term()
 
 

@@ -27,7 +27,7 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP, SETPOINTS
 from airl_mav.policy.actions import commands, discrete_actions
 from airl_mav.policy.layouts import Encoded, newest_frame
-from airl_mav.rehearsal.live_view import ViewEnds
+from airl_mav.rehearsal.live_view import ViewAddresses
 from airl_mav.training.training_folder import Evaluation, TrainingProgress
 
 SPEED = 2.0
@@ -95,7 +95,7 @@ class WatchedTraining(TrainingProgress):
     """Adapter from a training to a view. An `envs.sb3.Watcher`, and a `TrainingProgress`."""
 
     def __init__(
-        self, ends: ViewEnds, environment: EnvironmentSpec, onwards: TrainingProgress
+        self, ends: ViewAddresses, environment: EnvironmentSpec, onwards: TrainingProgress
     ) -> None:
         """Connect to a view of training in `environment`; `onwards` also receives the progress."""
         self._onwards = onwards
