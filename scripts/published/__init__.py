@@ -1,1 +1,1 @@
-"""Published results: figures with their provenance (docs/how-to/results.md)."""
+"""Published results: figures with their provenance (docs/contributing/results.md)."""

@@ -5,6 +5,9 @@ A page marks the generated parts:
     <!-- results: gap-short -->
     ...
     <!-- end of results -->
+
+The block `provenance` lists the command, date and commit of all other blocks of its page. On a
+page without that block, each table has them below it.
 """
 
 from __future__ import annotations
@@ -18,16 +21,19 @@ from airl_mav.core.files import replace_file
 from airl_mav.policy.card import MeasuredResult, read_card
 from airl_mav.policy.card_writing import write_card
 from published import tables_gap, tables_levels, tables_policies, tables_response
-from published.blocks import block_of
+from published.blocks import Block, block_of
 from published.declared import read_declared
 from published.record import ROOT, FlownRun, Record
-from published.text import made_line
+from published.text import made_line, made_table, source_line
 
 END = "<!-- end of results -->"
 MARKED = re.compile(
     r"^(?P<indent> *)<!-- results: (?P<name>[a-z0-9-]+) -->\n.*?^ *" + END + "$", re.M | re.S
 )
 ALONE = re.compile(r"^ *<!-- (?:results:|end of results)", re.M)
+
+PROVENANCE = "provenance"
+"""Name of the block with the provenance of the other blocks of the page."""
 
 POLICIES = ROOT / "profiles" / "policies"
 
@@ -48,30 +54,44 @@ def rendered(text: str, records: dict[str, Record], page: object) -> str:
     """
 
     def write(match: re.Match[str]) -> str:
-        return f"<!-- results: {match['name']} -->\n\n{body(match['name'], records, page)}\n\n{END}"
+        name = match["name"]
+        content = summary if name == PROVENANCE else _content(blocks[name], records, not summary)
+        return f"<!-- results: {name} -->\n\n{content}\n\n{END}"
 
-    if len(ALONE.findall(text)) != 2 * len(MARKED.findall(text)):
+    marks = _marks(text)
+    if len(ALONE.findall(text)) != 2 * len(marks):
         raise UsageError(f"{page}: a mark of results without its end, or in another form")
+    blocks = {name: _found(name, records, page) for name in marks if name != PROVENANCE}
+    names = dict.fromkeys(record for each in blocks.values() for record in each.records)
+    summary = made_table([records[name] for name in names]) if PROVENANCE in marks else ""
     return MARKED.sub(write, text)
 
 
-def body(name: str, records: dict[str, Record], page: object) -> str:
-    """Return the content of a block: the table, then its provenance."""
+def _marks(text: str) -> list[str]:
+    return [match["name"] for match in MARKED.finditer(text)]
+
+
+def _found(name: str, records: dict[str, Record], page: object) -> Block:
     found = block_of(name, records)
     if found is None:
         raise UsageError(f"{page}: results: {name}: no such block")
     for record in found.records:
         if record not in records:
             raise UsageError(f"{page}: results: {name}: no results/{record}.json")
-    lines = [made_line(records[each]) for each in found.records]
-    return "\n\n".join([found.render(records), "<br>\n".join(lines)])
+    return found
+
+
+def _content(found: Block, records: dict[str, Record], full: bool) -> str:
+    """Return a block's table, with its full provenance or only the names of its results."""
+    line = made_line if full else source_line
+    return "\n\n".join(
+        [found.render(records), "<br>\n".join(line(records[each]) for each in found.records)]
+    )
 
 
 def shown(records: dict[str, Record]) -> set[str]:
     """Return the names of the results on pages and cards."""
-    names = {
-        match["name"] for page in pages() for match in MARKED.finditer(page.read_text("utf-8"))
-    }
+    names = {name for page in pages() for name in _marks(page.read_text("utf-8"))}
     blocks = [block_of(name, records) for name in names]
     on_cards = {entry.name for entry in read_declared().values() if entry.cards}
     return on_cards | {record for each in blocks if each is not None for record in each.records}

@@ -65,12 +65,38 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 
 
 
 def made_line(record: Record) -> str:
-    """Return the line under a table: its provenance, with a note if outdated."""
+    """Return a result's command, date, commit, processor and file, with a note if outdated."""
     made = record.made
-    commit = f"commit {made.commit[:7]}" if made.commit else f"version {made.version}"
-    line = f"`{made.command}` · {made.date}, {commit}, {made.cpu} · `results/{record.name}.json`"
+    line = f"`{made.command}` · {made.date}, {_commit(record)}, {made.cpu}"
+    return f"{line} · {source_line(record)}"
+
+
+def source_line(record: Record) -> str:
+    """Return the file of a result, with a note if outdated."""
     stale = out_of_date(record)
-    return f"{line} · **{stale}**" if stale else line
+    return f"`results/{record.name}.json`" + (f" · **{stale}**" if stale else "")
+
+
+def made_table(records: Iterable[Record]) -> str:
+    """Return a table with the command, date, commit and processor of results."""
+    return table(
+        ("result", "command", "date", "source", "processor"),
+        (
+            (
+                f"`{each.name}`",
+                f"`{each.made.command}`",
+                each.made.date,
+                _commit(each),
+                each.made.cpu,
+            )
+            for each in records
+        ),
+    )
+
+
+def _commit(record: Record) -> str:
+    made = record.made
+    return f"commit {made.commit[:7]}" if made.commit else f"version {made.version}"
 
 
 def _rounded(value: float, digits: int, sign: str) -> str:

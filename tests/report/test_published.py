@@ -87,6 +87,19 @@ def test_an_older_behaviour_is_said_under_its_tables(
     assert said.split("`airl gap")[0] == pages.rendered(text, records, "page").split("`airl gap")[0]
 
 
+def test_a_page_with_a_provenance_block_lists_its_commands_there(
+    records: dict[str, Record], fresh: Record
+) -> None:
+    records = {**records, "gap": fresh}
+    marks = "".join(
+        f"<!-- results: {name} -->\n<!-- end of results -->\n"
+        for name in ("gap-short", "mitigation-runs", "provenance")
+    )
+    tables, listed = pages.rendered(marks, records, "page").split("<!-- results: provenance -->")
+    assert "airl " not in tables and tables.count("`results/gap.json`") == 2
+    assert listed.count(f"`{fresh.made.command}` | {fresh.made.date}") == 1
+
+
 def test_another_file_of_a_policy_is_out_of_date(fresh: Record) -> None:
     made = fresh.made.model_copy(update={"policies": {"static-obstacles": "0" * 64}})
     retrained = fresh.model_copy(update={"made": made})
