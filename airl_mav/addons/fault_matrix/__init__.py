@@ -3,7 +3,7 @@
 Flies each fault of the table at each phase in lockstep and tabulates how the flights ended.
 Command: `airl faults`.
 Depends on: `airl_mav.faults`, `firmware_sim.addons.fault_injection`, lockstep, experiments.
-Guide: docs/how-to/faults.md.
+Guide: docs/how-to/fault-matrix.md.
 """
 
 COMMANDS = {

@@ -3,7 +3,7 @@
 A vehicle has these sensors by `sensors.vision`, `rangefinder` and `optical_flow` of its profile, or
 a client sends ODOMETRY, VISION_POSITION_ESTIMATE, DISTANCE_SENSOR or OPTICAL_FLOW_RAD. Parameters:
 EKF2_EV_*, EKF2_RNG_*, EKF2_OF_*. Depends on: `firmware_sim` alone; needs no other add-on.
-Guides: docs/how-to/without-gps.md, rangefinder.md, optical-flow.md.
+Guide: docs/how-to/gps-denied.md.
 """
 
 _HERE = "firmware_sim.addons.auxiliary_estimation"
