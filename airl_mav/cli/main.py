@@ -15,6 +15,7 @@ from airl_mav import __version__
 from airl_mav.core.addons import entries
 from airl_mav.core.errors import EXIT_USAGE
 from airl_mav.core.progress import new_console
+from airl_mav.core.unsupported import refer
 
 SUBCOMMANDS: dict[str, str] = {
     # To add one: write cli/<name>_command.py with OPTIONS and run(), and a line here. Add-ons have
@@ -62,6 +63,7 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {near[0]}?" if near else f"accepted: {', '.join(known)}"
+        hint = refer([name]) or hint
         new_console(stderr=True, soft_wrap=True).print(
             f"error: airl {name}: no such command; {hint}", style="red"
         )

@@ -34,6 +34,7 @@ from airl_mav.core.errors import (
 from airl_mav.core.fields import range_of, validated
 from airl_mav.core.first_start import shown_by
 from airl_mav.core.progress import RichProgress, new_console
+from airl_mav.core.unsupported import refer
 from airl_mav.faults import Fault
 from airl_mav.profiles.loading import read_toml
 from airl_mav.scenario.aircraft import IN_WORDS
@@ -245,8 +246,12 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = EXIT_BROKEN
     except UsageError as error:
-        _fail(str(error))
+        _fail("; ".join(filter(None, (str(error), refer(words)))))
         code = EXIT_USAGE
+    except SystemExit as rejected:  # By tyro, which has printed why; or after --help.
+        if rejected.code and (reference := refer(words)):
+            _fail(reference)
+        raise
     except OSError as error:
         if (failure := machine_failure(error)) is None:
             raise

@@ -12,6 +12,7 @@ from typing import NamedTuple, TypeAlias
 
 from airl_mav.core.constants import DEG, GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import Vector
+from airl_mav.core.unsupported import PAGE
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim import interfaces
 from firmware_sim.mavlink.codec import Reader, Values, WireMessage, dialect, layout
@@ -216,8 +217,8 @@ def controls(message: Controls, time_us: int) -> interfaces.ActuatorControls:
         # The comparison is written so that NaN fails.
         if not -TOLERANCE <= value <= 1.0 + TOLERANCE:
             raise ControlsError(
-                f"HIL_ACTUATOR_CONTROLS controls[{i}] = {value:g}, a motor takes 0..1: is its "
-                "airframe a quadrotor?"
+                f"HIL_ACTUATOR_CONTROLS controls[{i}] = {value:g}: accepted: 0..1 from the motors "
+                f"of a quadrotor ({PAGE})"
             )
     a, b, c, d = (min(1.0, max(0.0, value)) for value in (a, b, c, d))
     return interfaces.ActuatorControls(time_us, (a, b, c, d), armed=True)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
+from airl_mav.core.unsupported import PAGE
 from airl_mav.profiles.parameters import SPEC_BY_NAME
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE, Corner, VehicleProfile
 from firmware_sim.interfaces import FirmwareMissingError
@@ -162,7 +163,7 @@ def _px4_problem(motors: Sequence[Corner], output: str, held: Mapping[str, Value
     if held["CA_AIRFRAME"] != _PX4_MULTIROTOR or held["CA_ROTOR_COUNT"] != len(MOTORS):
         return (
             f"PX4 flies CA_AIRFRAME {held['CA_AIRFRAME']} with CA_ROTOR_COUNT "
-            f"{held['CA_ROTOR_COUNT']}: expected a multirotor (0) with 4"
+            f"{held['CA_ROTOR_COUNT']}: expected a multirotor (0) with 4 ({PAGE})"
         )
     for number, expected in enumerate(motors, start=1):
         name = output.format(number)

@@ -13,6 +13,7 @@ from airl_mav import __version__
 from airl_mav.cli import main as entry
 from airl_mav.cli.list_command import KINDS
 from airl_mav.cli.main import main, subcommands
+from airl_mav.core.unsupported import PAGE
 from airl_mav.policy.registry import policy_names
 from airl_mav.profiles.loading import list_profiles
 from tests.support.processes import ROOT
@@ -55,6 +56,24 @@ def test_an_unknown_command_gets_a_hint(
     assert (code, out) == (2, "")
     assert err.startswith(f"error: airl {word}: no such command; {hint}")
     assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("swarm",),
+        ("sitl", "--vehicles", "2"),
+        ("sitl", "--vehicle", "fixed-wing"),
+        ("sitl", "--firmware=betaflight"),
+        ("sitl", "--level", "gazebo"),
+    ],
+)
+def test_things_that_do_not_exist_refer_to_their_page(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, err = run(capsys, *words)
+    assert code == 2
+    assert err.endswith(f" is unsupported: see {PAGE}\n")
 
 
 @pytest.mark.parametrize("kind", KINDS)

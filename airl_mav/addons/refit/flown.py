@@ -15,6 +15,7 @@ from airl_mav.black_box.mcap_file import BlackBox
 from airl_mav.black_box.messages import Decision, Phase
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
+from airl_mav.core.unsupported import PAGE
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import SETPOINT, commanded
 from airl_mav.vehicle_log import MOTORS, ClockAlignment, VehicleLog, align
@@ -105,7 +106,9 @@ def flown_by_log(log: VehicleLog) -> Flown:
     """Return the longest airborne stretch of a quadrotor's log; UsageError without one."""
     rotors = log.parameters.get("CA_ROTOR_COUNT", MOTORS)
     if rotors != MOTORS:
-        raise UsageError(f"{log.path}: CA_ROTOR_COUNT {rotors:g}: accepted: {MOTORS}, a quadrotor")
+        raise UsageError(
+            f"{log.path}: CA_ROTOR_COUNT {rotors:g}: accepted: {MOTORS}, a quadrotor ({PAGE})"
+        )
     path = _logged_path(log)
     ground_m = float(np.median(path.position[path.time_us < path.time_us[0] + US_PER_S, 2]))
     high = path.position[:, 2] < ground_m - AIRBORNE_M
