@@ -84,9 +84,8 @@ def _found(name: str, records: dict[str, Record], page: object) -> Block:
 def _content(found: Block, records: dict[str, Record], full: bool) -> str:
     """Return a block's table, with its full provenance or only the names of its results."""
     line = made_line if full else source_line
-    return "\n\n".join(
-        [found.render(records), "<br>\n".join(line(records[each]) for each in found.records)]
-    )
+    lines = [line(records[each]) for each in found.records]
+    return "\n\n".join([found.render(records), ("<br>\n" if full else ", ").join(lines)])
 
 
 def shown(records: dict[str, Record]) -> set[str]:

@@ -9,24 +9,44 @@ from published.text import NONE, both, interval_cell, number, percent, rate, tab
 # --- levels
 
 
-@block("ladder", "ladder")
-def ladder(records: Records) -> str:
-    return _levels((("", records["ladder"]),))
+_COMPARED = {
+    "ladder-fast": "`static-obstacles-fast`",
+    "ladder": "`static-obstacles`",
+    "ladder-one-arena": "`static-obstacles`, arena seed 431 alone",
+    "ladder-wind": "`static-obstacles`, wind",
+    "ladder-spread": "`static-obstacles`, domain randomization, noisy depth",
+    "ladder-dense": "`static-obstacles`, all of these in `dense-obstacles`",
+    "ladder-empty": "`crowded` in `no-obstacles`",
+    "ladder-crowded": "`crowded`, moving obstacles",
+}
+"""Results that compare gym and lockstep, with their titles."""
+
+
+@block("levels", *_COMPARED)
+def levels(records: Records) -> str:
+    rows = []
+    for name, title in _COMPARED.items():
+        record = records[name]
+        (gap,) = record.gaps.values()
+        pair = [record.runs[run] for run in (gap.reference, gap.target)]
+        changes = (gap.flight_time_s, gap.median_flight_time, gap.distance_m, gap.energy_j)
+        rows.append(
+            (
+                title,
+                f"{gap.success_rate.n}",
+                *(f"{number(run.success_rate, 1, scale=100.0)}" for run in pair),
+                both(gap.success_rate, 1, "+"),
+                *(both(change, 1, "+") for change in changes),
+            )
+        )
+    heads = ("seeds", "success, gym [%]", "success, lockstep [%]", "difference [points]")
+    changed = ("flight time [%]", "its median [%]", "distance [%]", "energy [%]")
+    return table(("policy and conditions", *heads, *changed), rows, 8)
 
 
 @block("ladder-fast", "ladder-fast")
 def ladder_fast(records: Records) -> str:
-    return _levels((("", records["ladder-fast"]),))
-
-
-@block("ladder-conditions", "ladder-wind", "ladder-spread", "ladder-dense")
-def ladder_conditions(records: Records) -> str:
-    parts = (
-        ("wind, 200 seeds", "ladder-wind"),
-        ("spread and depth noise, 100 seeds", "ladder-spread"),
-        ("all of it, in `dense-obstacles`, 160 seeds", "ladder-dense"),
-    )
-    return _levels(tuple((title, records[name]) for title, name in parts))
+    return _levels(records["ladder-fast"])
 
 
 @block("ladder-late", "ladder-late", "ladder-mitigated")
@@ -43,24 +63,9 @@ def ladder_late(records: Records) -> str:
     return table(("gym to lockstep, 396 ms", *heads), rows, 4)
 
 
-@block("ladder-crowded", "ladder-crowded")
-def ladder_crowded(records: Records) -> str:
-    return _levels((("", records["ladder-crowded"]),))
-
-
-@block("ladder-empty", "ladder-empty")
-def ladder_empty(records: Records) -> str:
-    return _levels((("", records["ladder-empty"]),))
-
-
-@block("ladder-one-arena", "ladder-one-arena")
-def ladder_one_arena(records: Records) -> str:
-    return _levels((("", records["ladder-one-arena"]),))
-
-
 @block("sitl", "sitl")
 def sitl(records: Records) -> str:
-    return _levels((("", records["sitl"]),), "sitl")
+    return _levels(records["sitl"], "sitl")
 
 
 _PREDICTED = {"`static-obstacles`": "predicted"}
@@ -104,41 +109,29 @@ def quantisation(records: Records) -> str:
     return table(("policy", *heads), rows, 6)
 
 
-def _levels(parts: tuple[tuple[str, Record], ...], target_level: str = "lockstep") -> str:
+def _levels(record: Record, target_level: str = "lockstep") -> str:
     """Return the runs of two levels side by side, and their differences over the pairs."""
-    rows = []
-    for title, record in parts:
-        (gap,) = record.gaps.values()
-        reference, target = record.runs[gap.reference], record.runs[gap.target]
-        head = f"{title}: " if title else ""
-        rows.append(
-            (
-                f"{head}success",
-                *(f"{rate(run)} %" for run in (reference, target)),
-                f"{number(gap.success_rate, 1, '+')} points",
-                interval_cell(gap.success_rate),
-            )
+    (gap,) = record.gaps.values()
+    pair = [record.runs[run] for run in (gap.reference, gap.target)]
+    rows = [
+        (
+            "success",
+            *(f"{rate(run)} %" for run in pair),
+            f"{number(gap.success_rate, 1, '+')} points",
+            interval_cell(gap.success_rate),
         )
-        for name, field, unit, scale in (
-            ("flight time", "flight_time_s", "s", 1.0),
-            ("distance", "distance_m", "m", 1.0),
-            ("energy", "energy_j", "kJ", 1e-3),
-        ):
-            change_of: Figure = getattr(gap, field)
-            rows.append(
-                (
-                    name,
-                    *(
-                        f"{number(getattr(r, field), 2, scale=scale)} {unit}"
-                        for r in (reference, target)
-                    ),
-                    f"{number(change_of, 1, '+')} %",
-                    interval_cell(change_of),
-                )
-            )
-            if field == "flight_time_s":
-                # One long flight can dominate a mean.
-                median = gap.median_flight_time
-                change = f"{number(median, 1, '+')} %"
-                rows.append(("its median by pairs", NONE, NONE, change, interval_cell(median)))
+    ]
+    for name, field, unit, scale in (
+        ("flight time", "flight_time_s", "s", 1.0),
+        ("distance", "distance_m", "m", 1.0),
+        ("energy", "energy_j", "kJ", 1e-3),
+    ):
+        change: Figure = getattr(gap, field)
+        values = (f"{number(getattr(run, field), 2, scale=scale)} {unit}" for run in pair)
+        rows.append((name, *values, f"{number(change, 1, '+')} %", interval_cell(change)))
+        if field == "flight_time_s":
+            # One long flight can dominate a mean.
+            median = gap.median_flight_time
+            percents = f"{number(median, 1, '+')} %"
+            rows.append(("its median by pairs", NONE, NONE, percents, interval_cell(median)))
     return table(("same seeds", "gym", target_level, "difference", "95 % interval"), rows)
